@@ -45,19 +45,21 @@ def springs(x):
 def test_a_rough_search_leaves_no_more_than_it_may_and_says_so():
     start = np.array([4e-3, 5e-3])
     rest = find_balance(springs, start)
-    rough = find_balance(springs, start, left=0.1)
+    rough = find_balance(springs, start, residual_share=0.1)
     assert rest.status is rough.status is BalanceStatus.OK
     assert rest.at_rest
     assert not rough.at_rest
     assert rough.trials < rest.trials
     missed = np.linalg.norm(rough.coordinates - rest.coordinates)
     assert 0 < missed < 0.15 * np.linalg.norm(rough.coordinates - start)
-    assert find_balance(springs, rest.coordinates, left=0.1).at_rest
+    assert find_balance(springs, rest.coordinates, residual_share=0.1).at_rest
 
 
 def test_a_rough_search_does_not_end_where_nothing_holds_it():
     """On a hilltop a short Newton step leads up it."""
-    hilltop = find_balance(lambda x: Trial(1e5 * x, -1e5 * np.eye(1)), np.array([1e-4]), left=0.5)
+    hilltop = find_balance(
+        lambda x: Trial(1e5 * x, -1e5 * np.eye(1)), np.array([1e-4]), residual_share=0.5
+    )
     assert hilltop.status is not BalanceStatus.OK
 
 

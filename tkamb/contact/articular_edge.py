@@ -84,11 +84,11 @@ class ArticularEdge:
         return np.asarray(np.maximum(self.away[tuple(cell.T)] - self.spacing / 2, 0.0), float)
 
 
-def _joined_to_outside(wanted: Mask, outside: Mask) -> Mask:
+def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
     """Return the connected parts of a mask (a, b) that hold a cell outside the insert."""
-    part, _ = label(wanted, structure=np.ones((3, 3)))
+    part, _ = label(flat, structure=np.ones((3, 3)))
     touching = np.unique(part[outside])
-    return np.asarray(wanted & np.isin(part, touching), bool)
+    return np.asarray(flat & np.isin(part, touching), bool)
 
 
 def edge_of_insert_flags(
@@ -108,15 +108,15 @@ def edge_of_insert_flags(
         settings: when contact is at the edge.
     """
     for side, own in sides.items():
-        carried = np.where(own, pressure, 0.0)
-        highest = float(carried.max(initial=0.0))
+        own_pressure = np.where(own, pressure, 0.0)
+        highest = float(own_pressure.max(initial=0.0))
         if highest <= 0.0:
             continue
-        loaded = np.flatnonzero(carried > settings.share * highest)
+        loaded = np.flatnonzero(own_pressure > settings.share * highest)
         away = edge.distance(points[loaded])
         if away.min() > settings.reach:
             continue
-        peak = float(away[np.argmax(carried[loaded])])
+        peak = float(away[np.argmax(own_pressure[loaded])])
         where = (
             "its peak pressure lies there"
             if peak <= settings.reach

@@ -126,15 +126,15 @@ def _fit(
     over, _ = insert.first(places + radius * normal, -normal)
     under, _ = femoral.first(transform(back, places - radius * normal), rotate(back, normal))
     of_insert, of_femoral = radius - over, under - radius
-    known = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
-    if known.mean() < CURVATURE.least_cover:
+    covered = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
+    if covered.mean() < CURVATURE.least_cover:
         return None
-    u, v = u[known], v[known]
+    u, v = u[covered], v[covered]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
-    heights = np.stack([of_insert[known], of_femoral[known]], axis=1)
+    heights = np.stack([of_insert[covered], of_femoral[covered]], axis=1)
     scale = radius ** np.array([0, 1, 1, 2, 2, 2])
-    found = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
-    return found[:, 0], found[:, 1]
+    coefficients = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
+    return coefficients[:, 0], coefficients[:, 1]
 
 
 def _hessian(quadric: Array) -> Array:

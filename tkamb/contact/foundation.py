@@ -133,6 +133,7 @@ class ElasticFoundation(ContactModel):
         result = press_by_search(self, state, load, pose, guess, nearby.reaction)
         if result.status is ContactStatus.OK and result.residual <= PRESS.load_tolerance:
             return result
+        # The reduced set of columns may have missed one; only a clear answer is taken from it.
         if result.status is ContactStatus.OUT_OF_RANGE and self._holds(nearby, load):
             return result
         return press_by_search(self, state, load, pose, guess)
@@ -147,10 +148,10 @@ class ElasticFoundation(ContactModel):
         if nearby.beyond - nearby.within > FOUNDATION.approach_step:
             return False
         pose = nearby.state.pair.pose_at_approach(nearby.pose, nearby.within)
-        found = self.evaluate(nearby.state, pose)
-        reaction = -float(found.wrench_on_insert[1])
+        result = self.evaluate(nearby.state, pose)
+        reaction = -float(result.wrench_on_insert[1])
         return (
-            found.status is ContactStatus.OK
+            result.status is ContactStatus.OK
             and reaction < FOUNDATION.reached_share * load - FOUNDATION.reached_force
         )
 
@@ -199,6 +200,8 @@ class _NearColumns:
         if approach > self._reach:
             samples, (gap, _, _) = self._around.at(pose)
             close = gap < NEAR
+            # The columns near by serve until the femur has come down by half of what they were
+            # chosen with; the other half is the margin for oblique gaps.
             self._near, self._reach, gap = samples.part(close), approach + NEAR / 2, gap[close]
         else:
             gap = gaps_along_normals(self._near, pair.femoral, pose)
@@ -208,6 +211,7 @@ class _NearColumns:
             self.beyond = min(self.beyond, approach)
             return np.inf
         pressure = layer_pressure(self._law, pair.material, strain)
+        # The pressure acts along the insert's normal; its y component carries the load.
         reaction = float((pressure * near.area) @ near.normals[:, 1])
         if approach > self.within:
             self.within, self._last = approach, reaction
@@ -218,9 +222,12 @@ def layer_pressure(law: Law, material: Material, strain: Array) -> Array:
     """Return the pressure (n,), Pa, of a column compressed by `strain` = d/h in [0, 1)."""
     if law == "linear":
         return material.confined_modulus * strain
+    # A confined layer is stiffer than a free bar by M / E; the curve is that of the bar at a strain
+    # that is larger by this factor.
     stiffening = material.confined_modulus / material.young_modulus
     pressure = np.zeros_like(strain)
     loaded = strain > 0
+    # Logarithmic strain: a layer pressed to nothing would carry an infinite stress.
     pressure[loaded] = material.stress(-stiffening * np.log1p(-strain[loaded]))
     return pressure
 
@@ -231,6 +238,7 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
         return np.full_like(strain, material.confined_modulus)
     stiffening = material.confined_modulus / material.young_modulus
     tangent = material.tangent(-stiffening * np.log1p(-strain))
+    # Chain rule of `layer_pressure`: d ln(1 - e) / de = -1 / (1 - e).
     return tangent * stiffening / (1.0 - strain)
 
 

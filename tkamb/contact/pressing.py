@@ -136,25 +136,25 @@ def press_by_search(
         )
     if load == 0:
         return unloaded_result(model, state, pose)
-    seen = _Evaluations(model, state, pose, guess)
+    evaluations = _Evaluations(model, state, pose, guess)
     start = guess.approach if guess is not None else PRESS.first_approach
-    found = search_load(reaction or seen.reaction, load, start)
-    if not math.isfinite(found.approach):
-        why = seen.at(found.deepest).flags
+    search = search_load(reaction or evaluations.reaction, load, start)
+    if not math.isfinite(search.approach):
+        why = evaluations.at(search.deepest).flags
         missed = f"a load of {load:g} N cannot be reached"
         return ContactResult.failed(
-            state, pose, missed, *why, iterations=found.evaluations, residual=found.residual
+            state, pose, missed, *why, iterations=search.evaluations, residual=search.residual
         )
-    return within_insert(state, _carried(seen.at(found.approach), found, load))
+    return within_insert(state, _carried(evaluations.at(search.approach), search, load))
 
 
-def _carried(result: ContactResult, found: LoadSearch, load: float) -> ContactResult:
+def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
     """Return the result with what the search says about it."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
     missed = not residual <= PRESS.coarse_tolerance
     return replace(
         result,
-        iterations=found.evaluations,
+        iterations=search.evaluations,
         residual=residual,
         status=ContactStatus.NOT_CONVERGED if missed else result.status,
         flags=(*result.flags, "the reaction jumps over the load") if missed else result.flags,
@@ -174,8 +174,8 @@ class _Evaluations:
     def at(self, approach: float) -> ContactResult:
         """Return the result at an approach (m)."""
         if self._last is None or approach != self._approach:
-            placed = self._state.pair.pose_at_approach(self._pose, approach)
-            self._last = self._model.evaluate(self._state, placed, self._guess)
+            pose = self._state.pair.pose_at_approach(self._pose, approach)
+            self._last = self._model.evaluate(self._state, pose, self._guess)
             self._approach = approach
         return self._last
 
@@ -183,8 +183,8 @@ class _Evaluations:
         """Return the reaction (N); inf where the model is out of range."""
         result = self.at(approach)
         force = -float(result.wrench_on_insert[1])
-        known = result.status is ContactStatus.OK and math.isfinite(force)
-        return force if known else math.inf
+        in_range = result.status is ContactStatus.OK and math.isfinite(force)
+        return force if in_range else math.inf
 
 
 def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
@@ -316,5 +316,7 @@ def thickness_near(pair: ContactPair, positions: Array) -> Array:
     met &= np.isfinite(leave)
     thick = np.where(met, leave + PRESS.ray_start_depth, 0.0).reshape(len(positions), -1)
     whole = met.reshape(thick.shape).all(axis=1)
-    found = np.where(whole, thick[:, 0], thick.max(axis=1))
-    return np.maximum(np.where(found > 0, found, positions[:, 1] - low), PRESS.ray_start_depth)
+    thickness = np.where(whole, thick[:, 0], thick.max(axis=1))
+    return np.maximum(
+        np.where(thickness > 0, thickness, positions[:, 1] - low), PRESS.ray_start_depth
+    )

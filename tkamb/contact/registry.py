@@ -84,7 +84,7 @@ def contact_model(
         InputError: no such name or option, an option's value that is none of its words, or
             a resolution that is not positive, resolves no contact, or is given twice.
     """
-    found, where = contact_class(name), f"contact model '{name}'"
+    cls, where = contact_class(name), f"contact model '{name}'"
     if resolution is not None and resolution_mm is not None:
         raise InputError("resolution and resolution_mm are both given", where, "give one of them")
     if resolution is None:
@@ -96,16 +96,16 @@ def contact_model(
         most = MAP_GRID.coarsest_mm
         hint = f"give more than 0, at most {most:g} mm ({most / 1e3:g} m)"
         raise InputError(words, where, hint)
-    own = _options(found)
+    own = _options(cls)
     for option, value in options.items():
         if option not in own:
             raise InputError(f"has no option '{option}'", where, names_near(option, own))
-        choices = _words(found, option)
+        choices = _words(cls, option)
         if choices and value not in choices:
-            mend = f"one of {', '.join(map(str, choices))}"
-            raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
-        _check_kind(found, option, value, where)
-    return found(resolution=spacing, **options)  # type: ignore[call-arg]
+            advice = f"one of {', '.join(map(str, choices))}"
+            raise InputError(f"option '{option}' cannot be {value!r}", where, advice)
+        _check_kind(cls, option, value, where)
+    return cls(resolution=spacing, **options)  # type: ignore[call-arg]
 
 
 def contact_options(name: str) -> tuple[str, ...]:
@@ -115,8 +115,8 @@ def contact_options(name: str) -> tuple[str, ...]:
 
 def _options(model: type[ContactModel]) -> list[str]:
     """Return the names of a model's own options."""
-    known = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]
-    return [option for option in known if option != "resolution"]
+    names = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]
+    return [option for option in names if option != "resolution"]
 
 
 def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
@@ -134,8 +134,8 @@ def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) 
         TypeAdapter(kind).validate_python(value, strict=True)
     except ValidationError:
         name = kind.__name__ if isinstance(kind, type) else str(kind)
-        mend = f"give a value of type {name}"
-        raise InputError(f"option '{option}' cannot be {value!r}", where, mend) from None
+        hint = f"give a value of type {name}"
+        raise InputError(f"option '{option}' cannot be {value!r}", where, hint) from None
 
 
 def contact_descriptions() -> dict[str, str]:
@@ -146,9 +146,9 @@ def contact_descriptions() -> dict[str, str]:
     lines = {}
     for name in contact_names():
         try:
-            found = contact_class(name)
-            own = ", ".join(_options(found)) or "none"
-            lines[name] = f"assumes {found.assumes}; needs {found.needs}; options: {own}"
+            cls = contact_class(name)
+            own = ", ".join(_options(cls)) or "none"
+            lines[name] = f"assumes {cls.assumes}; needs {cls.needs}; options: {own}"
         except InputError as error:
             lines[name] = str(error)
     return lines

@@ -243,16 +243,16 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)
     thickness = caster.last_exit(origins, DOWN) - distance
-    lost = ~np.isfinite(thickness)
-    if lost.mean() > 0.01:
+    without_end = ~np.isfinite(thickness)
+    if without_end.mean() > 0.01:
         raise InputError(
-            f"{lost.mean():.0%} of vertical rays enter it and never leave",
+            f"{without_end.mean():.0%} of vertical rays enter it and never leave",
             insert.name,
             "the insert must be a closed surface with outward normals",
         )
-    keep = np.flatnonzero(~lost)
-    if lost.any():
-        thickness[lost] = thickness[keep[cKDTree(xz[keep]).query(xz[lost])[1]]]
+    keep = np.flatnonzero(~without_end)
+    if without_end.any():
+        thickness[without_end] = thickness[keep[cKDTree(xz[keep]).query(xz[without_end])[1]]]
     return origins + distance[:, None] * DOWN, face, thickness
 
 

@@ -122,10 +122,10 @@ def adjust(
     turn, flags = 0.0, tuple[str, ...]()
     if gaps.lateral is not None and abs(angle) * distance > settings.level_difference:
         turn, flags = _limited_turn(query, recorded, angle, distance, settings)
-    turned = _turned(query, recorded, turn) if turn else recorded
-    moved, translation, more = moved_to_touch(query, turned, settings)
+    level = _turned(query, recorded, turn) if turn else recorded
+    touching, translation, more = moved_to_touch(query, level, settings)
     return Adjustment(
-        moved, recorded, translation, turn, angle, distance, settings, flags=(*flags, *more)
+        touching, recorded, translation, turn, angle, distance, settings, flags=(*flags, *more)
     )
 
 
@@ -144,9 +144,9 @@ def _limited_turn(
     largest = max(abs(angle), abs(turn))
     flags: tuple[str, ...] = ()
     if abs(largest - limit) <= margin:
-        done = "turned level" if largest < limit else "left as lift-off"
+        outcome = "turned level" if largest < limit else "left as lift-off"
         flags = (
-            f"coronal angle of {largest / DEGREE:.2f} deg is {done}: the limit of "
+            f"coronal angle of {largest / DEGREE:.2f} deg is {outcome}: the limit of "
             f"{limit / DEGREE:g} deg is less than {settings.input_change / MILLIMETRE:g} mm at a "
             "condyle away, and the split steps there",
         )
@@ -177,8 +177,8 @@ def moved_to_touch(
 
 
 def _check_near(gaps: CondyleGaps, settings: AdjustmentSettings) -> None:
-    found = [gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None]
-    nearest = min(found, key=abs)
+    condyle_gaps = [gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None]
+    nearest = min(condyle_gaps, key=abs)
     if abs(nearest) > settings.largest_recorded_gap:
         word = "above" if nearest > 0.0 else "inside"
         raise InputError(
@@ -247,6 +247,6 @@ def _turned(query: ClosestPointQuery, recorded: Array, turn: float) -> Array:
 
 def raised(at: Array, along_y: float) -> Array:
     """Return the pose (4, 4) moved by `along_y` (m) along the insert's y."""
-    moved = np.array(at)
-    moved[1, 3] += along_y
-    return moved
+    shifted = np.array(at)
+    shifted[1, 3] += along_y
+    return shifted

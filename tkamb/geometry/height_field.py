@@ -89,8 +89,8 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     tied = np.zeros(shape[0] * shape[1], bool)
     tied[line[~(sides.all(axis=0) | ~sides.any(axis=0))]] = True
     for quadrant in range(4):
-        here = sides[quadrant] & ((quadrant == 0) | tied[line])
-        lines, heights = _paired(line[here], height[here], rising[here], tied.size)
+        counts = sides[quadrant] & ((quadrant == 0) | tied[line])
+        lines, heights = _paired(line[counts], height[counts], rising[counts], tied.size)
         odd = np.bincount(lines, minlength=tied.size) % 2 == 1
         if quadrant == 0:
             mended = int(odd.sum())
@@ -181,18 +181,21 @@ def _signed_areas(
     sides = np.empty((3, 4, len(faces)), np.int8)
     for corner in range(3):
         start, end = faces[:, (corner + 1) % 3], faces[:, (corner + 2) % 3]
-        turned = start > end
-        tail, head = flat[np.where(turned, end, start)], flat[np.where(turned, start, end)]
+        reversed_edge = start > end
+        tail, head = (
+            flat[np.where(reversed_edge, end, start)],
+            flat[np.where(reversed_edge, start, end)],
+        )
         edge, offset = head - tail, points - tail
         value = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
-        tail, head = (whole_flat[np.where(t, end, start)] for t in (turned, ~turned))
+        tail, head = (whole_flat[np.where(t, end, start)] for t in (reversed_edge, ~reversed_edge))
         edge, offset = head - tail, whole_points - tail
         exact = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
-        orientation = np.where(turned, -1, 1)
+        orientation = np.where(reversed_edge, -1, 1)
         area[corner] = value * orientation
         for quadrant, (u, v) in enumerate(((1, 1), (-1, 1), (1, -1), (-1, -1))):
-            moved = np.where(edge[:, 1] != 0, -edge[:, 1] * u, edge[:, 0] * v)
-            sides[corner, quadrant] = np.sign(np.where(exact == 0, moved, exact)) * orientation
+            perturbed = np.where(edge[:, 1] != 0, -edge[:, 1] * u, edge[:, 0] * v)
+            sides[corner, quadrant] = np.sign(np.where(exact == 0, perturbed, exact)) * orientation
     return area, sides
 
 

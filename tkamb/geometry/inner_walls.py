@@ -163,5 +163,5 @@ def _divided(vertices: Array, faces: Index, dividing: dict[tuple[int, int], Inde
         a, b, c = vertices[faces[face]]
         cut = ears(vertices, np.array(ring), np.cross(b - a, c - a))
         added.extend((int(x), int(y), int(z)) for x, y, z in cut)
-    kept = np.delete(faces, list(by_face), axis=0)
-    return np.concatenate([kept, np.array(added, np.int64).reshape(-1, 3)])
+    whole_faces = np.delete(faces, list(by_face), axis=0)
+    return np.concatenate([whole_faces, np.array(added, np.int64).reshape(-1, 3)])

@@ -51,10 +51,12 @@ def corner_normals(surface: "Surface", crease: float, weights: Array) -> Array:
         rough = np.zeros(len(mean), bool)
         rough[vertex[~(lean > np.cos(crease / 2) + NORMAL.cosine_rounding)]] = True
         corners = np.flatnonzero(rough[vertex])
-        here, there = surface.corners_at_vertices.of(vertex[corners])
-        turn = np.einsum("pj,pj->p", normals[corners[here]], normals[there])
+        corner_of_pair, neighbour = surface.corners_at_vertices.of(vertex[corners])
+        turn = np.einsum("pj,pj->p", normals[corners[corner_of_pair]], normals[neighbour])
         counts = (turn >= np.cos(crease))[:, None]
-        total[corners] = _sums(here, np.where(counts, weighted[there], 0.0), len(corners))
+        total[corners] = _sums(
+            corner_of_pair, np.where(counts, weighted[neighbour], 0.0), len(corners)
+        )
     return _unit(total).reshape(-1, 3, 3)
 
 

@@ -246,12 +246,12 @@ class ChainState:
 
     def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
         """Return a laboratory force (3,), its point (3,) and moment (3,) as load on the tibia."""
-        here = self.laboratory_in_insert
+        laboratory = self.laboratory_in_insert
         return PointForces(
             "tibia",
-            transform(here, point)[None],
-            rotate(here, force)[None],
-            rotate(here, moment),
+            transform(laboratory, point)[None],
+            rotate(laboratory, force)[None],
+            rotate(laboratory, moment),
         )
 
     def _jacobian(self, link: str) -> Array:

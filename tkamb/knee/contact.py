@@ -123,13 +123,13 @@ class KneeContact:
         total = np.zeros((6, 6))
         for load in contact.loads if self.friction else ():
             normal, point = load.normal, load.point
-            moved = np.hstack([np.eye(3), -_cross_matrix(point)])
-            sliding = moved @ twist
+            point_jacobian = np.hstack([np.eye(3), -_cross_matrix(point)])
+            sliding = point_jacobian @ twist
             tangential = sliding - (sliding @ normal) * normal
             speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
             across = np.eye(3) - np.outer(normal, normal)
             slope = across / speed - np.outer(tangential, tangential) / speed**3
-            total += self.friction * load.force * moved.T @ slope @ moved
+            total += self.friction * load.force * point_jacobian.T @ slope @ point_jacobian
         return total
 
     def stiffness(
@@ -176,8 +176,8 @@ def batch_differences(
     sizes = settings.step * np.array([1.0, 1.0, 1.0, *np.full(3, 1.0 / settings.arm)])
     steps = np.concatenate([np.diag(sizes), -np.diag(sizes)])
     turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
-    found = wrenches(pose(turns @ place[:3, :3], turns @ place[:3, 3] + steps[:, :3]))
-    return ((found[:6] - found[6:]) / (2.0 * sizes[:, None])).T
+    values = wrenches(pose(turns @ place[:3, :3], turns @ place[:3, 3] + steps[:, :3]))
+    return ((values[:6] - values[6:]) / (2.0 * sizes[:, None])).T
 
 
 def differences(

@@ -56,6 +56,8 @@ class CondylePoint:
         friction against the sliding, fading below v0 = 1 mm/s.
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal
+        # Regularised Coulomb friction: the force fades to zero at standstill, where its direction
+        # would jump.
         speed = np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2)
         return np.asarray(self.normal - friction * tangential / speed)
 
@@ -91,8 +93,8 @@ def contact_points(
             insert's there.
     """
     gaps = query.at(pose)
-    found = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
-    condyles = {side: _condyle(gap, sliding) for side, gap in found.items()}
+    condyle_gaps = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
+    condyles = {side: _condyle(gap, sliding) for side, gap in condyle_gaps.items()}
     nearest = nearest_gap(gaps)
     problems: tuple[str, ...] = ()
     if abs(nearest) > CONTACT_POINT.max_gap:
@@ -114,8 +116,10 @@ def _find_lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
     if len(condyles) < 2:
         return frozenset()
     medial, lateral = condyles["medial"], condyles["lateral"]
+    # z is medial-lateral, so this is the distance of the condyles in the coronal plane.
     width = abs(lateral.point[2] - medial.point[2])
     higher = "lateral" if lateral.gap > medial.gap else "medial"
+    # Small angle: the difference of the gaps over the distance of the condyles.
     tilted = abs(lateral.gap - medial.gap) > CONTACT_POINT.lift_off_angle * width
     return frozenset(
         {higher} if tilted and condyles[higher].gap > CONTACT_POINT.lift_off_gap else ()

@@ -80,9 +80,9 @@ class JointEquilibrium:
             contact: (6,) w_contact on the insert.
         """
         axes, columns, wrench = self._sum_loads(coordinates, contact)
-        kept = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
-        left = wrench + np.einsum("...ij,...j->...i", columns, kept)
-        return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], left)
+        reactions = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
+        remainder = wrench + np.einsum("...ij,...j->...i", columns, reactions)
+        return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], remainder)
 
     def kept(self, coordinates: Array, contact: Array) -> Array:
         """Return y (6 - n,): what keeps the prescribed coordinates, flexion last."""
@@ -99,8 +99,8 @@ class JointEquilibrium:
     def kept_and_left(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
         """Return what `kept` does and R (6,), the wrench on the insert that is left over then."""
         axes, columns, wrench = self._sum_loads(coordinates, contact)
-        kept = _magnitudes(axes[self._prescribed], columns, wrench)
-        return kept, wrench + columns @ kept
+        reactions = _magnitudes(axes[self._prescribed], columns, wrench)
+        return reactions, wrench + columns @ reactions
 
     def whole(self, coordinates: Array, contact: Array) -> Array:
         """Return (m, 6): generalised forces on all coordinates, kept as at the last of m places.
@@ -110,8 +110,8 @@ class JointEquilibrium:
             contact: (6,) w_contact on the insert.
         """
         axes, columns, wrench = self._sum_loads(coordinates, contact)
-        kept = _magnitudes(axes[-1, self._prescribed], columns[-1], wrench[-1])
-        return -np.einsum("mij,mj->mi", axes, wrench + columns @ kept)
+        reactions = _magnitudes(axes[-1, self._prescribed], columns[-1], wrench[-1])
+        return -np.einsum("mij,mj->mi", axes, wrench + columns @ reactions)
 
     def columns(self, coordinates: Array) -> Array:
         """Return B (6, 6 - n) at coordinates (6,)."""

@@ -44,10 +44,10 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
         for name, end in (("proximal", bundle.proximal), ("distal", bundle.distal)):
             lateral = _lateral_place(end, chain)
             if sign * lateral < -LIGAMENT_SIDE.wrong_side_distance:
-                there, own = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
+                opposite, own = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
                 raise InputError(
-                    f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {there} side "
-                    f"of this {side} knee, a ligament of the {own} side by its name",
+                    f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {opposite} "
+                    f"side of this {side} knee, a ligament of the {own} side by its name",
                     f"[[ligament]] {bundle.name}",
                     "turn the sign of z in point_mm (z points to the right on either side), or "
                     "mend [patient] side or the name",

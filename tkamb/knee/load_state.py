@@ -115,8 +115,8 @@ def contradictions(
             name, pull = next(iter(pulls.items()))
             wrong.append(f"{name.removeprefix(MUSCLE)} would pull with {pull:.3g} N")
     for side in sorted(state.lifted - off):
-        there = solutions[LoadState(state.lifted - {side}, state.slack)]
-        force = there.values[f"{side}_normal"]
+        alternative = solutions[LoadState(state.lifted - {side}, state.slack)]
+        force = alternative.values[f"{side}_normal"]
         if not force < 0.0:
             wrong.append(f"{side} condyle would push with {force:.3g} N")
     return wrong

@@ -151,8 +151,8 @@ def touching_patella(coordinates: Array, point: Array, normal: Array) -> Patella
     """
     nan = float("nan")
     on_patella = np.full(3, nan)
-    known = (coordinates, point, normal, on_patella)
-    return PatellaState(*known, nan, nan, nan, nan, nan, PatellaStatus.OK)
+    place = (coordinates, point, normal, on_patella)
+    return PatellaState(*place, nan, nan, nan, nan, nan, PatellaStatus.OK)
 
 
 class PatellaFrame:
@@ -173,12 +173,15 @@ class PatellaFrame:
     def balance_at(self, coordinates: Array, contact: PatellarContact) -> PatellaBalance:
         """Return what `balance` does, with the contact there known already."""
         m = self.mechanism
-        here = m.contact.pose(coordinates)
+        patella_pose = m.contact.pose(coordinates)
         muscle = path_in_link(
-            self.origin, transform(here, m.muscle_insertion), m.femoral_outline, self.femur
+            self.origin, transform(patella_pose, m.muscle_insertion), m.femoral_outline, self.femur
         )
         ligament = path_in_link(
-            transform(here, m.ligament_proximal), self.tuberosity, m.insert_outline, self.insert
+            transform(patella_pose, m.ligament_proximal),
+            self.tuberosity,
+            m.insert_outline,
+            self.insert,
         )
         pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])

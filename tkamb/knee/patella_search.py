@@ -91,25 +91,25 @@ def solve_patella(
         The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
     """
     search = _Search(mechanism, pose_femur_in_insert)
-    found, several = None, False
+    balance, several = None, False
     if guess is not None and np.isfinite(guess).all():
         try:
-            found = search.follow(guess, slopes)
+            balance = search.follow(guess, slopes)
         except ComputationError:
-            found = None  # a guess that leads nowhere says nothing: all rotations are searched
-    if found is None:
+            balance = None  # a guess that leads nowhere says nothing: all rotations are searched
+    if balance is None:
         if not anywhere:
             return _nothing(PatellaStatus.MOMENT)
         try:
-            found, several = search.scan()
+            balance, several = search.scan()
         except _Lost as lost:
             return _nothing(lost.status)
-    if found.normal_force <= 0.0 or found.ligament_force <= 0.0:
+    if balance.normal_force <= 0.0 or balance.ligament_force <= 0.0:
         return _nothing(PatellaStatus.PULL)
     status = PatellaStatus.SEVERAL if several else PatellaStatus.OK
-    if found.contact.on_edge > 0.5:
+    if balance.contact.on_edge > 0.5:
         status = PatellaStatus.EDGE
-    return search.state(found, status)
+    return search.state(balance, status)
 
 
 class _Closing:
@@ -178,35 +178,35 @@ class _Search(PatellaFrame):
             ComputationError: there is none within `WIDEST_TURN`.
         """
         if slopes is not None:
-            found = self._closed_in(guess, slopes, (-NEAR_TURN, NEAR_TURN))
-            if found is not None:
-                return found
-        here = self.at_rotation(guess, float(guess[2]))
+            balance = self._closed_in(guess, slopes, (-NEAR_TURN, NEAR_TURN))
+            if balance is not None:
+                return balance
+        current = self.at_rotation(guess, float(guess[2]))
         step = FIRST_STEP
-        while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
-            turn = here.coordinates[2] + np.sign(here.moment) * step
-            there = self.at_rotation(here.coordinates, float(turn))
-            if there.moment * here.moment <= 0.0:
-                return self.between(here, there)
-            ahead = self._chord(here, there, PATELLA_SEARCH.max_chord_lengths)
+        while abs(current.coordinates[2] - guess[2]) < WIDEST_TURN:
+            turn = current.coordinates[2] + np.sign(current.moment) * step
+            next_balance = self.at_rotation(current.coordinates, float(turn))
+            if next_balance.moment * current.moment <= 0.0:
+                return self.between(current, next_balance)
+            ahead = self._chord(current, next_balance, PATELLA_SEARCH.max_chord_lengths)
             if ahead is not None:
                 return ahead
-            here, step = there, 1.6 * step
+            current, step = next_balance, 1.6 * step
         raise _Lost(PatellaStatus.MOMENT)
 
-    def between(self, here: PatellaBalance, there: PatellaBalance) -> PatellaBalance:
+    def between(self, first: PatellaBalance, second: PatellaBalance) -> PatellaBalance:
         """Return the balance at the zero of the moment between two rotations."""
-        found = self._chord(here, there)
-        if found is not None:
-            return found
-        last = here
+        balance = self._chord(first, second)
+        if balance is not None:
+            return balance
+        last = first
 
         def moment(rotation: float) -> float:
             nonlocal last
             last = self.at_rotation(last.coordinates, rotation)
             return last.moment
 
-        ends = (here.coordinates[2], there.coordinates[2])
+        ends = (first.coordinates[2], second.coordinates[2])
         try:
             brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
@@ -216,20 +216,20 @@ class _Search(PatellaFrame):
         return last
 
     def _chord(
-        self, here: PatellaBalance, there: PatellaBalance, reach: float = 1.0
+        self, first: PatellaBalance, second: PatellaBalance, reach: float = 1.0
     ) -> PatellaBalance | None:
         """Return the stable balance on the chord of two, at most `reach` times its length away."""
-        turn = float(there.coordinates[2] - here.coordinates[2])
-        way = (there.coordinates - here.coordinates)[:2] / turn
-        slope = (there.moment - here.moment) / turn
+        turn = float(second.coordinates[2] - first.coordinates[2])
+        way = (second.coordinates - first.coordinates)[:2] / turn
+        slope = (second.moment - first.moment) / turn
         if slope >= 0.0:
             return None
         slopes = np.zeros((3, 3))
-        slopes[:2, :2] = _slopes_in_plane(here)
+        slopes[:2, :2] = _slopes_in_plane(first)
         slopes[:2, 2], slopes[2, 2] = -slopes[:2, :2] @ way, slope
-        start = here.coordinates + np.append(way, 1.0) * -here.moment / slope
+        start = first.coordinates + np.append(way, 1.0) * -first.moment / slope
         span = np.array([min(0.0, reach * turn), max(0.0, reach * turn)])
-        return self._closed_in(start, slopes, span + here.coordinates[2] - start[2])
+        return self._closed_in(start, slopes, span + first.coordinates[2] - start[2])
 
     def _closed_in(
         self, start: Array, slopes: Array, span: Sequence[float]
@@ -282,17 +282,17 @@ class _Search(PatellaFrame):
             except ComputationError as error:
                 places.append(None)
                 misses.append(_condition(error))
-        found = []
-        for here, there in pairwise(places):
-            if here and there and here.moment > 0.0 >= there.moment:
+        balances = []
+        for first, second in pairwise(places):
+            if first and second and first.moment > 0.0 >= second.moment:
                 try:
-                    found.append(self.between(here, there))
+                    balances.append(self.between(first, second))
                 except ComputationError as error:
                     misses.append(_condition(error))
-        if not found:
+        if not balances:
             misses += [PatellaStatus.MOMENT] * any(places)
             raise _Lost(max(misses, key=_CONDITIONS.index))
-        return min(found, key=lambda b: b.muscle.length), len(found) > 1
+        return min(balances, key=lambda b: b.muscle.length), len(balances) > 1
 
     def first_touch(self, rotation: float) -> PatellaBalance:
         """Return the balance at a rotation, the patella swung in on its ligament from in front.
@@ -301,8 +301,8 @@ class _Search(PatellaFrame):
             ComputationError: it touches nothing, or gap or length do not hold where it does.
         """
         m = self.mechanism
-        turned = m.contact.pose(np.array([0.0, 0.0, rotation]))
-        proximal = transform(turned, m.ligament_proximal)
+        rotated = m.contact.pose(np.array([0.0, 0.0, rotation]))
+        proximal = transform(rotated, m.ligament_proximal)
         radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
 
         def place(lean: float) -> Array:
@@ -317,10 +317,10 @@ class _Search(PatellaFrame):
         for _ in range(6):
             middle = 0.5 * (free + deep)
             free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
-        found = self.at_rotation(place(free), rotation)
-        if np.linalg.norm((found.coordinates - place(free))[:2]) > PATELLA_SEARCH.max_distance:
+        balance = self.at_rotation(place(free), rotation)
+        if np.linalg.norm((balance.coordinates - place(free))[:2]) > PATELLA_SEARCH.max_distance:
             raise _Lost(PatellaStatus.GAP)
-        return found
+        return balance
 
 
 _CONDITIONS = (

@@ -128,11 +128,11 @@ def _side(contact: "ContactResult", knee: "Knee", side: str) -> Any:
 
 
 def _solid(
-    node: Any, surface: "Surface | None", pose: Array, left: bool, part: str, opacity: float
+    node: Any, surface: "Surface | None", pose: Array, is_left: bool, part: str, opacity: float
 ) -> None:
     if surface is None:
         return
-    own = mirrored_surface(surface) if left else surface
+    own = mirrored_surface(surface) if is_left else surface
     material = geometry.MeshPhongMaterial(
         color=COLOURS[part], opacity=opacity, transparent=opacity < 1.0
     )

@@ -100,12 +100,12 @@ def condyle_slip(
     lowest = LowestPoints(femoral, split)
     poses, profile = knee_pose(coordinates), InsertProfile(insert)
     centre = transform(poses, femoral.bounds.mean(axis=0))
-    found = [lowest.at(pose) for pose in poses]
+    gaps = [lowest.at(pose) for pose in poses]
     slips: list[CondyleSlip] = []
     for side in (0, 1):
-        if found[0][side] is None:
+        if gaps[0][side] is None:
             return slips[0], None
-        points = np.array([pair[side] for pair in found])
+        points = np.array([pair[side] for pair in gaps])
         slips.append(slip_of_points(points, poses, coordinates[:, 3], centre[:, 2], profile))
     return slips[0], slips[1]
 
@@ -146,10 +146,10 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
         poses: (f, 4, 4) pose_femoral_in_insert.
     """
     back = inverse(poses)
-    here = transform(back, points[:, None])[:, 0]
+    in_femur = transform(back, points[:, None])[:, 0]
     normal = rotate(back, -UP)
     angle = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
-    chord = np.diff(here, axis=0)
+    chord = np.diff(in_femur, axis=0)
     middle = np.einsum("fij,fj->fi", poses[1:, :3, :3] + poses[:-1, :3, :3], chord)
     size, twice = np.linalg.norm(chord, axis=1), np.linalg.norm(middle, axis=1)
     middle *= np.divide(size, twice, out=np.zeros_like(size), where=twice > 0.0)[:, None]
@@ -217,21 +217,21 @@ def roll_slip_motion(
     Returns:
         (f, 6) knee coordinates; NaN from where the femur leaves the insert.
     """
-    moved = np.array(coordinates, float)
-    poses, profile = knee_pose(moved), InsertProfile(insert)
+    changed = np.array(coordinates, float)
+    poses, profile = knee_pose(changed), InsertProfile(insert)
     touch = FirstTouch(femoral, insert, split)
     arms, arcs = _mean_condyle(LowestPoints(femoral, split), poses)
     centre_z = transform(poses, femoral.bounds.mean(axis=0))[:, 2]
-    axial = np.diff(moved[:, 3]) * _mean(arms[:, 2] + poses[:, 2, 3] - centre_z)
+    axial = np.diff(changed[:, 3]) * _mean(arms[:, 2] + poses[:, 2, 3] - centre_z)
     backwards = arcs - np.diff(np.asarray(slip, float))
-    contact = moved[0, 0] + arms[0, 0]
-    moved[0, 1] -= touch.travel(knee_pose(moved[0]))
-    for k in range(1, len(moved)):
+    contact = changed[0, 0] + arms[0, 0]
+    changed[0, 1] -= touch.travel(knee_pose(changed[0]))
+    for k in range(1, len(changed)):
         contact = _roll(profile, contact, poses[k, 2, 3] + arms[k, 2], backwards[k - 1])
         contact -= axial[k - 1]
-        moved[k, 0] = contact - arms[k, 0]
-        moved[k, 1] -= touch.travel(knee_pose(moved[k])) if np.isfinite(contact) else np.nan
-    return moved
+        changed[k, 0] = contact - arms[k, 0]
+        changed[k, 1] -= touch.travel(knee_pose(changed[k])) if np.isfinite(contact) else np.nan
+    return changed
 
 
 def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
@@ -239,8 +239,8 @@ def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
 
     Both depend on the rotations alone: arms (f, 3) m and femoral arcs (f-1,) m.
     """
-    found = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
-    points = np.array(found).swapaxes(0, 1)
+    condyle_points = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
+    points = np.array(condyle_points).swapaxes(0, 1)
     arcs = np.mean([femoral_arcs(side, poses) for side in points], axis=0)
     return points.mean(axis=0) - poses[:, :3, 3], np.asarray(arcs)
 

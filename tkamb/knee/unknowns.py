@@ -98,10 +98,10 @@ def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces
 
 def moment_pair(link: str, other: str, moment: Array) -> tuple[PointForces, ...]:
     """Return a free `moment` (3,) on `link` and its opposite on `other`."""
-    nothing = np.zeros((1, 3))
+    zero = np.zeros((1, 3))
     return (
-        PointForces(link, nothing, nothing, moment),
-        PointForces(other, nothing, nothing, -moment),
+        PointForces(link, zero, zero, moment),
+        PointForces(other, zero, zero, -moment),
     )
 
 
@@ -112,13 +112,13 @@ def muscle_load(name: str) -> str:
 
 def hip(point: Array) -> list[Unknown]:
     """Return hip force and moment on the femur at the hip centre (3,)."""
-    nothing = np.zeros((1, 3))
+    zero = np.zeros((1, 3))
     forces = [
         Unknown(f"hip_force_{name}", (PointForces("femur", point[None], axis[None]),))
         for name, axis in AXES.items()
     ]
     moments = [
-        Unknown(f"hip_moment_{name}", (PointForces("femur", nothing, nothing, axis),))
+        Unknown(f"hip_moment_{name}", (PointForces("femur", zero, zero, axis),))
         for name, axis in AXES.items()
     ]
     return forces + moments
@@ -187,13 +187,13 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
         lifted: one condyle is off, a coronal moment takes the place of its force.
         extensor: muscles act; without them the flexion moment joins the residuals.
     """
-    found = [
+    unknowns = [
         Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
         Unknown("residual_ml", pair("tibia", "femur", point, AXES["ml"])),
         Unknown("residual_axial", moment_pair("tibia", "femur", AXES["si"])),
     ]
     if lifted:
-        found.append(Unknown("residual_coronal", moment_pair("tibia", "femur", AXES["ap"])))
+        unknowns.append(Unknown("residual_coronal", moment_pair("tibia", "femur", AXES["ap"])))
     if not extensor:
-        found.append(Unknown("residual_flexion", moment_pair("tibia", "femur", AXES["ml"])))
-    return found
+        unknowns.append(Unknown("residual_flexion", moment_pair("tibia", "femur", AXES["ml"])))
+    return unknowns

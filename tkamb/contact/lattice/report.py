@@ -23,7 +23,7 @@ def result_of(
     gaps: Array,
     solution: Solution,
     rule: PressureRule,
-    sketch: bool = False,
+    forces_only: bool = False,
 ) -> ContactResult:
     """Return the contract's result.
 
@@ -34,7 +34,7 @@ def result_of(
         gaps: (c,) vertical gaps at that pose, m.
         solution: what the solver found.
         rule: how a nodal force becomes a pressure.
-        sketch: forces alone count: no areas within nodes, no gaps beside the contact, no flags.
+        forces_only: no areas within nodes, no gaps beside the contact and no flags are computed.
     """
     depth = solution.forces.approach if load is not None else 0.0
     pose = pose.copy()
@@ -42,7 +42,7 @@ def result_of(
     if solution.field is not None and not np.isfinite(solution.field).all():
         return ContactResult.failed(state, pose, "the solver left the range of numbers")
     force, pressure, area = _pressures(state, gaps - depth, solution, rule)
-    made = partial(
+    with_fields = partial(
         ContactResult.of,
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
@@ -53,8 +53,8 @@ def result_of(
         flags, collapsed = strain_flags(state, solution)
         if collapsed:
             return ContactResult.failed(state, pose, *flags)
-    if sketch:
-        return made(state, pose, pressure, gaps - depth, force, area, area)
+    if forces_only:
+        return with_fields(state, pose, pressure, gaps - depth, force, area, area)
     if not solution.converged:
         flags = (*flags, unsettled_flag(solution))
     gap = _gaps(state, pose, gaps - depth, force, solution)
@@ -64,7 +64,7 @@ def result_of(
             surface.points, surface.triangles, surface.triangle_area,
             pressure, gap, state.pair.material,
         )  # fmt: skip
-    result = made(state, pose, pressure, gap, force, area, covered, flags=flags)
+    result = with_fields(state, pose, pressure, gap, force, area, covered, flags=flags)
     return replace(result, flags=(*result.flags, *unresolved_flags(state, result)))
 
 
@@ -118,12 +118,12 @@ def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Sol
     """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
     problem = state.problem
     if solution.field is not None:
-        moved = solution.field[problem.contact_nodes[nodes]]
+        displacement = solution.field[problem.contact_nodes[nodes]]
     else:
         loaded = solution.forces.force != 0.0
         force = solution.forces.force[loaded, None] * solution.planes.normals[loaded]
-        moved = state.compliance.moved(nodes, solution.candidates[loaded], force)
-    positions = problem.surface_points[nodes] + moved
+        displacement = state.compliance.moved(nodes, solution.candidates[loaded], force)
+    positions = problem.surface_points[nodes] + displacement
     planes = tangent_planes(problem, positions, pose, None)
     return np.where(planes.normal_y < LEAST_NORMAL_Y, planes.gap(positions), np.inf)
 
@@ -142,6 +142,6 @@ def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -
 
 def beside(triangles: Index, touched: Mask) -> Mask:
     """Return which nodes (n,) share a triangle with one in contact and are not in contact."""
-    found = np.zeros_like(touched)
-    found[triangles[touched[triangles].any(axis=1)]] = True
-    return found & ~touched
+    neighbours = np.zeros_like(touched)
+    neighbours[triangles[touched[triangles].any(axis=1)]] = True
+    return neighbours & ~touched

@@ -69,34 +69,34 @@ class Relaxation:
         self._yields: Array | None = None
         self._passes, self.doubt = 0, 0.0
 
-    def yielding(self, found: Array | None) -> Array | None:
+    def yielding(self, measured: Array | None) -> Array | None:
         """Return how the knee is taken to yield.
 
         Args:
-            found: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
+            measured: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
         """
         self._passes, self.doubt = self._passes + 1, 0.0
-        last, self._yields = self._yields, found
+        last, self._yields = self._yields, measured
         step = next((part for until, part in STEPS if self._passes <= until), 0.0)
-        if last is None or found is None or step == 1.0:
-            return found
-        taken = last + step * (found - last)
-        away, size = (float(np.linalg.norm(part * TURNS)) for part in (found - taken, taken))
+        if last is None or measured is None or step == 1.0:
+            return measured
+        relaxed = last + step * (measured - last)
+        away, size = (float(np.linalg.norm(part * TURNS)) for part in (measured - relaxed, relaxed))
         if away > 0.0:
             self.doubt = away / size if size > 0.0 else np.inf
-        self._yields = taken
-        return taken
+        self._yields = relaxed
+        return relaxed
 
-    def mixed(self, asked: "MuscleShare") -> "MuscleShare":
+    def mixed(self, required: "MuscleShare") -> "MuscleShare":
         """Return the forces to hold next.
 
         Args:
-            asked: the sharing where the knee rested under those held before.
+            required: the sharing where the knee rested under those held before.
         """
-        held, self._held, self.settled = self._held, asked, False
-        if held is None:
-            return asked
-        away = asked.force - held.force
+        applied, self._held, self.settled = self._held, required, False
+        if applied is None:
+            return required
+        away = required.force - applied.force
         if self._last is not None:
             change = away - self._last
             part = -self._part * float(self._last @ change) / max(float(change @ change), 1e-12)
@@ -105,9 +105,10 @@ class Relaxation:
         self.settled = bool(np.abs(away).max() < MUSCLE_ITERATION.muscle_force_tolerance)
         if not self.settled:
             self._held = replace(
-                asked,
-                activation=held.activation + self._part * (asked.activation - held.activation),
-                force=held.force + self._part * away,
-                reserve=held.reserve + self._part * (asked.reserve - held.reserve),
+                required,
+                activation=applied.activation
+                + self._part * (required.activation - applied.activation),
+                force=applied.force + self._part * away,
+                reserve=applied.reserve + self._part * (required.reserve - applied.reserve),
             )
         return self._held

@@ -91,16 +91,16 @@ class FreeForces(Generic[J]):
             self.seen[self._start.tobytes()] = touch
 
     def balance(
-        self, stiffness: Array | None = None, left: float = 0.0, reach: float = np.inf
+        self, stiffness: Array | None = None, residual_share: float = 0.0, reach: float = np.inf
     ) -> Balance:
         """Return where the free coordinates come to rest, from the given place.
 
         Args:
             stiffness: (n, n) N/m of a search near by.
-            left: share of the way that may be left, see `find_balance`.
+            residual_share: share of the way that may be left, see `find_balance`.
             reach: m, likewise, how far it may go.
         """
-        return find_balance(self.trial, self._start, stiffness, left, reach)
+        return find_balance(self.trial, self._start, stiffness, residual_share, reach)
 
     def contact(self, balance: Balance) -> "ProbedContact":
         """Return the contact of a balance."""
@@ -115,10 +115,10 @@ class FreeForces(Generic[J]):
         if not contact.known:
             return Trial(np.full(len(x), np.nan))
         wrench, stiffness = self._with_friction(place, contact)
-        known_to = contact.accuracy * float(np.linalg.norm(wrench[:3]))
+        force_noise = contact.accuracy * float(np.linalg.norm(wrench[:3]))
         if stiffness is None:
             force = self._joint.imbalance(place, wrench) / self._scale
-            return Trial(force, known_to=known_to)
+            return Trial(force, force_noise=force_noise)
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
         forces = self._joint.imbalance(place + steps, wrench) / self._scale
@@ -126,7 +126,7 @@ class FreeForces(Generic[J]):
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
         gain = self._joint.contact_gain(place) / self._scale[:, None]
         tangent = -(change + gain @ stiffness @ twists.T)
-        return Trial(forces[-1], tangent, contact.exact, known_to)
+        return Trial(forces[-1], tangent, contact.exact, force_noise)
 
     def at(self, balance: Balance) -> Array:
         """Return the knee coordinates (6,) of a balance."""
@@ -194,8 +194,8 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
             per_wrench: (6,), see `tension_per_wrench`.
         """
         wrench, _ = self._with_friction(self._place, contact)
-        kept, left = self._joint.kept_and_left(self._place, wrench)
-        return float(kept[-1] + per_wrench @ left)
+        reactions, remainder = self._joint.kept_and_left(self._place, wrench)
+        return float(reactions[-1] + per_wrench @ remainder)
 
     def pushes(self, balance: Balance) -> bool:
         """Return whether the patellar ligament, where it is taut, would have to push."""

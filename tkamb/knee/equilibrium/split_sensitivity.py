@@ -50,10 +50,10 @@ def split_sensitivity(
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
     place[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
-    turned = probe.pressed(load, knee_pose(place), result, like)
-    if turned.status is not ContactStatus.OK:
+    rotated = probe.pressed(load, knee_pose(place), result, like)
+    if rotated.status is not ContactStatus.OK:
         return float("nan"), None
-    return (_medial(turned) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step, turned
+    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step, rotated
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:

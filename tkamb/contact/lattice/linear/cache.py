@@ -90,7 +90,7 @@ def cache_folder() -> Path:
 
 
 def operator_key(
-    solid: Solid, held: NDArray[Any], contact_nodes: NDArray[Any], coarse: bool = True
+    solid: Solid, fixed: NDArray[Any], contact_nodes: NDArray[Any], coarse: bool = True
 ) -> str:
     """Return the content hash of an operator: of all that it depends on, and of the code."""
     material = solid.material
@@ -98,14 +98,14 @@ def operator_key(
     kind = (type(solid).__name__, "16 bits" if coarse else "single")
     words = (made_by, *kind, material.young_modulus, material.poisson_ratio)
     digest = hashlib.sha256(repr(words).encode())
-    for array in (solid.nodes, solid.spacing, solid.cells, held, contact_nodes):
+    for array in (solid.nodes, solid.spacing, solid.cells, fixed, contact_nodes):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
 def cached_operator(
     solid: Solid,
-    held: Mask,
+    fixed: Mask,
     contact_nodes: Index,
     make: Callable[[], ElasticOperator],
     coarse: bool = True,
@@ -117,31 +117,31 @@ def cached_operator(
 
     Args:
         solid: cells and material.
-        held: (3n,) unknowns held by the boundary.
+        fixed: (3n,) unknowns held by the boundary.
         contact_nodes: (c,) nodes that can be touched.
         make: makes the operator.
         coarse: whether that has a factor of 16-bit integers.
         limit: bytes that the folder may hold; a larger operator is not kept.
     """
-    if int((~held).sum()) < FACTOR_CACHE.least_unknowns:
+    if int((~fixed).sum()) < FACTOR_CACHE.least_unknowns:
         return make()
-    key = operator_key(solid, held, contact_nodes, coarse)
+    key = operator_key(solid, fixed, contact_nodes, coarse)
     path = cache_folder() / f"{key}.operator"
     try:
-        found = read_operator(path, key, limit)
-        if found is not None:
-            check_operator(*found, solid, held, contact_nodes)
-            return found[0]
+        stored = read_operator(path, key, limit)
+        if stored is not None:
+            check_operator(*stored, solid, fixed, contact_nodes)
+            return stored[0]
     except DamagedOperator as damage:
         _log.warning("%s: %s; the operator is made again", path, damage)
-    made = make()
-    if sum(part.nbytes for part in _parts(made)) <= limit:
+    fresh = make()
+    if sum(part.nbytes for part in _parts(fresh)) <= limit:
         try:
-            write_operator(path, key, made)
+            write_operator(path, key, fresh)
             prune(path.parent, limit)
         except OSError as error:
             _log.warning("%s: not kept (%s)", path, error.strerror or error)
-    return made
+    return fresh
 
 
 class DamagedOperator(Exception):
@@ -152,7 +152,7 @@ def check_operator(
     operator: ElasticOperator,
     mapped: mmap.mmap,
     solid: Solid,
-    held: Mask,
+    fixed: Mask,
     contact_nodes: Index,
 ) -> None:
     """Hold an operator that was read against the solid that it is to be of.
@@ -163,7 +163,7 @@ def check_operator(
     Raises:
         DamagedOperator: it is of other unknowns, or does not invert the solid's stiffness.
     """
-    same = np.array_equal(operator.free, ~held)
+    same = np.array_equal(operator.free, ~fixed)
     if not same or not np.array_equal(operator.contact_nodes, contact_nodes):
         raise DamagedOperator("is of another boundary")
     try:

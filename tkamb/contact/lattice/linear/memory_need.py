@@ -50,9 +50,11 @@ class TooLittleMemoryError(ComputationError):
         likely: bytes that it will come to in the end, where more follows.
     """
 
-    def __init__(self, need: float, left: float, likely: float) -> None:
-        self.left, self.likely = left, max(need, likely)
-        what = f"{need / 1e9:.2g} GB of memory are needed, {max(left, 0) / 1e9:.2g} GB are left"
+    def __init__(self, need: float, available: float, likely: float) -> None:
+        self.left, self.likely = available, max(need, likely)
+        what = (
+            f"{need / 1e9:.2g} GB of memory are needed, {max(available, 0) / 1e9:.2g} GB are left"
+        )
         super().__init__(what, "lattice", "take a coarser resolution")
 
     def hint(self, size: float) -> str:
@@ -76,10 +78,10 @@ def check_memory(need: float, likely: float = 0.0) -> None:
     Raises:
         TooLittleMemoryError: they are not left.
     """
-    left = available_memory()
-    if MEMORY_NEED.safety_factor * need > left:
+    available = available_memory()
+    if MEMORY_NEED.safety_factor * need > available:
         raise TooLittleMemoryError(
-            MEMORY_NEED.safety_factor * need, left, MEMORY_NEED.safety_factor * likely
+            MEMORY_NEED.safety_factor * need, available, MEMORY_NEED.safety_factor * likely
         )
 
 
@@ -107,7 +109,7 @@ def factor_memory(
     """
     rank = np.empty(joined.shape[0], np.int64)
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
-    kept = live = peak = response = 0.0
+    stored = live = peak = response = 0.0
     columns = np.zeros(len(tree.own))
     below: dict[int, list[Index]] = {}
     start = 0
@@ -122,8 +124,8 @@ def factor_memory(
         )
         # W in 8 bytes and as it is kept, the update (m, m), and those not taken yet.
         block = float(k + m) * k
-        kept += block
-        peak = max(peak, itemsize * kept + 8.0 * (live + block + float(m) * m))
+        stored += block
+        peak = max(peak, itemsize * stored + 8.0 * (live + block + float(m) * m))
         live += float(m) * m - sum(
             (MEMORY_NEED.unknowns_per_node * len(child)) ** 2.0 for child in children
         )
@@ -135,4 +137,4 @@ def factor_memory(
                 below.setdefault(parent, []).append(boundary)
         start = stop
     entries = MEMORY_NEED.unknowns_per_node**2 * joined.nnz
-    return MEMORY_NEED.entry_bytes * entries + max(peak, itemsize * (kept + response))
+    return MEMORY_NEED.entry_bytes * entries + max(peak, itemsize * (stored + response))

@@ -86,12 +86,12 @@ class HalfResponse:
 
     def among(self, unknowns: Index) -> "HalfResponse":
         """Return the response of some of the unknowns (u,) alone; it shares the columns."""
-        wanted = self.rank[unknowns]
-        live = np.flatnonzero(wanted >= 0)
-        order = live[np.argsort(wanted[live])]
+        ranks = self.rank[unknowns]
+        live = np.flatnonzero(ranks >= 0)
+        order = live[np.argsort(ranks[live])]
         rank = np.full(len(unknowns), -1)
         rank[order] = np.arange(len(order))
-        blocks, places = _of_columns(*self._parts[:3], wanted[order])
+        blocks, places = _of_columns(*self._parts[:3], ranks[order])
         return HalfResponse(rank, blocks, self.values, places)
 
     def compliance(self, some: Index | None = None) -> Array:
@@ -201,10 +201,10 @@ def _add_products(
 def _of_columns(blocks: Index, edges: Index, places: Index, columns: Index) -> tuple[Index, Index]:
     """Return blocks and places of some columns (u,), increasing, in their numbers."""
     firsts, lasts = np.searchsorted(columns, blocks[:, 2]), np.searchsorted(columns, blocks[:, 3])
-    kept = np.flatnonzero(lasts > firsts)
-    some, at = blocks[kept], 0
+    nonempty = np.flatnonzero(lasts > firsts)
+    some, at = blocks[nonempty], 0
     chosen = np.empty((lasts - firsts).sum(), np.int64)
-    for number, block in enumerate(kept):
+    for number, block in enumerate(nonempty):
         first, last = firsts[block], lasts[block]
         for k in range(first, last):
             chosen[at] = places[edges[block] + columns[k] - blocks[block, 2]]

@@ -127,15 +127,15 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
     inside = np.ceil(high - COLUMN.tie) - np.floor(low + COLUMN.tie) - 1
     thick = high - low > 0.5 + COLUMN.tie
     single = ~thick & (inside <= 1)
-    held = single & (inside == 1)
+    thin = single & (inside == 1)
     joined = thick & (first >= last)
     upwards = (np.abs(low - first) <= np.abs(high - first)) & (first < count - 1)
     last = np.where(joined, first + upwards, last)
     first = np.where(joined, last - 1, first)
-    middle = np.where(held, np.floor(low + COLUMN.tie) + 1, np.round(0.5 * (low + high))).astype(
+    middle = np.where(thin, np.floor(low + COLUMN.tie) + 1, np.round(0.5 * (low + high))).astype(
         np.int64
     )
-    return Ends(np.where(single, middle, first), np.where(single, middle, last), single, held)
+    return Ends(np.where(single, middle, first), np.where(single, middle, last), single, thin)
 
 
 def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
@@ -241,17 +241,17 @@ def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> A
     """
     height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):
-        here = np.flatnonzero(end)
-        base = target[here].copy()
+        rows = np.flatnonzero(end)
+        base = target[rows].copy()
         base[:, 1] = rays.surface.bounds[0, 1] - field.spacing[1]
         ray, t, face = rays.all(base, (0.0, 1.0, 0.0))
         right = rays.surface.face_normals[face, 1] * facing > COLUMN.wall_normal_y
         ray, y = ray[right], base[ray[right], 1] + t[right]
-        off = np.abs(y - height[here[ray]])
+        off = np.abs(y - height[rows[ray]])
         order = np.lexsort((off, ray))
-        found, head = np.unique(ray[order], return_index=True)
-        value = np.full(len(here), np.nan)
+        with_hit, head = np.unique(ray[order], return_index=True)
+        value = np.full(len(rows), np.nan)
         close = off[order][head] <= COLUMN.max_height_change * field.spacing[1]
-        value[found[close]] = y[order][head][close]
-        height[here] = value
+        value[with_hit[close]] = y[order][head][close]
+        height[rows] = value
     return height

@@ -205,14 +205,14 @@ def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
     corner = np.argwhere(_all_corners(field.member))
     grid = corner[:, None, :] + CORNERS
     cells = np.ravel_multi_index(tuple(np.moveaxis(grid, -1, 0)), shape)
-    found = len(cells)
+    total = len(cells)
     cells = cells[~_bridges_gap(field, cells)]
     points = field.points.reshape(-1, 3)
     cells = cells[scaled_jacobians(points[cells]) > GRID.least_jacobian]
     cells = cells[shortest_edges(points[cells]) > GRID.least_edge * field.spacing.min()]
     cells = cells[insert.winding.inside(points[cells].mean(axis=1))]
     cells = cells[standing_pieces(cells, _on_bottom(field))]
-    return cells, found - len(cells)
+    return cells, total - len(cells)
 
 
 def _all_corners(member: Mask) -> Mask:

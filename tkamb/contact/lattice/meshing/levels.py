@@ -115,9 +115,9 @@ def _smooth_part(height: Array, across: Array) -> Array:
     a, b = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(height.size, height.size))
     label = connected_components(graph, directed=False)[1].reshape(height.shape)
-    known = np.isfinite(height)
-    largest = np.bincount(label[known]).argmax()
-    return np.where(known & (label == largest), height, np.nan)
+    finite = np.isfinite(height)
+    largest = np.bincount(label[finite]).argmax()
+    return np.where(finite & (label == largest), height, np.nan)
 
 
 def _slope_limited(height: Array, across: Array) -> Array:
@@ -127,9 +127,9 @@ def _slope_limited(height: Array, across: Array) -> Array:
         before = result.copy()
         for axis in range(2):
             rise = LAYER.max_slope * across[axis]
-            moved = np.moveaxis(result, axis, 0)
-            moved[1:] = np.minimum(moved[1:], moved[:-1] + rise)
-            moved[:-1] = np.minimum(moved[:-1], moved[1:] + rise)
+            along_axis = np.moveaxis(result, axis, 0)
+            along_axis[1:] = np.minimum(along_axis[1:], along_axis[:-1] + rise)
+            along_axis[:-1] = np.minimum(along_axis[:-1], along_axis[1:] + rise)
         if np.array_equal(before, result):
             return np.where(np.isfinite(height), result, np.nan)
 

@@ -102,13 +102,13 @@ def missing_part(nodes: Array, cells: Index, spacing: Array, insert: Surface) ->
     ]
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
     flat = points.reshape(-1, 3)
-    lost = insert.winding.inside(flat) & ~outer_skin(nodes, cells).winding.inside(flat)
-    regions, count = label_regions(lost.reshape(points.shape[:3]))
+    missing = insert.winding.inside(flat) & ~outer_skin(nodes, cells).winding.inside(flat)
+    regions, count = label_regions(missing.reshape(points.shape[:3]))
     if not count:
         return None
     largest = regions == 1 + int(np.bincount(regions.ravel())[1:].argmax())
-    held = points[largest]
-    low, high = held.min(axis=0) - step / 2.0, held.max(axis=0) + step / 2.0
+    part_points = points[largest]
+    low, high = part_points.min(axis=0) - step / 2.0, part_points.max(axis=0) + step / 2.0
     return MissingPart(
         float(largest.sum() * step.prod()), tuple(high - low), tuple((low + high) / 2.0)
     )
@@ -138,8 +138,8 @@ def solid_volume(insert: Surface, centres: Array) -> float:
     lines = [
         np.arange(low[a] + PIECE.line_spacing / 2, high[a], PIECE.line_spacing) for a in (2, 0)
     ]
-    found = inside_intervals(insert, 1, *lines)
-    return float((found.upper - found.lower).sum() * PIECE.line_spacing**2)
+    intervals = inside_intervals(insert, 1, *lines)
+    return float((intervals.upper - intervals.lower).sum() * PIECE.line_spacing**2)
 
 
 def volume_error(nodes: Array, cells: Index, insert: Surface) -> float:

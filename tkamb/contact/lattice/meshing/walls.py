@@ -72,14 +72,14 @@ def _filled_cells(field: NodeField, surface: Surface) -> Mask:
         whole &= m[corner]
         centre += y[corner] / 8.0
     x, z = ((line[1:] + line[:-1]) / 2.0 for line in field.lines)
-    found = inside_intervals(surface, 1, z, x)
+    intervals = inside_intervals(surface, 1, z, x)
     filled = np.zeros_like(whole)
-    a, b = found.second, found.first
+    a, b = intervals.second, intervals.first
     rank = np.arange(len(a)) - np.searchsorted(b * len(x) + a, b * len(x) + a)
     for r in range(int(rank.max(initial=-1)) + 1):
         at = rank == r
         low, high = np.full((len(x), len(z)), np.inf), np.full((len(x), len(z)), -np.inf)
-        low[a[at], b[at]], high[a[at], b[at]] = found.lower[at], found.upper[at]
+        low[a[at], b[at]], high[a[at], b[at]] = intervals.lower[at], intervals.upper[at]
         filled |= (centre > low[:, None]) & (centre < high[:, None])
     return whole & filled
 
@@ -121,13 +121,13 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
         chosen = near <= 0.5 * field.spacing[axis]
         move[..., column] = np.where(chosen, np.where(forth <= back, forth, -back), 0.0)
         _leave_far_side(hits[axis : axis + 2], chosen & (forth > back), chosen & (forth <= back))
-    moved: Nodes = np.nonzero((move != 0.0).any(axis=-1))
-    target = _corner_or_wall(firing[moved], move[moved], rays)
-    height = refired_inwards(field, moved, target, -move[moved], rays)
+    nodes: Nodes = np.nonzero((move != 0.0).any(axis=-1))
+    target = _corner_or_wall(firing[nodes], move[nodes], rays)
+    height = refired_inwards(field, nodes, target, -move[nodes], rays)
     good = np.isfinite(height)
-    moved = tuple(index[good] for index in moved)
+    nodes = tuple(index[good] for index in nodes)
     target[:, 1] = height
-    field.points[moved] = target[good]
+    field.points[nodes] = target[good]
 
 
 def _leave_far_side(pair: list[WallHits], forth_left: Mask, back_left: Mask) -> None:

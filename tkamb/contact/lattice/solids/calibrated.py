@@ -34,7 +34,7 @@ from tkamb.contact.lattice.solids.cell_loops import (
     strained_cells,
 )
 from tkamb.contact.lattice.solids.curve import STRESS_CURVE, ShearCurve
-from tkamb.contact.lattice.solids.solid import SOLID, Noticed, Solid, chunks
+from tkamb.contact.lattice.solids.solid import SOLID, ScreenedElements, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
@@ -103,9 +103,9 @@ def body_diagonal_stiffness(edges: Array) -> float:
     none = spring_families(edges, 0.0)
     per_unit = spring_families(edges, 1.0) - none
     families = none + candidates[:, None] * per_unit
-    kept = families.min(axis=1) >= 0
-    if kept.any():
-        candidates = candidates[kept]
+    complete = families.min(axis=1) >= 0
+    if complete.any():
+        candidates = candidates[complete]
     corners = box_corners(edges)[None]
     matrices = spring_matrix(corners, none)
     matrices = matrices + candidates[:, None, None] * spring_matrix(corners, per_unit)
@@ -187,7 +187,7 @@ class CalibratedNetwork(Solid):
         (first, work), (second, more) = in_halves(added, len(self.cells))
         return first + second, residuals, work + more
 
-    def noticeable(self, displacement: Array, share: float) -> Noticed | None:
+    def noticeable(self, displacement: Array, share: float) -> ScreenedElements | None:
         """Return the cells whose share of h may exceed `share`, N; see `Solid`.
 
         |(mu - mu_s) K_d u| <= (mu - mu_s) e (3 V lambda)^½, lambda the largest eigenvalue of K_d.
@@ -202,11 +202,11 @@ class CalibratedNetwork(Solid):
         def noticed(some: slice) -> tuple[Index, Array]:
             shapes = corners[some], gradients[some], volume[some], self._stiffest
             limits = strain, 3 * SOLID.always_checked_strain
-            found, norms = strained_cells(*shapes, self.cells[some], displacement, *limits)
-            return found + some.start, norms
+            numbers, norms = strained_cells(*shapes, self.cells[some], displacement, *limits)
+            return numbers + some.start, norms
 
         both = in_halves(noticed, len(self.cells))
-        return Noticed(*(np.concatenate(parts) for parts in zip(*both, strict=True)))
+        return ScreenedElements(*(np.concatenate(parts) for parts in zip(*both, strict=True)))
 
     @cached_property
     def _stiffest(self) -> float:

@@ -179,9 +179,9 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: I
         gradient[:] = 0.0
         for corner in range(8):
             for a in range(3):
-                moved = displacement[cells[cell, corner], a]
+                component = displacement[cells[cell, corner], a]
                 for b in range(3):
-                    gradient[a, b] += moved * gradients[cell, corner, b]
+                    gradient[a, b] += component * gradients[cell, corner, b]
         for a in range(3):
             for b in range(3):
                 strains[k, a, b] = (gradient[a, b] + gradient[b, a]) / 2
@@ -189,7 +189,7 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: I
 
 
 @dataclass(frozen=True, eq=False)
-class Noticed:
+class ScreenedElements:
     """Elements that a bound does not pass over.
 
     Args:
@@ -272,7 +272,7 @@ class Solid(ABC):
         work = float(np.vdot(displacement, beyond - internal)) / DIFFERENCE
         return internal, residuals, work
 
-    def noticeable(self, displacement: Array, share: float) -> Noticed | None:
+    def noticeable(self, displacement: Array, share: float) -> ScreenedElements | None:
         """Return the elements whose share of h may matter; None: all may.
 
         Of no other is the norm of `nonlinear_residual` above `share`, N, or a principal strain of
@@ -304,7 +304,9 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def least_principal_strain(self, displacement: Array, some: Noticed | None = None) -> float:
+    def least_principal_strain(
+        self, displacement: Array, some: ScreenedElements | None = None
+    ) -> float:
         """Return the smallest principal strain of the mean gradients of cells, by default of all.
 
         It is no smaller than minus the norm of its tensor: where the cell of largest norm is
@@ -313,7 +315,7 @@ class Solid(ABC):
         if some is None:
             strain = self.strain(displacement)
             norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
-            some = Noticed(np.arange(len(strain)), norms)
+            some = ScreenedElements(np.arange(len(strain)), norms)
         if not len(some.elements):
             return 0.0
         most = int(some.strain.argmax())

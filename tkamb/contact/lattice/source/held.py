@@ -95,20 +95,20 @@ class HeldNodes:
         """Sum of forces (N) that move the active nodes down together, per metre (linear)."""
         return float(cho_solve(self._factor, np.ones(len(self._chosen))).sum())
 
-    def spread(self, given: Array) -> Array:
+    def spread(self, prescribed: Array) -> Array:
         """Return the displacement (n, 3), m, that given y (a,), m, of the active nodes cause.
 
         It is that of the undeformed lattice; the active nodes have the given y exactly.
         """
         count = len(self._response.problem.solid.nodes)
-        if not len(given):
+        if not len(prescribed):
             return np.zeros((count, 3))
         y = np.zeros(len(self._operator.factor.order))
-        self._push(cho_solve(self._factor, given), y)
+        self._push(cho_solve(self._factor, prescribed), y)
         self._operator.factor.backward(y)
-        moved = self._operator.nodal(y)
-        moved.ravel()[self.unknowns] = given
-        return moved
+        field = self._operator.nodal(y)
+        field.ravel()[self.unknowns] = prescribed
+        return field
 
     def solve(self, tangent: Tangent, force: Array) -> Array:
         """Return the displacement (n, 3), m, of the free unknowns under a force (n, 3), N.
@@ -128,14 +128,14 @@ class HeldNodes:
             return self._free(self._solve_linear(x.reshape(shape)))
 
         size = (force.size, force.size)
-        found, _ = cg(
+        solution, _ = cg(
             LinearOperator(size, matvec=stiffness, dtype=float),
             self._free(force),
             rtol=settings.tolerance,
             maxiter=settings.max_iterations,
             M=LinearOperator(size, matvec=inverse, dtype=float),
         )
-        return np.asarray(found.reshape(shape))
+        return np.asarray(solution.reshape(shape))
 
     def _free(self, values: Array) -> Array:
         """Return values (3n,) with zeros at the held unknowns."""
@@ -145,8 +145,8 @@ class HeldNodes:
         """Return P f (n, 3) of a force (n, 3)."""
         y = self._operator.start(force)
         if len(self._chosen):
-            held = self._response.half.project(y)[self._chosen]
-            self._push(-cho_solve(self._factor, held), y)
+            projection = self._response.half.project(y)[self._chosen]
+            self._push(-cho_solve(self._factor, projection), y)
         self._operator.factor.backward(y)
         return self._operator.nodal(y)
 
