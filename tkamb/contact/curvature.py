@@ -79,12 +79,14 @@ def osculate(
         not curve apart there.
     """
     point, normal = start, _start_normal(insert, start)
+    # The point depends on the normal and the normal on the point: fit, step, turn the frame.
     for _ in range(CURVATURE.max_iterations):
         frame = np.stack([*_tangents(normal), normal])
         fits = _fit(insert, femoral, pose, point, frame, radius)
         if fits is None:
             return None
         of_insert, of_femoral = fits
+        # The gap is itself a quadric; its minimum is the contact point.
         difference = of_femoral - of_insert
         step = _nearest_place(difference, radius)
         if step is None or np.linalg.norm(point - start) > CURVATURE.max_distance * radius:
@@ -92,6 +94,8 @@ def osculate(
         if np.linalg.norm(step) < CURVATURE.position_tolerance:
             return _described(point, frame, of_insert, of_femoral)
         point = point + np.append(step, _value(of_insert, step)) @ frame
+        # At the contact point both surfaces share their normal; before convergence the mean is
+        # taken.
         slope = (_slope(of_insert, step) + _slope(of_femoral, step)) / 2
         normal = np.append(-slope, 1.0) @ frame
         normal /= np.linalg.norm(normal)
@@ -126,12 +130,14 @@ def _fit(
     over, _ = insert.first(places + radius * normal, -normal)
     under, _ = femoral.first(transform(back, places - radius * normal), rotate(back, normal))
     of_insert, of_femoral = radius - over, under - radius
+    # A ray that met another part of a mesh, or nothing, is no sample of this patch.
     covered = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
     if covered.mean() < CURVATURE.least_cover:
         return None
     u, v = u[covered], v[covered]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
     heights = np.stack([of_insert[covered], of_femoral[covered]], axis=1)
+    # Columns of equal size keep the least squares well conditioned: u is some millimetres.
     scale = radius ** np.array([0, 1, 1, 2, 2, 2])
     coefficients = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
     return coefficients[:, 0], coefficients[:, 1]
@@ -153,10 +159,12 @@ def _slope(quadric: Array, place: Array) -> Array:
 def _nearest_place(difference: Array, radius: float) -> Array | None:
     """Return the minimum (2,) of the gap, at most one radius away; None if it has none."""
     values, vectors = np.linalg.eigh(_hessian(difference))
+    # Not convex in all directions: the bodies conform, and no nearest point exists.
     if values[0] <= 0:
         return None
     step = -vectors @ ((vectors.T @ difference[1:3]) / values)
     length = float(np.linalg.norm(step))
+    # The quadric describes the patch only, so that a step stays within it.
     return np.asarray(step * min(1.0, radius / length)) if length > 0 else step
 
 

@@ -151,6 +151,7 @@ def press_by_search(
 def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
     """Return the result with what the search says about it."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
+    # Written with `not`, so that NaN counts as missed.
     missed = not residual <= PRESS.coarse_tolerance
     return replace(
         result,
@@ -199,6 +200,8 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
         load: N, positive.
         start: m, where the search begins.
     """
+    # The root of the reaction is nearly linear in the approach (F ~ d^2 for a sphere on a layer,
+    # d^1.5 on a half-space), so that the secant converges fast.
     target = math.sqrt(load)
     trial = start if 0 < start < PRESS.max_approach else PRESS.first_approach
     low, low_value, high, high_value = 0.0, -target, math.nan, math.nan
@@ -211,6 +214,8 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
             break
         side = -1 if force < load else 1
         if side < 0:
+            # Illinois rule: an end that stays twice is halved, so that both ends of the bracket
+            # move.
             high_value *= 0.5 if last_side < 0 else 1.0
             low, low_value = trial, math.sqrt(max(force, 0.0)) - target
         else:
@@ -224,12 +229,15 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
             if math.isnan(high)
             else _between(low, low_value, high, high_value)
         )
+    # A bracket whose upper end has a finite reaction encloses the load; else the range ended below
+    # it.
     reached = best[0] <= PRESS.load_tolerance or math.isfinite(high_value)
     return LoadSearch(best[1] if reached else math.nan, count, best[0], deepest)
 
 
 def _ahead(trial: float, force: float, load: float) -> float:
     """Return a deeper trial: the reaction taken as quadratic, a little beyond, at most x4."""
+    # No upper end yet: extrapolate by F ~ d^2, a little beyond, so that the load is bracketed next.
     factor = 2.0 if force <= 0 else min(1.05 * math.sqrt(load / force), 4.0)
     return min(trial * factor + 1e-9, PRESS.max_approach)
 
@@ -237,9 +245,11 @@ def _ahead(trial: float, force: float, load: float) -> float:
 def _between(low: float, low_value: float, high: float, high_value: float) -> float:
     """Return false position in the bracket, its middle where an end is out of range."""
     middle = 0.5 * (low + high)
+    # Out of range at the upper end: a secant through infinity says nothing, so bisect.
     if not math.isfinite(high_value):
         return middle
     trial = (low * high_value - high * low_value) / (high_value - low_value)
+    # Rounding may put the secant's root outside the bracket.
     return trial if low < trial < high else middle
 
 
@@ -315,6 +325,7 @@ def thickness_near(pair: ContactPair, positions: Array) -> Array:
     leave, _ = pair.insert.rays.first(columns, DOWN)
     met &= np.isfinite(leave)
     thick = np.where(met, leave + PRESS.ray_start_depth, 0.0).reshape(len(positions), -1)
+    # Away from the rim all rays meet the insert and the middle one counts.
     whole = met.reshape(thick.shape).all(axis=1)
     thickness = np.where(whole, thick[:, 0], thick.max(axis=1))
     return np.maximum(

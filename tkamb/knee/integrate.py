@@ -81,6 +81,8 @@ def implicit_step(
     cache, ahead, last = model.createData(), np.array(v, float), np.inf
     change, slope = np.zeros(model.nv), None
     for _ in range(IMPLICIT_STEP.max_newton_steps):
+        # theta 0.5 is the implicit midpoint rule, without numerical damping; 1 is implicit Euler,
+        # which damps.
         middle = (1.0 - theta) * v + theta * ahead
         place = pin.integrate(model, q, theta * step * middle)
         try:
@@ -95,6 +97,7 @@ def implicit_step(
         if external is not None:
             forces = pin.StdVec_Force([f + e for f, e in zip(forces, external, strict=True)])
         torque = push - drag * middle
+        # Residual of the theta rule for the velocity at the end of the step.
         missed = ahead - v - step * pin.aba(model, cache, place, middle, torque, forces)
         size = float(np.abs(missed).max())
         if size < IMPLICIT_STEP.velocity_tolerance or (
@@ -107,8 +110,12 @@ def implicit_step(
             stiffness = stiffness + _turning(knee, own, data)
             damping = knee.damping(place, middle, data)
             pin.computeABADerivatives(model, cache, place, middle, torque, forces)
+            # Pinocchio's derivatives hold the forces constant; the knee's stiffness adds how they
+            # change.
             by_q = cache.ddq_dq - cache.Minv @ jacobian.T @ stiffness @ jacobian
             by_v = cache.ddq_dv - cache.Minv @ (jacobian.T @ damping @ jacobian + np.diag(drag))
+            # Derivative of the residual by the end velocity: place depends on it with theta step,
+            # velocity with theta.
             slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
         last = size
         change = -np.linalg.solve(slope, missed)

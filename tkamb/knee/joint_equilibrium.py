@@ -93,6 +93,7 @@ class JointEquilibrium:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
         axes, columns = knee_axes(coordinates), self.columns(coordinates)
         rows = axes[self._prescribed]
+        # Projection that takes the reactions of the prescribed coordinates out of a contact wrench.
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
 
@@ -140,6 +141,7 @@ class JointEquilibrium:
 
 def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
     """Return y with rows (columns y + wrench) = 0."""
+    # Prescribed coordinates are held: their reactions make the generalised forces on them vanish.
     right = np.einsum("...ij,...j->...i", rows, wrench)
     return np.asarray(-np.linalg.solve(rows @ columns, right[..., None])[..., 0])
 
@@ -202,6 +204,7 @@ def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
     shank = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
     free = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
     end, along = free[0].points[0], free[0].forces[0]
+    # The ligament may wrap the insert, so that its anchor is the first point on the shank along it.
     away = min(float((load.points[0] - end) @ along) for load in shank)
     return PatellarLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
 
@@ -215,9 +218,12 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     hip = unknowns.hip(state.point("hip", np.zeros(3)))
     ground = [geometry.ground] if geometry.ground else []
     columns = state.generalised([*(unknown.loads for unknown in hip), ground])
+    # As in `KneeSystem`: what hip and knee supply together, the ground reaction taken off.
     without = state.inertial - columns[:, -1]
+    # The first six equations hold no internal loads of the knee, so that they give the hip's alone.
     at_hip = np.linalg.solve(columns[:6, :6], without[:6])
     knee = (without - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
+    # Generalised forces are axes times wrench; solved for the wrench on the tibia.
     return np.asarray(np.linalg.solve(knee_axes(coordinates), knee))
 
 

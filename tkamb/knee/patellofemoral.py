@@ -169,9 +169,8 @@ class PatellofemoralContact:
         few = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
         samples = transform(self.pose(np.asarray(coordinates, float)), few)
         low, high = self._nearest.surface.bounds
-        samples = samples[
-            ((samples >= low) & (samples <= high)).all(axis=1)
-        ]  # beside its box none is in it
+        # A sample outside the femur's box cannot lie inside the femur.
+        samples = samples[((samples >= low) & (samples <= high)).all(axis=1)]
         near = self._nearest.at(samples)
         apart = np.einsum("ij,ij->i", samples - near.points, near.normals)
         return bool((apart < 0.0).any())
@@ -225,8 +224,11 @@ def _which_matter(
         if seen_at[n, 0] < np.inf:
             displacement[n] = np.sqrt(np.sum((samples[n] - seen_at[n]) ** 2))
             side = 0 if on_left[n] else 1
+            # Upper bound of the gap of this side: the triangle inequality bounds how far a distance
+            # changes when a sample moves.
             nearest[side] = min(nearest[side], distance[n] + displacement[n])
     for n in range(count):
+        # Lower bound of this sample's distance against it: beyond the range the weight is zero.
         beyond = distance[n] - displacement[n] >= nearest[0 if on_left[n] else 1] + reach
         if displacement[n] != 0.0 and not beyond:  # nor where it is NaN
             which[number] = n
@@ -274,6 +276,8 @@ def _take(
         n, face, edge = which[m], faces[m], False
         for corner in range(3):
             edge |= sharp[face, corner] and weights[m, corner] < EDGE_MARGIN
+        # On a sharp edge the normal is not that of one face; the vertices' mean turns without a
+        # jump.
         normals = vertex_normals[face] if edge else smooth_normals[face]
         along, length = 0.0, 0.0
         for k in range(3):
@@ -285,6 +289,7 @@ def _take(
             length += outward[k] ** 2
         for k in range(3):
             normal[n, k] = outward[k] / np.sqrt(length)
+        # The sign comes from the smooth normal: a sample behind the femur's surface is inside.
         distance[n] = -apart[m] if along < 0.0 else apart[m]
         on_edge[n] = 1.0 if edge else 0.0
 
@@ -322,6 +327,7 @@ def _mean_over_sides(
             behind = distance[n] - nearest
             if on_left[n] != (side == 0) or behind >= reach:
                 continue
+            # Boltzmann weights relative to the nearest sample, so that no exponential overflows.
             weight = np.exp(-behind / depth)
             total += weight
             means[side, 0] += weight * distance[n]
@@ -330,6 +336,8 @@ def _mean_over_sides(
                 means[side, 1 + k] += weight * foot[n, k]
                 means[side, 4 + k] += weight * normal[n, k]
         means[side] /= total
+        # The weighted mean over a paraboloid exceeds its smallest distance by tau; that is taken
+        # off.
         means[side, 0] -= depth
 
 
@@ -344,6 +352,8 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
         contact: (`FIELDS`,) to be written: gap, share of the left, shift, tilt, share on edges,
             point (3,) and normal (3,) of the line of action in the sagittal plane.
     """
+    # The gap is a parabola in the left side's share of the force; its minimum is where the button
+    # comes to equilibrium in shift and tilt.
     curvature, slope = 0.0, sides[0, 0] - sides[1, 0]
     for k in range(2):
         at, offset = (6, 0.0) if k == 0 else (3, middle)
@@ -353,6 +363,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
     if curvature < STRAIGHT:
         left_share = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
     else:
+        # A facet cannot pull, so that the share stays in [0, 1].
         left_share = min(max(-slope / curvature, 0.0), 1.0)
     mean = left_share * sides[0] + (1.0 - left_share) * sides[1]
     moment, length = 0.0, np.sqrt(mean[4] ** 2 + mean[5] ** 2)
@@ -360,6 +371,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
         part = left_share if side == 0 else 1.0 - left_share
         moment += (sides[side, 1] - mean[1]) * part * sides[side, 5]
         moment -= (sides[side, 2] - mean[2]) * part * sides[side, 4]
+    # Lateral part of the normal, and the distance of the force from the middle.
     aside, lever = mean[6], mean[3] - middle
     contact[0] = mean[0] + 0.5 * (yields[0] * aside**2 + yields[1] * lever**2)
     contact[1], contact[2], contact[3], contact[4] = (

@@ -125,7 +125,10 @@ def slip_of_points(
     height, slope = profile.at(points)
     on_insert = np.column_stack([points[:, 0], height])
     travelled = arc(np.diff(on_insert, axis=0), np.diff(slope))
+    # x is anterior; an arc counts as positive when the contact moves backwards, as in roll-back.
     backwards = -np.sign(np.diff(points[:, 0]))
+    # Axial rotation moves the contact point forwards by the lateral distance from the femoral
+    # centre, along the slope of the insert.
     lever = _mean(points[:, 2] - centre_z) / np.cos(_mean(slope))
     return CondyleSlip(
         _cumulate(femoral_arcs(points, poses)),
@@ -145,8 +148,10 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
         points: (f, 3) m, lowest points, insert frame.
         poses: (f, 4, 4) pose_femoral_in_insert.
     """
+    # Femoral axes, in which a contact point's path is the arc that has rolled.
     back = inverse(poses)
     in_femur = transform(back, points[:, None])[:, 0]
+    # The angle of the downward normal in femoral axes is the turn of the arc.
     normal = rotate(back, -UP)
     angle = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
     chord = np.diff(in_femur, axis=0)
@@ -158,6 +163,7 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
 
 def arc(chord: Array, turn: Array) -> Array:
     """Return the length (n,) of circular arcs over chords (n, 2) whose tangent turns (n,) rad."""
+    # Arc over chord of a circle: (turn / 2) / sin(turn / 2).
     half = 0.5 * np.abs(turn)
     stretch = np.where(half > 1e-6, half / np.where(half > 1e-6, np.sin(half), 1.0), 1.0)
     return np.asarray(np.linalg.norm(chord, axis=1) * stretch)
@@ -248,6 +254,7 @@ def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
 def _roll(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
     """Return x after an arc backwards along the insert's surface at z (midpoint rule)."""
     _, slope = profile.at(np.array([[x, 0.0, z]]))
+    # Midpoint rule: the slope half-way along the arc decides its projection on x.
     middle = x - 0.5 * backwards * np.cos(slope[0])
     _, slope = profile.at(np.array([[middle, 0.0, z]]))
     return float(x - backwards * np.cos(slope[0]))

@@ -52,7 +52,10 @@ class ShearCurve:
             return cls(material.shear_modulus, None)
         stress, tangent = material.stress(_STRAINS), material.tangent(_STRAINS)
         nine_bulk = 9 * material.bulk_modulus
+        # Uniaxial strain minus its volumetric part leaves the equivalent deviatoric strain: e = eps
+        # - s / (9 K).
         strain = _STRAINS - stress / nine_bulk
+        # Chain rule: ds/de from ds/deps.
         spline = CubicHermiteSpline(strain, stress, tangent / (1 - tangent / nine_bulk))
         return cls(material.shear_modulus, spline)
 
@@ -92,4 +95,5 @@ class ShearCurve:
             return np.zeros_like(equivalent)
         floored = np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1])
         slope = self.spline(floored, 1) / 3 - self.modulus(floored)
+        # Below this strain the curve is elastic and the quotient is rounding.
         return np.where(equivalent < 1e-7, 0.0, slope / floored**2)

@@ -220,6 +220,8 @@ class Solid(ABC):
 
     def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
+        # The mean gradient makes the volumetric part constant in a cell (B-bar), so that nearly
+        # incompressible material does not lock.
         self.gradients, self.volume = mean_gradient(self.corners())
         if not (self.volume > 0).all():
             raise InputError(
@@ -267,6 +269,7 @@ class Solid(ABC):
         """
         residuals = self.nonlinear_residual(displacement)
         internal = self.linear_force(displacement) - self.scatter.sum(residuals)
+        # Directional derivative along the displacement itself: one more evaluation gives u K u.
         further = (1 + DIFFERENCE) * displacement
         beyond = self.linear_force(further) - self.residual_force(further)
         work = float(np.vdot(displacement, beyond - internal)) / DIFFERENCE
@@ -320,6 +323,8 @@ class Solid(ABC):
             return 0.0
         most = int(some.strain.argmax())
         largest = self.strain(displacement, some.elements[[most]])
+        # The norm of a strain bounds its principal values, so that elements with a smaller norm
+        # than the compression found already cannot have more.
         near = some.strain >= -np.linalg.eigvalsh(largest)[0, 0]
         near[most] = True  # compressed along one axis its norm is its compression, but for rounding
         return float(np.linalg.eigvalsh(self.strain(displacement, some.elements[near])).min())
@@ -327,6 +332,7 @@ class Solid(ABC):
     def bulk(self, cells: slice) -> Array:
         """Return K V g gᵀ of some cells (k, 24, 24), N/m, g · u their mean dilatation."""
         g = self.gradients[cells].reshape(-1, 24)
+        # Volumetric stiffness K V g gᵀ, with g the mean gradient of the dilatation.
         scale = self.material.bulk_modulus * self.volume[cells]
         return (scale[:, None] * g)[:, :, None] * g[:, None, :]
 
