@@ -83,6 +83,8 @@ class PostPair(ContactPair):
             if not np.isfinite(gap).any():
                 break
             k = int(np.nanargmin(gap))
+            # Zoom into one cell of the grid around the smallest gap; each zoom gains a factor of
+            # 20.
             least, reach = float(gap[k]), (high - low) / (TICKS - 1)
             place = np.array([x[k], z[k]])
             low = np.maximum(place - reach, self.insert.bounds[0, [0, 2]])
@@ -158,6 +160,7 @@ class CamPost:
         if model.name in NO_LINE_CONTACT:
             hint = "take foundation, lattice or fe"
             raise InputError(f"contact model '{model.name}' has no line contact", WHERE, hint)
+        # The post is turned so that its back faces up: the contact models press along y.
         low, high = post.bounds
         front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
         self.in_turned = np.eye(4)
@@ -225,6 +228,7 @@ class CamPost:
 
     def _in_insert(self, load: CondyleWrench) -> CondyleWrench:
         x = twist_matrix(self.in_turned)
+        # Wrench and twist change frames by transposed matrices, so that the work stays the same.
         stiffness = None if load.stiffness is None else x.T @ load.stiffness @ x
         centre = transform(inverse(self.in_turned), load.centre)
         return CondyleWrench(x.T @ load.wrench, centre, stiffness)
@@ -305,6 +309,7 @@ def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
     if split is None:
         hint = "leave the key out, or give a component with two condyles"
         raise InputError("one condyle has no cam", WHERE, hint)
+    # z of the triangles, measured from the plane between the condyles.
     across = femoral.triangles[:, :, 2] - split
     behind = femoral.triangles[:, :, 0].max(axis=1) < femoral.bounds[:, 0].mean()
     own = behind & (across.min(axis=1) < reach) & (across.max(axis=1) > -reach)

@@ -49,6 +49,8 @@ class CondyleWrench:
         """
         force = self.wrench[:3]
         moment = self.wrench[3:] - cross(self.centre, force)
+        # Point of the resultant's line that is nearest to the centre: the moment about it is
+        # parallel to the force.
         return self.centre + cross(force, moment) / (force @ force)
 
 

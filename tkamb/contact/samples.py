@@ -100,6 +100,7 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     xz, covered, cell = _cells(caster, centres, hit.reshape(shape), resolution)
     points, face, thickness = _through(caster, xz, insert)
     normals = insert.smooth_normals(points, face)
+    # Covered area seen from above over the cosine of the slope: the area on the surface itself.
     area = covered * resolution**2 / np.maximum(normals[:, 1], MAP_POINT.least_normal_y)
     triangles = _grid_triangles(cell, shape)
     depth = _depth(caster, points, normals, thickness)
@@ -134,7 +135,10 @@ def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array
     columns = samples.points, samples.normals, samples.thickness, samples.depth
     origins, normals, below = _columns(*columns, back)
     gap, face = _first_entry(femoral, origins, normals)
+    # Rays start inside the insert, so that a femur that has penetrated is still met from outside.
     gap -= below
+    # On a steep wall a column starts well beside its point, seen from above, and may start in the
+    # femur there. Where the surface point itself is free, the gap above it counts.
     aside = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < MAP_POINT.side_start_normal_y))
     if len(aside):
         rim = origins[aside] + below[aside, None] * normals[aside]
@@ -177,12 +181,15 @@ def _mark_within(distance: Array, face: Index, directions: Array, normals: Array
             facing = 0.0
             for k in range(3):
                 facing += directions[n, k] * normals[face[n], k]
+            # The ray leaves the femur at its first hit, so that it began inside: penetrated deeper
+            # than the column sees.
             if facing > 0.0:
                 distance[n] = -np.inf
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
     """Return cell centres (n, 2) as x, z, and how many there are along x and z."""
+    # Symmetric about the origin, so that a mirrored insert gets mirrored points.
     half = np.abs(insert.bounds[:, [0, 2]]).max(axis=0)
     count = np.maximum(np.ceil(half / resolution), 1)
     if 4 * count.prod() > MAP_POINT.max_map_cells:
@@ -203,6 +210,7 @@ def _cells(
     around = [np.roll(np.pad(hit, 1), (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     some, every = np.any(around, axis=0)[1:-1, 1:-1], np.all(around, axis=0)[1:-1, 1:-1]
     rim = np.flatnonzero(some & ~every)
+    # Cells that the rim crosses: their covered share by rays at the centres of sub-cells.
     ticks = (np.arange(MAP_POINT.rim_rays) + 0.5) / MAP_POINT.rim_rays - 0.5
     offsets = resolution * np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     rays = centres[rim, None] + offsets
@@ -215,6 +223,8 @@ def _cells(
     nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
     on_mean = np.isfinite(_first(caster, mean)[0])[:, None]
     xz, share = centres.copy(), every.ravel().astype(float)
+    # The point of a partly covered cell is the centroid of what is covered, or the nearest ray to
+    # it that meets the insert.
     xz[rim], share[rim] = np.where(on_mean, mean, nearest), count / MAP_POINT.rim_rays**2
     cell = np.flatnonzero(share > 0)
     if not cell.size:

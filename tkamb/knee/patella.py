@@ -183,11 +183,17 @@ class PatellaFrame:
             m.insert_outline,
             self.insert,
         )
+        # Unit forces on the patella: the muscle pulls it back along its path, the ligament towards
+        # the tibia.
         pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])
         if abs(np.linalg.det(sides)) < PATELLA.least_determinant:
             raise ComputationError("the patellar ligament runs along the contact normal")
+        # Force equilibrium in the sagittal plane, per newton of muscle: two equations for ligament
+        # and contact.
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
+        # The moment about the origin that is left decides the patella's rotation: it vanishes in
+        # equilibrium.
         moment = (
             _cross(muscle.points[-1], pull)
             + ligament_force * _cross(ligament.points[0], hold)

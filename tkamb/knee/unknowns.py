@@ -75,6 +75,8 @@ def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
     if columns.shape != (len(right), len(right)):
         raise ValueError(f"{columns.shape[1]} unknown loads for {len(right)} equations")
     size = np.linalg.norm(columns, axis=0)
+    # Unit columns: the condition number then measures the geometry, not newtons against newton
+    # metres.
     scaled = columns / np.where(size > 0, size, 1.0)
     condition = float(np.linalg.cond(scaled))
     regular = bool(np.isfinite(condition) and condition < UNKNOWNS.max_condition)
@@ -150,6 +152,8 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
         normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
         femur_ml: (3,) the femur's ML axis.
     """
+    # The second component, along the groove: frictionless contact needs it to be zero, and its size
+    # shows how far the place is from equilibrium.
     tangent = cross(femur_ml, normal)
     return [
         Unknown("patellofemoral", pair("patella", "femur", point, normal)),
@@ -164,6 +168,8 @@ def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
         point: (3,) where it rests on the femur.
         femur_ml: (3,) the femur's ML axis, normal to the patella's plane.
     """
+    # Any two directions across the medial-lateral axis span what holds an unloaded patella in its
+    # plane.
     first = cross(femur_ml, AXES["ap"])
     first /= np.linalg.norm(first)
     return [

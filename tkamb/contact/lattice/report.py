@@ -36,6 +36,8 @@ def result_of(
         rule: how a nodal force becomes a pressure.
         forces_only: no areas within nodes, no gaps beside the contact and no flags are computed.
     """
+    # `evaluate` gets the final pose, `press` the pose of first touch, from which the solver's
+    # approach is taken off.
     depth = solution.forces.approach if load is not None else 0.0
     pose = pose.copy()
     pose[1, 3] -= depth
@@ -84,6 +86,7 @@ def _pressures(
     size[solution.candidates] = solution.forces.force
     area = _areas(state, gaps, size > 0, rule)
     if rule == "source":
+        # Sharma's pressure counts the part of a nodal force along the insert's normal.
         size = np.maximum(-np.einsum("ij,ij->i", force, state.surface.normals), 0.0)
     return force, size / area, area
 
@@ -103,6 +106,8 @@ def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution:
         solution: what the solver found.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
+    # The edge of contact depends on the deformed gaps of the neighbours only; farther away the
+    # undeformed gap is near enough.
     close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)
     own = solution.candidates[close[solution.candidates]]
     gap = gaps.copy()
@@ -125,6 +130,7 @@ def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Sol
         displacement = state.compliance.moved(nodes, solution.candidates[loaded], force)
     positions = problem.surface_points[nodes] + displacement
     planes = tangent_planes(problem, positions, pose, None)
+    # A femoral normal that does not point down cannot be loaded by a vertical press.
     return np.where(planes.normal_y < LEAST_NORMAL_Y, planes.gap(positions), np.inf)
 
 
