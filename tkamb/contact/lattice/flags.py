@@ -87,6 +87,7 @@ def edge_flags(
         peaks: side -> (3,) m, where its pressure is highest, insert frame.
     """
     reach = np.maximum(LATTICE_FLAG.edge_distance_cells * spacing, LATTICE_FLAG.least_edge_distance)
+    # Eight directions at equal distance; the diagonals are shortened to it.
     around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None] * reach
     sites = (np.array(list(peaks.values())).reshape(-1, 1, 3) + around).reshape(-1, 3)
     normals = femoral.over(sites, pose)[1].reshape(len(peaks), len(AROUND), 3)
@@ -103,6 +104,7 @@ def _sharpness(normals: NDArray[np.float64]) -> str:
     """Return in words how sharply the surface turns around the middle point, if it does."""
     if not np.isfinite(normals).all():
         return "ends"
+    # The middle row is the place of the peak itself.
     cosine = normals @ normals[len(AROUND) // 2]
     turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
     return f"turns by {turn / DEGREE:.0f} deg" if turn > LATTICE_FLAG.sharp_edge_angle else ""
@@ -115,6 +117,8 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
         least = solid.least_principal_strain(solution.field, solution.noticed)
         kind = "principal strain"
     else:
+        # A linear solver keeps no field of displacements: the mean strain of a column stands for
+        # it.
         sunk = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]
         least, kind = float(sunk.min(initial=0.0)), "mean strain of a column"
     if least <= LATTICE_FLAG.collapse_strain:

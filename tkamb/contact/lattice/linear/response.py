@@ -98,6 +98,8 @@ class HalfResponse:
         """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
+        # C = H Hᵀ with H the half solves: the compliance is summed block by block of the
+        # elimination tree.
         inner = np.zeros((len(rows), self.columns))
         firsts, lasts = np.searchsorted(rows, self.blocks[:, 2:]).T
         for block in np.flatnonzero(lasts > firsts):
@@ -142,6 +144,7 @@ class HalfResponse:
     @cached_property
     def _middle(self) -> int:
         """How many of the blocks hold half of the numbers."""
+        # Blocks are halved by their work, which is rows times columns, for two threads.
         sizes = (self.blocks[:, 1] - self.blocks[:, 0]) * (self.blocks[:, 3] - self.blocks[:, 2])
         return int(np.searchsorted(np.cumsum(sizes), sizes.sum() / 2))
 
@@ -283,6 +286,7 @@ class HalfSolves:
         right = self._of(member)
         del self._waiting[member]
         a, b = np.searchsorted(self._rows, [front.start, front.stop])
+        # Unit forces at the contact unknowns that this front eliminates.
         right[np.arange(a, b) - first, self._rows[a:b] - front.start] += 1.0
         count = front.stop - front.start
         if len(front.boundary):

@@ -160,6 +160,7 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
     """Return what `build_grid` does, and log nothing."""
     extent = insert.bounds[1] - insert.bounds[0]
     spacing = grid_spacing(extent, target_size)
+    # Checked before any array is made: a mesh in millimetres would ask for 1e9 times as many cells.
     count = float((extent / spacing).prod())
     if count > GRID.max_cells:
         raise InputError(
@@ -189,6 +190,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
         raise InputError(
             f"a cell size of {target_size / MILLIMETRE:g} mm", mend="give a positive size"
         )
+    # Sizes are tried outwards from the target until all three spacings fit near-cubic cells.
     for percent in range(400):
         for size in (target_size / 1.01**percent, target_size * 1.01**percent):
             spacing = extent / np.maximum(np.round(extent / size), 1.0)

@@ -98,10 +98,12 @@ def body_diagonal_stiffness(edges: Array) -> float:
     """
     square = edges**2
     pairs = square * np.roll(square, 1)
+    # Beyond it a face diagonal's stiffness would be negative.
     upper = np.prod(edges) * square.sum() / (4 * pairs.max())
     candidates = np.linspace(0, upper, 201)[1:-1]
     none = spring_families(edges, 0.0)
     per_unit = spring_families(edges, 1.0) - none
+    # Family stiffnesses are linear in the body diagonal's, so that two evaluations give all.
     families = none + candidates[:, None] * per_unit
     complete = families.min(axis=1) >= 0
     if complete.any():
@@ -109,6 +111,8 @@ def body_diagonal_stiffness(edges: Array) -> float:
     corners = box_corners(edges)[None]
     matrices = spring_matrix(corners, none)
     matrices = matrices + candidates[:, None, None] * spring_matrix(corners, per_unit)
+    # Six eigenvalues are rigid motions; the seventh is the softest deformation, which hourglassing
+    # would make zero.
     return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
 
 

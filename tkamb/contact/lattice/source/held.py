@@ -88,11 +88,13 @@ class HeldNodes:
     @cached_property
     def _factor(self) -> tuple[Array, bool]:
         """Cholesky factor of ZᵀZ, the compliance of the held unknowns."""
+        # Compliance of the active nodes; symmetric and positive definite.
         return cho_factor(self._response.compliance[np.ix_(self._chosen, self._chosen)])
 
     @property
     def slope(self) -> float:
         """Sum of forces (N) that move the active nodes down together, per metre (linear)."""
+        # Forces that move all active nodes by one: their sum is the stiffness of the contact.
         return float(cho_solve(self._factor, np.ones(len(self._chosen))).sum())
 
     def spread(self, prescribed: Array) -> Array:
@@ -128,6 +130,8 @@ class HeldNodes:
             return self._free(self._solve_linear(x.reshape(shape)))
 
         size = (force.size, force.size)
+        # The elastic factor is the preconditioner: near to the tangent, so that few iterations are
+        # needed.
         solution, _ = cg(
             LinearOperator(size, matvec=stiffness, dtype=float),
             self._free(force),
@@ -146,6 +150,7 @@ class HeldNodes:
         y = self._operator.start(force)
         if len(self._chosen):
             projection = self._response.half.project(y)[self._chosen]
+            # Reactions of the active nodes that bring their vertical displacement back to zero.
             self._push(-cho_solve(self._factor, projection), y)
         self._operator.factor.backward(y)
         return self._operator.nodal(y)
