@@ -119,16 +119,16 @@ def test_loads_that_follow_the_motion_do_not_hold_up_the_search():
     np.testing.assert_allclose(end.coordinates, 0.0, atol=2e-6)
 
 
-@pytest.mark.parametrize("known_to", [0.0, 0.4])
-def test_forces_are_balanced_to_what_they_are_known_to(known_to):
+@pytest.mark.parametrize("force_noise", [0.0, 0.4])
+def test_forces_are_balanced_to_what_they_are_known_to(force_noise):
     """The answer of a model solved to a tolerance jumps by as much: here across the rest."""
 
     def jumping(x):
         jump = np.where(x < 1e-4, 0.3, -0.3)
-        return Trial(2e5 * (1e-4 - x) + jump, known_to=known_to)
+        return Trial(2e5 * (1e-4 - x) + jump, force_noise=force_noise)
 
     end = find_balance(jumping, np.array([-2e-4]))
-    assert (end.status is BalanceStatus.OK) == (known_to > 0.3)
+    assert (end.status is BalanceStatus.OK) == (force_noise > 0.3)
     assert end.coordinates == pytest.approx([1e-4], abs=5e-6)
 
 

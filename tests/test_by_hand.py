@@ -14,7 +14,7 @@ from tkamb.contact.registry import contact_model
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.contact_points import CondylePoint
-from tkamb.knee.equations import RESIDUAL_SHIFT, solve_knee
+from tkamb.knee.equations import EQUATION, solve_knee
 from tkamb.knee.ligaments import quadratic_toe_force, two_line_force
 from tkamb.knee.unknowns import residuals
 from tkamb.run.mechanics import Mechanics
@@ -91,7 +91,7 @@ def test_sensitivity_is_the_difference_when_the_residuals_act_elsewhere(frame, m
     geometry = frame.geometry
     total = np.linalg.norm(solve_knee(geometry, FRICTION).contact_force)
     changes = []
-    for shift in (-RESIDUAL_SHIFT, RESIDUAL_SHIFT):
+    for shift in (-EQUATION.residual_shift, EQUATION.residual_shift):
         monkeypatch.setattr(
             knee_module.unknowns,
             "residuals",

@@ -17,7 +17,7 @@ from tkamb.contact.foundation import (
 )
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search, search_load
+from tkamb.contact.pressing import PRESS, press_by_search, search_load
 from tkamb.contact.result import ContactStatus
 from tkamb.contact.samples import gaps_and_facets, sample_surface
 from tkamb.errors import InputError
@@ -302,7 +302,7 @@ def test_a_guess_spares_the_bed_and_changes_nothing(aside, monkeypatch):
     monkeypatch.setattr(neighbourhood, "gaps_and_facets", counted)
     found = model.press(state, 1500.0, lowered(0), before)
     assert found.status is ContactStatus.OK
-    assert found.residual <= LOAD_TOLERANCE
+    assert found.residual <= PRESS.load_tolerance
     np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
     nearer_than = neighbourhood.FARTHEST / neighbourhood.OBLIQUE
     assert (looked[0] < len(state.points)) == (aside < nearer_than)
@@ -411,5 +411,5 @@ def test_the_search_for_a_load_says_how_near_it_came(power, start):
     found = search_load(reaction, 800.0, start)
     assert found.approach == pytest.approx((800.0 / 1e9) ** (1 / power), rel=1e-6)
     assert found.residual == pytest.approx(abs(reaction(found.approach) / 800.0 - 1.0), abs=1e-15)
-    assert found.residual <= LOAD_TOLERANCE
+    assert found.residual <= PRESS.load_tolerance
     assert found.deepest >= found.approach

@@ -25,6 +25,14 @@ from tkamb.run.mechanics import FrameLoads, Mechanics
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)
+CONDYLE_LENGTHS = (
+    "notch_depth",
+    "facet_depth",
+    "strip_width",
+    "sample_spacing",
+    "highest_sample",
+    "deepest_notch",
+)
 
 
 @cache
@@ -240,16 +248,20 @@ def scaled_case(case: Case) -> Case:
 def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     """Lengths, masses and times scaled, gravity and the model's own lengths along."""
     unscaled = shipped_loads()  # with the model's own lengths as they are
-    monkeypatch.setattr(contact_points, "STANDSTILL", contact_points.STANDSTILL * LENGTH / TIME)
+    speed = contact_points.CONTACT_POINT.standstill_speed * LENGTH / TIME
+    contact_point = replace(contact_points.CONTACT_POINT, standstill_speed=speed)
+    monkeypatch.setattr(contact_points, "CONTACT_POINT", contact_point)
     own_lengths = {
-        knee: ("RESIDUAL_SHIFT",),
-        patellofemoral: ("PATCH_DEPTH", "SAMPLE_SPACING", "REACH"),
-        closest: ("FACET_DEPTH", "REGION_RADIUS", "SAMPLE_SPACING", "NEARLY_AS_CLOSE"),
-        condyles: ("NOTCH_DEPTH", "STRIP_WIDTH", "_DEEPEST"),
+        (knee, "EQUATION"): ("residual_shift",),
+        (patellofemoral, "PATELLOFEMORAL"): ("patch_depth", "sample_spacing", "sample_range"),
+        (closest, "CLOSEST_POINT"): ("region_radius", "clearance", "gap_range"),
+        (closest, "CONDYLE"): CONDYLE_LENGTHS,
+        (condyles, "CONDYLE"): CONDYLE_LENGTHS,
     }
-    for module, names in own_lengths.items():
-        for name in names:
-            monkeypatch.setattr(module, name, getattr(module, name) * LENGTH)
+    for (module, name), fields in own_lengths.items():
+        settings = getattr(module, name)
+        scaled_fields = {field: getattr(settings, field) * LENGTH for field in fields}
+        monkeypatch.setattr(module, name, replace(settings, **scaled_fields))
     patella = patellofemoral.PatellofemoralContact.__init__
     ml, lateral_yield, tilt_yield = patella.__defaults__
     scaled = (ml, lateral_yield * LENGTH, tilt_yield / LENGTH)

@@ -40,7 +40,7 @@ def cached(counts=(5, 3, 6), limit=1e9, nu=0.45):
 
 
 def solve_twice(_):
-    cache.LEAST_UNKNOWNS = 1
+    cache.FACTOR_CACHE = cache.FactorCacheSettings(least_unknowns=1)
     operator, _, solid = cached()
     return operator.solve(np.ones_like(solid.nodes))
 
@@ -48,7 +48,8 @@ def solve_twice(_):
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "operators"))
-    monkeypatch.setattr(cache, "LEAST_UNKNOWNS", 1)
+    settings = cache.FactorCacheSettings(least_unknowns=1)
+    monkeypatch.setattr(cache, "FACTOR_CACHE", settings)
     return tmp_path / "operators"
 
 

@@ -36,7 +36,7 @@ from tkamb.contact.lattice.meshing.grid import (
     grid_spacing,
 )
 from tkamb.contact.lattice.meshing.levels import Levels
-from tkamb.contact.lattice.meshing.notches import BULGE
+from tkamb.contact.lattice.meshing.notches import NOTCH
 from tkamb.contact.lattice.meshing.quality import measure_quality
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
@@ -185,7 +185,7 @@ def test_contact_nodes_lie_on_the_surface(name):
     away = distances(surface, lattice.nodes[lattice.contact_nodes], reach=5e-4)
     in_a_notch = notch_nodes(lattice)
     assert away[~in_a_notch].max() < 1e-9
-    assert away.max() < BULGE * np.linalg.norm(lattice.spacing[[0, 2]])
+    assert away.max() < NOTCH.corner_margin * np.linalg.norm(lattice.spacing[[0, 2]])
     assert np.abs(lattice.nodes[lattice.bottom_nodes, 1]).max() < 5e-5
     assert scaled_jacobians(lattice.nodes[lattice.cells]).min() > 0.0
     columns = lattice.index[lattice.contact_nodes][:, [0, 2]]
@@ -420,7 +420,7 @@ def test_ten_micrometres_of_jitter_leave_the_classes_right(name):
     kind, nodes = lattice.node_class, lattice.nodes
     away = distances(surface, nodes[kind == CONTACT], 5e-4)
     diagonal = np.linalg.norm(lattice.spacing[[0, 2]])
-    on_top = away < np.where(notch_nodes(lattice), BULGE * diagonal, 3e-5)
+    on_top = away < np.where(notch_nodes(lattice), NOTCH.corner_margin * diagonal, 3e-5)
     on_bottom = np.abs(nodes[kind == BOTTOM, 1]) < 5e-5
     within = surface.winding.inside(nodes[kind == INTERNAL])
     near_wall = distances(surface, nodes[kind == OTHER], 2.5e-3) < 2.5e-3

@@ -35,7 +35,7 @@ def test_the_count_bounds_what_is_taken(counts, monkeypatch):
     prepare_operator(stiffness, index, held, top, SINGLE)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < memory_need.SPARE * needs[0] < 3 * peak
+    assert peak < memory_need.MEMORY_NEED.safety_factor * needs[0] < 3 * peak
 
 
 def test_a_single_front_takes_its_matrix_in_8_bytes_and_in_4():
@@ -44,7 +44,7 @@ def test_a_single_front_takes_its_matrix_in_8_bytes_and_in_4():
     joined = sparse.csr_matrix(np.ones((30, 30)))
     tree = Dissection([nodes], [-1])
     found = memory_need.factor_memory(tree, joined, np.zeros(30, bool), 4)
-    assert found == memory_need.MATRIX_BYTES * 90**2 + (8 + 4) * 90**2
+    assert found == memory_need.MEMORY_NEED.entry_bytes * 90**2 + (8 + 4) * 90**2
 
 
 def test_the_updates_of_two_fronts_wait_for_the_third():
@@ -58,7 +58,7 @@ def test_the_updates_of_two_fronts_wait_for_the_third():
     last = 4 * (2 * own + 30**2) + 8 * (2 * update + 30**2)
     at_second = 4 * 2 * own + 8 * (update + own + update)
     assert at_second > last
-    assert found == memory_need.MATRIX_BYTES * 9 * joined.sum() + at_second
+    assert found == memory_need.MEMORY_NEED.entry_bytes * 9 * joined.sum() + at_second
 
 
 @pytest.mark.parametrize("left", [2e8, 6e7, 1.5e7])

@@ -15,7 +15,7 @@ from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.nonlinear_balance import elements_that_count
 from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.settings import LatticeSolverSettings
-from tkamb.contact.lattice.solids.solid import SMALL_STRAIN
+from tkamb.contact.lattice.solids.solid import SOLID
 from tkamb.contact.lattice.solver import solve
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
@@ -140,7 +140,7 @@ def test_no_share_of_an_element_that_is_passed_over_exceeds_the_limit(pressed, s
     others = np.setdiff1d(np.arange(len(sizes)), noticed.elements)
     assert sizes[others].max(initial=0.0) <= share
     strain = np.linalg.eigvalsh(solid.strain(field, others))
-    assert np.abs(strain).max(initial=0.0) < 2 * SMALL_STRAIN
+    assert np.abs(strain).max(initial=0.0) < 2 * SOLID.always_checked_strain
     norms = np.linalg.norm(solid.strain(field, noticed.elements), axis=(1, 2))
     assert noticed.strain == pytest.approx(norms, rel=1e-9, abs=1e-12)
     everywhere = min(solid.least_principal_strain(field, noticed), strain.min(initial=np.inf))
@@ -205,7 +205,8 @@ def test_the_compliance_at_hand_stays_within_its_bound(state, monkeypatch):
     """Spare nodes are worked out along with those wanted, unless there are too many."""
     wanted, spare = np.array([3, 5]), np.arange(2, 9)
     for most, kept in ((7, spare), (6, wanted)):
-        monkeypatch.setattr(compliance, "MOST_STORED", most)
+        settings = compliance.ComplianceSettings(max_nodes=most)
+        monkeypatch.setattr(compliance, "COMPLIANCE", settings)
         cache = ComplianceCache(state.problem.operator.half)
         cache.among(wanted, spare)
         assert cache.nodes.tolist() == kept.tolist()
@@ -218,9 +219,9 @@ def test_the_compliance_grows_node_by_node(state, monkeypatch):
     half = state.problem.operator.half
     nodes = np.array([2, 3, 5, 8, 20, 21, 30])
     whole = by_component(half.among(unknowns_of(nodes)).compliance())
-    monkeypatch.setattr(compliance, "SPACE", 2)
+    monkeypatch.setattr(compliance, "COMPLIANCE", compliance.ComplianceSettings(spare_nodes=2))
     for few in (0, 100):
-        monkeypatch.setattr(response, "FEW", few)
+        monkeypatch.setattr(response, "RESPONSE", response.ResponseSettings(few_columns=few))
         cache = ComplianceCache(half)
         for some in ([20], [5, 8], [2], [8, 21, 30], [3, 5]):
             cache.among(np.array(some), np.array(some))

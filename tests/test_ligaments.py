@@ -15,7 +15,7 @@ from tkamb.io.scene.lines import ligament
 from tkamb.io.scene.tables import LigamentTable
 from tkamb.knee.generic_ligaments import condylar_axis, generic_ligaments
 from tkamb.knee.ligaments import (
-    TOE_STRAIN,
+    LIGAMENT,
     Ligament,
     build_ligaments,
     ligament_loads,
@@ -51,17 +51,25 @@ def bundle_of(**changes: object) -> Ligament:
 )
 def test_laws(law: object, stiffness: float, terminal: float) -> None:
     """Slack carries nothing, both branches meet at 2 eps1, the terminal slope is k."""
-    strain = np.array([-0.5, 0.0, 2 * TOE_STRAIN * (1 - 1e-12), 2 * TOE_STRAIN * (1 + 1e-12), 0.1])
+    strain = np.array(
+        [
+            -0.5,
+            0.0,
+            2 * LIGAMENT.toe_strain * (1 - 1e-12),
+            2 * LIGAMENT.toe_strain * (1 + 1e-12),
+            0.1,
+        ]
+    )
     force = law(SLACK * (1 + strain), SLACK, stiffness)
     assert force[0] == 0.0
     assert force[1] == 0.0
     assert force[2] == pytest.approx(force[3], rel=1e-9)
-    assert force[2] == pytest.approx(terminal * TOE_STRAIN)
-    assert (force[4] - force[3]) / (0.1 - 2 * TOE_STRAIN) == pytest.approx(terminal)
+    assert force[2] == pytest.approx(terminal * LIGAMENT.toe_strain)
+    assert (force[4] - force[3]) / (0.1 - 2 * LIGAMENT.toe_strain) == pytest.approx(terminal)
 
 
 def test_quadratic_toe_has_no_kink() -> None:
-    e, h = 2 * TOE_STRAIN, 1e-7
+    e, h = 2 * LIGAMENT.toe_strain, 1e-7
     f = quadratic_toe_force(SLACK * (1 + np.array([e - h, e, e + h])), SLACK, 1.0)
     assert (f[1] - f[0]) / h == pytest.approx((f[2] - f[1]) / h, rel=1e-4)
 

@@ -10,9 +10,9 @@ from tkamb.contact.foundation import LinearFoundation
 from tkamb.geometry.frames import knee_pose
 from tkamb.knee.equilibrium import released
 from tkamb.knee.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.knee.equilibrium.released import KNEE_CHANGE, ReleasedKnee, ahead
+from tkamb.knee.equilibrium.released import RELEASED_KNEE, ReleasedKnee, ahead
 from tkamb.knee.equilibrium.released_forces import SCALE
-from tkamb.knee.equilibrium.starts import FARTHEST_AHEAD, carried_on
+from tkamb.knee.equilibrium.starts import INITIAL_POSE, carried_on
 
 CELL = 1e-3
 
@@ -45,19 +45,21 @@ def springs(x):
 def test_a_rough_search_leaves_no_more_than_it_may_and_says_so():
     start = np.array([4e-3, 5e-3])
     rest = find_balance(springs, start)
-    rough = find_balance(springs, start, left=0.1)
+    rough = find_balance(springs, start, residual_share=0.1)
     assert rest.status is rough.status is BalanceStatus.OK
     assert rest.at_rest
     assert not rough.at_rest
     assert rough.trials < rest.trials
     missed = np.linalg.norm(rough.coordinates - rest.coordinates)
     assert 0 < missed < 0.15 * np.linalg.norm(rough.coordinates - start)
-    assert find_balance(springs, rest.coordinates, left=0.1).at_rest
+    assert find_balance(springs, rest.coordinates, residual_share=0.1).at_rest
 
 
 def test_a_rough_search_does_not_end_where_nothing_holds_it():
     """On a hilltop a short Newton step leads up it."""
-    hilltop = find_balance(lambda x: Trial(1e5 * x, -1e5 * np.eye(1)), np.array([1e-4]), left=0.5)
+    hilltop = find_balance(
+        lambda x: Trial(1e5 * x, -1e5 * np.eye(1)), np.array([1e-4]), residual_share=0.5
+    )
     assert hilltop.status is not BalanceStatus.OK
 
 
@@ -70,7 +72,7 @@ def test_what_is_ahead_of_passes_that_shrink_is_their_series(ratio):
 
 def test_what_is_ahead_is_not_guessed_from_passes_that_do_not_settle():
     """One short pass after a long one foretells nothing: a search that trusts it ends too soon."""
-    short = 1.5 * KNEE_CHANGE
+    short = 1.5 * RELEASED_KNEE.knee_tolerance
     for ways in ([np.inf, np.inf, short], [np.inf, 1e-3, short], [1e-3, 0.9e-3, short]):
         assert ahead(ways) == 1.0
     assert ahead([1e-3, 4e-4, 3e-4]) == 1.0
@@ -87,7 +89,7 @@ def test_a_search_begins_where_steady_frames_go_on_and_no_farther():
     assert np.array_equal(carried_on(steady[:1]), steady[0])
     assert np.array_equal(carried_on([np.zeros(6), step, np.zeros(6)]), np.zeros(6))
     leap = carried_on([np.zeros(6), 50 * step, 100 * step]) - 100 * step
-    assert np.linalg.norm(leap * SCALE) == pytest.approx(FARTHEST_AHEAD, rel=1e-9)
+    assert np.linalg.norm(leap * SCALE) == pytest.approx(INITIAL_POSE.max_extrapolation, rel=1e-9)
 
 
 def test_what_a_lost_patella_leaves_unknown_is_asked_for_again(monkeypatch):

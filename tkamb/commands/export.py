@@ -43,14 +43,14 @@ def _export(options: argparse.Namespace) -> int:
 
 def _export_deck(options: argparse.Namespace) -> int:
     from tkamb.atomic import write_text
-    from tkamb.contact.registry import COARSEST_MM
+    from tkamb.contact.registry import MAP_GRID
     from tkamb.io.claim import check_output_file
     from tkamb.run.decks.frame import SUFFIX, frame_press
 
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")
-    if options.resolution is not None and not 0 < options.resolution <= COARSEST_MM:
-        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
+    if options.resolution is not None and not 0 < options.resolution <= MAP_GRID.coarsest_mm:
+        mend = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
         raise InputError(f"resolution {options.resolution} mm", "--resolution", mend)
     check_output_file(options.out, options.force)
     found = frame_press(options.folder, options.frame, options.resolution)

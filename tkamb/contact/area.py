@@ -1,16 +1,28 @@
 """How much of a surface is in contact, and how much of it is above a pressure."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tkamb.contact.materials import Material
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 
-NO_EDGE = 0.5
-"""Share of a side where the femoral surface ends, or rises more than it goes along, before the
-neighbour: contact may end anywhere between the two."""
-LEAST_GAP = 1e-12
-"""m; a node that is not in contact is at least this far off."""
+
+@dataclass(frozen=True)
+class ContactAreaSettings:
+    """Contact area from nodal pressures and gaps."""
+
+    unknown_edge_share: float = 0.5
+    """Share of a cell side, 1: where the edge of contact is put if the femoral surface ends,
+    or rises more than it goes along, before the neighbour. Contact may then end anywhere
+    between the two nodes, so the middle is taken."""
+    least_gap: float = 1e-12
+    """m: smallest gap of a node that is not in contact. It keeps a division from zero; gaps
+    that matter are above 1e-7 m."""
+
+
+CONTACT_AREA = ContactAreaSettings()
 
 
 def covered_areas(
@@ -46,22 +58,26 @@ def covered_areas(
     """
     touched = pressure > 0
     a, b, c = touched[triangles.T].view(np.int8)
+    # Triangles with all corners in contact count whole; mixed ones are cut by a straight edge.
     count = a + b + c
     near = np.flatnonzero(count)
     corners, count = triangles[near], count[near]
     part = triangle_area[near]
     mixed = np.flatnonzero(count < 3)
+    # The odd corner is the only one in contact, or the only one out of contact. The edge of contact
+    # cuts the two sides that meet there.
     single = count[mixed] == 1
     odd = np.argmax(touched[corners[mixed]] == single[:, None], axis=1)
     own, others = corners[mixed, odd], corners[mixed[:, None], (odd[:, None] + [1, 2]) % 3]
     inside = np.where(single[:, None], own[:, None], others)
     outside = np.where(single[:, None], others, own[:, None])
     share = _share(points, inside, outside, pressure, gap, material)
+    # A triangle cut at shares s and t of two sides leaves the part s t at their common corner.
     cut = np.where(single, share.prod(axis=1), 1.0 - (1.0 - share).prod(axis=1))
     part[mixed] *= cut
-    held = touched[corners]
+    in_contact = touched[corners]
     shares = np.repeat(part / count, count)
-    return np.asarray(np.bincount(corners[held], shares, len(points)), float)
+    return np.asarray(np.bincount(corners[in_contact], shares, len(points)), float)
 
 
 def _share(
@@ -75,12 +91,17 @@ def _share(
     """Return which share of the sides from nodes in contact (m, 2) to others is in contact."""
     distance = np.linalg.norm(points[inside] - points[outside], axis=2)
     smooth = gap[outside] < distance
-    opening = np.where(smooth, np.maximum(gap[outside], LEAST_GAP), distance)
+    opening = np.where(smooth, np.maximum(gap[outside], CONTACT_AREA.least_gap), distance)
     modulus = material.young_modulus / (1.0 - material.poisson_ratio**2)
+    # At the rim p² grows linearly with the distance inside the edge, and the gap with its power 3/2
+    # outside (Hertz). Both laws share one factor, which fixes where the edge lies.
     square, rise = pressure[inside] ** 2, (0.75 * modulus * opening) ** (2 / 3)
     scale = np.sqrt(rise / (3.0 * square))
+    # Closed form of the only real root of the cubic; it has no cancellation for small gaps.
     root = 2.0 * scale * np.sinh(np.arcsinh(1.5 * distance / (rise * scale)) / 3.0)
-    return np.where(smooth, np.minimum(square * root**3 / distance, 1.0), NO_EDGE)
+    return np.where(
+        smooth, np.minimum(square * root**3 / distance, 1.0), CONTACT_AREA.unknown_edge_share
+    )
 
 
 def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:
@@ -97,6 +118,8 @@ def area_above(points: Array, triangles: Index, pressure: Array, level: float) -
         pressure: (n,) Pa.
         level: Pa, positive.
     """
+    # p² is interpolated, because it is linear at the rim of a Hertzian contact while p has a
+    # vertical slope there.
     return float(_area_above(points, triangles, pressure**2, level**2))
 
 
@@ -116,8 +139,8 @@ def _area_above(points: Array, triangles: Index, square: Array, level: float) ->
                 slope = 0.0  # of the linear q, times size
                 for i in range(3):
                     j, m = (axis + 1) % 3, (axis + 2) % 3
-                    turned = across[j] * edges[i, m] - across[m] * edges[i, j]
-                    slope += square[triangles[k, i]] * turned
+                    cross = across[j] * edges[i, m] - across[m] * edges[i, j]
+                    slope += square[triangles[k, i]] * cross
                 for i in range(3):
                     total[triangles[k, i], axis] += slope / (4.0 * size)
             for i in range(3):
@@ -136,6 +159,8 @@ def _area_above(points: Array, triangles: Index, square: Array, level: float) ->
                 for axis in range(3):
                     rise += (total[one, axis] - total[other, axis]) * edges[i, axis]
             for i in range(3):
+                # Linear interpolation underestimates a concave p²; the nodal slopes give the mean
+                # of the quadratic term.
                 values[i] = square[corners[i]] + rise / 24.0
             area += size * _share_above(values, level)
     return area

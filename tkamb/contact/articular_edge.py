@@ -63,6 +63,7 @@ class ArticularEdge:
             settings: when contact is at the edge.
         """
         low, high = insert.bounds[:, [0, 2]]
+        # Two rows of margin on each side, so that the outside is one connected region.
         count = np.ceil((high - low) / settings.spacing).astype(int) + 4
         origin = low - 1.5 * settings.spacing
         x, z = (origin[d] + settings.spacing * np.arange(count[d]) for d in (0, 1))
@@ -74,6 +75,8 @@ class ArticularEdge:
         upright = insert.face_normals[face][:, 1].reshape(count)
         inside = distance_transform_edt(covered, settings.spacing)
         steep = covered & (upright < np.cos(settings.steepest)) & (inside <= settings.rim)
+        # Steep ground counts as rim only where it is connected to the outside; a post's flank is
+        # not.
         beyond = _joined_to_outside(~covered | steep, ~covered)
         return cls(origin, distance_transform_edt(~beyond, settings.spacing), settings.spacing)
 
@@ -81,14 +84,16 @@ class ArticularEdge:
         """Return the distance (n,) of points (n, 3) from the edge in x and z, m; 0 beyond it."""
         cell = np.round((points[:, [0, 2]] - self.origin) / self.spacing).astype(int)
         cell = np.clip(cell, 0, np.array(self.away.shape) - 1)
+        # The distance is measured between ray places; the edge lies half a spacing nearer on
+        # average.
         return np.asarray(np.maximum(self.away[tuple(cell.T)] - self.spacing / 2, 0.0), float)
 
 
-def _joined_to_outside(wanted: Mask, outside: Mask) -> Mask:
+def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
     """Return the connected parts of a mask (a, b) that hold a cell outside the insert."""
-    part, _ = label(wanted, structure=np.ones((3, 3)))
+    part, _ = label(flat, structure=np.ones((3, 3)))
     touching = np.unique(part[outside])
-    return np.asarray(wanted & np.isin(part, touching), bool)
+    return np.asarray(flat & np.isin(part, touching), bool)
 
 
 def edge_of_insert_flags(
@@ -108,15 +113,16 @@ def edge_of_insert_flags(
         settings: when contact is at the edge.
     """
     for side, own in sides.items():
-        carried = np.where(own, pressure, 0.0)
-        highest = float(carried.max(initial=0.0))
+        own_pressure = np.where(own, pressure, 0.0)
+        highest = float(own_pressure.max(initial=0.0))
         if highest <= 0.0:
             continue
-        loaded = np.flatnonzero(carried > settings.share * highest)
+        # A faint pressure at the rim does not make an edge contact.
+        loaded = np.flatnonzero(own_pressure > settings.share * highest)
         away = edge.distance(points[loaded])
         if away.min() > settings.reach:
             continue
-        peak = float(away[np.argmax(carried[loaded])])
+        peak = float(away[np.argmax(own_pressure[loaded])])
         where = (
             "its peak pressure lies there"
             if peak <= settings.reach

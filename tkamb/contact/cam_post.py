@@ -36,13 +36,24 @@ WHERE = "[contact] post"
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Rows: the turned axes in the insert frame."""
 UP = np.array([0.0, 1.0, 0.0])
-SKIN = 1e-3
-"""m; rays start so far above the post."""
+
+
+@dataclass(frozen=True)
+class CamPostSettings:
+    """Contact of cam and post."""
+
+    ray_start_height: float = 1e-3
+    """m: height above the post at which rays down begin. Chosen well above the noise of a mesh."""
+    search_margin: float = 3 * MILLIMETRE
+    """m: how far beside the post the cam is still taken, because the femur's medial-lateral
+    position moves it. """
+
+
+CAM_POST = CamPostSettings()
+
 TICKS, ZOOMS = 41, 3
 """Rays along either edge of the grid on which the clearance is looked for, and how often it is made
 twenty times finer: 16 mm are known to less than a micrometre."""
-BESIDE = 3 * MILLIMETRE
-"""How far the cam is taken beside the post, which the femur's ML position moves."""
 NO_LINE_CONTACT = ("hertz",)
 """Models that know no contact along a line."""
 
@@ -72,6 +83,8 @@ class PostPair(ContactPair):
             if not np.isfinite(gap).any():
                 break
             k = int(np.nanargmin(gap))
+            # Zoom into one cell of the grid around the smallest gap; each zoom gains a factor of
+            # 20.
             least, reach = float(gap[k]), (high - low) / (TICKS - 1)
             place = np.array([x[k], z[k]])
             low = np.maximum(place - reach, self.insert.bounds[0, [0, 2]])
@@ -83,7 +96,7 @@ class PostPair(ContactPair):
         far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
         below = points + (pose[1, 3] - 2 * far) * UP
         up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
-        above = points + (self.insert.bounds[1, 1] + SKIN) * UP
+        above = points + (self.insert.bounds[1, 1] + CAM_POST.ray_start_height) * UP
         down, _ = self.insert.rays.first(above, -UP)
         gap = (below[:, 1] + up) - (above[:, 1] - down)
         return np.where(np.isfinite(gap), gap, np.nan)
@@ -145,13 +158,14 @@ class CamPost:
         material: Material,
     ) -> None:
         if model.name in NO_LINE_CONTACT:
-            mend = "take foundation, lattice or fe"
-            raise InputError(f"contact model '{model.name}' has no line contact", WHERE, mend)
+            hint = "take foundation, lattice or fe"
+            raise InputError(f"contact model '{model.name}' has no line contact", WHERE, hint)
+        # The post is turned so that its back faces up: the contact models press along y.
         low, high = post.bounds
         front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
         self.in_turned = np.eye(4)
         self.in_turned[:3, :3], self.in_turned[:3, 3] = TURN, -TURN @ front
-        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + BESIDE)
+        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + CAM_POST.search_margin)
         self._foot = float(low[1])
         self._prepare(model, PostPair(cam, post.moved(self.in_turned), material))
 
@@ -214,6 +228,7 @@ class CamPost:
 
     def _in_insert(self, load: CondyleWrench) -> CondyleWrench:
         x = twist_matrix(self.in_turned)
+        # Wrench and twist change frames by transposed matrices, so that the work stays the same.
         stiffness = None if load.stiffness is None else x.T @ load.stiffness @ x
         centre = transform(inverse(self.in_turned), load.centre)
         return CondyleWrench(x.T @ load.wrench, centre, stiffness)
@@ -229,8 +244,8 @@ class CamPost:
 class PostProbe:
     """Cam and post at neighbouring poses; see `tkamb.contact.probe.Probe`."""
 
-    def __init__(self, cam_post: CamPost, turned: Any) -> None:
-        self._cam_post, self._turned = cam_post, turned
+    def __init__(self, cam_post: CamPost, rotated_model: Any) -> None:
+        self._cam_post, self._turned = cam_post, rotated_model
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4): its post alone."""
@@ -292,8 +307,9 @@ def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
         InputError: nothing lies there.
     """
     if split is None:
-        mend = "leave the key out, or give a component with two condyles"
-        raise InputError("one condyle has no cam", WHERE, mend)
+        hint = "leave the key out, or give a component with two condyles"
+        raise InputError("one condyle has no cam", WHERE, hint)
+    # z of the triangles, measured from the plane between the condyles.
     across = femoral.triangles[:, :, 2] - split
     behind = femoral.triangles[:, :, 0].max(axis=1) < femoral.bounds[:, 0].mean()
     own = behind & (across.min(axis=1) < reach) & (across.max(axis=1) > -reach)

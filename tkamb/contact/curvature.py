@@ -7,15 +7,28 @@ import numpy as np
 from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.geometry.rays import RayCaster
 
-SAMPLES = 21
-"""Rays across a patch."""
-ROUNDS = 12
-SETTLED = 1e-7
-"""m; a contact point that moves less is found."""
-FARTHEST = 3.0
-"""Patch radii that the contact point may move away from where the meshes touch."""
-LEAST_COVER = 0.6
-"""Share of a patch that both meshes must cover."""
+
+@dataclass(frozen=True)
+class CurvatureSettings:
+    """Curvature of the two surfaces at a contact point, from a patch of rays."""
+
+    samples: int = 21
+    """Rays per side of the square patch. Chosen: a quadric has six coefficients, 441 rays
+    average out the mesh."""
+    max_iterations: int = 12
+    """Iterations that find the contact point at most."""
+    position_tolerance: float = 1e-7
+    """m: the contact point has converged when an iteration moves it by less. Far below the
+    size of a triangle."""
+    max_distance: float = 3.0
+    """Patch radii: farthest distance of the contact point from where the meshes touch first.
+    Farther away the two surfaces are not described by the patch."""
+    least_cover: float = 0.6
+    """Share of a patch, 1: part that both meshes must cover. With less the quadric is an
+    extrapolation."""
+
+
+CURVATURE = CurvatureSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +79,23 @@ def osculate(
         not curve apart there.
     """
     point, normal = start, _start_normal(insert, start)
-    for _ in range(ROUNDS):
+    # The point depends on the normal and the normal on the point: fit, step, turn the frame.
+    for _ in range(CURVATURE.max_iterations):
         frame = np.stack([*_tangents(normal), normal])
         fits = _fit(insert, femoral, pose, point, frame, radius)
         if fits is None:
             return None
         of_insert, of_femoral = fits
+        # The gap is itself a quadric; its minimum is the contact point.
         difference = of_femoral - of_insert
         step = _nearest_place(difference, radius)
-        if step is None or np.linalg.norm(point - start) > FARTHEST * radius:
+        if step is None or np.linalg.norm(point - start) > CURVATURE.max_distance * radius:
             return None
-        if np.linalg.norm(step) < SETTLED:
+        if np.linalg.norm(step) < CURVATURE.position_tolerance:
             return _described(point, frame, of_insert, of_femoral)
         point = point + np.append(step, _value(of_insert, step)) @ frame
+        # At the contact point both surfaces share their normal; before convergence the mean is
+        # taken.
         slope = (_slope(of_insert, step) + _slope(of_femoral, step)) / 2
         normal = np.append(-slope, 1.0) @ frame
         normal /= np.linalg.norm(normal)
@@ -104,7 +121,7 @@ def _fit(
     insert: RayCaster, femoral: RayCaster, pose: Array, point: Array, frame: Array, radius: float
 ) -> tuple[Array, Array] | None:
     """Return quadric coefficients (6,) of the insert and of the femur over the tangent plane."""
-    ticks = np.linspace(-radius, radius, SAMPLES)
+    ticks = np.linspace(-radius, radius, CURVATURE.samples)
     u, v = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     disc = u**2 + v**2 <= radius**2 * 1.0001
     u, v = u[disc], v[disc]
@@ -113,15 +130,17 @@ def _fit(
     over, _ = insert.first(places + radius * normal, -normal)
     under, _ = femoral.first(transform(back, places - radius * normal), rotate(back, normal))
     of_insert, of_femoral = radius - over, under - radius
-    known = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
-    if known.mean() < LEAST_COVER:
+    # A ray that met another part of a mesh, or nothing, is no sample of this patch.
+    covered = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
+    if covered.mean() < CURVATURE.least_cover:
         return None
-    u, v = u[known], v[known]
+    u, v = u[covered], v[covered]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
-    heights = np.stack([of_insert[known], of_femoral[known]], axis=1)
+    heights = np.stack([of_insert[covered], of_femoral[covered]], axis=1)
+    # Columns of equal size keep the least squares well conditioned: u is some millimetres.
     scale = radius ** np.array([0, 1, 1, 2, 2, 2])
-    found = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
-    return found[:, 0], found[:, 1]
+    coefficients = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
+    return coefficients[:, 0], coefficients[:, 1]
 
 
 def _hessian(quadric: Array) -> Array:
@@ -140,10 +159,12 @@ def _slope(quadric: Array, place: Array) -> Array:
 def _nearest_place(difference: Array, radius: float) -> Array | None:
     """Return the minimum (2,) of the gap, at most one radius away; None if it has none."""
     values, vectors = np.linalg.eigh(_hessian(difference))
+    # Not convex in all directions: the bodies conform, and no nearest point exists.
     if values[0] <= 0:
         return None
     step = -vectors @ ((vectors.T @ difference[1:3]) / values)
     length = float(np.linalg.norm(step))
+    # The quadric describes the patch only, so that a step stays within it.
     return np.asarray(step * min(1.0, radius / length)) if length > 0 else step
 
 

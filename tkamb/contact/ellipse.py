@@ -6,8 +6,17 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipkm1, elliprd
 
-SLENDEREST = 1e-6
-"""Smallest ratio of semi-axes that is solved for."""
+
+@dataclass(frozen=True)
+class EllipseSettings:
+    """Hertz's contact ellipse."""
+
+    smallest_axis_ratio: float = 1e-6
+    """1: smallest ratio of the semi-axes that is solved for. Below it the contact is a line
+    contact, and elliptic integrals lose their digits."""
+
+
+ELLIPSE = EllipseSettings()
 
 
 @dataclass(frozen=True)
@@ -48,11 +57,15 @@ def contact_ellipse(
         approach: delta, m, positive, of distant points along the normal.
         plane_modulus: E* = E/(1 - nu²), Pa (the other body rigid).
     """
+    # The axis ratio follows from the curvatures alone; size and pressure then from the approach.
     ratio = _axis_ratio(steep / flat)
+    # Complete elliptic integral K(1 - ratio²); `ellipkm1` keeps its digits for slender ellipses,
+    # where K diverges.
     first = float(ellipkm1(ratio**2))
     long_axis = np.sqrt(approach * float(elliprd(0.0, ratio**2, 1.0)) / (3 * first * flat))
     short_axis = ratio * long_axis
     peak = plane_modulus * approach / (short_axis * first)
+    # Volume of a semi-ellipsoid of height p0 over the ellipse.
     force = 2 / 3 * np.pi * long_axis * short_axis * peak
     return ContactEllipse(float(long_axis), float(short_axis), float(peak), float(force))
 
@@ -65,6 +78,7 @@ def _axis_ratio(curvature_ratio: float) -> float:
         both = elliprd(0.0, 1.0, square) / elliprd(0.0, square, 1.0)
         return float(np.log(both) - np.log(curvature_ratio))
 
+    # Equal curvatures give a circle; rounding may put the root at a positive logarithm.
     if curvature_ratio <= 1.0 or excess(0.0) >= 0:
         return 1.0
-    return float(np.exp(brentq(excess, np.log(SLENDEREST), 0.0, xtol=1e-15)))
+    return float(np.exp(brentq(excess, np.log(ELLIPSE.smallest_axis_ratio), 0.0, xtol=1e-15)))

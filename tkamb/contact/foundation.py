@@ -9,7 +9,7 @@ from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.narrow import narrow_flags
 from tkamb.contact.neighbourhood import NEAR, Neighbourhood
-from tkamb.contact.pressing import LOAD_TOLERANCE, press_by_search
+from tkamb.contact.pressing import PRESS, press_by_search
 from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.contact.samples import (
@@ -24,17 +24,30 @@ from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse, rotate, tr
 
 Law = Literal["nonlinear", "linear"]
 
-THINNEST = 1e-6
-"""m; a layer thinner than this, at the insert's rim, counts as this thick."""
-NARROW = 1e-9
-"""m; with a stiffness of some 1e8 N/m a reaction rises by 0.1 N between approaches this near."""
+
+@dataclass(frozen=True)
+class FoundationSettings:
+    """The elastic foundation (bed of springs)."""
+
+    least_thickness: float = 1e-6
+    """m: a layer thinner than this, at the insert's rim, counts as this thick. It keeps
+    pressure = modulus * penetration / thickness finite."""
+    approach_step: float = 1e-9
+    """m: distance of two approaches between which a reaction is taken as constant. With a
+    stiffness of some 1e8 N/m it changes by 0.1 N."""
+    reached_share: float = 0.99
+    """1: a reaction below this share of the load, less `reached_force`, does not reach the
+    load within `approach_step`."""
+    reached_force: float = 1.0
+    """N: see `reached_share`; ten times what `approach_step` changes."""
+
+
+FOUNDATION = FoundationSettings()
+
 TOO_DEEP = "the penetration exceeds half the insert's thickness"
 OVER_THE_EDGE = (
     "the femoral component reaches over the insert's edge, deeper than half of what is there"
 )
-WELL_BELOW = 0.99
-SMALL_LOAD = 1.0
-"""N; a reaction below that share of a load, less this, does not reach the load within `NARROW`."""
 WIDEST_EDGE = NEAR
 """m: no gap is taken to change by more across a column."""
 SUMS = 46
@@ -97,7 +110,7 @@ class ElasticFoundation(ContactModel):
             return ContactResult.failed(state, pose, "the pose is not finite")
         samples = state.surface
         gap = gaps_along_normals(samples, state.pair.femoral, pose)
-        strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, THINNEST)
+        strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if (deep := strain >= DEEPEST).any():
             whole = (samples.depth >= samples.thickness)[deep].any()
             return ContactResult.failed(state, pose, TOO_DEEP if whole else OVER_THE_EDGE)
@@ -118,8 +131,9 @@ class ElasticFoundation(ContactModel):
         """
         nearby = _NearColumns(self.law, state, pose, guess)
         result = press_by_search(self, state, load, pose, guess, nearby.reaction)
-        if result.status is ContactStatus.OK and result.residual <= LOAD_TOLERANCE:
+        if result.status is ContactStatus.OK and result.residual <= PRESS.load_tolerance:
             return result
+        # The reduced set of columns may have missed one; only a clear answer is taken from it.
         if result.status is ContactStatus.OUT_OF_RANGE and self._holds(nearby, load):
             return result
         return press_by_search(self, state, load, pose, guess)
@@ -131,12 +145,15 @@ class ElasticFoundation(ContactModel):
         are; and it carries less than the load up to there if it does just before, since it rises
         with the approach. One evaluation there thus says what a search over the bed would.
         """
-        if nearby.beyond - nearby.within > NARROW:
+        if nearby.beyond - nearby.within > FOUNDATION.approach_step:
             return False
         pose = nearby.state.pair.pose_at_approach(nearby.pose, nearby.within)
-        found = self.evaluate(nearby.state, pose)
-        reaction = -float(found.wrench_on_insert[1])
-        return found.status is ContactStatus.OK and reaction < WELL_BELOW * load - SMALL_LOAD
+        result = self.evaluate(nearby.state, pose)
+        reaction = -float(result.wrench_on_insert[1])
+        return (
+            result.status is ContactStatus.OK
+            and reaction < FOUNDATION.reached_share * load - FOUNDATION.reached_force
+        )
 
     def probe(self, state: SampledContact, guess: ContactResult | None = None) -> Any:
         """Return the probe with near columns and exact stiffness; see `ContactModel`."""
@@ -173,25 +190,28 @@ class _NearColumns:
     def reaction(self, approach: float) -> float:
         """Return the reaction (N) at an approach (m); inf where it is out of range.
 
-        Where the range ends it is known to `NARROW`: between the two sides of the end it is the
-        reaction before it.
+        The end of the range is found to `FOUNDATION.approach_step`. Between the two approaches
+        that enclose it, the reaction is the last one within the range.
         """
-        if self.within < approach < self.beyond <= self.within + NARROW:
+        if self.within < approach < self.beyond <= self.within + FOUNDATION.approach_step:
             return self._last
         pair = self.state.pair
         pose = pair.pose_at_approach(self.pose, approach)
         if approach > self._reach:
             samples, (gap, _, _) = self._around.at(pose)
             close = gap < NEAR
+            # The columns near by serve until the femur has come down by half of what they were
+            # chosen with; the other half is the margin for oblique gaps.
             self._near, self._reach, gap = samples.part(close), approach + NEAR / 2, gap[close]
         else:
             gap = gaps_along_normals(self._near, pair.femoral, pose)
         near = self._near
-        strain = np.maximum(-gap, 0.0) / np.maximum(near.thickness, THINNEST)
+        strain = np.maximum(-gap, 0.0) / np.maximum(near.thickness, FOUNDATION.least_thickness)
         if (strain >= DEEPEST).any():
             self.beyond = min(self.beyond, approach)
             return np.inf
         pressure = layer_pressure(self._law, pair.material, strain)
+        # The pressure acts along the insert's normal; its y component carries the load.
         reaction = float((pressure * near.area) @ near.normals[:, 1])
         if approach > self.within:
             self.within, self._last = approach, reaction
@@ -202,9 +222,12 @@ def layer_pressure(law: Law, material: Material, strain: Array) -> Array:
     """Return the pressure (n,), Pa, of a column compressed by `strain` = d/h in [0, 1)."""
     if law == "linear":
         return material.confined_modulus * strain
+    # A confined layer is stiffer than a free bar by M / E; the curve is that of the bar at a strain
+    # that is larger by this factor.
     stiffening = material.confined_modulus / material.young_modulus
     pressure = np.zeros_like(strain)
     loaded = strain > 0
+    # Logarithmic strain: a layer pressed to nothing would carry an infinite stress.
     pressure[loaded] = material.stress(-stiffening * np.log1p(-strain[loaded]))
     return pressure
 
@@ -215,6 +238,7 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
         return np.full_like(strain, material.confined_modulus)
     stiffening = material.confined_modulus / material.young_modulus
     tangent = material.tangent(-stiffening * np.log1p(-strain))
+    # Chain rule of `layer_pressure`: d ln(1 - e) / de = -1 / (1 - e).
     return tangent * stiffening / (1.0 - strain)
 
 
@@ -263,7 +287,7 @@ class FoundationProbe:
         """Return the contact of the loaded columns, with gaps (n,) and femoral normals (n, 3)."""
         if not len(gap):
             return ProbedContact({}, tangent=True)
-        strain = -gap / np.maximum(samples.thickness, THINNEST)
+        strain = -gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if not (strain < DEEPEST).all():
             return ProbedContact({}, known=False)
         force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
@@ -291,7 +315,7 @@ class FoundationProbe:
         normals = rotate(pose, femoral.smooth_normals(met, face[near]))
         cosine = np.abs(np.einsum("ij,ij->i", normals, samples.normals))
         change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
-        edge = np.clip(change, NARROW, WIDEST_EDGE)
+        edge = np.clip(change, FOUNDATION.approach_step, WIDEST_EDGE)
         share = np.clip(0.5 - gap / edge, 0.0, 1.0)
         gap = np.minimum(gap, 0.0)
         rate = self._rate(samples, gap) * share
@@ -310,7 +334,7 @@ class FoundationProbe:
 
     def _rate(self, samples: SurfaceSamples, gap: Array) -> Array:
         """Return the slope (n,) of the columns' forces by their penetrations, N/m."""
-        thickness = np.maximum(samples.thickness, THINNEST)
+        thickness = np.maximum(samples.thickness, FOUNDATION.least_thickness)
         slope = layer_slope(self._law, self._state.pair.material, -gap / thickness)
         return slope * samples.area / thickness
 

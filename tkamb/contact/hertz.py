@@ -10,17 +10,29 @@ from tkamb.contact.curvature import OsculatingContact, osculate
 from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
-from tkamb.contact.samples import STEEPEST, SampledContact, SurfaceSamples, gaps_along_normals
+from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
 from tkamb.geometry.frames import SIDES, Array, Index
 
-SHORT_AXIS_SUB_CELLS = 10
-"""Sub-cells on the ellipse's short semi-axis, over which the pressure is averaged."""
+
+@dataclass(frozen=True)
+class HertzSettings:
+    """Hertz's contact of a condyle."""
+
+    short_axis_sub_cells: int = 10
+    """Sub-cells on the ellipse's short semi-axis over which the pressure of a map point is
+    averaged."""
+    least_share_on_insert: float = 0.95
+    """1: share of the semi-ellipsoid of pressure that must lie on the insert. With less the
+    contact reaches over the rim and Hertz's solution does not hold."""
+    smallest_curvature_ratio: float = 1e-6
+    """1: smallest ratio of the two relative curvatures that still makes an ellipse; below it,
+    a line contact."""
+
+
+HERTZ = HertzSettings()
+
 FEWEST_SUB_CELLS, MOST_SUB_CELLS = 6, 50
 """Bounds of the sub-cells per edge of a grid cell."""
-LEAST_HELD = 0.95
-"""Share of the semi-ellipsoid that must lie on the insert."""
-FLATTEST = 1e-6
-"""Smallest ratio of the two relative curvatures that still makes an ellipse."""
 
 
 CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
@@ -83,6 +95,7 @@ class Hertz(ContactModel):
         if not np.isfinite(pose).all():
             return ContactResult.failed(state, pose, "the pose is not finite")
         samples, material = state.surface, state.pair.material
+        # The femoral component is rigid, so only the insert's compliance counts.
         plane_modulus = material.young_modulus / (1 - material.poisson_ratio**2)
         pressure = np.zeros((2, len(samples.points)))
         patches: list[CondyleContact | None] = [None, None]
@@ -97,15 +110,16 @@ class Hertz(ContactModel):
             depth = indentation(geometry, pose)
             if depth <= 0:
                 continue
+            # Hertz's gap is A x² + B y² with A and B half the relative principal curvatures.
             flat, steep = geometry.contact.relative / 2
             patch = contact_ellipse(flat, steep, depth, plane_modulus)
             pressure[side], share = map_pressure(samples, geometry.contact, patch)
-            if share < LEAST_HELD:
+            if share < HERTZ.least_share_on_insert:
                 return ContactResult.failed(
                     state, pose, f"{SIDES[side]} contact ellipse leaves the insert"
                 )
-            carried = patches[side] = _described(samples, geometry.contact, patch)
-            if patch.long_axis > carried.thickness:
+            described = patches[side] = _described(samples, geometry.contact, patch)
+            if patch.long_axis > described.thickness:
                 flags.append(f"{SIDES[side]} contact ellipse is wider than the insert is thick")
         return _collected(state, pose, pressure, patches, tuple(flags))
 
@@ -118,6 +132,7 @@ def condyle_geometry(
     None for a condyle that does not lie over the insert. The last few answers are kept.
     """
     level = np.array(pose, float)
+    # The geometry does not depend on the height, so that presses at one pose share it.
     level[1, 3] = 0.0
     return _geometry(state, level.tobytes(), patch_radius)
 
@@ -127,6 +142,7 @@ def indentation(geometry: CondyleGeometry, pose: Array) -> float:
     contact = geometry.contact
     if contact is None:
         return float("nan")
+    # Travel is along y, penetration along the normal at the contact point.
     return float((geometry.height - pose[1, 3]) * contact.normal[1] - contact.gap)
 
 
@@ -140,17 +156,23 @@ def map_pressure(
     """
     pressure = np.zeros(len(samples.points))
     offset = samples.points - contact.point
-    wanted = patch.force * contact.normal[1]
-    if patch.short_axis < samples.resolution / MOST_SUB_CELLS * SHORT_AXIS_SUB_CELLS:
+    # The map must carry the y component of the force, which is what a load prescribes.
+    vertical_force = patch.force * contact.normal[1]
+    if patch.short_axis < samples.resolution / MOST_SUB_CELLS * HERTZ.short_axis_sub_cells:
         nearest = int(np.einsum("ij,ij->i", offset, offset).argmin())
-        pressure[nearest] = wanted / (samples.area[nearest] * samples.normals[nearest, 1])
+        pressure[nearest] = vertical_force / (samples.area[nearest] * samples.normals[nearest, 1])
         return pressure, 1.0
     beyond = np.abs(offset @ contact.axes.T) - [patch.long_axis, patch.short_axis]
+    # A second surface below or above the contact (post, lip) is not pressed.
     low = np.abs(offset @ contact.normal) < patch.long_axis + samples.resolution
     near = np.flatnonzero((beyond.max(axis=1) < 2 * samples.resolution) & low)
     pressure[near] = patch.peak_pressure * _cell_means(samples, near, contact, patch)
-    held = float((pressure * samples.area) @ samples.normals[:, 1])
-    return (pressure * (wanted / held), held / wanted) if held > 0 else (pressure, 0.0)
+    force_on_map = float((pressure * samples.area) @ samples.normals[:, 1])
+    return (
+        (pressure * (vertical_force / force_on_map), force_on_map / vertical_force)
+        if force_on_map > 0
+        else (pressure, 0.0)
+    )
 
 
 def _cell_means(
@@ -160,16 +182,19 @@ def _cell_means(
     patch: ContactEllipse,
 ) -> Array:
     """Return the mean of sqrt(1 - (u/a)² - (v/b)²) over the grid cells of points (m,)."""
-    wanted = int(np.ceil(SHORT_AXIS_SUB_CELLS * samples.resolution / patch.short_axis))
-    count = min(max(wanted, FEWEST_SUB_CELLS), MOST_SUB_CELLS)
+    needed_sub_cells = int(
+        np.ceil(HERTZ.short_axis_sub_cells * samples.resolution / patch.short_axis)
+    )
+    count = min(max(needed_sub_cells, FEWEST_SUB_CELLS), MOST_SUB_CELLS)
     ticks = ((np.arange(count) + 0.5) / count - 0.5) * samples.resolution
     dx, dz = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     normals = samples.normals[near]
-    slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], STEEPEST)
+    slope = -normals[:, [0, 2]] / np.maximum(normals[:, 1:2], MAP_POINT.least_normal_y)
     rise = slope[:, :1] * dx + slope[:, 1:] * dz
     offset = np.stack(np.broadcast_arrays(dx, rise, dz), axis=-1)
     positions = (samples.points[near] - contact.point)[:, None] + offset
     u, v = np.moveaxis(positions @ contact.axes.T, -1, 0)
+    # Hertz's pressure is p0 sqrt(1 - (u/a)² - (v/b)²) inside the ellipse.
     inside = 1 - (u / patch.long_axis) ** 2 - (v / patch.short_axis) ** 2
     return np.sqrt(np.maximum(inside, 0.0)).mean(axis=1)
 
@@ -200,9 +225,11 @@ def _collected(
     result = ContactResult.of(state, pose, both, gap, medial=pressure[0] > 0)
     sides = {
         side: None
-        if patch is None or found is None
-        else replace(patch, force=found.force, mean_pressure=found.force / patch.area)
-        for side, patch, found in zip(SIDES, patches, (result.medial, result.lateral), strict=True)
+        if patch is None or condyle is None
+        else replace(patch, force=condyle.force, mean_pressure=condyle.force / patch.area)
+        for side, patch, condyle in zip(
+            SIDES, patches, (result.medial, result.lateral), strict=True
+        )
     }
     of_map = set(peak_flags({"medial": result.medial, "lateral": result.lateral}))
     others = (flag for flag in result.flags if flag not in of_map)
@@ -219,16 +246,19 @@ def _geometry(
     state: SampledContact, level: bytes, patch_radius: float
 ) -> tuple[CondyleGeometry | None, CondyleGeometry | None]:
     pose = np.frombuffer(level).reshape(4, 4)
-    found: list[CondyleGeometry | None] = []
+    condyles: list[CondyleGeometry | None] = []
     for touch in state.pair.first_touch.at(pose):
         if touch is None:
-            found.append(None)
+            condyles.append(None)
             continue
         touching = pose.copy()
         touching[1, 3] = -touch.travel
         contact = osculate(
             state.pair.insert.rays, state.pair.femoral.rays, touching, touch.point, patch_radius
         )
-        usable = contact is not None and contact.relative[0] > FLATTEST * contact.relative[1]
-        found.append(CondyleGeometry(-touch.travel, contact if usable else None))
-    return found[0], found[1]
+        usable = (
+            contact is not None
+            and contact.relative[0] > HERTZ.smallest_curvature_ratio * contact.relative[1]
+        )
+        condyles.append(CondyleGeometry(-touch.travel, contact if usable else None))
+    return condyles[0], condyles[1]

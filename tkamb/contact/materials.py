@@ -102,6 +102,8 @@ class RambergOsgood:
 def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) -> None:
     """Write the solutions u (n,) of u + alpha u^n = elastic (n,), not negative."""
     for k in range(len(elastic)):
+        # Both the elastic and the plastic part alone are upper bounds of the ratio. Newton's method
+        # falls monotonically from the smaller one, because the equation is convex.
         u, plastic = elastic[k], (elastic[k] / alpha) ** (1.0 / exponent)
         if plastic < u:
             u = plastic
@@ -156,8 +158,12 @@ class TabulatedLaw:
     def _curve(self) -> PchipInterpolator:
         """The mirrored table; one more step of the last chord gives it that slope at its end."""
         strain, values = np.asarray(self.strain, float), np.asarray(self.values, float)
+        # One more point in line with the last two: the curve leaves its table with a slope that
+        # PCHIP does not flatten to an end condition.
         strain = np.append(strain, 2 * strain[-1] - strain[-2])
         values = np.append(values, 2 * values[-1] - values[-2])
+        # Mirrored at the origin, so that tension follows compression and the slope at zero is that
+        # of the curve itself. PCHIP keeps the stress from falling between points.
         return PchipInterpolator(
             np.concatenate([-strain[:0:-1], strain]), np.concatenate([-values[:0:-1], values])
         )
@@ -174,6 +180,7 @@ class TabulatedLaw:
     def stress(self, strain: Array, young_modulus: float) -> Array:
         """Return stress, Pa."""
         inside = np.clip(strain, -self.strain[-1], self.strain[-1])
+        # Beyond the table the curve goes on with its last slope.
         beyond = (strain - inside) * self._slope(self.strain[-1])
         return (self._curve(inside) + beyond) * (young_modulus / self.young_modulus)
 

@@ -48,23 +48,23 @@ class NamedClasses(Generic[Base]):
         where = f"{self.kind} '{name}' ({offers[name]})"
         module, _, attribute = offers[name].partition(":")
         try:
-            found = getattr(import_module(module), attribute)
+            cls = getattr(import_module(module), attribute)
         except (ImportError, AttributeError) as error:
-            mend = "install what it needs"
-            raise InputError(f"cannot be loaded ({error})", where, mend) from error
-        if not (isinstance(found, type) and issubclass(found, self.base)):
+            hint = "install what it needs"
+            raise InputError(f"cannot be loaded ({error})", where, hint) from error
+        if not (isinstance(cls, type) and issubclass(cls, self.base)):
             base = f"{self.base.__module__}.{self.base.__name__}"
             raise InputError(f"is not a subclass of {base}", where)
-        return found
+        return cls
 
     def _offers(self) -> dict[str, str]:
         """Return name -> "module:Class"."""
         offers = dict(self.built_in)
         for point in sorted(entry_points(group=self.group), key=lambda p: p.name):
-            known = offers.setdefault(point.name, point.value)
-            if known != point.value:
+            first = offers.setdefault(point.name, point.value)
+            if first != point.value:
                 raise InputError(
-                    f"two {self.kind}s are called '{point.name}': {known} and {_origin(point)}",
+                    f"two {self.kind}s are called '{point.name}': {first} and {_origin(point)}",
                     mend="uninstall or rename one",
                 )
         return offers

@@ -5,6 +5,7 @@ lies between them, and the sum over them is not the integral over the contact.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,10 +13,20 @@ from tkamb.geometry.frames import Index, Mask
 
 TOO_NARROW = "contact is too narrow"
 """Words of the flag, after "the <side> "."""
-FEWEST_WITHIN = 5
-"""Points with contact all around from which a peak is right within 8 %, wherever the contact lies
-among the points: a sphere's with about 17 points in contact, three rows of points under a
-cylinder. With none a lattice's peak is 5 to 96 % too low (docs/lattice.md)."""
+
+
+@dataclass(frozen=True)
+class NarrowContactSettings:
+    """When a contact is too narrow for the map's points."""
+
+    least_inner_points: int = 5
+    """Points with contact all around, from which a peak is right within 8 %, wherever the
+    contact lies among the points. That is a sphere's contact with about 17 points, or three
+    rows of points under a cylinder. With no such point a lattice's peak is 5 to 96 % too
+    low (docs/lattice.md)."""
+
+
+NARROW_CONTACT = NarrowContactSettings()
 
 
 def narrow_flags(
@@ -24,7 +35,9 @@ def narrow_flags(
     sides: Mapping[str, Mask],
     points: str = "cells",
 ) -> Iterator[str]:
-    """Yield a flag for each condyle whose contact has fewer than `FEWEST_WITHIN`.
+    """Yield a flag for each condyle with fewer than `NARROW_CONTACT.least_inner_points`.
+
+    An inner point has contact all around.
 
     Args:
         triangles: (k, 3) of the contact surface.
@@ -34,7 +47,10 @@ def narrow_flags(
     """
     within = surrounded(triangles, touched)
     for side, own in sides.items():
-        if touched[own].any() and np.count_nonzero(within & own) < FEWEST_WITHIN:
+        if (
+            touched[own].any()
+            and np.count_nonzero(within & own) < NARROW_CONTACT.least_inner_points
+        ):
             yield (
                 f"the {side} {TOO_NARROW} for the {points}: its peak pressure cannot be "
                 f"relied on and is mostly too low; take finer {points}"

@@ -37,20 +37,22 @@ class Neighbourhood:
 
     def at(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
         """Return the columns near by at a pose (4, 4), and their gaps and facets."""
-        near, here = np.empty(len(self._gap), np.int64), np.empty_like(self._seen_at)
-        number = _near(self._bed.points, inverse(pose), self._seen_at, self._gap, near, here)
+        near, places = np.empty(len(self._gap), np.int64), np.empty_like(self._seen_at)
+        number = _near(self._bed.points, inverse(pose), self._seen_at, self._gap, near, places)
         near = near[:number]
         columns = self._bed.part(near)
-        found = gaps_and_facets(columns, self._femoral, pose)
-        self._gap[near], self._seen_at[near] = np.minimum(found[0], FARTHEST), here[:number]
-        return columns, found
+        facing = gaps_and_facets(columns, self._femoral, pose)
+        self._gap[near], self._seen_at[near] = np.minimum(facing[0], FARTHEST), places[:number]
+        return columns, facing
 
     def _places(self, pose: Array) -> Array:
         return transform(inverse(pose), self._bed.points)
 
 
 @compiled_as_written
-def _near(points: Array, pose: Array, seen_at: Array, gap: Array, near: Index, here: Array) -> int:
+def _near(
+    points: Array, pose: Array, seen_at: Array, gap: Array, near: Index, places: Array
+) -> int:
     """Write which columns the femoral component may reach, and return how many.
 
     Args:
@@ -59,16 +61,16 @@ def _near(points: Array, pose: Array, seen_at: Array, gap: Array, near: Index, h
         seen_at: (n, 3) m, femoral frame, where the columns were seen last.
         gap: (n,) m, with what gap.
         near: (n,) to be written.
-        here: (n, 3) m, likewise: where those are.
+        places: (n, 3) m, likewise: where those are.
     """
     number = 0
     for n in range(len(points)):
         square = 0.0
         for i in range(3):
-            here[number, i] = pose[i, 3]
+            places[number, i] = pose[i, 3]
             for j in range(3):
-                here[number, i] += pose[i, j] * points[n, j]
-            square += (here[number, i] - seen_at[n, i]) ** 2
+                places[number, i] += pose[i, j] * points[n, j]
+            square += (places[number, i] - seen_at[n, i]) ** 2
         if gap[n] - OBLIQUE * np.sqrt(square) < NEAR:
             near[number] = n
             number += 1

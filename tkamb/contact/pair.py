@@ -76,9 +76,9 @@ class ContactPair:
 
     def pose_at_approach(self, pose: Array, approach: float) -> Array:
         """Return the pose moved along y to an approach (m)."""
-        moved = np.array(pose, float)
-        moved[1, 3] = self.first_touch_height(pose) - approach
-        return moved
+        pose_at = np.array(pose, float)
+        pose_at[1, 3] = self.first_touch_height(pose) - approach
+        return pose_at
 
 
 @lru_cache(maxsize=8)

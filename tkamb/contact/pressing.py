@@ -17,27 +17,41 @@ from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
 
-LOAD_TOLERANCE = 1e-6
-"""Largest relative difference between reaction and load that counts as reached."""
-COARSE_TOLERANCE = 1e-3
-"""The same for a model whose reaction jumps: beyond it the press has not converged."""
-FIRST_APPROACH = 5e-5
-"""m; where the search begins without a guess."""
-DEEPEST = 0.02
-"""m; no insert carries a load at a greater approach."""
-FINEST_TRAVEL = 1e-16
-"""m; a bracket this narrow cannot be narrowed."""
-MOST_EVALUATIONS = 80
 
-HALF = 0.5
-"""Approach over thickness beyond which a result is flagged; at 1 it is none."""
-AROUND = 0.5 * MILLIMETRE
-"""Within this of its rim the insert is as thick as anywhere so near: it has no thickness there."""
-SKIN = 1e-7
-"""m; rays into the insert start so far below its surface, and nothing counts as thinner."""
+@dataclass(frozen=True)
+class PressSettings:
+    """The search for the approach that carries a load."""
+
+    load_tolerance: float = 1e-6
+    """1: relative difference of reaction and load below which the search has converged."""
+    coarse_tolerance: float = 1e-3
+    """1: the same for a model whose reaction jumps, as map points come into contact one by
+    one. Above it the press has not converged."""
+    first_approach: float = 5e-5
+    """m: initial guess of the approach where the caller has none."""
+    max_approach: float = 0.02
+    """m: largest approach that is searched; no insert carries a load beyond it."""
+    least_bracket: float = 1e-16
+    """m: width of a bracket that cannot be narrowed, the rounding of an approach of 1 mm."""
+    max_evaluations: int = 80
+    """Evaluations of the reaction in one press; bisection of `max_approach` to `least_bracket`
+    needs 48."""
+    flagged_thickness_share: float = 0.5
+    """1: approach over thickness from which a result is flagged. At 1 the result is a failed
+    contact."""
+    rim_distance: float = 0.5 * MILLIMETRE
+    """m: within this distance of its rim the insert counts as thick as anywhere so near,
+    because it has no thickness at the rim."""
+    ray_start_depth: float = 1e-7
+    """m: depth below the surface at which rays into the insert begin; nothing counts as
+    thinner."""
+
+
+PRESS = PressSettings()
+
 
 THROUGH = "is there a spike or a thin place in a mesh?"
-COLUMNS = np.array([(x, 0.0, z) for x in (0, -1, 1) for z in (0, -1, 1)]) * AROUND
+COLUMNS = np.array([(x, 0.0, z) for x in (0, -1, 1) for z in (0, -1, 1)]) * PRESS.rim_distance
 DOWN = np.array([0.0, -1.0, 0.0])
 
 Reaction = Callable[[float], float]
@@ -122,25 +136,26 @@ def press_by_search(
         )
     if load == 0:
         return unloaded_result(model, state, pose)
-    seen = _Evaluations(model, state, pose, guess)
-    start = guess.approach if guess is not None else FIRST_APPROACH
-    found = search_load(reaction or seen.reaction, load, start)
-    if not math.isfinite(found.approach):
-        why = seen.at(found.deepest).flags
+    evaluations = _Evaluations(model, state, pose, guess)
+    start = guess.approach if guess is not None else PRESS.first_approach
+    search = search_load(reaction or evaluations.reaction, load, start)
+    if not math.isfinite(search.approach):
+        why = evaluations.at(search.deepest).flags
         missed = f"a load of {load:g} N cannot be reached"
         return ContactResult.failed(
-            state, pose, missed, *why, iterations=found.evaluations, residual=found.residual
+            state, pose, missed, *why, iterations=search.evaluations, residual=search.residual
         )
-    return within_insert(state, _carried(seen.at(found.approach), found, load))
+    return within_insert(state, _carried(evaluations.at(search.approach), search, load))
 
 
-def _carried(result: ContactResult, found: LoadSearch, load: float) -> ContactResult:
+def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
     """Return the result with what the search says about it."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
-    missed = not residual <= COARSE_TOLERANCE
+    # Written with `not`, so that NaN counts as missed.
+    missed = not residual <= PRESS.coarse_tolerance
     return replace(
         result,
-        iterations=found.evaluations,
+        iterations=search.evaluations,
         residual=residual,
         status=ContactStatus.NOT_CONVERGED if missed else result.status,
         flags=(*result.flags, "the reaction jumps over the load") if missed else result.flags,
@@ -160,8 +175,8 @@ class _Evaluations:
     def at(self, approach: float) -> ContactResult:
         """Return the result at an approach (m)."""
         if self._last is None or approach != self._approach:
-            placed = self._state.pair.pose_at_approach(self._pose, approach)
-            self._last = self._model.evaluate(self._state, placed, self._guess)
+            pose = self._state.pair.pose_at_approach(self._pose, approach)
+            self._last = self._model.evaluate(self._state, pose, self._guess)
             self._approach = approach
         return self._last
 
@@ -169,8 +184,8 @@ class _Evaluations:
         """Return the reaction (N); inf where the model is out of range."""
         result = self.at(approach)
         force = -float(result.wrench_on_insert[1])
-        known = result.status is ContactStatus.OK and math.isfinite(force)
-        return force if known else math.inf
+        in_range = result.status is ContactStatus.OK and math.isfinite(force)
+        return force if in_range else math.inf
 
 
 def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
@@ -185,47 +200,56 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
         load: N, positive.
         start: m, where the search begins.
     """
+    # The root of the reaction is nearly linear in the approach (F ~ d^2 for a sphere on a layer,
+    # d^1.5 on a half-space), so that the secant converges fast.
     target = math.sqrt(load)
-    trial = start if 0 < start < DEEPEST else FIRST_APPROACH
+    trial = start if 0 < start < PRESS.max_approach else PRESS.first_approach
     low, low_value, high, high_value = 0.0, -target, math.nan, math.nan
     best, deepest, last_side, count = (math.inf, math.nan), 0.0, 0, 0
-    while count < MOST_EVALUATIONS:
+    while count < PRESS.max_evaluations:
         force, deepest, count = reaction(trial), max(deepest, trial), count + 1
         residual = abs(force - load) / load if math.isfinite(force) else math.inf
         best = min(best, (residual, trial))
-        if residual <= LOAD_TOLERANCE:
+        if residual <= PRESS.load_tolerance:
             break
         side = -1 if force < load else 1
         if side < 0:
+            # Illinois rule: an end that stays twice is halved, so that both ends of the bracket
+            # move.
             high_value *= 0.5 if last_side < 0 else 1.0
             low, low_value = trial, math.sqrt(max(force, 0.0)) - target
         else:
             low_value *= 0.5 if last_side > 0 else 1.0
             high, high_value = trial, math.sqrt(max(force, 0.0)) - target
         last_side = side
-        if trial >= DEEPEST or high - low <= FINEST_TRAVEL:
+        if trial >= PRESS.max_approach or high - low <= PRESS.least_bracket:
             break
         trial = (
             _ahead(trial, force, load)
             if math.isnan(high)
             else _between(low, low_value, high, high_value)
         )
-    reached = best[0] <= LOAD_TOLERANCE or math.isfinite(high_value)
+    # A bracket whose upper end has a finite reaction encloses the load; else the range ended below
+    # it.
+    reached = best[0] <= PRESS.load_tolerance or math.isfinite(high_value)
     return LoadSearch(best[1] if reached else math.nan, count, best[0], deepest)
 
 
 def _ahead(trial: float, force: float, load: float) -> float:
     """Return a deeper trial: the reaction taken as quadratic, a little beyond, at most x4."""
+    # No upper end yet: extrapolate by F ~ d^2, a little beyond, so that the load is bracketed next.
     factor = 2.0 if force <= 0 else min(1.05 * math.sqrt(load / force), 4.0)
-    return min(trial * factor + 1e-9, DEEPEST)
+    return min(trial * factor + 1e-9, PRESS.max_approach)
 
 
 def _between(low: float, low_value: float, high: float, high_value: float) -> float:
     """Return false position in the bracket, its middle where an end is out of range."""
     middle = 0.5 * (low + high)
+    # Out of range at the upper end: a secant through infinity says nothing, so bisect.
     if not math.isfinite(high_value):
         return middle
     trial = (low * high_value - high * low_value) / (high_value - low_value)
+    # Rounding may put the secant's root outside the bracket.
     return trial if low < trial < high else middle
 
 
@@ -252,7 +276,7 @@ def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResul
         ratio, words = compression(state.pair, touch, result)
         if ratio >= 1.0:
             return ContactResult.failed(state, result.pose, f"{words}: {THROUGH}", *result.flags)
-        if ratio >= HALF:
+        if ratio >= PRESS.flagged_thickness_share:
             more = (*more, f"{words}: {THROUGH}")
     return replace(result, flags=(*result.flags, *more)) if more else result
 
@@ -288,18 +312,22 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
 def thickness_near(pair: ContactPair, positions: Array) -> Array:
     """Return the insert's thickness (n,), m, along y at positions (n, 3), from its top down.
 
-    To where it ends first. Near a rim it is the largest within `AROUND`; the height above the
-    bottom where no column meets the insert.
+    The thickness ends where a ray from the top first leaves the insert. Near a rim it is the
+    largest one within `PRESS.rim_distance`. Where no ray meets the insert, it is the height above
+    the bottom.
     """
     low, high = pair.insert.bounds[:, 1]
     columns = (positions[:, None] + COLUMNS).reshape(-1, 3)
-    columns[:, 1] = high + AROUND
+    columns[:, 1] = high + PRESS.rim_distance
     enter, _ = pair.insert.rays.first(columns, DOWN)
     met = np.isfinite(enter)
-    columns[met, 1] -= enter[met] + SKIN
+    columns[met, 1] -= enter[met] + PRESS.ray_start_depth
     leave, _ = pair.insert.rays.first(columns, DOWN)
     met &= np.isfinite(leave)
-    thick = np.where(met, leave + SKIN, 0.0).reshape(len(positions), -1)
+    thick = np.where(met, leave + PRESS.ray_start_depth, 0.0).reshape(len(positions), -1)
+    # Away from the rim all rays meet the insert and the middle one counts.
     whole = met.reshape(thick.shape).all(axis=1)
-    found = np.where(whole, thick[:, 0], thick.max(axis=1))
-    return np.maximum(np.where(found > 0, found, positions[:, 1] - low), SKIN)
+    thickness = np.where(whole, thick[:, 0], thick.max(axis=1))
+    return np.maximum(
+        np.where(thickness > 0, thickness, positions[:, 1] - low), PRESS.ray_start_depth
+    )

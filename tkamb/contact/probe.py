@@ -48,8 +48,10 @@ class CondyleWrench:
         they leave a small moment, about this point only its part along the resultant.
         """
         force = self.wrench[:3]
-        left = self.wrench[3:] - cross(self.centre, force)
-        return self.centre + cross(force, left) / (force @ force)
+        moment = self.wrench[3:] - cross(self.centre, force)
+        # Point of the resultant's line that is nearest to the centre: the moment about it is
+        # parallel to the force.
+        return self.centre + cross(force, moment) / (force @ force)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,12 +154,12 @@ def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, Co
     """
     magnitude = np.linalg.norm(result.nodal_force, axis=1)
     medial = medial_points(result.points, result.pose, split)
-    found = {}
+    wrenches = {}
     for side, own in (("medial", medial), ("lateral", ~medial)):
         chosen = own & (magnitude > 0)
         if chosen.any():
             weight = magnitude[chosen]
             centre = weight @ result.points[chosen] / weight.sum()
             wrench = wrench_of(result.points[chosen], result.nodal_force[chosen])
-            found[side] = CondyleWrench(wrench, centre)
-    return found
+            wrenches[side] = CondyleWrench(wrench, centre)
+    return wrenches

@@ -8,7 +8,7 @@ package offers a model through the entry-point group `tkamb.contact`:
 """
 
 import math
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
@@ -16,8 +16,18 @@ from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError, names_near
 from tkamb.units import MILLIMETRE
 
-COARSEST_MM = 10.0
-"""A condyle's contact is 5 to 20 mm across: a coarser map resolves nothing."""
+
+@dataclass(frozen=True)
+class MapGridSettings:
+    """The spacing of a pressure map."""
+
+    coarsest_mm: float = 10.0
+    """mm: largest spacing that is accepted. A condyle's contact is 5 to 20 mm across; a
+    coarser map resolves nothing."""
+
+
+MAP_GRID = MapGridSettings()
+
 
 OPTION_RANGES = {"tolerance": (1e-9, 0.1), "patch_radius": (5e-4, 3e-2)}
 """Option -> least and largest value that it may have. Below the least tolerance rounding decides;
@@ -78,7 +88,7 @@ def contact_model(
         InputError: no such name or option, an option's value that is none of its words, or
             a resolution that is not positive, resolves no contact, or is given twice.
     """
-    found, where = contact_class(name), f"contact model '{name}'"
+    cls, where = contact_class(name), f"contact model '{name}'"
     if resolution is not None and resolution_mm is not None:
         raise InputError("resolution and resolution_mm are both given", where, "give one of them")
     if resolution is None:
@@ -86,19 +96,20 @@ def contact_model(
         words, spacing = f"resolution {resolution_mm} mm", resolution_mm * MILLIMETRE
     else:
         words, spacing = f"resolution {resolution} m", resolution
-    if not (math.isfinite(spacing) and 0 < spacing <= COARSEST_MM * MILLIMETRE):
-        mend = f"give more than 0, at most {COARSEST_MM:g} mm ({COARSEST_MM / 1e3:g} m)"
-        raise InputError(words, where, mend)
-    own = _options(found)
+    if not (math.isfinite(spacing) and 0 < spacing <= MAP_GRID.coarsest_mm * MILLIMETRE):
+        most = MAP_GRID.coarsest_mm
+        hint = f"give more than 0, at most {most:g} mm ({most / 1e3:g} m)"
+        raise InputError(words, where, hint)
+    own = _options(cls)
     for option, value in options.items():
         if option not in own:
             raise InputError(f"has no option '{option}'", where, names_near(option, own))
-        choices = _words(found, option)
+        choices = _words(cls, option)
         if choices and value not in choices:
-            mend = f"one of {', '.join(map(str, choices))}"
-            raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
-        _check_kind(found, option, value, where)
-    return found(resolution=spacing, **options)  # type: ignore[call-arg]
+            advice = f"one of {', '.join(map(str, choices))}"
+            raise InputError(f"option '{option}' cannot be {value!r}", where, advice)
+        _check_kind(cls, option, value, where)
+    return cls(resolution=spacing, **options)  # type: ignore[call-arg]
 
 
 def contact_options(name: str) -> tuple[str, ...]:
@@ -108,8 +119,8 @@ def contact_options(name: str) -> tuple[str, ...]:
 
 def _options(model: type[ContactModel]) -> list[str]:
     """Return the names of a model's own options."""
-    known = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]
-    return [option for option in known if option != "resolution"]
+    names = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]
+    return [option for option in names if option != "resolution"]
 
 
 def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
@@ -133,8 +144,8 @@ def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) 
         TypeAdapter(kind).validate_python(value, strict=True)
     except ValidationError:
         name = kind.__name__ if isinstance(kind, type) else str(kind)
-        mend = f"give a value of type {name}"
-        raise InputError(f"option '{option}' cannot be {value!r}", where, mend) from None
+        hint = f"give a value of type {name}"
+        raise InputError(f"option '{option}' cannot be {value!r}", where, hint) from None
 
 
 def contact_descriptions() -> dict[str, str]:
@@ -145,9 +156,9 @@ def contact_descriptions() -> dict[str, str]:
     lines = {}
     for name in contact_names():
         try:
-            found = contact_class(name)
-            own = ", ".join(_options(found)) or "none"
-            lines[name] = f"assumes {found.assumes}; needs {found.needs}; options: {own}"
+            cls = contact_class(name)
+            own = ", ".join(_options(cls)) or "none"
+            lines[name] = f"assumes {cls.assumes}; needs {cls.needs}; options: {own}"
         except InputError as error:
             lines[name] = str(error)
     return lines

@@ -16,13 +16,22 @@ from tkamb.contact.pair import ContactPair, ContactSurface, PreparedContact
 from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-HIGHEST_KNOWN = 100.0 * MEGAPASCAL
-"""Peak pressure beyond which polyethylene's curves are extrapolated (they end at 40 to 60 MPa)."""
 
-LEAST_PATCH_SHARE = 0.05
-"""Share of the force that a patch of contact must carry to count as a second condyle's."""
-LEAST_PATCH_DISTANCE = 15.0 * MILLIMETRE
-"""Between the centres of two condyles' patches; those of a knee are 40 to 50 mm apart."""
+@dataclass(frozen=True)
+class ContactResultSettings:
+    """What a contact result is flagged and split by."""
+
+    max_measured_pressure: float = 100.0 * MEGAPASCAL
+    """Pa: peak pressure beyond which polyethylene's stress-strain curves are extrapolated.
+    They end at 40 to 60 MPa."""
+    least_patch_share: float = 0.05
+    """1: share of the force that a patch of contact must carry to count as a second condyle's."""
+    least_patch_distance: float = 15.0 * MILLIMETRE
+    """m: smallest distance between the centres of two condyles' patches; those of a knee are
+    40 to 50 mm apart."""
+
+
+CONTACT_RESULT = ContactResultSettings()
 
 
 class ContactStatus(Enum):
@@ -243,8 +252,9 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
 def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) -> Iterator[str]:
     """Yield a flag where a component with one condyle presses on two separate patches.
 
-    Patches are the loaded points that triangles of the map join. Two count where each carries
-    `LEAST_PATCH_SHARE` of the force and their centres are `LEAST_PATCH_DISTANCE` apart.
+    Patches are the loaded points that triangles of the map join. Two patches
+    count where each carries `CONTACT_RESULT.least_patch_share` of the force and their centres are
+    `CONTACT_RESULT.least_patch_distance` apart.
 
     Args:
         surface: the map's points and triangles.
@@ -261,12 +271,12 @@ def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) ->
     patch = connected_components(graph, directed=False)[1][loaded]
     weight = np.linalg.norm(nodal_force[loaded], axis=1)
     force = np.bincount(patch, weight)
-    large = np.flatnonzero(force > LEAST_PATCH_SHARE * force.sum())
+    large = np.flatnonzero(force > CONTACT_RESULT.least_patch_share * force.sum())
     centres = np.array(
         [np.bincount(patch, weight * x)[large] / force[large] for x in surface.points[loaded].T]
     ).T
     apart = np.linalg.norm(centres[:, None] - centres, axis=2).max(initial=0.0)
-    if apart > LEAST_PATCH_DISTANCE:
+    if apart > CONTACT_RESULT.least_patch_distance:
         yield (
             f"contact in separate patches {apart / MILLIMETRE:.0f} mm apart, but the femoral "
             "component shows one condyle: all of it is called medial; check the meshes' axes"
@@ -312,9 +322,10 @@ def thickness_under(position: Array, points: Array, thickness: Array) -> float:
 
 def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
     """Yield a flag for each condyle whose peak pressure is beyond what any law was fitted to."""
+    limit = CONTACT_RESULT.max_measured_pressure
     for side, condyle in sides.items():
-        if condyle is not None and condyle.peak_pressure > HIGHEST_KNOWN:
+        if condyle is not None and condyle.peak_pressure > limit:
             yield (
-                f"{side} peak above {HIGHEST_KNOWN / MEGAPASCAL:.0f} MPa: polyethylene's law is "
+                f"{side} peak above {limit / MEGAPASCAL:.0f} MPa: polyethylene's law is "
                 "not known there; is this the lip or an edge?"
             )

@@ -15,17 +15,30 @@ from tkamb.geometry.surface import Surface
 DOWN = np.array([0.0, -1.0, 0.0])
 DEEPEST = 0.5
 """Share of the thickness that a penetration is seen to: rays against the femur start there."""
-RIM_RAYS = 8
-"""Rays per edge of a cell at the rim, to find how much of it is covered."""
-STEEPEST = 0.1
-"""Smallest n_y taken for a tributary area: 84 deg from the horizontal."""
-SIDEWAYS = 0.5
-"""n_y below which a column starts well beside its point, seen from above: 60 deg."""
-SKIN = 1e-6
-"""m; rays into the insert start so far below its surface."""
-MOST_CELLS = 4_000_000
-MOST_WALLS = 8
-"""Walls within the insert that a ray along the normal passes at most."""
+
+
+@dataclass(frozen=True)
+class MapPointSettings:
+    """The map points on the articular surface."""
+
+    rim_rays: int = 8
+    """Rays per edge of a map cell at the rim, by which its covered part is measured (64 rays a
+    cell)."""
+    least_normal_y: float = 0.1
+    """1: smallest superior component of the normal that a tributary area is divided by: 84 deg
+    from the horizontal."""
+    side_start_normal_y: float = 0.5
+    """1: below this superior component of the normal (60 deg) a column begins well beside its
+    point, seen from above."""
+    ray_start_depth: float = 1e-6
+    """m: depth below the surface at which rays into the insert begin."""
+    max_map_cells: int = 4_000_000
+    """Map cells over the bounding box: a knee's map at about 0.03 mm."""
+    max_inner_walls: int = 8
+    """Walls within the insert that a ray along the normal passes at most."""
+
+
+MAP_POINT = MapPointSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +100,8 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     xz, covered, cell = _cells(caster, centres, hit.reshape(shape), resolution)
     points, face, thickness = _through(caster, xz, insert)
     normals = insert.smooth_normals(points, face)
-    area = covered * resolution**2 / np.maximum(normals[:, 1], STEEPEST)
+    # Covered area seen from above over the cosine of the slope: the area on the surface itself.
+    area = covered * resolution**2 / np.maximum(normals[:, 1], MAP_POINT.least_normal_y)
     triangles = _grid_triangles(cell, shape)
     depth = _depth(caster, points, normals, thickness)
     return SurfaceSamples(points, normals, area, thickness, triangles, depth, resolution)
@@ -121,8 +135,11 @@ def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array
     columns = samples.points, samples.normals, samples.thickness, samples.depth
     origins, normals, below = _columns(*columns, back)
     gap, face = _first_entry(femoral, origins, normals)
+    # Rays start inside the insert, so that a femur that has penetrated is still met from outside.
     gap -= below
-    aside = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < SIDEWAYS))
+    # On a steep wall a column starts well beside its point, seen from above, and may start in the
+    # femur there. Where the surface point itself is free, the gap above it counts.
+    aside = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < MAP_POINT.side_start_normal_y))
     if len(aside):
         rim = origins[aside] + below[aside, None] * normals[aside]
         above, onto = _first_entry(femoral, rim, normals[aside])
@@ -164,15 +181,18 @@ def _mark_within(distance: Array, face: Index, directions: Array, normals: Array
             facing = 0.0
             for k in range(3):
                 facing += directions[n, k] * normals[face[n], k]
+            # The ray leaves the femur at its first hit, so that it began inside: penetrated deeper
+            # than the column sees.
             if facing > 0.0:
                 distance[n] = -np.inf
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
     """Return cell centres (n, 2) as x, z, and how many there are along x and z."""
+    # Symmetric about the origin, so that a mirrored insert gets mirrored points.
     half = np.abs(insert.bounds[:, [0, 2]]).max(axis=0)
     count = np.maximum(np.ceil(half / resolution), 1)
-    if 4 * count.prod() > MOST_CELLS:
+    if 4 * count.prod() > MAP_POINT.max_map_cells:
         raise InputError(
             f"a resolution of {resolution * 1e3:g} mm makes {4 * count.prod():.2g} cells",
             insert.name,
@@ -190,17 +210,22 @@ def _cells(
     around = [np.roll(np.pad(hit, 1), (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     some, every = np.any(around, axis=0)[1:-1, 1:-1], np.all(around, axis=0)[1:-1, 1:-1]
     rim = np.flatnonzero(some & ~every)
-    ticks = (np.arange(RIM_RAYS) + 0.5) / RIM_RAYS - 0.5
+    # Cells that the rim crosses: their covered share by rays at the centres of sub-cells.
+    ticks = (np.arange(MAP_POINT.rim_rays) + 0.5) / MAP_POINT.rim_rays - 0.5
     offsets = resolution * np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     rays = centres[rim, None] + offsets
-    on = np.isfinite(_first(caster, rays.reshape(-1, 2))[0]).reshape(len(rim), RIM_RAYS**2)
+    on = np.isfinite(_first(caster, rays.reshape(-1, 2))[0]).reshape(
+        len(rim), MAP_POINT.rim_rays**2
+    )
     count = on.sum(axis=1)
     mean = np.einsum("ij,ijk->ik", on, rays) / np.maximum(count, 1)[:, None]
     away = np.where(on, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
     nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
     on_mean = np.isfinite(_first(caster, mean)[0])[:, None]
     xz, share = centres.copy(), every.ravel().astype(float)
-    xz[rim], share[rim] = np.where(on_mean, mean, nearest), count / RIM_RAYS**2
+    # The point of a partly covered cell is the centroid of what is covered, or the nearest ray to
+    # it that meets the insert.
+    xz[rim], share[rim] = np.where(on_mean, mean, nearest), count / MAP_POINT.rim_rays**2
     cell = np.flatnonzero(share > 0)
     if not cell.size:
         raise InputError(
@@ -228,16 +253,16 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)
     thickness = caster.last_exit(origins, DOWN) - distance
-    lost = ~np.isfinite(thickness)
-    if lost.mean() > 0.01:
+    without_end = ~np.isfinite(thickness)
+    if without_end.mean() > 0.01:
         raise InputError(
-            f"{lost.mean():.0%} of vertical rays enter it and never leave",
+            f"{without_end.mean():.0%} of vertical rays enter it and never leave",
             insert.name,
             "the insert must be a closed surface with outward normals",
         )
-    keep = np.flatnonzero(~lost)
-    if lost.any():
-        thickness[lost] = thickness[keep[cKDTree(xz[keep]).query(xz[lost])[1]]]
+    keep = np.flatnonzero(~without_end)
+    if without_end.any():
+        thickness[without_end] = thickness[keep[cKDTree(xz[keep]).query(xz[without_end])[1]]]
     return origins + distance[:, None] * DOWN, face, thickness
 
 
@@ -248,14 +273,14 @@ def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -
     """
     depth = np.zeros(len(points))
     open_ = np.arange(len(points))
-    for _ in range(MOST_WALLS):
-        start = points[open_] - (depth[open_] + SKIN)[:, None] * normals[open_]
+    for _ in range(MAP_POINT.max_inner_walls):
+        start = points[open_] - (depth[open_] + MAP_POINT.ray_start_depth)[:, None] * normals[open_]
         step, face = caster.first(start, -normals[open_])
         facing = np.einsum("ij,ij->i", caster.surface.face_normals[face], normals[open_])
         inside = np.isfinite(step) & (facing < 0.0)
         if not inside.any():
             break
-        depth[open_[inside]] += SKIN + step[inside]
+        depth[open_[inside]] += MAP_POINT.ray_start_depth + step[inside]
         open_ = open_[inside]
     return np.where(depth > 0.0, depth, thickness)
 

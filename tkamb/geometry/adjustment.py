@@ -39,33 +39,32 @@ RestoreRule = Literal["both", "either"]
 
 @dataclass(frozen=True)
 class AdjustmentSettings:
-    """The limits of the adjustment and the rule by which it is undone.
-
-    Args:
-        largest_angle: rad; a coronal angle from here on is lift-off and is not corrected
-            (Sharma 2008: 0.5 deg, what fluoroscopy errs by).
-        largest_translation: m; the adjustment moves the femur by no more than this along y
-            (Sharma 2008: 0.5 mm, what fluoroscopy errs by).
-        restore_when: "both": the recorded rotation is restored if penetration and coronal angle
-            after the press exceed the adjustment (Sharma 2008); "either": if one of them does.
-        input_change: m; a change of the recorded pose that must not change the answer by a
-            step without a flag. A fifth of what fluoroscopy errs by.
-        largest_recorded_gap: m; with both condyles farther than this from the insert the pose is
-            no recorded contact.
-        level_difference: m; condyles whose gaps differ by less are level as far as a mesh can
-            say, and the femur is not turned.
-        touch_difference: m; difference of the condyles' clearances at which they touch together.
-        max_turns: most steps of the search for the turn at which they do.
-    """
+    """The limits of the adjustment and the rule by which it is undone."""
 
     largest_angle: float = 0.5 * DEGREE
+    """rad: a coronal angle from here on is lift-off and is not corrected (Sharma 2008: 0.5
+    deg, what fluoroscopy errs by)."""
     largest_translation: float = 0.5 * MILLIMETRE
+    """m: the adjustment moves the femur by no more than this along y (Sharma 2008: 0.5 mm,
+    what fluoroscopy errs by)."""
     restore_when: RestoreRule = "both"
+    """"both": the recorded rotation is restored if penetration and coronal angle after the
+    press exceed the adjustment (Sharma 2008); "either": if one of them does."""
     input_change: float = 0.1 * MILLIMETRE
+    """m: a change of the recorded pose that must not change the answer by a step without a
+    flag. A fifth of what fluoroscopy errs by."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
+    """m: with both condyles farther than this from the insert the pose is no recorded contact."""
     level_difference: float = 5e-6
+    """m: condyles whose gaps differ by less are level as far as a mesh can say, and the femur
+    is not turned."""
     touch_difference: float = 1e-7
+    """m: difference of the condyles' clearances at which they touch together."""
     max_turns: int = 20
+    """Most steps of the search for the turn at which they do."""
+
+
+ADJUSTMENT = AdjustmentSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ class Adjustment:
     coronal_angle: float
     measured_angle: float
     intercondylar_distance: float
-    settings: AdjustmentSettings = AdjustmentSettings()
+    settings: AdjustmentSettings = ADJUSTMENT
     penetration: float = math.nan
     final_angle: float = math.nan
     restored: bool = False
@@ -103,7 +102,7 @@ class Adjustment:
 def adjust(
     query: ClosestPointQuery,
     recorded: Array,
-    settings: AdjustmentSettings = AdjustmentSettings(),
+    settings: AdjustmentSettings = ADJUSTMENT,
 ) -> Adjustment:
     """Return the adjusted pose.
 
@@ -123,10 +122,10 @@ def adjust(
     turn, flags = 0.0, tuple[str, ...]()
     if gaps.lateral is not None and abs(angle) * distance > settings.level_difference:
         turn, flags = _limited_turn(query, recorded, angle, distance, settings)
-    turned = _turned(query, recorded, turn) if turn else recorded
-    moved, translation, more = moved_to_touch(query, turned, settings)
+    level = _turned(query, recorded, turn) if turn else recorded
+    touching, translation, more = moved_to_touch(query, level, settings)
     return Adjustment(
-        moved, recorded, translation, turn, angle, distance, settings, flags=(*flags, *more)
+        touching, recorded, translation, turn, angle, distance, settings, flags=(*flags, *more)
     )
 
 
@@ -145,9 +144,9 @@ def _limited_turn(
     largest = max(abs(angle), abs(turn))
     flags: tuple[str, ...] = ()
     if abs(largest - limit) <= margin:
-        done = "turned level" if largest < limit else "left as lift-off"
+        outcome = "turned level" if largest < limit else "left as lift-off"
         flags = (
-            f"coronal angle of {largest / DEGREE:.2f} deg is {done}: the limit of "
+            f"coronal angle of {largest / DEGREE:.2f} deg is {outcome}: the limit of "
             f"{limit / DEGREE:g} deg is less than {settings.input_change / MILLIMETRE:g} mm at a "
             "condyle away, and the split steps there",
         )
@@ -178,8 +177,8 @@ def moved_to_touch(
 
 
 def _check_near(gaps: CondyleGaps, settings: AdjustmentSettings) -> None:
-    found = [gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None]
-    nearest = min(found, key=abs)
+    condyle_gaps = [gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None]
+    nearest = min(condyle_gaps, key=abs)
     if abs(nearest) > settings.largest_recorded_gap:
         word = "above" if nearest > 0.0 else "inside"
         raise InputError(
@@ -248,6 +247,6 @@ def _turned(query: ClosestPointQuery, recorded: Array, turn: float) -> Array:
 
 def raised(at: Array, along_y: float) -> Array:
     """Return the pose (4, 4) moved by `along_y` (m) along the insert's y."""
-    moved = np.array(at)
-    moved[1, 3] += along_y
-    return moved
+    shifted = np.array(at)
+    shifted[1, 3] += along_y
+    return shifted

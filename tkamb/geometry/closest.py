@@ -258,11 +258,11 @@ class _CloseRegion:
         own = transform(inverse(pose), closest)
         near = _facing_alike(self._samples, self._normals, own, CLOSEST_POINT.region_radius)
         points = np.concatenate([transform(pose, self._samples[near]), closest[None]])
-        within, found = other.within(points, abs(gap) + CLOSEST_POINT.gap_range)
+        within, nearest = other.within(points, abs(gap) + CLOSEST_POINT.gap_range)
         near, points = near[within[:-1]], points[within[:-1]]
-        facing = -np.einsum("ij,ij->i", rotate(pose, self._normals[near]), found.normals[:-1])
-        above = np.einsum("ij,ij->i", points - found.points[:-1], found.normals[:-1])
-        excess = np.where(above < 0, -1, 1) * found.distance[:-1] - gap
+        facing = -np.einsum("ij,ij->i", rotate(pose, self._normals[near]), nearest.normals[:-1])
+        above = np.einsum("ij,ij->i", points - nearest.points[:-1], nearest.normals[:-1])
+        excess = np.where(above < 0, -1, 1) * nearest.distance[:-1] - gap
         excess = np.where(excess < -CONDYLE.facet_depth, np.inf, np.maximum(excess, 0.0))
         weights = (
             self._areas[near]
@@ -270,8 +270,8 @@ class _CloseRegion:
             * np.exp(-excess / CONDYLE.facet_depth)
         )
         weights = np.append(weights, self._areas.mean())
-        mean = weights @ found.normals
-        centre = other.at((weights @ found.points / weights.sum())[None]).points[0]
+        mean = weights @ nearest.normals
+        centre = other.at((weights @ nearest.points / weights.sum())[None]).points[0]
         return centre, mean / np.linalg.norm(mean)
 
 
@@ -302,21 +302,21 @@ def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
 @compiled_as_written
 def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[Index, Array]:
     """Return which points (n, 3) lie within a box once they are moved, and where they are then."""
-    found, moved, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
+    inside, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
     for i in range(len(points)):
         within = True
         for axis in (1, 0, 2):  # most of a condyle is above the insert
             place = pose[axis, 3]
             for k in range(3):
                 place += pose[axis, k] * points[i, k]
-            moved[count, axis] = place
+            places[count, axis] = place
             if not low[axis] < place < high[axis]:
                 within = False
                 break
         if within:
-            found[count] = i
+            inside[count] = i
             count += 1
-    return found[:count].copy(), moved[:count].copy()
+    return inside[:count].copy(), places[:count].copy()
 
 
 @compiled_as_written
@@ -335,14 +335,16 @@ def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -
         square[i] = x * x + y * y + z * z
         if square[i] < square[nearest]:
             nearest = i
-    here, found, count = normals[nearest], np.empty(len(samples), np.int64), 0
+    normal, alike_samples, count = normals[nearest], np.empty(len(samples), np.int64), 0
     for i in range(len(samples)):
         if square[i] <= radius * radius:
-            alike = normals[i, 0] * here[0] + normals[i, 1] * here[1] + normals[i, 2] * here[2]
+            alike = (
+                normals[i, 0] * normal[0] + normals[i, 1] * normal[1] + normals[i, 2] * normal[2]
+            )
             if alike > 0.5:
-                found[count] = i
+                alike_samples[count] = i
                 count += 1
-    return found[:count].copy()
+    return alike_samples[:count].copy()
 
 
 @compiled_as_written

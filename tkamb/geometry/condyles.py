@@ -180,9 +180,9 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
 
 def _rise(outline: Array) -> Array:
     """Return by how much each strip (n,) of an outline rises above the valleys beside it, m."""
-    left = np.minimum.accumulate(outline)
+    least_before = np.minimum.accumulate(outline)
     right = np.minimum.accumulate(outline[::-1])[::-1]
-    return np.asarray(outline - np.maximum(left, right), float)
+    return np.asarray(outline - np.maximum(least_before, right), float)
 
 
 class LowestPoints:

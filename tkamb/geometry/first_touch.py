@@ -106,14 +106,14 @@ def _arrays(tree: TriangleTree) -> tuple[Array, Array, Array]:
 
 
 @compiled_as_written
-def _turned_box(box: Array, rotation: Array, translation: Array, turned: Array) -> None:
+def _turned_box(box: Array, rotation: Array, translation: Array, result: Array) -> None:
     """Write the box (6,) about a box at another place."""
     for i in range(3):
         middle, half = translation[i], 0.0
         for j in range(3):
             middle += 0.5 * rotation[i, j] * (box[j] + box[j + 3])
             half += 0.5 * abs(rotation[i, j]) * (box[j + 3] - box[j])
-        turned[i], turned[i + 3] = middle - half, middle + half
+        result[i], result[i + 3] = middle - half, middle + half
 
 
 @compiled_as_written
@@ -193,21 +193,34 @@ def _beyond(upper: Array, plane: tuple[float, float, float, float]) -> float:
 
 @compiled_as_written
 def _cut(
-    polygon: Array, count: int, kept: Array, ax: float, az: float, bx: float, bz: float, way: float
+    polygon: Array,
+    count: int,
+    inside: Array,
+    ax: float,
+    az: float,
+    bx: float,
+    bz: float,
+    way: float,
 ) -> int:
     """Write the part of a polygon (n, 3) of x, z, clearance on one side of an edge; return n."""
     number = 0
-    for here in range(count):
-        there = (here + 1) % count
-        first = way * ((bx - ax) * (polygon[here, 1] - az) - (bz - az) * (polygon[here, 0] - ax))
-        second = way * ((bx - ax) * (polygon[there, 1] - az) - (bz - az) * (polygon[there, 0] - ax))
+    for corner in range(count):
+        following = (corner + 1) % count
+        first = way * (
+            (bx - ax) * (polygon[corner, 1] - az) - (bz - az) * (polygon[corner, 0] - ax)
+        )
+        second = way * (
+            (bx - ax) * (polygon[following, 1] - az) - (bz - az) * (polygon[following, 0] - ax)
+        )
         if first >= 0.0:
-            kept[number] = polygon[here]
+            inside[number] = polygon[corner]
             number += 1
         if (first > 0.0 and second < 0.0) or (first < 0.0 and second > 0.0):
             share = first / (first - second)
             for k in range(3):
-                kept[number, k] = polygon[here, k] + share * (polygon[there, k] - polygon[here, k])
+                inside[number, k] = polygon[corner, k] + share * (
+                    polygon[following, k] - polygon[corner, k]
+                )
             number += 1
     return number
 
@@ -219,7 +232,7 @@ def _over_each_other(
     plane: tuple[float, float, float, float],
     best: float,
     polygon: Array,
-    kept: Array,
+    spare: Array,
     point: Array,
 ) -> float:
     """Return the least clearance of two triangles (9,) where it is below the best so far.
@@ -230,7 +243,7 @@ def _over_each_other(
         plane: of the lower one, not a wall.
         best: m.
         polygon: (`MOST_CORNERS`, 3) to work in.
-        kept: likewise.
+        spare: likewise.
         point: (3,) m, written where a smaller clearance is found: on the lower triangle.
     """
     height, a, b, area = plane
@@ -243,8 +256,8 @@ def _over_each_other(
         second = (first + 1) % 3
         ax, az = lower[3 * first], lower[3 * first + 2]
         bx, bz = lower[3 * second], lower[3 * second + 2]
-        count = _cut(polygon, count, kept, ax, az, bx, bz, way)
-        polygon, kept = kept, polygon
+        count = _cut(polygon, count, spare, ax, az, bx, bz, way)
+        polygon, spare = spare, polygon
     for corner in range(count):
         x, z, clearance = polygon[corner, 0], polygon[corner, 1], polygon[corner, 2]
         if clearance < best:
@@ -284,7 +297,7 @@ def _least_clearance(
     upper_held, lower_held = len(upper_corners) // uppers, len(lower_corners) // lowers
     waiting, least = np.empty((MOST_WAITING, 2), np.int64), np.empty(MOST_WAITING)
     box, upper = np.empty(6), np.empty((upper_held, 9))
-    polygon, kept = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
+    polygon, spare = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
     waiting[0, 0], waiting[0, 1], least[0], size = 1, 1, -np.inf, 1
     while size > 0:
         size -= 1
@@ -310,7 +323,7 @@ def _least_clearance(
                 for place in range(upper_held):
                     if _over(upper[place], lower) and _beyond(upper[place], plane) < best:
                         best = _over_each_other(
-                            upper[place], lower, plane, best, polygon, kept, point
+                            upper[place], lower, plane, best, polygon, spare, point
                         )
             continue
         # the larger of the two boxes is halved

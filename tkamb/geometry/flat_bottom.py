@@ -33,8 +33,18 @@ FLAT_BOTTOM = FlatBottomSettings()
 
 TILT_LIMIT = math.radians(30.0)
 """A bottom tilted by less than this from -y is turned level."""
-INNER_SHARE = 0.5
-"""A flat of which a larger share faces material is a wall inside the part."""
+
+
+@dataclass(frozen=True)
+class InnerFlatSettings:
+    """Flat faces inside a part."""
+
+    inner_share: float = 0.5
+    """1: a flat face of which a larger share faces material is a wall inside the part."""
+
+
+INNER_FLAT = InnerFlatSettings()
+
 _CONE = math.radians(15.0)
 
 _log = logging.getLogger("tkamb")
@@ -136,7 +146,7 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
 def _is_inner(surface: Surface, flat: FlatBottom) -> bool:
     """Say whether most of a flat has material on its outer side."""
     area = surface.areas[flat.faces]
-    return bool(area @ facing_material(surface, flat.faces) > INNER_SHARE * area.sum())
+    return bool(area @ facing_material(surface, flat.faces) > INNER_FLAT.inner_share * area.sum())
 
 
 def _faces_elsewhere(name: str, flat: FlatBottom, rotation: Array) -> InputError:

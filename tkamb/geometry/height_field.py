@@ -38,8 +38,16 @@ class HeightFieldSettings:
 
 HEIGHT_FIELD = HeightFieldSettings()
 
-SAME_WALL = 1e-7
-"""m: two bodies nearer to one another touch; ten times what single precision rounds off."""
+
+@dataclass(frozen=True)
+class BodyContactSettings:
+    """Bodies of one mesh that touch."""
+
+    touching_distance: float = 1e-7
+    """m: two bodies nearer to one another touch. Ten times the rounding of single precision."""
+
+
+BODY_CONTACT = BodyContactSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +89,8 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     tied = np.zeros(shape[0] * shape[1], bool)
     tied[line[~(sides.all(axis=0) | ~sides.any(axis=0))]] = True
     for quadrant in range(4):
-        here = sides[quadrant] & ((quadrant == 0) | tied[line])
-        lines, heights = _paired(line[here], height[here], rising[here], tied.size)
+        counts = sides[quadrant] & ((quadrant == 0) | tied[line])
+        lines, heights = _paired(line[counts], height[counts], rising[counts], tied.size)
         odd = np.bincount(lines, minlength=tied.size) % 2 == 1
         if quadrant == 0:
             mended = int(odd.sum())
@@ -173,18 +181,23 @@ def _signed_areas(
     sides = np.empty((3, 4, len(faces)), np.int8)
     for corner in range(3):
         start, end = faces[:, (corner + 1) % 3], faces[:, (corner + 2) % 3]
-        turned = start > end
-        tail, head = flat[np.where(turned, end, start)], flat[np.where(turned, start, end)]
+        reversed_edge = start > end
+        tail, head = (
+            flat[np.where(reversed_edge, end, start)],
+            flat[np.where(reversed_edge, start, end)],
+        )
         edge, offset = head - tail, points - tail
         value = edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0]
-        tails, heads = (whole_flat[np.where(t, end, start)] for t in (turned, ~turned))
+        tails, heads = (
+            whole_flat[np.where(t, end, start)] for t in (reversed_edge, ~reversed_edge)
+        )
         edges, offsets = heads - tails, whole_points - tails
         exact = edges[:, 0] * offsets[:, 1] - edges[:, 1] * offsets[:, 0]
-        orientation = np.where(turned, -1, 1)
+        orientation = np.where(reversed_edge, -1, 1)
         area[corner] = value * orientation
         for quadrant, (u, v) in enumerate(((1, 1), (-1, 1), (1, -1), (-1, -1))):
-            moved = np.where(edges[:, 1] != 0, -edges[:, 1] * u, edges[:, 0] * v)
-            sides[corner, quadrant] = np.sign(np.where(exact == 0, moved, exact)) * orientation
+            perturbed = np.where(edges[:, 1] != 0, -edges[:, 1] * u, edges[:, 0] * v)
+            sides[corner, quadrant] = np.sign(np.where(exact == 0, perturbed, exact)) * orientation
     return area, sides
 
 
@@ -207,7 +220,9 @@ def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index
     ends = np.flatnonzero((winding > 0) != (winding - step > 0))
     line, height = line[ends], height[ends]
     touching = np.zeros(len(ends), bool)
-    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (np.diff(height)[1::2] <= SAME_WALL)
+    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (
+        np.diff(height)[1::2] <= BODY_CONTACT.touching_distance
+    )
     touching[2::2] = touching[1:-1:2]
     lines = np.concatenate([lines, line[~touching]])
     heights = np.concatenate([heights, height[~touching]])

@@ -19,12 +19,22 @@ from tkamb.geometry.polygons import ears
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import connected_parts, is_closed, open_edges
 
-BEYOND = 2e-5
-"""m outside a triangle, where it is asked whether there is material: wider gaps part two bodies."""
-ON_EDGE = 1e-6
-"""m: a vertex this near to an open edge lies on it."""
-LEAST_AREA = 2e-6
-"""m²; less is no wall, but triangles in a narrow corner."""
+
+@dataclass(frozen=True)
+class InnerWallSettings:
+    """Walls inside a part."""
+
+    probe_distance: float = 2e-5
+    """m: distance from a triangle at which material is looked for; wider gaps separate two
+    bodies."""
+    edge_distance: float = 1e-6
+    """m: a vertex this near to an open edge lies on it."""
+    least_area: float = 2e-6
+    """m²: less is no wall, but triangles in a narrow corner."""
+
+
+INNER_WALL = InnerWallSettings()
+
 SAMPLES = np.array(
     [[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.45, 0.45, 0.1],
      [0.1, 0.45, 0.45], [0.45, 0.1, 0.45]]
@@ -52,7 +62,7 @@ class InnerWall:
 def facing_material(surface: Surface, faces: Index) -> Mask:
     """Say which triangles (m,) of a closed surface have material on their outer side."""
     points = np.einsum("sc,kcx->ksx", SAMPLES, surface.triangles[faces])
-    points += BEYOND * surface.face_normals[faces][:, None]
+    points += INNER_WALL.probe_distance * surface.face_normals[faces][:, None]
     within = surface.winding.inside(points.reshape(-1, 3)).reshape(len(faces), -1)
     return np.asarray(within.all(axis=1))
 
@@ -73,7 +83,7 @@ def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
         return None
     inner = np.flatnonzero(within)
     area = surface.areas[inner]
-    if area.sum() / 2.0 < LEAST_AREA:
+    if area.sum() / 2.0 < INNER_WALL.least_area:
         return None
     centre = area @ surface.triangles[inner].mean(axis=1) / area.sum()
     rest = _joined_along_rims(vertices, np.delete(faces, inner, axis=0))
@@ -100,7 +110,7 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
         if not len(part):
             continue
         whole = Surface(vertices, faces[part], merged=True)
-        points = whole.triangles.mean(axis=1) + BEYOND * whole.face_normals
+        points = whole.triangles.mean(axis=1) + INNER_WALL.probe_distance * whole.face_normals
         for b in range(len(bodies)):
             if group[a] != group[b] and skins[b].winding.inside(points).any():
                 group = [group[a] if each == group[b] else each for each in group]
@@ -119,11 +129,15 @@ def _joined_along_rims(vertices: Array, faces: Index) -> Index:
         along = vertices[end] - vertices[start]
         length = float(np.linalg.norm(along))
         middle = (vertices[start] + vertices[end]) / 2.0
-        near = loose[tree.query_ball_point(middle, length / 2.0 + ON_EDGE)]
+        near = loose[tree.query_ball_point(middle, length / 2.0 + INNER_WALL.edge_distance)]
         near = near[(near != start) & (near != end)]
         share = (vertices[near] - vertices[start]) @ along / length**2
         off = np.linalg.norm(vertices[near] - vertices[start] - share[:, None] * along, axis=1)
-        on = (off < ON_EDGE) & (share * length > ON_EDGE) & ((1 - share) * length > ON_EDGE)
+        on = (
+            (off < INNER_WALL.edge_distance)
+            & (share * length > INNER_WALL.edge_distance)
+            & ((1 - share) * length > INNER_WALL.edge_distance)
+        )
         if on.any():
             dividing[int(start), int(end)] = near[on][np.argsort(share[on])]
     return _divided(vertices, faces, dividing)
@@ -149,5 +163,5 @@ def _divided(vertices: Array, faces: Index, dividing: dict[tuple[int, int], Inde
         a, b, c = vertices[faces[number]]
         cut = ears(vertices, np.array(ring), np.cross(b - a, c - a))
         added.extend((int(x), int(y), int(z)) for x, y, z in cut)
-    kept = np.delete(faces, list(by_face), axis=0)
-    return np.concatenate([kept, np.array(added, np.int64).reshape(-1, 3)])
+    whole_faces = np.delete(faces, list(by_face), axis=0)
+    return np.concatenate([whole_faces, np.array(added, np.int64).reshape(-1, 3)])

@@ -16,7 +16,16 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-_MOST_SAMPLES = 150_000
+@dataclass(frozen=True)
+class NearestSettings:
+    """Nearest points of two surfaces."""
+
+    max_samples: int = 150_000
+    """Samples of a surface at most; it bounds memory and time."""
+
+
+NEAREST = NearestSettings()
+
 FLAT = 1e-14
 """A triangle whose squared area is less, relative to its edges', has no plane."""
 DEEPEST = 64
@@ -78,9 +87,11 @@ class NearestPoints:
 
     def within(self, points: Array, reach: float) -> tuple[Index, Nearest]:
         """Return which points (n, 3) have one within `reach`, m, and what `at` says of those."""
-        found = self._found(points, reach)
-        near = np.flatnonzero(found.faces >= 0)
-        return near, Nearest(found.distance[near], found.faces[near], found.weights[near], self)
+        nearest = self._found(points, reach)
+        near = np.flatnonzero(nearest.faces >= 0)
+        return near, Nearest(
+            nearest.distance[near], nearest.faces[near], nearest.weights[near], self
+        )
 
     def _found(self, points: ArrayLike, reach: float) -> Nearest:
         return Nearest(*_nearest_points(*self._tree, rows(points), float(reach)), self)
@@ -96,7 +107,7 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     triangles = surface.triangles
     longest = surface.longest_edges
     cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
-    while (cuts**2).sum() > max(_MOST_SAMPLES, len(triangles)) and cuts.max() > 1:
+    while (cuts**2).sum() > max(NEAREST.max_samples, len(triangles)) and cuts.max() > 1:
         spacing *= 1.2
         cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
     area = surface.areas / cuts**2
@@ -202,7 +213,7 @@ def _nearest_place(
         Place in `faces`, squared distance (m²), barycentrics 2 and 3 of the nearest point.
     """
     leaves, place, size = len(boxes) // 2, NO_TRIANGLE, 1
-    held = len(faces) // leaves
+    leaf_size = len(faces) // leaves
     best, second, third = reach * reach, 0.0, 0.0
     if guess >= 0:
         square, s, t = _foot(corners[guess], point)
@@ -215,11 +226,11 @@ def _nearest_place(
         if apart[size] > best:
             continue
         if box >= leaves:
-            for here in range((box - leaves) * held, (box - leaves + 1) * held):
-                square, s, t = _foot(corners[here], point)
-                if square > best or (square == best and place >= 0 and faces[place] <= faces[here]):
+            for row in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
+                square, s, t = _foot(corners[row], point)
+                if square > best or (square == best and place >= 0 and faces[place] <= faces[row]):
                     continue
-                place, best, second, third = here, square, s, t
+                place, best, second, third = row, square, s, t
             continue
         one, other = 2 * box, 2 * box + 1
         near, far = _apart(boxes[one], point), _apart(boxes[other], point)

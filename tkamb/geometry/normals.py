@@ -1,5 +1,6 @@
 """Normals of the smooth surface that a triangulation stands for: at corners, and in between."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +16,17 @@ SHARP_EDGE = float(np.deg2rad(40.0))
 """rad: neighbouring triangles that turn by more than this meet in a sharp edge."""
 NO_CREASE = float(np.pi)
 """rad: all triangles at a vertex count, however they turn."""
-ROUNDING = 1e-9
-"""Of a cosine."""
+
+
+@dataclass(frozen=True)
+class NormalSettings:
+    """Normals of a mesh."""
+
+    cosine_rounding: float = 1e-9
+    """1: difference of two cosines that is rounding."""
+
+
+NORMAL = NormalSettings()
 
 
 def corner_normals(surface: "Surface", crease: float, weights: Array) -> Array:
@@ -39,12 +49,14 @@ def corner_normals(surface: "Surface", crease: float, weights: Array) -> Array:
         # two within half the crease of the mean turn by no more than all of it: those need no pairs
         lean = np.einsum("cj,cj->c", normals, _unit(mean)[vertex])
         rough = np.zeros(len(mean), bool)
-        rough[vertex[~(lean > np.cos(crease / 2) + ROUNDING)]] = True
+        rough[vertex[~(lean > np.cos(crease / 2) + NORMAL.cosine_rounding)]] = True
         corners = np.flatnonzero(rough[vertex])
-        here, there = surface.corners_at_vertices.of(vertex[corners])
-        turn = np.einsum("pj,pj->p", normals[corners[here]], normals[there])
+        corner_of_pair, neighbour = surface.corners_at_vertices.of(vertex[corners])
+        turn = np.einsum("pj,pj->p", normals[corners[corner_of_pair]], normals[neighbour])
         counts = (turn >= np.cos(crease))[:, None]
-        total[corners] = _sums(here, np.where(counts, weighted[there], 0.0), len(corners))
+        total[corners] = _sums(
+            corner_of_pair, np.where(counts, weighted[neighbour], 0.0), len(corners)
+        )
     return _unit(total).reshape(-1, 3, 3)
 
 

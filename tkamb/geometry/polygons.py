@@ -1,16 +1,24 @@
 """Polygons of any number of corners into triangles, concave ones as they are."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.ragged import counted
 
-ROUNDING = 1e-12
-"""Of a polygon's area: a signed area of less is none."""
+
+@dataclass(frozen=True)
+class PolygonSettings:
+    """Polygons of a section."""
+
+    area_rounding: float = 1e-12
+    """1: a signed area below this share of the polygon's extent is zero."""
+    least_area_share: float = 1e-9
+    """1: a polygon that encloses a smaller share of the area that it covers crosses itself."""
 
 
-CROSSED = 1e-9
-"""Of the area that a polygon covers: one that encloses less in all crosses itself."""
+POLYGON = PolygonSettings()
 
 
 class CrossedPolygonError(ValueError):
@@ -44,16 +52,19 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     total = np.stack([np.bincount(polygon, part, len(ends)) for part in cross.T], axis=1)
     along = np.einsum("ij,ij->i", cross, total[polygon])
     size = np.einsum("ij,ij->i", total, total)
-    turned = np.unique(polygon[along < -ROUNDING * size[polygon]])
+    concave = np.unique(polygon[along < -POLYGON.area_rounding * size[polygon]])
     longest = np.zeros(len(ends))
     np.maximum.at(longest, polygon, np.einsum("ij,ij->i", c - a, c - a))
     covered = np.bincount(polygon, np.linalg.norm(cross, axis=1), len(ends))
-    if ((np.sqrt(size) < CROSSED * covered) & (covered > CROSSED * longest)).any():
+    if (
+        (np.sqrt(size) < POLYGON.least_area_share * covered)
+        & (covered > POLYGON.least_area_share * longest)
+    ).any():
         raise CrossedPolygonError("a polygon crosses itself")
-    if not len(turned):
+    if not len(concave):
         return fans
-    cut = [ears(vertices, corners[starts[p] : ends[p]], total[p]) for p in turned]
-    return np.concatenate([fans[~np.isin(polygon, turned)], *cut])
+    cut = [ears(vertices, corners[starts[p] : ends[p]], total[p]) for p in concave]
+    return np.concatenate([fans[~np.isin(polygon, concave)], *cut])
 
 
 def ears(vertices: Array, ring: Index, normal: Array) -> Index:
@@ -67,35 +78,41 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
     axis = int(np.argmax(np.abs(normal)))
     plane = [(axis + 1) % 3, (axis + 2) % 3]
     points = vertices[ring][:, plane if normal[axis] > 0 else plane[::-1]]
-    least = ROUNDING * abs(float(normal[axis]))
-    left, triangles = list(range(len(ring))), []
+    least = POLYGON.area_rounding * abs(float(normal[axis]))
+    remaining, triangles = list(range(len(ring))), []
     at = tried = 0
     flat_ears = False
-    while len(left) > 3:
-        at %= len(left)
-        before, here, after = left[at - 1], left[at], left[(at + 1) % len(left)]
-        if _is_ear(points, left, (before, here, after), least, flat_ears):
-            triangles.append((before, here, after))
-            del left[at]
+    while len(remaining) > 3:
+        at %= len(remaining)
+        before, corner, after = (
+            remaining[at - 1],
+            remaining[at],
+            remaining[(at + 1) % len(remaining)],
+        )
+        if _is_ear(points, remaining, (before, corner, after), least, flat_ears):
+            triangles.append((before, corner, after))
+            del remaining[at]
             at, tried, flat_ears = max(at - 1, 0), 0, False
             continue
         at, tried = at + 1, tried + 1
-        if tried > len(left):  # what is left has no ear of an area: collinear corners, or crossed
+        if tried > len(
+            remaining
+        ):  # what is left has no ear of an area: collinear corners, or crossed
             if flat_ears:
                 raise CrossedPolygonError(f"a polygon of {len(ring)} corners crosses itself")
             tried, flat_ears = 0, True
-    triangles.append((left[0], left[1], left[2]))
+    triangles.append((remaining[0], remaining[1], remaining[2]))
     return ring[np.array(triangles)]
 
 
 def _is_ear(
-    points: Array, left: list[int], ear: tuple[int, int, int], least: float, flat: bool
+    points: Array, remaining: list[int], ear: tuple[int, int, int], least: float, flat: bool
 ) -> bool:
     """Say whether a corner can be cut off: it is convex, and no other corner lies in it.
 
     Args:
         points: (m, 2) all corners.
-        left: those that are not cut off yet.
+        remaining: those that are not cut off yet.
         ear: the corner between its neighbours.
         least: twice the area of a triangle that is none.
         flat: whether a corner on the line between its neighbours will do.
@@ -104,7 +121,7 @@ def _is_ear(
     area = _twice_area(a, b, c)
     if area <= least:
         return bool(flat and abs(area) <= least)
-    others = points[left]
+    others = points[remaining]
     corner = (others == a).all(axis=1) | (others == b).all(axis=1) | (others == c).all(axis=1)
     sides = np.stack([_twice_area(p, q, others) for p, q in ((a, b), (b, c), (c, a))])
     return not ((sides >= -least).all(axis=0) & ~corner).any()

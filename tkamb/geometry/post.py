@@ -86,9 +86,9 @@ def find_post(insert: Surface) -> Post | None:
     """
     low, high = insert.bounds
     x, z = (np.arange(low[a] + POST.line_spacing / 2, high[a], POST.line_spacing) for a in (0, 2))
-    found = inside_intervals(insert, 1, z, x)
+    intervals = inside_intervals(insert, 1, z, x)
     top = np.full((len(x), len(z)), -np.inf)
-    np.maximum.at(top, (found.second, found.first), found.upper)
+    np.maximum.at(top, (intervals.second, intervals.first), intervals.upper)
     dish = float(np.percentile(top[np.isfinite(top)], 2.0))
     patches, count = label(top > dish + POST.least_rise)
     for number in range(1, count + 1):

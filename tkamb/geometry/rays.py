@@ -40,8 +40,17 @@ PARALLEL = 1e-9
 DEEPEST = 64
 """Boxes that wait at one time: one of each level."""
 NO_TRIANGLE = -1
-TOUCHING = 1e-6
-"""m; shells so near to each other have no gap between them."""
+
+
+@dataclass(frozen=True)
+class RayGapSettings:
+    """Gaps between shells along a ray."""
+
+    touching_distance: float = 1e-6
+    """m: shells so near to each other have no gap between them."""
+
+
+RAY_GAP = RayGapSettings()
 
 
 class RayCaster:
@@ -104,13 +113,13 @@ class RayCaster:
             for k in np.flatnonzero(out):
                 last[number] = own[k]
                 entries = np.flatnonzero(
-                    ~out & (own >= own[k] - TOUCHING) & (np.arange(len(own)) != k)
+                    ~out & (own >= own[k] - RAY_GAP.touching_distance) & (np.arange(len(own)) != k)
                 )
-                later = entries[own[entries] > own[0] + TOUCHING]
+                later = entries[own[entries] > own[0] + RAY_GAP.touching_distance]
                 if not len(later):
                     break
                 next_in = later[0]
-                touching = own[next_in] - own[k] <= TOUCHING
+                touching = own[next_in] - own[k] <= RAY_GAP.touching_distance
                 void = shells[k] == shells[next_in] != shells[0]
                 if not (touching or void):
                     break
@@ -272,7 +281,7 @@ def _first_crossings(
         Distance (n,) m, inf for none; triangle (n,), -1; barycentrics (n, 3), NaN.
     """
     count, leaves = len(origins), len(boxes) // 2
-    held = len(faces) // leaves
+    leaf_size = len(faces) // leaves
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
     waiting, enters = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
@@ -283,7 +292,7 @@ def _first_crossings(
             _set_direction(directions[n], direction, slowness)
         if not np.isfinite(origin[0] + origin[1] + origin[2]):
             continue
-        best, found, size = np.inf, NO_TRIANGLE, 1
+        best, best_face, size = np.inf, NO_TRIANGLE, 1
         waiting[0], enters[0] = 1, _entry(boxes[1], origin, slowness)
         while size > 0:
             size -= 1
@@ -291,12 +300,12 @@ def _first_crossings(
             if enters[size] > best or enters[size] == np.inf:
                 continue
             if box >= leaves:
-                for place in range((box - leaves) * held, (box - leaves + 1) * held):
+                for place in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
                     t, u, v = _crossing(planes[place], origin, direction)
                     if t < least or t > best or not min(u, v, 1.0 - u - v) >= -outside:
                         continue
-                    if t < best or faces[place] < found:
-                        best, found = t, faces[place]
+                    if t < best or faces[place] < best_face:
+                        best, best_face = t, faces[place]
                         weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - u - v, u, v
                 continue
             one, other = 2 * box, 2 * box + 1
@@ -309,7 +318,7 @@ def _first_crossings(
             if near < np.inf and near <= best:
                 waiting[size], enters[size] = one, near
                 size += 1
-        distance[n], face[n] = best, found
+        distance[n], face[n] = best, best_face
     return distance, face, weights
 
 
@@ -341,7 +350,7 @@ def _all_crossings(
         face: (m,), likewise.
     """
     leaves, number = len(boxes) // 2, 0
-    held = len(faces) // leaves
+    leaf_size = len(faces) // leaves
     waiting, direction, slowness = np.empty(DEEPEST, np.int64), np.empty(3), np.empty(3)
     for n in range(len(origins)):
         origin = origins[n]
@@ -359,7 +368,7 @@ def _all_crossings(
                 waiting[size], waiting[size + 1] = 2 * box, 2 * box + 1
                 size += 2
                 continue
-            for place in range((box - leaves) * held, (box - leaves + 1) * held):
+            for place in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
                 t, u, v = _crossing(planes[place], origin, direction)
                 if t < least or t == np.inf or not min(u, v, 1.0 - u - v) >= -outside:
                     continue

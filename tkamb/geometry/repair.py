@@ -72,10 +72,10 @@ def repair(vertices: Array, faces: Index) -> Repair:
     vertices, faces = _merged(vertices, faces)
     faces, collapsed = _without_collapsed(faces)
     faces, duplicates = _without_duplicates(faces)
-    turned, welded, filled, widest, one_sided = 0, 0, 0, 0.0, False
+    reversed_faces, welded, filled, widest, one_sided = 0, 0, 0, 0.0, False
     closed = is_closed(faces)
     if not closed:
-        faces, turned, one_sided = _wound(vertices, faces)
+        faces, reversed_faces, one_sided = _wound(vertices, faces)
         faces, welded = _welded(vertices, faces)
         if welded:
             faces, more = _without_collapsed(faces)
@@ -83,24 +83,24 @@ def repair(vertices: Array, faces: Index) -> Repair:
             faces, more = _without_duplicates(faces)
             duplicates += more
             faces, more, one_sided = _wound(vertices, faces)
-            turned += more
+            reversed_faces += more
         vertices, faces, filled, widest = _filled(vertices, faces)
     faces, inside_out = _outward(vertices, faces)
     vertices, faces = _referenced(vertices, faces)
     notices = (
         _notice(duplicates, "duplicate face", "removed"),
         _notice(collapsed, "degenerate face", "removed"),
-        _notice(turned, "face", "with flipped winding turned"),
+        _notice(reversed_faces, "face", "with flipped winding turned"),
         _notice(inside_out, "face", "of an inside-out body turned"),
         _notice(unused, "unreferenced vertex", "removed"),
         _notice(welded, "open vertex", "welded to a neighbour"),
         _notice(filled, "small hole", f"closed (up to {1e3 * widest:.2g} mm wide)"),
     )
-    said = tuple(notice for notice in notices if notice)
+    messages = tuple(notice for notice in notices if notice)
     if closed:
-        return Repair(vertices, faces, said, (), np.empty(0, np.int64), one_sided)
+        return Repair(vertices, faces, messages, (), np.empty(0, np.int64), one_sided)
     holes = tuple(boundary_loops(vertices, faces))
-    return Repair(vertices, faces, said, holes, _forks(faces), one_sided)
+    return Repair(vertices, faces, messages, holes, _forks(faces), one_sided)
 
 
 def _notice(count: int, noun: str, what: str) -> str:
@@ -158,18 +158,20 @@ def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
     directed = half_edges(faces)
     order = np.argsort(edge, kind="stable")
     pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
-    left, right = pairs[:, 0] // 3, pairs[:, 1] // 3
+    one, other = pairs[:, 0] // 3, pairs[:, 1] // 3
     differ = directed[pairs[:, 0], 0] == directed[pairs[:, 1], 0]
-    rows = np.concatenate([left, left + k])
-    columns = np.concatenate([right + k * differ, right + k * ~differ])
+    rows = np.concatenate([one, one + k])
+    columns = np.concatenate([other + k * differ, other + k * ~differ])
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * k, 2 * k))
     labels = connected_components(graph, directed=False)[1]
-    here, turned = labels[:k], labels[k:]
-    one_sided = bool((here == turned).any())
+    forward, backward = labels[:k], labels[k:]
+    one_sided = bool((forward == backward).any())
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.bincount(here, np.linalg.norm(cross, axis=1) + 1e-30, labels.max() + 1)
-    flip = (area[turned] > area[here]) | ((area[turned] == area[here]) & (turned < here))
+    area = np.bincount(forward, np.linalg.norm(cross, axis=1) + 1e-30, labels.max() + 1)
+    flip = (area[backward] > area[forward]) | (
+        (area[backward] == area[forward]) & (backward < forward)
+    )
     result = faces.copy()
     if not one_sided:
         result[flip] = result[flip][:, ::-1]
@@ -221,7 +223,7 @@ def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
         return faces, 0
     open_parts = set(np.unique(part[np.isin(faces, open_edges(faces)).any(axis=1)]))
     boxes = [_box(vertices[faces[part == p]]) for p in range(len(volume))]
-    result, turned = faces.copy(), 0
+    result, reversed_faces = faces.copy(), 0
     for p in np.flatnonzero(volume < 0):
         within = any(
             (boxes[q][0] < boxes[p][0]).all() and (boxes[p][1] < boxes[q][1]).all()
@@ -231,8 +233,8 @@ def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
             continue
         members = part == p
         result[members] = result[members][:, ::-1]
-        turned += int(members.sum())
-    return result, turned
+        reversed_faces += int(members.sum())
+    return result, reversed_faces
 
 
 def _box(corners: Array) -> tuple[Array, Array]:

@@ -46,8 +46,8 @@ def convex_outline(points: Array, offset: float = 0.0, step_deg: float = 2.0) ->
         if offset > 0.0:
             angle = np.deg2rad(np.arange(0.0, 360.0, step_deg))
             circle = offset * np.column_stack([np.cos(angle), np.sin(angle)])
-            grown = (hull[:, None] + circle).reshape(-1, 2)
-            hull = grown[ConvexHull(grown).vertices]
+            offset_points = (hull[:, None] + circle).reshape(-1, 2)
+            hull = offset_points[ConvexHull(offset_points).vertices]
     except (QhullError, ValueError, IndexError):
         raise InputError("the section spans no area", "sagittal outline") from None
     return hull

@@ -53,17 +53,17 @@ def coarsened(surface: Surface) -> Coarsened | None:
     Parts of a surface are looked at one by one; a part is undone as a whole or not at all.
     None where nothing is to be undone.
     """
-    found: Coarsened | None = None
+    coarse: Coarsened | None = None
     for _ in range(SUBDIVISION.most_levels):
-        step = _coarsened_once(surface if found is None else found.surface)
+        step = _coarsened_once(surface if coarse is None else coarse.surface)
         if step is None:
             break
-        if found is None:
-            found = step
+        if coarse is None:
+            coarse = step
         else:
-            corners = found.corners @ step.corners[found.parent]
-            found = Coarsened(step.surface, step.parent[found.parent], corners)
-    return found
+            corners = coarse.corners @ step.corners[coarse.parent]
+            coarse = Coarsened(step.surface, step.parent[coarse.parent], corners)
+    return coarse
 
 
 def _coarsened_once(surface: Surface) -> Coarsened | None:
@@ -117,21 +117,21 @@ class _Search:
         starts = [[first], *([face] for face in self._across[first])]
         if len(part) % 4 == 0:
             for start in starts:
-                found = self._spread(np.array(start))
-                if found is not None and 4 * len(found) == len(part):
-                    return found
+                centres = self._spread(np.array(start))
+                if centres is not None and 4 * len(centres) == len(part):
+                    return centres
         return np.zeros(0, np.int64)
 
     def _spread(self, start: Index) -> Index | None:
         """Return all middle triangles that follow from one; None where they contradict."""
         kind = np.zeros(len(self._faces), np.int8)  # 1: middle, 2: at a tip
         even = np.zeros(len(self._points), bool)
-        new, found = start, []
+        new, layers = start, []
         while new.size:
             if not self._are_middles(new) or (kind[new] == 2).any():
                 return None
             kind[new] = 1
-            found.append(new)
+            layers.append(new)
             if (kind[self._across[new]] == 1).any():
                 return None
             kind[self._across[new]] = 2
@@ -140,7 +140,7 @@ class _Search:
             even[tips] = True
             new = self._beyond(tips)
             new = new[kind[new] != 1] if (new >= 0).all() else np.array([-1])
-        every = np.concatenate(found)
+        every = np.concatenate(layers)
         return None if even[self._faces[every]].any() else every
 
     def _are_middles(self, faces: Index) -> bool:
@@ -164,9 +164,9 @@ def _across(faces: Index) -> Index:
     pair = np.full((len(count), 2), -1)
     two = count == 2
     pair[two] = order[first[two][:, None] + [0, 1]] // 3
-    here = pair[edge].reshape(-1, 3, 2)
+    edges = pair[edge].reshape(-1, 3, 2)
     own = np.arange(len(faces))[:, None]
-    other = np.where(here[..., 0] == own, here[..., 1], here[..., 0])
+    other = np.where(edges[..., 0] == own, edges[..., 1], edges[..., 0])
     return np.roll(other, -1, axis=1)
 
 

@@ -57,11 +57,11 @@ def threads() -> int:
     Raises:
         InputError: TKAMB_THREADS is neither.
     """
-    asked = os.environ.get(VARIABLE, "")
-    if asked not in ("", "1", "2"):
-        raise InputError(f"{asked!r} is neither 1 nor 2", VARIABLE)
-    if asked:
-        return int(asked)
+    text = os.environ.get(VARIABLE, "")
+    if text not in ("", "1", "2"):
+        raise InputError(f"{text!r} is neither 1 nor 2", VARIABLE)
+    if text:
+        return int(text)
     own = getattr(os, "sched_getaffinity", None)  # Linux: what this process was given
     return min(2, len(own(0)) if own else os.cpu_count() or 1)
 

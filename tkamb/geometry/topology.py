@@ -190,16 +190,24 @@ def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
     label = connected_parts(faces)
     parts = [np.flatnonzero(label == part) for part in range(int(label.max(initial=-1)) + 1)]
     loose = np.unique(open_edges(faces))
-    found = [_body(vertices, faces, part, loose) for part in parts]
+    parts_as_bodies = [_body(vertices, faces, part, loose) for part in parts]
     volume = np.bincount(label, signed_volumes(vertices, faces))
-    outer = [k for k in range(len(found)) if volume[k] >= 0 or not found[k].closed]
-    held: dict[int, list[Index]] = {k: [found[k].faces] for k in outer}
-    for k in set(range(len(found))) - set(outer):
-        around = [q for q in outer if found[q].closed and _within(found[k], found[q])]
-        held.setdefault(min(around, key=lambda q: found[q].area, default=k), []).append(parts[k])
+    outer = [
+        k for k in range(len(parts_as_bodies)) if volume[k] >= 0 or not parts_as_bodies[k].closed
+    ]
+    contained: dict[int, list[Index]] = {k: [parts_as_bodies[k].faces] for k in outer}
+    for k in set(range(len(parts_as_bodies))) - set(outer):
+        around = [
+            q
+            for q in outer
+            if parts_as_bodies[q].closed and _within(parts_as_bodies[k], parts_as_bodies[q])
+        ]
+        contained.setdefault(
+            min(around, key=lambda q: parts_as_bodies[q].area, default=k), []
+        ).append(parts[k])
     bodies = [
         Body(np.sort(np.concatenate(own)), b.extents, b.centre, b.area, b.closed)
-        for b, own in ((found[k], own) for k, own in held.items())
+        for b, own in ((parts_as_bodies[k], own) for k, own in contained.items())
     ]
     return sorted(bodies, key=lambda body: -body.area)
 

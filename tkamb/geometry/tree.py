@@ -91,11 +91,11 @@ class TriangleTree:
         vertices = self.corners.reshape(-1, 3)
         total = (self._surface.areas[:, None] * self._surface.face_normals)[self.faces]
         while count:
-            here, total = planes[count : 2 * count], total.reshape(count, -1, 3).sum(axis=1)
+            level, total = planes[count : 2 * count], total.reshape(count, -1, 3).sum(axis=1)
             length = np.linalg.norm(total, axis=1, keepdims=True)
-            np.divide(total, length, out=here[:, :3], where=length > 0.0)
-            along = vertices.reshape(count, -1, 3) @ here[:, :3, None]
-            here[:, 3] = along[:, :, 0].max(axis=1)
+            np.divide(total, length, out=level[:, :3], where=length > 0.0)
+            along = vertices.reshape(count, -1, 3) @ level[:, :3, None]
+            level[:, 3] = along[:, :, 0].max(axis=1)
             count //= 2
         return planes
 
@@ -122,16 +122,16 @@ def _halve(centres: Array, order: Index, leaves: int) -> None:
     """
     parts = 1
     while parts < leaves:
-        held = len(order) // parts
-        for first in range(0, len(order), held):
+        part_size = len(order) // parts
+        for first in range(0, len(order), part_size):
             longest, axis = -1.0, 0
             for k in range(3):
                 low, high = np.inf, -np.inf
-                for n in range(first, first + held):
+                for n in range(first, first + part_size):
                     low, high = min(low, centres[order[n], k]), max(high, centres[order[n], k])
                 if high - low > longest:
                     longest, axis = high - low, k
-            _part(centres, order, axis, first, first + held - 1, first + held // 2)
+            _part(centres, order, axis, first, first + part_size - 1, first + part_size // 2)
         parts *= 2
 
 
@@ -149,18 +149,18 @@ def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle
     """
     while first < last:
         pivot = centres[order[(first + last) // 2], axis]
-        left, right = first, last
-        while left <= right:
-            while centres[order[left], axis] < pivot:
-                left += 1
-            while centres[order[right], axis] > pivot:
-                right -= 1
-            if left <= right:
-                order[left], order[right] = order[right], order[left]
-                left, right = left + 1, right - 1
-        if middle <= right:
-            last = right
-        elif middle >= left:
-            first = left
+        low, high = first, last
+        while low <= high:
+            while centres[order[low], axis] < pivot:
+                low += 1
+            while centres[order[high], axis] > pivot:
+                high -= 1
+            if low <= high:
+                order[low], order[high] = order[high], order[low]
+                low, high = low + 1, high - 1
+        if middle <= high:
+            last = high
+        elif middle >= low:
+            first = low
         else:
             return

@@ -33,12 +33,19 @@ from tkamb.geometry.frames import Array, Index, Mask
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
-MAX_BUCKETS = 1_000_000
-"""Of the plan view, in all; more cost memory and gain nothing."""
+
+@dataclass(frozen=True)
+class WindingSettings:
+    """Winding numbers by a plan view."""
+
+    max_buckets: int = 1_000_000
+    """Buckets of the plan view in all; more cost memory and gain nothing."""
+    plan_bits: int = 29
+    """Bits of half the size of the plan view, so that products of differences fit into 63
+    bits."""
 
 
-PLAN_BITS = 29
-"""Half the size of the plan view is so many bits: products of differences then fit into 63."""
+WINDING = WindingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +65,7 @@ class PlanGrid:
         """Return the grid over the positions (n, 2) of vertices."""
         low, high = plan.min(axis=0), plan.max(axis=0)
         half = float((high - low).max()) / 2.0
-        return cls((low + high) / 2.0, (2**PLAN_BITS - 1) / max(half, 1e-30))
+        return cls((low + high) / 2.0, (2**WINDING.plan_bits - 1) / max(half, 1e-30))
 
     @property
     def step(self) -> float:
@@ -68,7 +75,9 @@ class PlanGrid:
     def whole(self, plan: Array) -> Index:
         """Return positions (n, 2), m, as whole numbers; what lies far outside is brought near."""
         numbers = np.rint((plan - self.middle) * self.scale)
-        return np.clip(numbers, -(2 ** (PLAN_BITS + 1)), 2 ** (PLAN_BITS + 1)).astype(np.int64)
+        return np.clip(
+            numbers, -(2 ** (WINDING.plan_bits + 1)), 2 ** (WINDING.plan_bits + 1)
+        ).astype(np.int64)
 
 
 class WindingNumber:
@@ -92,7 +101,7 @@ class WindingNumber:
     def _buckets(self) -> tuple[Index, Index, Index, Index, Index]:
         """Lower corner (2,), edge (2,) and number (2,) of the buckets; first ones; triangles."""
         low = self._plan.min(axis=0)
-        per_side = int(np.ceil(np.sqrt(min(max(len(self._faces), 1), MAX_BUCKETS))))
+        per_side = int(np.ceil(np.sqrt(min(max(len(self._faces), 1), WINDING.max_buckets))))
         count = np.array([per_side, per_side], np.int64)
         edge = (self._plan.max(axis=0) - low) // count + 1
         corners = self._plan[self._faces]

@@ -51,35 +51,35 @@ def given_material(table: Mapping[str, Any], where: object = "[material]") -> Ma
     Raises:
         InputError: an unknown, missing or superfluous key, or a value out of range.
     """
-    given = {key: value for key, value in table.items() if value is not None and value != ()}
-    for key in given:
+    entries = {key: value for key, value in table.items() if value is not None and value != ()}
+    for key in entries:
         if key not in KEYS:
             raise InputError(f"unknown key '{key}'", where, names_near(key, KEYS))
     for key in NUMBERS:
-        value = given.get(key, 0.0)
+        value = entries.get(key, 0.0)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(f"cannot be {value!r}", f"{where}: {key}", "give a number")
-    base = None if "base" not in given else material(given["base"])
-    if base is not None and set(given) == {"base"}:
+    base = None if "base" not in entries else material(entries["base"])
+    if base is not None and set(entries) == {"base"}:
         return base
-    _check_name(given, where)
-    law = _law(given, base, where)
-    modulus = given.get("young_modulus_MPa")
+    _check_name(entries, where)
+    law = _law(entries, base, where)
+    modulus = entries.get("young_modulus_MPa")
     if modulus is not None:
         modulus *= MEGAPASCAL
-    elif isinstance(law, TabulatedLaw) and "strain" in given:
+    elif isinstance(law, TabulatedLaw) and "strain" in entries:
         modulus = law.young_modulus
     elif base is not None:
         modulus = base.young_modulus
     else:
         raise InputError("'young_modulus_MPa' is missing", where, EXAMPLE)
-    ratio = given.get("poisson_ratio", None if base is None else base.poisson_ratio)
+    ratio = entries.get("poisson_ratio", None if base is None else base.poisson_ratio)
     if ratio is None:
         raise InputError("'poisson_ratio' is missing", where, "UHMWPE has about 0.45")
-    sources = tuple(given.get("sources", ()))
+    sources = tuple(entries.get("sources", ()))
     if base is not None:
         sources += tuple(f"{base.name}: {source}" for source in base.sources)
-    name = given.get("name") or ("own" if base is None else f"{base.name} (changed)")
+    name = entries.get("name") or ("own" if base is None else f"{base.name} (changed)")
     return replace(Material(name, float(modulus), float(ratio), law), sources=sources)
 
 
@@ -155,23 +155,23 @@ def material_in_words(values: Mapping[str, Any]) -> str:
     return f"{values['name']}: {', '.join(parts)} ({sources})"
 
 
-def _check_name(given: Mapping[str, Any], where: object) -> None:
-    name = given.get("name")
+def _check_name(entries: Mapping[str, Any], where: object) -> None:
+    name = entries.get("name")
     if name in MATERIALS:
         what = f"name '{name}' is that of a built-in material"
         raise InputError(what, where, "choose another: results of both must be told apart")
 
 
-def _law(given: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
+def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
     """Return the curve that is given, or the base's."""
-    name = given.get("law")
+    name = entries.get("law")
     if name is not None and name not in LAW_KEYS:
         raise InputError(f"no law '{name}'", where, names_near(str(name), LAW_KEYS))
     own = base.law if base is not None else None
     if name is None and isinstance(own, RambergOsgood):
         name = "ramberg-osgood"
     name = name or "linear"
-    values = {key: given[key] for keys in LAW_KEYS.values() for key in keys if key in given}
+    values = {key: entries[key] for keys in LAW_KEYS.values() for key in keys if key in entries}
     if name == "ramberg-osgood" and isinstance(own, RambergOsgood):
         values = {
             "alpha": own.alpha,

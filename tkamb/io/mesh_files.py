@@ -11,7 +11,7 @@ from tkamb.atomic import replaced_file
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality
 from tkamb.contact.lattice.meshing.whole import whole_lattice
-from tkamb.contact.registry import COARSEST_MM
+from tkamb.contact.registry import MAP_GRID
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.topology import separate_bodies
@@ -79,8 +79,8 @@ def lattice_of_file(
     """
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is no .vtu file", "out", "name it like lattice.vtu")
-    if not 0 < resolution_mm <= COARSEST_MM:
-        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
+    if not 0 < resolution_mm <= MAP_GRID.coarsest_mm:
+        mend = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
         raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", mend)
     surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":

@@ -14,8 +14,16 @@ from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import KneeLoads
 from tkamb.units import MILLIMETRE
 
-FAR = 5.0 * MILLIMETRE
-"""A contact point that moves farther has jumped: onto eminence or lip, or off it."""
+
+@dataclass(frozen=True)
+class AdjustmentEffectSettings:
+    """What an adjustment of the pose changes."""
+
+    jump_distance: float = 5.0 * MILLIMETRE
+    """m: a contact point that moves farther has jumped onto the eminence or lip, or off it."""
+
+
+ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
 
 
 @dataclass(frozen=True)
@@ -49,12 +57,12 @@ def adjustment_effect(
     """
     total, before = (float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded))
     share = _share(adjusted, points_adjusted) - _share(recorded, points_recorded)
-    carry, carried = (
+    with_adjustment, without = (
         _name_carriers(loads, points)
         for loads, points in ((adjusted, points_adjusted), (recorded, points_recorded))
     )
-    if carry != carried:
-        cause = f"with it {carry}, without it {carried}"
+    if with_adjustment != without:
+        cause = f"with it {with_adjustment}, without it {without}"
     else:
         cause = _largest_move(points_adjusted, points_recorded)
     return AdjustmentEffect(total - before, share, cause)
@@ -73,7 +81,7 @@ def _name_carriers(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> str:
 
 def _largest_move(now: Mapping[str, CondylePoint], before: Mapping[str, CondylePoint]) -> str:
     """Return which contact point moved most."""
-    moved = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
-    side = max(moved, key=lambda name: moved[name])
-    word = "jumps" if moved[side] > FAR else "moves"
-    return f"the {side} contact point {word} by {moved[side] / MILLIMETRE:.1f} mm"
+    distances = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
+    side = max(distances, key=lambda name: distances[name])
+    word = "jumps" if distances[side] > ADJUSTMENT_EFFECT.jump_distance else "moves"
+    return f"the {side} contact point {word} by {distances[side] / MILLIMETRE:.1f} mm"

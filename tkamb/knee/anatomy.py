@@ -77,15 +77,15 @@ class Anatomy:
         Raises:
             InputError: no such frame.
         """
-        known = {
+        names = {
             "femur": self.femur,
             "tibia": self.tibia,
             "femoral": self.femoral,
             "insert": self.insert,
             "hip": self.hip,
         }
-        if name in known:
-            return known[name]
+        if name in names:
+            return names[name]
         if name == "patella" and self.patella is not None:
             return self.patella
         return _frame(self.model, self.names.get(name, name))
@@ -161,11 +161,11 @@ def find_anatomy(
 def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
     """Return a frame by name; of several of one name the body's."""
     if not model.existFrame(name):
-        known = [frame.name for frame in model.frames]
-        mend = names_near(name, known)
+        names = [frame.name for frame in model.frames]
+        hint = names_near(name, names)
         if part is not None:
-            mend = f"name it: frames={{'{part}': ...}}; {mend}"
-        raise InputError(f"no frame '{name}' in the model", "frames", mend)
+            hint = f"name it: frames={{'{part}': ...}}; {hint}"
+        raise InputError(f"no frame '{name}' in the model", "frames", hint)
     same = [frame for frame in model.frames if frame.name == name]
     bodies = [frame for frame in same if frame.type == pin.FrameType.BODY]
     frame = (bodies or same)[0]
@@ -197,13 +197,13 @@ def _path(model: pin.Model, one: int, other: int) -> tuple[int, ...]:
 
 
 def _check_joints(model: pin.Model, joints: Sequence[str], path: tuple[int, ...]) -> None:
-    found = [model.names[joint] for joint in path]
+    joint_names = [model.names[joint] for joint in path]
     for name in joints:
-        if name not in found:
-            words = f"the joints between tibia and femur are {', '.join(found)}"
+        if name not in joint_names:
+            words = f"the joints between tibia and femur are {', '.join(joint_names)}"
             raise InputError(f"joint '{name}' is not part of the knee", "joints", words)
     if joints and len(joints) != len(path):
-        left_out = ", ".join(name for name in found if name not in joints)
+        left_out = ", ".join(name for name in joint_names if name not in joints)
         raise InputError(f"leaves out {left_out}", "joints", "name all joints of the knee")
 
 
@@ -217,14 +217,14 @@ def _shank(
     """
     side = {tibia, *path} - {femur}
     apart = {0, femur} | (set() if patella is None else {patella.joint})
-    grown = True
-    while grown:
+    grows = True
+    while grows:
         before = len(side)
         side |= {int(model.parents[joint]) for joint in side if joint} - apart
         side |= {
             joint for joint in range(1, model.njoints) if int(model.parents[joint]) in side - {0}
         } - apart
-        grown = len(side) > before
+        grows = len(side) > before
     return tuple(sorted(side - {0}))
 
 

@@ -61,13 +61,13 @@ class CanonicalChain(Chain):
     def __init__(
         self,
         anatomy: Anatomy,
-        left: bool,
+        is_left: bool,
         with_patella: bool,
         component: Place,
         insert: Place,
     ) -> None:
         self.joints = KNEE_JOINT_NAMES + (PATELLA_JOINT_NAMES if with_patella else ())
-        self._left = left
+        self._left = is_left
         model, user = pin.Model(), anatomy.model
         model.gravity = pin.Motion(self._right(np.array(user.gravity.vector)))
         joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
@@ -151,9 +151,9 @@ class Bridge:
     """
 
     def __init__(
-        self, anatomy: Anatomy, left: bool, chain: Chain, component: Place, insert: Place
+        self, anatomy: Anatomy, is_left: bool, chain: Chain, component: Place, insert: Place
     ) -> None:
-        self.anatomy, self.left, self.chain = anatomy, left, chain
+        self.anatomy, self.left, self.chain = anatomy, is_left, chain
         self.component, self.insert = component, insert
         self._chain_data = chain.model.createData()
         self._last = chain.model.getJointId(KNEE_JOINT_NAMES[-1])
@@ -191,9 +191,9 @@ class Bridge:
         if self.anatomy.patella is not None and "patella_ap" in self.chain.joints:
             plane = data.oMi[self.anatomy.plane.joint] * self.anatomy.plane.placement
             own = data.oMi[self.anatomy.patella.joint] * self.anatomy.patella.placement
-            there = self._right(plane.actInv(own))
-            turn = np.arctan2(there[1, 0], there[0, 0])
-            patella = np.array([there[0, 3], there[1, 3], turn])
+            relative = self._right(plane.actInv(own))
+            turn = np.arctan2(relative[1, 0], relative[0, 0])
+            patella = np.array([relative[0, 3], relative[1, 3], turn])
         return KneePlace(pose, knee_coordinates(pose), patella)
 
     def twist(self, data: Any) -> Array:
@@ -203,12 +203,12 @@ class Bridge:
             data: of the user's model, with joint placements and velocities up to date.
         """
         insert = data.oMi[self.insert.joint] * self.insert.placement
-        found = np.zeros(6)
+        total = np.zeros(6)
         for place, sign in ((self.component, 1.0), (self.insert, -1.0)):
             if place.joint:
                 to_insert = insert.actInv(data.oMi[place.joint])
-                found += sign * to_insert.act(data.v[place.joint]).vector
-        return mirrored_spatial(found) if self.left else found
+                total += sign * to_insert.act(data.v[place.joint]).vector
+        return mirrored_spatial(total) if self.left else total
 
     def motion(self, data: Any, patella: bool) -> ChainMotion:
         """Return how the chain moves, after the user's `pin.forwardKinematics(..., q, v, a)`.
@@ -222,8 +222,8 @@ class Bridge:
         tibia, still = anatomy.tibia, pin.Motion.Zero()
         pose = self._right(data.oMi[tibia.joint] * tibia.placement)
         rates = [
-            tibia.placement.actInv(still if not tibia.joint else moved[tibia.joint]).vector
-            for moved in (data.v, data.a)
+            tibia.placement.actInv(still if not tibia.joint else derivative[tibia.joint]).vector
+            for derivative in (data.v, data.a)
         ]
         q = pin.neutral(self.chain.model)
         q[7:13] = place.coordinates
@@ -241,7 +241,7 @@ class Bridge:
         return ChainMotion(pose, tibia_rates[0], tibia_rates[1], joints)
 
     def _rates(
-        self, q: Array, place: Array, data: Any, base: Place, moved: Place, own: slice
+        self, q: Array, place: Array, data: Any, base: Place, follower: Place, own: slice
     ) -> Array:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
@@ -250,10 +250,10 @@ class Bridge:
             place: (n,) the coordinates.
             data: of the user's model.
             base: the body that carries,
-            moved: and the one that moves.
+            follower: and the one that moves.
             own: the n coordinates among the chain's joints.
         """
-        twist, rate = self._relative(data, base, moved)
+        twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data
         joint = self._last if own.start == 0 else model.njoints - 1
         columns = slice(6 + own.start, 6 + own.stop)
@@ -264,24 +264,24 @@ class Bridge:
         acceleration = _solved(jacobian, rate - cache.a[joint].vector)
         return np.stack([place, v[columns], acceleration])
 
-    def _relative(self, data: Any, base: Place, moved: Place) -> tuple[Array, Array]:
+    def _relative(self, data: Any, base: Place, follower: Place) -> tuple[Array, Array]:
         """Return s and s' of the module (6,), of one body against another, in the moved axes."""
-        there, still = data.oMi[moved.joint] * moved.placement, pin.Motion.Zero()
+        placement, still = data.oMi[follower.joint] * follower.placement, pin.Motion.Zero()
         own, own_rate = (
-            moved.placement.actInv(still if not moved.joint else values[moved.joint])
+            follower.placement.actInv(still if not follower.joint else values[follower.joint])
             for values in (data.v, data.a)
         )
-        to_moved = there.actInv(data.oMi[base.joint])
-        carried, carried_rate = (
+        to_moved = placement.actInv(data.oMi[base.joint])
+        base_twist, base_rate = (
             still if not base.joint else to_moved.act(values[base.joint])
             for values in (data.v, data.a)
         )
-        twist = own - carried
-        rate = own_rate - carried_rate - own.cross(twist)
-        found = twist.vector, rate.vector
+        twist = own - base_twist
+        rate = own_rate - base_rate - own.cross(twist)
+        pair = twist.vector, rate.vector
         if not self.left:
-            return found
-        return mirrored_spatial(found[0]), mirrored_spatial(found[1])
+            return pair
+        return mirrored_spatial(pair[0]), mirrored_spatial(pair[1])
 
     def shank_needs(self, data: Any, external: Any) -> Array:
         """Return the wrench (6,) that the knee must exert on the shank, insert frame.
@@ -299,8 +299,8 @@ class Bridge:
         bodies, sign = anatomy.shank, 1.0
         if anatomy.fixed:
             model = anatomy.model
-            carried = anatomy.knee_joints[0]
-            bodies, sign = tuple(model.subtrees[carried]), -1.0
+            first_joint = anatomy.knee_joints[0]
+            bodies, sign = tuple(model.subtrees[first_joint]), -1.0
         total = np.zeros(6)
         gravity = anatomy.model.gravity
         for joint in bodies:

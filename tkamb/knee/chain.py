@@ -58,8 +58,10 @@ class Chain:
             raise InputError(f"Pinocchio cannot build the chain ({error})", "URDF") from None
         self.joints = KNEE_JOINT_NAMES + (PATELLA_JOINT_NAMES if with_patella else ())
         keep = {"universe", "root_joint", *self.joints}
+        # Other joints of the URDF (toes, wrists) are fixed at zero; their masses stay.
         lock = [full.getJointId(name) for name in full.names if name not in keep]
         model = pin.buildReducedModel(full, lock, pin.neutral(full)) if lock else full
+        # The laboratory's y points up.
         model.gravity = pin.Motion(np.array([0.0, -gravity, 0.0]), np.zeros(3))
         self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
         self._take(model)
@@ -178,6 +180,8 @@ class Chain:
         root_in_tibia = pin.SE3(inverse(self._tibia_in_root))
         q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
         q[:7] = pin.SE3ToXYZQUAT(pin.SE3(motion.tibia) * root_in_tibia)
+        # Pinocchio's free joint wants the twist in the root's own axes, the recording gives the
+        # tibia's.
         v[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_velocity)).vector
         a[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_acceleration)).vector
         for name, column, (x, rate, acceleration) in zip(
@@ -198,6 +202,8 @@ class ChainState:
     def __init__(self, chain: Chain, q: Array, v: Array, a: Array) -> None:
         self.chain, self.q, self.v, self.a = chain, q, v, a
         self.data = chain.model.createData()
+        # Recursive Newton-Euler: M a + C + gravity, all that forces have to supply. The data are
+        # overwritten by the next call, hence the copy.
         self.inertial: Array = pin.rnea(chain.model, self.data, q, v, a).copy()
         pin.computeJointJacobians(chain.model, self.data, q)
         pin.updateFramePlacements(chain.model, self.data)
@@ -246,12 +252,12 @@ class ChainState:
 
     def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
         """Return a laboratory force (3,), its point (3,) and moment (3,) as load on the tibia."""
-        here = self.laboratory_in_insert
+        laboratory = self.laboratory_in_insert
         return PointForces(
             "tibia",
-            transform(here, point)[None],
-            rotate(here, force)[None],
-            rotate(here, moment),
+            transform(laboratory, point)[None],
+            rotate(laboratory, force)[None],
+            rotate(laboratory, moment),
         )
 
     def _jacobian(self, link: str) -> Array:

@@ -17,26 +17,26 @@ from tkamb.contact.probe import CondyleWrench, ProbedContact
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, cross, pose
-from tkamb.knee.contact_points import STANDSTILL, CondylePoint
+from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
 from tkamb.knee.load import wrench_of
 
 
 @dataclass(frozen=True)
 class DifferenceSettings:
-    """How the stiffness of a model without an exact tangent is found: by central differences.
-
-    Args:
-        step: m, of a translation. Large against what the solver's tolerance leaves open, small
-            against the radius of the contact.
-        exact_step: m, the same for a model without a solver, whose answers are exact.
-        arm: m; a rotation is this step over this arm.
-        tolerance: solver tolerance of a model that has one, for these evaluations.
-    """
+    """How the stiffness of a model without an exact tangent is found: by central differences."""
 
     step: float = 4e-6
+    """m: of a translation. Large against what the solver's tolerance leaves open, small
+    against the radius of the contact."""
     exact_step: float = 1e-9
+    """m: the same for a model without a solver, whose answers are exact."""
     arm: float = 0.025
+    """m: a rotation is this step over this arm."""
     tolerance: float = 1e-6
+    """Solver tolerance of a model that has one, for these evaluations."""
+
+
+CONTACT_DIFFERENCE = DifferenceSettings()
 
 
 class KneeContact:
@@ -58,7 +58,7 @@ class KneeContact:
     ) -> None:
         self.model, self.pair, self.friction = model, pair, friction
         self.state: Any = model.prepare(pair)
-        self._settings = settings or DifferenceSettings()
+        self._settings = settings or CONTACT_DIFFERENCE
 
     def probe(self, guess: ContactResult | None = None) -> Any:
         """Return a new probe (`tkamb.contact.probe.Probe`), which a caller keeps as warm start."""
@@ -123,13 +123,13 @@ class KneeContact:
         total = np.zeros((6, 6))
         for load in contact.loads if self.friction else ():
             normal, point = load.normal, load.point
-            moved = np.hstack([np.eye(3), -_cross_matrix(point)])
-            sliding = moved @ twist
+            point_jacobian = np.hstack([np.eye(3), -_cross_matrix(point)])
+            sliding = point_jacobian @ twist
             tangential = sliding - (sliding @ normal) * normal
-            speed = float(np.sqrt(tangential @ tangential + STANDSTILL**2))
+            speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
             across = np.eye(3) - np.outer(normal, normal)
             slope = across / speed - np.outer(tangential, tangential) / speed**3
-            total += self.friction * load.force * moved.T @ slope @ moved
+            total += self.friction * load.force * point_jacobian.T @ slope @ point_jacobian
         return total
 
     def stiffness(
@@ -176,8 +176,8 @@ def batch_differences(
     sizes = settings.step * np.array([1.0, 1.0, 1.0, *np.full(3, 1.0 / settings.arm)])
     steps = np.concatenate([np.diag(sizes), -np.diag(sizes)])
     turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
-    found = wrenches(pose(turns @ place[:3, :3], turns @ place[:3, 3] + steps[:, :3]))
-    return ((found[:6] - found[6:]) / (2.0 * sizes[:, None])).T
+    values = wrenches(pose(turns @ place[:3, :3], turns @ place[:3, 3] + steps[:, :3]))
+    return ((values[:6] - values[6:]) / (2.0 * sizes[:, None])).T
 
 
 def differences(

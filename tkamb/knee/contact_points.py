@@ -12,17 +12,25 @@ from tkamb.units import DEGREE, MILLIMETRE
 if TYPE_CHECKING:
     from tkamb.geometry.closest import ClosestPointQuery, CondyleGap, CondyleGaps
 
-LIFT_OFF_ANGLE = 0.5 * DEGREE
-LIFT_OFF_GAP = 0.5 * MILLIMETRE
-"""A condyle is off the insert where both its gap and the coronal angle of the two gaps exceed
-what fluoroscopy errs by (Sharma 2008, 4.3)."""
 
-FARTHEST_GAP = 3e-3
-"""m: a femoral component farther from the insert, or deeper in it, is misplaced."""
+@dataclass(frozen=True)
+class ContactPointSettings:
+    """Contact points, lift-off and friction of the condyles."""
+
+    lift_off_angle: float = 0.5 * DEGREE
+    """rad: a condyle is off the insert where the coronal angle of the two gaps exceeds this
+    and its gap exceeds `lift_off_gap`. It is the error of fluoroscopy (Sharma 2008, 4.3)."""
+    lift_off_gap: float = 0.5 * MILLIMETRE
+    """m: gap of a condyle that is off the insert, see `lift_off_angle`. It is the error of
+    fluoroscopy (Sharma 2008, 4.3)."""
+    max_gap: float = 3e-3
+    """m: a femoral component farther from the insert, or deeper in it, is misplaced."""
+    standstill_speed: float = 1e-3
+    """m/s: friction fades below this sliding speed, because its direction is not defined at
+    rest."""
 
 
-STANDSTILL = 1e-3
-"""m/s: friction fades below this sliding speed, where its direction is not defined."""
+CONTACT_POINT = ContactPointSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +56,9 @@ class CondylePoint:
         friction against the sliding, fading below v0 = 1 mm/s.
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal
-        speed = np.sqrt(tangential @ tangential + STANDSTILL**2)
+        # Regularised Coulomb friction: the force fades to zero at standstill, where its direction
+        # would jump.
+        speed = np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2)
         return np.asarray(self.normal - friction * tangential / speed)
 
 
@@ -83,11 +93,11 @@ def contact_points(
             insert's there.
     """
     gaps = query.at(pose)
-    found = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
-    condyles = {side: _condyle(gap, sliding) for side, gap in found.items()}
+    condyle_gaps = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
+    condyles = {side: _condyle(gap, sliding) for side, gap in condyle_gaps.items()}
     nearest = nearest_gap(gaps)
     problems: tuple[str, ...] = ()
-    if abs(nearest) > FARTHEST_GAP:
+    if abs(nearest) > CONTACT_POINT.max_gap:
         word = "apart" if nearest > 0 else "overlapping"
         problems = (f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm",)
     return ContactPoints(condyles, _find_lifted(condyles), problems)
@@ -106,7 +116,11 @@ def _find_lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
     if len(condyles) < 2:
         return frozenset()
     medial, lateral = condyles["medial"], condyles["lateral"]
+    # z is medial-lateral, so this is the distance of the condyles in the coronal plane.
     width = abs(lateral.point[2] - medial.point[2])
     higher = "lateral" if lateral.gap > medial.gap else "medial"
-    tilted = abs(lateral.gap - medial.gap) > LIFT_OFF_ANGLE * width
-    return frozenset({higher} if tilted and condyles[higher].gap > LIFT_OFF_GAP else ())
+    # Small angle: the difference of the gaps over the distance of the condyles.
+    tilted = abs(lateral.gap - medial.gap) > CONTACT_POINT.lift_off_angle * width
+    return frozenset(
+        {higher} if tilted and condyles[higher].gap > CONTACT_POINT.lift_off_gap else ()
+    )

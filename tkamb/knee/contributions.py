@@ -47,11 +47,11 @@ def condyle_contributions(
     system = KneeSystem(bare, friction, LoadState(loads.lifted, slack))
     lines = share.lines.unit_loads(geometry.state)
     moment = unknowns.moment_pair("tibia", "femur", unknowns.AXES["ml"])
-    known = {LIGAMENTS: geometry.ligaments} | ({POST: geometry.post} if geometry.post else {})
-    unit = system.response(geometry.state.generalised([*known.values(), *lines, moment]))
+    constants = {LIGAMENTS: geometry.ligaments} | ({POST: geometry.post} if geometry.post else {})
+    unit = system.response(geometry.state.generalised([*constants.values(), *lines, moment]))
     outside = np.array([system.solution.values[name] for name in system.names])
     force = share.force[share.crossing]
-    pulls = np.concatenate([np.ones(len(known)), force])
+    pulls = np.concatenate([np.ones(len(constants)), force])
     caused = np.column_stack([outside, unit[:, :-1] * pulls])
     pulled = np.zeros(len(outside))
     if not slack:
@@ -60,7 +60,7 @@ def condyle_contributions(
         per_newton = unit[:, -1] / unit[row, -1]
         caused = caused - np.outer(per_newton, caused[row])
         pulled = per_newton * extensor.tension(loads.values)
-    names = [EXTERNAL, *known, *(share.muscles[i] for i in share.crossing), EXTENSORS]
+    names = [EXTERNAL, *constants, *(share.muscles[i] for i in share.crossing), EXTENSORS]
     caused = np.column_stack([caused, pulled])
     return {
         side: dict(zip(names, caused[system.names.index(f"{side}_normal")].tolist(), strict=True))

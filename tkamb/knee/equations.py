@@ -23,8 +23,18 @@ from tkamb.knee.load import PointForces
 from tkamb.knee.load_state import LoadState, contradictions, load_states, wrong_signs
 from tkamb.knee.unknowns import Unknown, muscle_load, solve
 
-RESIDUAL_SHIFT = 0.010
-"""m: how far the residuals' point is moved along y for their sensitivity."""
+
+@dataclass(frozen=True)
+class EquationSettings:
+    """The equations of motion of the leg."""
+
+    residual_shift: float = 0.010
+    """m: shift along y of the point where the residuals act, by which their sensitivity is
+    measured."""
+
+
+EQUATION = EquationSettings()
+
 
 PATELLAR = ("patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
@@ -128,21 +138,25 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
     off = geometry.lifted
     extensors = geometry.extensor.muscles if geometry.extensor else ()
     first, *others = load_states(geometry.condyles, off, extensors)
+    # The state in which everything carries load is tried first; most frames need no other.
     full = KneeSystem(geometry, friction, first)
     condition = full.solution.condition
     if not full.solution.regular:
         return replace(unsolved(("singular equations",)), condition=condition)
     if not wrong_signs(first, full.solution):
         return full.loads()
+    # A contact that would pull, or a muscle that would push, carries nothing. All combinations are
+    # solved, and the one that contradicts no sign is taken.
     systems = {first: full} | {state: KneeSystem(geometry, friction, state) for state in others}
     solutions = {state: system.solution for state, system in systems.items()}
     wrong = {state: contradictions(state, solutions, off) for state in systems}
-    held = [system for state, system in systems.items() if not wrong[state]]
-    if not held:
+    admissible = [system for state, system in systems.items() if not wrong[state]]
+    if not admissible:
         reasons = ", ".join(f"{state.label}: {wrong[state][0]}" for state in systems)
         problem = f"no load state has all signs right ({reasons})"
         return replace(unsolved((problem,)), condition=condition)
-    return replace(held[0].loads(), ambiguous=len(held) > 1)
+    # More than one admissible state: the first carries most, and the frame is flagged.
+    return replace(admissible[0].loads(), ambiguous=len(admissible) > 1)
 
 
 def solved_unknowns(geometry: KneeGeometry, loads: KneeLoads, friction: float) -> list[Unknown]:
@@ -161,8 +175,8 @@ def solved_unknowns(geometry: KneeGeometry, loads: KneeLoads, friction: float) -
 def unsolved(problems: Iterable[str]) -> KneeLoads:
     """Return a frame without a number, and why."""
     nan = np.nan
-    nothing = (frozenset[str](), False, False)
-    return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, *nothing, tuple(problems))
+    state = (frozenset[str](), False, False)
+    return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
 
 
 def dome_sensitivity(
@@ -225,16 +239,20 @@ class KneeSystem:
         self.lifted, self.slack = assumed
         state = geometry.state
         hip = unknowns.hip(state.point("hip", np.zeros(3)))
-        found = self.unknowns = [*hip, *self._extensor(), *self._knee()]
-        self.names = [unknown.name for unknown in found]
+        unknown_forces = self.unknowns = [*hip, *self._extensor(), *self._knee()]
+        self.names = [unknown.name for unknown in unknown_forces]
         ground = [geometry.ground] if geometry.ground else []
+        # Unit couples about x and z; by them the residual forces are shifted along y in
+        # `sensitivity`.
         couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]
         pulls = geometry.share.loads(state) if geometry.share else ()
-        known = (*geometry.ligaments, *geometry.post, *pulls)
-        groups = [*(unknown.loads for unknown in found), *couples, ground, known]
+        given_loads = (*geometry.ligaments, *geometry.post, *pulls)
+        groups = [*(unknown.loads for unknown in unknown_forces), *couples, ground, given_loads]
         columns = state.generalised(groups)
         self._columns, self._couples = columns[:, :-4], columns[:, -4:-2]
+        # M a - ground reaction: what hip and knee have to supply together.
         self._outside = state.inertial - columns[:, -2]
+        # Known loads of the knee (ligaments, post, muscles) change sides of the equation.
         self._right = self._outside - columns[:, -1]
         self.solution = solve(self.names, self._columns, self._right)
 
@@ -272,6 +290,7 @@ class KneeSystem:
 
     def response(self, loads: Array) -> Array:
         """Return what one unit of each known load, columns (k, n), adds to the unknowns (k, n)."""
+        # Unknowns balance the added loads, hence the sign.
         return np.asarray(-np.linalg.solve(self._columns, loads))
 
     def sensitivity(self) -> float:
@@ -282,16 +301,16 @@ class KneeSystem:
         if not self.geometry.condyles:
             return 0.0
         total = np.linalg.norm(self.contact_force(self.solution.values))
-        shifts = np.array([-RESIDUAL_SHIFT, RESIDUAL_SHIFT])[:, None]
+        shifts = np.array([-EQUATION.residual_shift, EQUATION.residual_shift])[:, None]
         about_x, about_z = self._couples.T
         columns = np.stack([self._columns, self._columns])
         columns[:, :, self.names.index("residual_ap")] -= shifts * about_z
         columns[:, :, self.names.index("residual_ml")] += shifts * about_x
         try:
-            moved = np.linalg.solve(columns, self._right[:, None])[:, :, 0]
+            solutions = np.linalg.solve(columns, self._right[:, None])[:, :, 0]
         except np.linalg.LinAlgError:
             return np.inf
-        forces = [self.contact_force(dict(zip(self.names, x, strict=True))) for x in moved]
+        forces = [self.contact_force(dict(zip(self.names, x, strict=True))) for x in solutions]
         return float(np.abs(np.linalg.norm(forces, axis=1) - total).max())
 
     def external_moments(self) -> tuple[float, float]:
@@ -302,6 +321,8 @@ class KneeSystem:
         centre is the femoral origin, where the three axes meet.
         """
         hip = self._columns[:, :6]
+        # The first six equations are those of the floating base. The knee's internal loads vanish
+        # in them, so that they give the hip's six unknowns.
         at_hip = np.linalg.solve(hip[:6], self._outside[:6])
         knee = self._outside - hip @ at_hip
         rows = self.geometry.state.chain.knee_columns()

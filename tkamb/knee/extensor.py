@@ -245,9 +245,9 @@ class ExtensorFrames(ExtensorLines):
         states, other._joints = list(self.states), self._joints.copy()
         for k in frames:
             near = self.states[k]
-            found = solve_patella(other._mechanism, poses[k], near.coordinates, near.slopes)
-            states[k] = found
-            other._joints[k, 0] += found.coordinates - near.coordinates
+            solution = solve_patella(other._mechanism, poses[k], near.coordinates, near.slopes)
+            states[k] = solution
+            other._joints[k, 0] += solution.coordinates - near.coordinates
         other.states = states
         return other
 
@@ -268,9 +268,9 @@ class ExtensorFrames(ExtensorLines):
         if guess is not None and own.status.found:
             # a guess from a frame far before may lead nowhere, where its own leads to the place
             near = guess.coordinates
-            found = solve_patella(self._mechanism, pose, near, guess.slopes, anywhere=False)
-            if found.status.found:
-                return found
+            solution = solve_patella(self._mechanism, pose, near, guess.slopes, anywhere=False)
+            if solution.status.found:
+                return solution
             guess = None
         last = own if guess is None else guess
         return solve_patella(self._mechanism, pose, last.coordinates, last.slopes)
@@ -299,18 +299,18 @@ class ExtensorFrames(ExtensorLines):
         into 0.1 N.
         """
         places = np.array([state.coordinates for state in self.states])
-        found = np.flatnonzero(np.isfinite(places).all(axis=1))
-        if len(found) < 2:
+        solved_frames = np.flatnonzero(np.isfinite(places).all(axis=1))
+        if len(solved_frames) < 2:
             flexion = knee_coordinates(poses)[:, KNEE_COORDINATES.index("flexion")] / DEGREE
             raise InputError(
-                f"no place of the patella is found in {len(places) - len(found)} of "
+                f"no place of the patella is found in {len(places) - len(solved_frames)} of "
                 f"{len(places)} frames; first: {self.states[0].status.value}",
                 "[patella]",
                 "check its mesh, the lines' points, length_mm, and the motion's angle_unit: "
                 f"flexion is read as {flexion.min():.3g} to {flexion.max():.3g} deg",
             )
-        part = slice(found[0], found[-1] + 1)
-        bridged = PchipInterpolator(time[found], places[found])(time[part])
+        part = slice(solved_frames[0], solved_frames[-1] + 1)
+        bridged = PchipInterpolator(time[solved_frames], places[solved_frames])(time[part])
         result = np.full((len(places), 3, 3), np.nan)
         result[part] = np.stack(rates(time[part], bridged), axis=1)
         result[np.isnan(places).any(axis=1)] = np.nan

@@ -107,12 +107,16 @@ def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
     assert extensor is not None
     femur_ml = state.pose("femur")[:3, 2]
     pressed = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
-    held = [geometry.muscles[0], *pressed]
-    loads = [*(unknown.loads for unknown in held), extensor.patellar_ligament, geometry.ligaments]
+    unknown_forces = [geometry.muscles[0], *pressed]
+    loads = [
+        *(unknown.loads for unknown in unknown_forces),
+        extensor.patellar_ligament,
+        geometry.ligaments,
+    ]
     columns = state.generalised(loads)[state.chain.patella_columns()]
-    matrix, ligament, known = columns[:, :3], columns[:, 3], columns[:, 4]
-    names = [unknown.name for unknown in held]
-    alone = unknowns.solve(names, matrix, state.inertial[state.chain.patella_columns()] - known)
+    matrix, ligament, constants = columns[:, :3], columns[:, 3], columns[:, 4]
+    names = [unknown.name for unknown in unknown_forces]
+    alone = unknowns.solve(names, matrix, state.inertial[state.chain.patella_columns()] - constants)
     if not alone.regular:
         raise ComputationError("singular equations", "muscles")
     return -float(np.linalg.solve(matrix, ligament)[0]), alone.values[names[0]]

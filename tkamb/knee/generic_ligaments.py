@@ -51,7 +51,7 @@ def generic_ligaments(
     femoral: Surface,
     insert: Surface,
     pose_insert_in_tibia: Array,
-    wanted: Sequence[str] = ("MCL", "LCL", "PCL"),
+    chosen: Sequence[str] = ("MCL", "LCL", "PCL"),
 ) -> tuple[Ligament, ...]:
     """Return the bundles of a generic set, scaled to an implant.
 
@@ -59,7 +59,7 @@ def generic_ligaments(
         femoral: femoral component in the femur link's frame (right knee).
         insert: insert in the insert frame.
         pose_insert_in_tibia: (4, 4).
-        wanted: ligaments that the patient has, of MCL, LCL, PCL, ACL.
+        chosen: ligaments that the patient has, of MCL, LCL, PCL, ACL.
 
     Returns:
         Bundles between the links "femur" and "tibia"; the reference pose is extension.
@@ -68,7 +68,7 @@ def generic_ligaments(
         InputError: no such ligament.
     """
     names = {name.split("_")[0] for name in BUNDLES}
-    for name in wanted:
+    for name in chosen:
         if name not in names:
             raise InputError(
                 f"no generic ligament '{name}'", None, f"there are {', '.join(sorted(names))}"
@@ -76,12 +76,12 @@ def generic_ligaments(
     axis = condylar_axis(femoral)
     femoral_unit = 0.5 * float(np.ptp(femoral.bounds[:, 2]))
     insert_unit = 0.5 * float(np.ptp(insert.bounds[:, 2]))
-    found = []
+    ligaments = []
     for name, bundle in BUNDLES.items():
-        if name.split("_")[0] in wanted:
+        if name.split("_")[0] in chosen:
             proximal = axis + femoral_unit * np.array(bundle.proximal)
             distal = transform(pose_insert_in_tibia, insert_unit * np.array(bundle.distal))
-            found.append(
+            ligaments.append(
                 Ligament(
                     PREFIX + name,
                     LinkPoint("femur", proximal),
@@ -91,7 +91,7 @@ def generic_ligaments(
                     reference_strain=bundle.reference_strain,
                 )
             )
-    return tuple(found)
+    return tuple(ligaments)
 
 
 def condylar_axis(femoral: Surface) -> Array:

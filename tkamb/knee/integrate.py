@@ -14,6 +14,7 @@ doi:10.1007/3-540-30666-8.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,20 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 from tkamb.knee.knee import Knee, KneeData
 
-VELOCITY_TOLERANCE = 1e-8
-"""m/s and rad/s: what Newton's method leaves of the step's equation."""
-MAX_NEWTON_STEPS = 40
+
+@dataclass(frozen=True)
+class ImplicitStepSettings:
+    """An implicit time step of the knee."""
+
+    velocity_tolerance: float = 1e-8
+    """m/s and rad/s: residual of the step's equation below which Newton's method has
+    converged."""
+    max_newton_steps: int = 40
+    """Newton steps at most."""
+
+
+IMPLICIT_STEP = ImplicitStepSettings()
+
 REUSE_BELOW = 0.2
 """The slope of the step's equation is kept while each step of Newton's method leaves less of it."""
 
@@ -68,7 +80,9 @@ def implicit_step(
     push = np.zeros(model.nv) if tau is None else tau
     cache, ahead, last = model.createData(), np.array(v, float), np.inf
     change, slope = np.zeros(model.nv), None
-    for _ in range(MAX_NEWTON_STEPS):
+    for _ in range(IMPLICIT_STEP.max_newton_steps):
+        # theta 0.5 is the implicit midpoint rule, without numerical damping; 1 is implicit Euler,
+        # which damps.
         middle = (1.0 - theta) * v + theta * ahead
         place = pin.integrate(model, q, theta * step * middle)
         try:
@@ -83,9 +97,12 @@ def implicit_step(
         if external is not None:
             forces = pin.StdVec_Force([f + e for f, e in zip(forces, external, strict=True)])
         torque = push - drag * middle
+        # Residual of the theta rule for the velocity at the end of the step.
         missed = ahead - v - step * pin.aba(model, cache, place, middle, torque, forces)
         size = float(np.abs(missed).max())
-        if size < VELOCITY_TOLERANCE or (size < 1e3 * VELOCITY_TOLERANCE and size >= last):
+        if size < IMPLICIT_STEP.velocity_tolerance or (
+            size < 1e3 * IMPLICIT_STEP.velocity_tolerance and size >= last
+        ):
             return pin.integrate(model, q, step * middle), ahead
         if slope is None or size > REUSE_BELOW * last:  # else the slope still serves
             jacobian = knee.relative_jacobian(place)
@@ -93,8 +110,12 @@ def implicit_step(
             stiffness = stiffness + _turning(knee, own, data)
             damping = knee.damping(place, middle, data)
             pin.computeABADerivatives(model, cache, place, middle, torque, forces)
+            # Pinocchio's derivatives hold the forces constant; the knee's stiffness adds how they
+            # change.
             by_q = cache.ddq_dq - cache.Minv @ jacobian.T @ stiffness @ jacobian
             by_v = cache.ddq_dv - cache.Minv @ (jacobian.T @ damping @ jacobian + np.diag(drag))
+            # Derivative of the residual by the end velocity: place depends on it with theta step,
+            # velocity with theta.
             slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
         last = size
         change = -np.linalg.solve(slope, missed)

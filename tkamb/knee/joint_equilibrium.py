@@ -80,9 +80,9 @@ class JointEquilibrium:
             contact: (6,) w_contact on the insert.
         """
         axes, columns, wrench = self._sum_loads(coordinates, contact)
-        kept = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
-        left = wrench + np.einsum("...ij,...j->...i", columns, kept)
-        return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], left)
+        reactions = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
+        remainder = wrench + np.einsum("...ij,...j->...i", columns, reactions)
+        return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], remainder)
 
     def kept(self, coordinates: Array, contact: Array) -> Array:
         """Return y (6 - n,): what keeps the prescribed coordinates, flexion last."""
@@ -93,14 +93,15 @@ class JointEquilibrium:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
         axes, columns = knee_axes(coordinates), self.columns(coordinates)
         rows = axes[self._prescribed]
+        # Projection that takes the reactions of the prescribed coordinates out of a contact wrench.
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
 
     def kept_and_left(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
         """Return what `kept` does and R (6,), the wrench on the insert that is left over then."""
         axes, columns, wrench = self._sum_loads(coordinates, contact)
-        kept = _magnitudes(axes[self._prescribed], columns, wrench)
-        return kept, wrench + columns @ kept
+        reactions = _magnitudes(axes[self._prescribed], columns, wrench)
+        return reactions, wrench + columns @ reactions
 
     def whole(self, coordinates: Array, contact: Array) -> Array:
         """Return (m, 6): generalised forces on all coordinates, kept as at the last of m places.
@@ -110,8 +111,8 @@ class JointEquilibrium:
             contact: (6,) w_contact on the insert.
         """
         axes, columns, wrench = self._sum_loads(coordinates, contact)
-        kept = _magnitudes(axes[-1, self._prescribed], columns[-1], wrench[-1])
-        return -np.einsum("mij,mj->mi", axes, wrench + columns @ kept)
+        reactions = _magnitudes(axes[-1, self._prescribed], columns[-1], wrench[-1])
+        return -np.einsum("mij,mj->mi", axes, wrench + columns @ reactions)
 
     def columns(self, coordinates: Array) -> Array:
         """Return B (6, 6 - n) at coordinates (6,)."""
@@ -140,6 +141,7 @@ class JointEquilibrium:
 
 def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
     """Return y with rows (columns y + wrench) = 0."""
+    # Prescribed coordinates are held: their reactions make the generalised forces on them vanish.
     right = np.einsum("...ij,...j->...i", rows, wrench)
     return np.asarray(-np.linalg.solve(rows @ columns, right[..., None])[..., 0])
 
@@ -202,6 +204,7 @@ def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
     shank = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
     free = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
     end, along = free[0].points[0], free[0].forces[0]
+    # The ligament may wrap the insert, so that its anchor is the first point on the shank along it.
     away = min(float((load.points[0] - end) @ along) for load in shank)
     return PatellarLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
 
@@ -215,9 +218,12 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     hip = unknowns.hip(state.point("hip", np.zeros(3)))
     ground = [geometry.ground] if geometry.ground else []
     columns = state.generalised([*(unknown.loads for unknown in hip), ground])
+    # As in `KneeSystem`: what hip and knee supply together, the ground reaction taken off.
     without = state.inertial - columns[:, -1]
+    # The first six equations hold no internal loads of the knee, so that they give the hip's alone.
     at_hip = np.linalg.solve(columns[:6, :6], without[:6])
     knee = (without - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
+    # Generalised forces are axes times wrench; solved for the wrench on the tibia.
     return np.asarray(np.linalg.solve(knee_axes(coordinates), knee))
 
 

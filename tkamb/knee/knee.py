@@ -53,11 +53,21 @@ if TYPE_CHECKING:
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Its name among the tensions."""
-SAME_PLACE = 1e-9
-"""m and rad: an insert this near to its flat bottom's frame stands in it."""
-POSE_TOLERANCE = 1e-12
-"""m and rad, of the joints that make a pose of the knee."""
-MAX_POSE_STEPS = 30
+
+
+@dataclass(frozen=True)
+class KneeSettings:
+    """The knee object: frames and poses."""
+
+    frame_tolerance: float = 1e-9
+    """m and rad: an insert frame this near to that of its flat bottom is the same frame."""
+    pose_tolerance: float = 1e-12
+    """m and rad: residual of the joint coordinates that make a given pose of the knee."""
+    max_pose_steps: int = 30
+    """Newton steps at most to find these coordinates."""
+
+
+KNEE = KneeSettings()
 
 
 @dataclass(eq=False)
@@ -371,8 +381,8 @@ class Knee:
             from tkamb.contact.probe import condyle_wrenches
 
             assert self.contact is not None
-            found = condyle_wrenches(contact, self.contact.pair.split)
-            condyles = instant.resultants(0, instant.coordinates, found)
+            wrenches = condyle_wrenches(contact, self.contact.pair.split)
+            condyles = instant.resultants(0, instant.coordinates, wrenches)
             off = frozenset(instant.sides - set(condyles))
             points = replace(NO_CONTACT, condyles=condyles, lifted=off)
         elif self.contact is not None:
@@ -472,8 +482,8 @@ class Knee:
             geometry = self._loaded(knee, instant, points)
             loads = self._solved(geometry, data)
         if loads is None:
-            nothing = replace(knee.geometry, problems=(knee.problem,))
-            loads = self._solved(nothing, data)
+            unsolvable = replace(knee.geometry, problems=(knee.problem,))
+            loads = self._solved(unsolvable, data)
         left_over = float(np.abs(knee.balance.force).max())
         return Equilibrium(
             q_end,
@@ -543,7 +553,7 @@ class Knee:
     # -- building --
 
     def _surfaces(
-        self, left: bool, contact: object, extensor: object
+        self, is_left: bool, contact: object, extensor: object
     ) -> "tuple[Surface | None, Surface | None, Surface | None]":
         """Return femoral component, insert and button, those of a right knee.
 
@@ -551,22 +561,22 @@ class Knee:
             InputError: one that is needed is missing or cannot be used.
         """
         implant = self.implant
-        wanted = {"femoral": contact is not None or extensor is not None}
-        wanted |= {"insert": contact is not None, "patella": extensor is not None}
-        found: list[Surface | None] = []
-        for name, needed in wanted.items():
+        needs = {"femoral": contact is not None or extensor is not None}
+        needs |= {"insert": contact is not None, "patella": extensor is not None}
+        surfaces: list[Surface | None] = []
+        for name, needed in needs.items():
             mesh = getattr(implant, name)
             if mesh is None and needed:
                 what = "[the contact]" if name == "insert" else "the contact or the extensor"
                 raise InputError(f"has no {name} mesh", "Implant", f"{what} needs it")
             if mesh is None:
-                found.append(None)
+                surfaces.append(None)
                 continue
             surface = as_surface(mesh, f"{name} mesh", closed=name == "insert")
-            found.append(mirrored_surface(surface) if left else surface)
-        return found[0], found[1], found[2]
+            surfaces.append(mirrored_surface(surface) if is_left else surface)
+        return surfaces[0], surfaces[1], surfaces[2]
 
-    def _insert_place(self, left: bool) -> Place:
+    def _insert_place(self, is_left: bool) -> Place:
         """Return the insert frame on the tibia, and move the insert into it."""
         place = self.anatomy.insert
         if self.insert is None or self.implant.placed:
@@ -574,10 +584,10 @@ class Knee:
         from tkamb.geometry.flat_bottom import insert_placement
 
         placement = insert_placement(self.insert)
-        if np.abs(placement - np.eye(4)).max() < SAME_PLACE:
+        if np.abs(placement - np.eye(4)).max() < KNEE.frame_tolerance:
             return place
         self.insert = self.insert.moved(placement)
-        mesh_in_insert = mirrored_pose(placement) if left else placement
+        mesh_in_insert = mirrored_pose(placement) if is_left else placement
         return Place(place.joint, place.placement * se3(inverse(mesh_in_insert)))
 
     def _bundle(self, bundle: "Ligament") -> "Ligament":
@@ -625,7 +635,7 @@ class Knee:
         places = tuple(self.anatomy.frame(point.link) for point in points)
         return _Line(places, tuple(point.position for point in points))
 
-    def _build_extensor(self, extensor: Extensor, left: bool) -> Any:
+    def _build_extensor(self, extensor: Extensor, is_left: bool) -> Any:
         from tkamb.knee.extensor import ExtensorLines, ExtensorParts
         from tkamb.knee.muscles import check_muscles
 
@@ -637,7 +647,7 @@ class Knee:
             bone = as_surface(wrap.bone, "bone mesh")
             to_component = self.bridge.component.placement.inverse() * self.anatomy.femur.placement
             pose = to_component.homogeneous
-            if left:
+            if is_left:
                 bone, pose = mirrored_surface(bone), mirrored_pose(pose)
             wrap = replace(wrap, bone=bone.moved(pose))
         muscle = replace(muscle, points=points, wrap=wrap)
@@ -727,13 +737,13 @@ class Knee:
     def _find_patella(self, place: KneePlace, data: KneeData) -> "PatellaState":
         lines = self._extensor_lines
         if self._finds_patella:
-            data.patella = found = lines.solved(place.pose, data.patella)
+            data.patella = solution = lines.solved(place.pose, data.patella)
         else:
             assert place.patella is not None
-            found = lines.given(place.pose, place.patella)
-        if not found.status.found:
-            raise ComputationError(f"patella lost: {found.status.value}", "extensor")
-        return found
+            solution = lines.given(place.pose, place.patella)
+        if not solution.status.found:
+            raise ComputationError(f"patella lost: {solution.status.value}", "extensor")
+        return solution
 
     def _link_poses(self, place: KneePlace, patella: "PatellaState | None") -> dict[str, Array]:
         """Return link -> pose (4, 4) in the insert frame."""
@@ -763,11 +773,11 @@ class Knee:
         tension = tensions.get(self.extensor.quadriceps.name, 0.0)
         extensor, muscle = self._extensor_lines.loads(place.coordinates[5], _Posed(poses), patella)
         point, normal = patella.contact_point[None], patella.contact_normal
-        held = tensions.get(PATELLAR_LIGAMENT)
-        if held is not None:
+        patellar_tension = tensions.get(PATELLAR_LIGAMENT)
+        if patellar_tension is not None:
             pulls = [
                 *_scaled(muscle.loads, tension),
-                *_scaled(extensor.patellar_ligament, held),
+                *_scaled(extensor.patellar_ligament, patellar_tension),
             ]
             pull = sum(load.forces.sum(axis=0) for load in pulls if load.link == "patella")
             across = poses["femur"][:3, 2]
@@ -800,16 +810,18 @@ class Knee:
                 continue
             placements = [data.data.oMi[place.joint] for place in line.places]
             at = [
-                here.act(place.placement.act(position))
-                for here, place, position in zip(
+                placement.act(place.placement.act(position))
+                for placement, place, position in zip(
                     placements, line.places, line.positions, strict=True
                 )
             ]
             steps = np.diff(np.array(at), axis=0)
             along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
             pulls = tension * np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
-            for here, place, point, pull in zip(placements, line.places, at, pulls, strict=True):
-                forces[place.joint] += here.actInv(pin.Force(pull, cross(point, pull)))
+            for placement, place, point, pull in zip(
+                placements, line.places, at, pulls, strict=True
+            ):
+                forces[place.joint] += placement.actInv(pin.Force(pull, cross(point, pull)))
         return pin.StdVec_Force(forces)
 
     def _ligament_stiffness(self, place: KneePlace) -> Array:
@@ -855,20 +867,20 @@ class Knee:
         pin.forwardKinematics(self.model, data.data, q, v, a)
         if pulled:
             external = self._with_lines(data, pulled, external)
-        bridge, here = self.bridge, data.data
-        chain_motion = bridge.motion(here, self.extensor is not None)
+        bridge, pin_data = self.bridge, data.data
+        chain_motion = bridge.motion(pin_data, self.extensor is not None)
         patella = None
         if self.extensor is not None:
             assert self.extensor is not None
-            found = None if self._finds_patella else chain_motion.joints[0, 6:]
+            joints = None if self._finds_patella else chain_motion.joints[0, 6:]
             place = knee_pose(chain_motion.joints[0, :6])
-            patella = PatellaAt(self._extensor_lines, place, found, self.extensor.solved)
+            patella = PatellaAt(self._extensor_lines, place, joints, self.extensor.solved)
         return Instant(
             self.chain,
             chain_motion,
-            bridge.shank_needs(here, external),
-            bridge.external_on(self.anatomy.femur, here, external),
-            bridge.external_on(self.anatomy.patella, here, external),
+            bridge.shank_needs(pin_data, external),
+            bridge.external_on(self.anatomy.femur, pin_data, external),
+            bridge.external_on(self.anatomy.patella, pin_data, external),
             self.ligaments,
             patella,
             self.friction,
@@ -898,17 +910,17 @@ class Knee:
 
     def _nearest_points(self, instant: Instant) -> dict[str, Array]:
         gaps = self.query.at(knee_pose(instant.coordinates))
-        found = {"medial": gaps.medial.centre}
-        return found | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
+        centres = {"medial": gaps.medial.centre}
+        return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
         """Return the knee at rest, from first touch at the other coordinates of q."""
-        from tkamb.knee.equilibrium.starts import Starts
+        from tkamb.knee.equilibrium.starts import InitialPoses
 
         pair, recorded = self._need_contact().pair, instant.coordinates
         if not np.isfinite(pair.first_touch_height(knee_pose(recorded))):
             raise ComputationError("the femoral component does not lie over the insert", "q")
-        return Starts(recorded[None], search, pair, None).rest(0, (), points)
+        return InitialPoses(recorded[None], search, pair, None).rest(0, (), points)
 
     def _loaded(
         self, knee: "KneeEquilibrium", instant: Instant, points: dict[str, Array]
@@ -931,19 +943,19 @@ class Knee:
             InputError: these joints cannot make that pose.
         """
         model, data = self.model, self.model.createData()
-        wanted = se3(mirrored_pose(target) if self.left else target)
+        target_placement = se3(mirrored_pose(target) if self.left else target)
         columns = [
             model.joints[joint].idx_v + k
             for joint in self.anatomy.knee_joints
             for k in range(model.joints[joint].nv)
         ]
         q = np.array(q, float)
-        for _ in range(MAX_POSE_STEPS):
+        for _ in range(KNEE.max_pose_steps):
             pin.forwardKinematics(model, data, q)
             insert = data.oMi[self.bridge.insert.joint] * self.bridge.insert.placement
             femur = data.oMi[self.bridge.component.joint] * self.bridge.component.placement
-            error = pin.log6(wanted * insert.actInv(femur).inverse()).vector
-            if np.abs(error).max() < POSE_TOLERANCE:
+            error = pin.log6(target_placement * insert.actInv(femur).inverse()).vector
+            if np.abs(error).max() < KNEE.pose_tolerance:
                 return q
             jacobian = self.relative_jacobian(q)[:, columns]
             step = np.zeros(model.nv)
@@ -981,6 +993,6 @@ def _in_plane(coordinates: Array) -> Array:
     """Return the patella's pose (4, 4) in its plane's frame at (ap, si, rotation)."""
     ap, si, rotation = coordinates
     c, s = np.cos(rotation), np.sin(rotation)
-    found = np.eye(4)
-    found[:2, :2], found[:2, 3] = [[c, -s], [s, c]], [ap, si]
-    return found
+    result = np.eye(4)
+    result[:2, :2], result[:2, 3] = [[c, -s], [s, c]], [ap, si]
+    return result

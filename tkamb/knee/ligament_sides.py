@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, transform
@@ -10,9 +11,18 @@ from tkamb.knee.ligaments import Ligament
 from tkamb.knee.load import LinkPoint
 from tkamb.units import MILLIMETRE
 
-WRONG_SIDE = 8.0 * MILLIMETRE
-"""Beyond the middle, on the other side: collateral ligaments end 20 to 45 mm off it, and no frame
-is off the knee's middle by as much as this."""
+
+@dataclass(frozen=True)
+class LigamentSideSettings:
+    """Whether a collateral ligament is on its side of the knee."""
+
+    wrong_side_distance: float = 8.0 * MILLIMETRE
+    """m beyond the middle of the knee, on the other side. Collateral ligaments end 20 to 45 mm
+    from the middle, and no frame is displaced by as much as this."""
+
+
+LIGAMENT_SIDE = LigamentSideSettings()
+
 
 _MEDIAL = re.compile(r"mcl|(medial|tibial)[ _-]*collateral", re.IGNORECASE)
 _LATERAL = re.compile(r"(?<![a-z])l[ _-]?cl|fcl|(lateral|fibular)[ _-]*collateral", re.IGNORECASE)
@@ -33,11 +43,11 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
         sign = _lateral_sign(bundle.name)
         for name, end in (("proximal", bundle.proximal), ("distal", bundle.distal)):
             lateral = _lateral_place(end, chain)
-            if sign * lateral < -WRONG_SIDE:
-                there, own = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
+            if sign * lateral < -LIGAMENT_SIDE.wrong_side_distance:
+                opposite, own = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
                 raise InputError(
-                    f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {there} side "
-                    f"of this {side} knee, a ligament of the {own} side by its name",
+                    f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {opposite} "
+                    f"side of this {side} knee, a ligament of the {own} side by its name",
                     f"[[ligament]] {bundle.name}",
                     "turn the sign of z in point_mm (z points to the right on either side), or "
                     "mend [patient] side or the name",

@@ -25,11 +25,21 @@ from tkamb.geometry.frames import Array, transform
 from tkamb.knee.load import LinkPoint, PointForces, wrench_of
 from tkamb.units import DEGREE
 
-TOE_STRAIN = 0.03
-"""eps1: the toe region ends at twice this strain, the same for every ligament."""
 
-FARTHEST_REFERENCE = 15.0 * DEGREE
-"""rad: a recorded frame farther than this from the reference flexion is no reference pose."""
+@dataclass(frozen=True)
+class LigamentSettings:
+    """Force-length curve and reference pose of ligaments."""
+
+    toe_strain: float = 0.03
+    """1: eps1 of Blankevoort's curve; the toe region ends at twice this strain, the same for
+    every ligament."""
+    max_reference_distance: float = 15.0 * DEGREE
+    """rad: a recorded frame whose flexion is farther from the reference flexion is no
+    reference pose."""
+
+
+LIGAMENT = LigamentSettings()
+
 
 Law = Literal["two-line", "quadratic-toe"]
 
@@ -37,19 +47,21 @@ Law = Literal["two-line", "quadratic-toe"]
 def two_line_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
     """Return the tension (N) of the two-line law; `stiffness` in N/m, lengths in m."""
     length, slack = np.asarray(length, float), np.asarray(slack_length, float)
+    # The first line has half the slope of the second one; they meet at twice the toe strain.
     toe = 0.5 * np.asarray(stiffness) * (length - slack)
-    line = np.asarray(stiffness) * (length - (1.0 + TOE_STRAIN) * slack)
+    line = np.asarray(stiffness) * (length - (1.0 + LIGAMENT.toe_strain) * slack)
     strain = (length - slack) / slack
-    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
+    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT.toe_strain, toe, line))
 
 
 def quadratic_toe_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
     """Return the tension (N) of the quadratic-toe law; `stiffness` in N per unit strain."""
     length, slack = np.asarray(length, float), np.asarray(slack_length, float)
     strain = (length - slack) / slack
-    toe = np.asarray(stiffness) * strain**2 / (4.0 * TOE_STRAIN)
-    line = np.asarray(stiffness) * (strain - TOE_STRAIN)
-    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
+    # Force and slope are continuous where the parabola meets the line, at twice the toe strain.
+    toe = np.asarray(stiffness) * strain**2 / (4.0 * LIGAMENT.toe_strain)
+    line = np.asarray(stiffness) * (strain - LIGAMENT.toe_strain)
+    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT.toe_strain, toe, line))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +180,9 @@ def ligament_loads(
     """
     points = [*(bundle.proximal for bundle in ligaments), *(bundle.distal for bundle in ligaments)]
     links = np.array([point.link for point in points]).reshape(2, -1)
-    here = np.array([poses[point.link] for point in points], float)
+    link_poses = np.array([poses[point.link] for point in points], float)
     places = np.array([point.position for point in points], float)
-    ends = np.einsum("nij,nj->ni", here[:, :3, :3], places) + here[:, :3, 3]
+    ends = np.einsum("nij,nj->ni", link_poses[:, :3, :3], places) + link_poses[:, :3, 3]
     ends = ends.reshape(2, -1, 3)
     tension, pull = BundleArrays.of(ligaments, *ends).pulls(*ends)
     loads = []
@@ -211,9 +223,10 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
     length = float(bundle.length(_frame(poses, reference)))
     if length == 0.0:
         raise InputError("both ends are the same point", where)
+    # A slack length that is given needs no reference pose.
     if not np.isnan(bundle.slack_length):
         return bundle
-    if abs(flexion[reference] - bundle.reference_flexion) > FARTHEST_REFERENCE:
+    if abs(flexion[reference] - bundle.reference_flexion) > LIGAMENT.max_reference_distance:
         raise InputError(
             f"its reference pose is at {bundle.reference_flexion / DEGREE:g} deg of flexion, but "
             f"the nearest recorded frame is at {flexion[reference] / DEGREE:.0f} deg",
@@ -222,12 +235,13 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
             f"motion's angle_unit: flexion is read as {np.nanmin(flexion) / DEGREE:.3g} to "
             f"{np.nanmax(flexion) / DEGREE:.3g} deg",
         )
+    # Strain is relative to the slack length: e = L / L0 - 1, solved for L0.
     return replace(bundle, slack_length=length / (1.0 + bundle.reference_strain))
 
 
-def nearest_frame(flexion: Array, wanted: float) -> int:
+def nearest_frame(flexion: Array, target: float) -> int:
     """Return the index of the frame whose flexion (f,) is nearest to the wanted one, rad."""
-    return int(np.nanargmin(np.abs(flexion - wanted)))
+    return int(np.nanargmin(np.abs(flexion - target)))
 
 
 def strain_table(

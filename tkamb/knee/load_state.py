@@ -9,17 +9,26 @@ those that the recorded gap excludes.
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
 from tkamb.knee.unknowns import MUSCLE, Solution
 
-ROUNDING = 1e-6
-"""N: a sign that is wrong by less is rounding."""
 
-PATELLA_MOMENT = 0.25
-"""N·m: the patella's own weight and inertia (up to 5 N on an arm of 45 mm), which stand between
-an extensor that pulls and one that is slack."""
+@dataclass(frozen=True)
+class LoadStateSettings:
+    """Which parts of the extensor carry load."""
+
+    force_rounding: float = 1e-6
+    """N: a force of the wrong sign that is smaller is rounding."""
+    patella_moment: float = 0.25
+    """N m: moment of the patella's own weight and inertia, up to 5 N on an arm of 45 mm. It
+    separates an extensor that carries from one that is slack."""
+
+
+LOAD_STATE = LoadStateSettings()
+
 
 PATELLAR_LOADS = ("patellar_ligament", "patellofemoral")
 
@@ -78,12 +87,12 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
     wrong = [
         f"{name.removeprefix(MUSCLE).replace('_', ' ')} {values[name]:.3g} N"
         for name in one_sided
-        if values.get(name, 0.0) < -ROUNDING
+        if values.get(name, 0.0) < -LOAD_STATE.force_rounding
     ]
     if state.slack:
         # on the tibia, about insert z; without contact it is given on the femur
         extension = values.get("residual_flexion", 0.0) - values.get("knee_moment_flexion", 0.0)
-        if extension > PATELLA_MOMENT:
+        if extension > LOAD_STATE.patella_moment:
             wrong.append(f"extension moment {extension:.3g} N·m needed")
     return wrong
 
@@ -102,12 +111,12 @@ def contradictions(
     if state.slack:
         taut = solutions[LoadState(state.lifted, frozenset())].values
         pulls = {name: taut[name] for name in (*_muscles(taut), "patellar_ligament")}
-        if not min(pulls.values()) < -ROUNDING:
+        if not min(pulls.values()) < -LOAD_STATE.force_rounding:
             name, pull = next(iter(pulls.items()))
             wrong.append(f"{name.removeprefix(MUSCLE)} would pull with {pull:.3g} N")
     for side in sorted(state.lifted - off):
-        there = solutions[LoadState(state.lifted - {side}, state.slack)]
-        force = there.values[f"{side}_normal"]
+        alternative = solutions[LoadState(state.lifted - {side}, state.slack)]
+        force = alternative.values[f"{side}_normal"]
         if not force < 0.0:
             wrong.append(f"{side} condyle would push with {force:.3g} N")
     return wrong

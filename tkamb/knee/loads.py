@@ -87,14 +87,14 @@ class KneeLoads:
         extensor, values = self.geometry.extensor, self.equations.values
         if extensor is None:
             return {}
-        found = {name: values.get(muscle_load(name), NAN) for name in extensor.muscles}
-        return found | {"patellar_ligament": values.get("patellar_ligament", NAN)}
+        values_by_name = {name: values.get(muscle_load(name), NAN) for name in extensor.muscles}
+        return values_by_name | {"patellar_ligament": values.get("patellar_ligament", NAN)}
 
 
 def knee_loads(
     geometry: KneeGeometry,
     solved: SolvedLoads,
-    left: bool,
+    is_left: bool,
     forces: Mapping[str, Any],
 ) -> KneeLoads:
     """Return solved loads as those of the user's knee.
@@ -102,29 +102,33 @@ def knee_loads(
     Args:
         geometry: what the equations stand on.
         solved: their solution, of a right knee.
-        left: the user's knee is a left one.
+        is_left: the user's knee is a left one.
         forces: `external_forces`, `residual_forces` and `hip_forces`.
     """
     values = {
-        name: -value if left and _mirrored(name) else value for name, value in solved.values.items()
+        name: -value if is_left and _mirrored(name) else value
+        for name, value in solved.values.items()
     }
-    force = solved.contact_force * (np.array([1.0, 1.0, -1.0]) if left else 1.0)
-    found, extensor = values.get, geometry.extensor
+    force = solved.contact_force * (np.array([1.0, 1.0, -1.0]) if is_left else 1.0)
+    value_of, extensor = values.get, geometry.extensor
     return KneeLoads(
         np.asarray(force),
-        {side: found(f"{side}_normal", 0.0 if solved.values else NAN) for side in _sides(geometry)},
+        {
+            side: value_of(f"{side}_normal", 0.0 if solved.values else NAN)
+            for side in _sides(geometry)
+        },
         extensor.tension(values) if extensor else NAN,
-        found("patellar_ligament", NAN),
-        found("patellofemoral", NAN),
-        found("patellofemoral_tangential", NAN),
+        value_of("patellar_ligament", NAN),
+        value_of("patellofemoral", NAN),
+        value_of("patellofemoral_tangential", NAN),
         dict(geometry.tensions),
         {
             name.removeprefix("residual_"): value
             for name, value in values.items()
             if name.startswith("residual_")
         },
-        np.array([found(f"hip_force_{axis}", NAN) for axis in ("ap", "si", "ml")]),
-        np.array([found(f"hip_moment_{axis}", NAN) for axis in ("ap", "si", "ml")]),
+        np.array([value_of(f"hip_force_{axis}", NAN) for axis in ("ap", "si", "ml")]),
+        np.array([value_of(f"hip_moment_{axis}", NAN) for axis in ("ap", "si", "ml")]),
         solved.external_flexion,
         solved.external_adduction,
         solved.condition,

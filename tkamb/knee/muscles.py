@@ -22,8 +22,16 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
     from tkamb.knee.chain import Chain
 
-SECTIONS = 7
-"""Sagittal planes across the band whose sections are wrapped."""
+
+@dataclass(frozen=True)
+class MuscleBandSettings:
+    """A muscle as a band around the femur."""
+
+    sections: int = 7
+    """Sagittal planes across the band whose sections are wrapped."""
+
+
+MUSCLE_BAND = MuscleBandSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +57,7 @@ class SagittalWrap:
             below: m, what lies above this y is left out.
         """
         surfaces = [part] if self.bone is None else [part, self.bone]
-        planes = middle + np.linspace(-self.band, self.band, SECTIONS)
+        planes = middle + np.linspace(-self.band, self.band, MUSCLE_BAND.sections)
         return sagittal_outline(surfaces, planes, self.half_thickness, below=below)
 
 

@@ -27,8 +27,16 @@ Mesh = Any
 Point = LinkPoint | tuple[str, Sequence[float]]
 """A point on a frame of the model."""
 
-LARGEST_PART = 0.5
-"""m: no part of an implant is longer; a longer one was given in millimetres."""
+
+@dataclass(frozen=True)
+class PartSettings:
+    """Checks of the implant meshes."""
+
+    max_length: float = 0.5
+    """m: no part of an implant is longer; a longer one was given in millimetres."""
+
+
+PART = PartSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +116,7 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
     if not np.isfinite(vertices).all():
         raise InputError("holds coordinates that are not finite", name, "check the mesh")
     extent = float(np.ptp(vertices, axis=0).max())
-    if not 0.0 < extent < LARGEST_PART:
+    if not 0.0 < extent < PART.max_length:
         raise InputError(
             f"is {extent:.4g} m long",
             name,

@@ -15,8 +15,17 @@ from tkamb.geometry.frames import Array, inverse, rotate, transform
 from tkamb.knee.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.knee.wrapping import TautPath, path_in_link
 
-FLATTEST = 1e-6
-"""Determinant of the contact normal and the ligament's direction: less is one line."""
+
+@dataclass(frozen=True)
+class PatellaSettings:
+    """Equilibrium of the patella."""
+
+    least_determinant: float = 1e-6
+    """1: determinant of contact normal and ligament direction (unit vectors) below which the
+    two are one line."""
+
+
+PATELLA = PatellaSettings()
 
 
 class PatellaStatus(Enum):
@@ -142,8 +151,8 @@ def touching_patella(coordinates: Array, point: Array, normal: Array) -> Patella
     """
     nan = float("nan")
     on_patella = np.full(3, nan)
-    known = (coordinates, point, normal, on_patella)
-    return PatellaState(*known, nan, nan, nan, nan, nan, PatellaStatus.OK)
+    place = (coordinates, point, normal, on_patella)
+    return PatellaState(*place, nan, nan, nan, nan, nan, PatellaStatus.OK)
 
 
 class PatellaFrame:
@@ -164,18 +173,27 @@ class PatellaFrame:
     def balance_at(self, coordinates: Array, contact: PatellarContact) -> PatellaBalance:
         """Return what `balance` does, with the contact there known already."""
         m = self.mechanism
-        here = m.contact.pose(coordinates)
+        patella_pose = m.contact.pose(coordinates)
         muscle = path_in_link(
-            self.origin, transform(here, m.muscle_insertion), m.femoral_outline, self.femur
+            self.origin, transform(patella_pose, m.muscle_insertion), m.femoral_outline, self.femur
         )
         ligament = path_in_link(
-            transform(here, m.ligament_proximal), self.tuberosity, m.insert_outline, self.insert
+            transform(patella_pose, m.ligament_proximal),
+            self.tuberosity,
+            m.insert_outline,
+            self.insert,
         )
+        # Unit forces on the patella: the muscle pulls it back along its path, the ligament towards
+        # the tibia.
         pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])
-        if abs(np.linalg.det(sides)) < FLATTEST:
+        if abs(np.linalg.det(sides)) < PATELLA.least_determinant:
             raise ComputationError("the patellar ligament runs along the contact normal")
+        # Force equilibrium in the sagittal plane, per newton of muscle: two equations for ligament
+        # and contact.
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
+        # The moment about the origin that is left decides the patella's rotation: it vanishes in
+        # equilibrium.
         moment = (
             _cross(muscle.points[-1], pull)
             + ligament_force * _cross(ligament.points[0], hold)

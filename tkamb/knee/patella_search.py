@@ -14,7 +14,7 @@ direction of the unbalanced moment until that changes sign.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, transform
 from tkamb.knee.patella import (
-    FLATTEST,
+    PATELLA,
     ExtensorMechanism,
     PatellaBalance,
     PatellaFrame,
@@ -31,31 +31,36 @@ from tkamb.knee.patella import (
     PatellaStatus,
 )
 
-TOLERANCE = 1e-8
-"""m, of gap and ligament length."""
 
-TURN_TOLERANCE = 1e-7
-"""rad, of the rotation at which the moment vanishes."""
+@dataclass(frozen=True)
+class PatellaSearchSettings:
+    """The search for the patella's place."""
 
-FARTHEST_AHEAD = 8.0
-"""Lengths of a chord that a search looks ahead along it."""
+    length_tolerance: float = 1e-8
+    """m: residual of gap and ligament length below which the search has converged."""
+    rotation_tolerance: float = 1e-7
+    """rad: tolerance of the rotation at which the moment vanishes."""
+    max_chord_lengths: float = 8.0
+    """Chord lengths: how far a search extrapolates along a chord."""
+    max_evaluations: int = 14
+    """Evaluations of one approach from a place near by."""
+    lever_arm: float = 0.02
+    """m: arm that makes a rotation comparable to a length when slopes are updated from a step."""
+    max_distance: float = 5e-3
+    """m: a place farther from where the button touched first lies behind the femur."""
 
-MOST_LOOKS = 14
-"""Of one approach to a place near by."""
+
+PATELLA_SEARCH = PatellaSearchSettings()
+
 
 LONGEST_STEP = np.array([5e-3, 5e-3, np.deg2rad(4.0)])
 """m, m and rad, of the coordinates in one step."""
 
-LEVER = 0.02
-"""m: a radian counts as much when slopes are learnt from a step."""
 
 FIRST_STEP = np.deg2rad(0.5)
 NEAR_TURN = np.deg2rad(12.0)
 WIDEST_TURN = np.deg2rad(40.0)
 """rad: first step, reach of a quick look, and end of the search about the guess."""
-
-NEAR = 5e-3
-"""m: a place found farther from where the button first touched lies behind the femur."""
 
 
 class _Lost(ComputationError):
@@ -86,25 +91,25 @@ def solve_patella(
         The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
     """
     search = _Search(mechanism, pose_femur_in_insert)
-    found, several = None, False
+    balance, several = None, False
     if guess is not None and np.isfinite(guess).all():
         try:
-            found = search.follow(guess, slopes)
+            balance = search.follow(guess, slopes)
         except ComputationError:
-            found = None  # a guess that leads nowhere says nothing: all rotations are searched
-    if found is None:
+            balance = None  # a guess that leads nowhere says nothing: all rotations are searched
+    if balance is None:
         if not anywhere:
             return _nothing(PatellaStatus.MOMENT)
         try:
-            found, several = search.scan()
+            balance, several = search.scan()
         except _Lost as lost:
             return _nothing(lost.status)
-    if found.normal_force <= 0.0 or found.ligament_force <= 0.0:
+    if balance.normal_force <= 0.0 or balance.ligament_force <= 0.0:
         return _nothing(PatellaStatus.PULL)
     status = PatellaStatus.SEVERAL if several else PatellaStatus.OK
-    if found.contact.on_edge > 0.5:
+    if balance.contact.on_edge > 0.5:
         status = PatellaStatus.EDGE
-    return search.state(found, status)
+    return search.state(balance, status)
 
 
 class _Closing:
@@ -122,7 +127,7 @@ class _Closing:
 
     @property
     def closed(self) -> bool:
-        return bool(np.abs(self.errors).max() < TOLERANCE)
+        return bool(np.abs(self.errors).max() < PATELLA_SEARCH.length_tolerance)
 
     def step(self, balance: PatellaBalance) -> Array:
         """Return the step (2,) in ap and si from a balance, 5 mm at most."""
@@ -133,7 +138,7 @@ class _Closing:
         if learns:
             missed = self.errors - before - self._slopes @ self._step
             self._slopes += np.outer(missed, self._step) / (self._step @ self._step)
-        if not learns or abs(np.linalg.det(self._slopes)) < FLATTEST:
+        if not learns or abs(np.linalg.det(self._slopes)) < PATELLA.least_determinant:
             self._slopes = _slopes_in_plane(balance)
         step = np.linalg.solve(self._slopes, -self.errors)
         self._step = np.asarray(
@@ -173,37 +178,37 @@ class _Search(PatellaFrame):
             ComputationError: there is none within `WIDEST_TURN`.
         """
         if slopes is not None:
-            found = self._closed_in(guess, slopes, (-NEAR_TURN, NEAR_TURN))
-            if found is not None:
-                return found
-        here = self.at_rotation(guess, float(guess[2]))
+            balance = self._closed_in(guess, slopes, (-NEAR_TURN, NEAR_TURN))
+            if balance is not None:
+                return balance
+        current = self.at_rotation(guess, float(guess[2]))
         step = FIRST_STEP
-        while abs(here.coordinates[2] - guess[2]) < WIDEST_TURN:
-            turn = here.coordinates[2] + np.sign(here.moment) * step
-            there = self.at_rotation(here.coordinates, float(turn))
-            if there.moment * here.moment <= 0.0:
-                return self.between(here, there)
-            ahead = self._chord(here, there, FARTHEST_AHEAD)
+        while abs(current.coordinates[2] - guess[2]) < WIDEST_TURN:
+            turn = current.coordinates[2] + np.sign(current.moment) * step
+            next_balance = self.at_rotation(current.coordinates, float(turn))
+            if next_balance.moment * current.moment <= 0.0:
+                return self.between(current, next_balance)
+            ahead = self._chord(current, next_balance, PATELLA_SEARCH.max_chord_lengths)
             if ahead is not None:
                 return ahead
-            here, step = there, 1.6 * step
+            current, step = next_balance, 1.6 * step
         raise _Lost(PatellaStatus.MOMENT)
 
-    def between(self, here: PatellaBalance, there: PatellaBalance) -> PatellaBalance:
+    def between(self, first: PatellaBalance, second: PatellaBalance) -> PatellaBalance:
         """Return the balance at the zero of the moment between two rotations."""
-        found = self._chord(here, there)
-        if found is not None:
-            return found
-        last = here
+        balance = self._chord(first, second)
+        if balance is not None:
+            return balance
+        last = first
 
         def moment(rotation: float) -> float:
             nonlocal last
             last = self.at_rotation(last.coordinates, rotation)
             return last.moment
 
-        ends = (here.coordinates[2], there.coordinates[2])
+        ends = (first.coordinates[2], second.coordinates[2])
         try:
-            brentq(moment, *ends, xtol=TURN_TOLERANCE, rtol=1e-12)
+            brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
             # the patella that is followed from one end lies elsewhere at the other, so that the
             # moment there has another sign than the one that was found before
@@ -211,20 +216,20 @@ class _Search(PatellaFrame):
         return last
 
     def _chord(
-        self, here: PatellaBalance, there: PatellaBalance, reach: float = 1.0
+        self, first: PatellaBalance, second: PatellaBalance, reach: float = 1.0
     ) -> PatellaBalance | None:
         """Return the stable balance on the chord of two, at most `reach` times its length away."""
-        turn = float(there.coordinates[2] - here.coordinates[2])
-        way = (there.coordinates - here.coordinates)[:2] / turn
-        slope = (there.moment - here.moment) / turn
+        turn = float(second.coordinates[2] - first.coordinates[2])
+        way = (second.coordinates - first.coordinates)[:2] / turn
+        slope = (second.moment - first.moment) / turn
         if slope >= 0.0:
             return None
         slopes = np.zeros((3, 3))
-        slopes[:2, :2] = _slopes_in_plane(here)
+        slopes[:2, :2] = _slopes_in_plane(first)
         slopes[:2, 2], slopes[2, 2] = -slopes[:2, :2] @ way, slope
-        start = here.coordinates + np.append(way, 1.0) * -here.moment / slope
+        start = first.coordinates + np.append(way, 1.0) * -first.moment / slope
         span = np.array([min(0.0, reach * turn), max(0.0, reach * turn)])
-        return self._closed_in(start, slopes, span + here.coordinates[2] - start[2])
+        return self._closed_in(start, slopes, span + first.coordinates[2] - start[2])
 
     def _closed_in(
         self, start: Array, slopes: Array, span: Sequence[float]
@@ -238,9 +243,9 @@ class _Search(PatellaFrame):
             slopes: (3, 3) of gap, ligament length and moment, about.
             span: rad, least and greatest rotation from the start.
         """
-        scale = np.array([1.0, 1.0, LEVER])
+        scale = np.array([1.0, 1.0, PATELLA_SEARCH.lever_arm])
         coordinates, step, before = start, None, np.zeros(3)
-        for _ in range(MOST_LOOKS):
+        for _ in range(PATELLA_SEARCH.max_evaluations):
             if not span[0] <= coordinates[2] - start[2] <= span[1]:
                 return None
             balance = self.balance(coordinates)
@@ -252,7 +257,10 @@ class _Search(PatellaFrame):
             if not _stable(slopes):
                 return None
             step, before = -np.linalg.solve(slopes, errors), errors
-            if np.abs(errors[:2]).max() < TOLERANCE and abs(step[2]) < TURN_TOLERANCE:
+            if (
+                np.abs(errors[:2]).max() < PATELLA_SEARCH.length_tolerance
+                and abs(step[2]) < PATELLA_SEARCH.rotation_tolerance
+            ):
                 return replace(balance, slopes=slopes)
             step = step / max(1.0, float(np.abs(step / LONGEST_STEP).max()))
             coordinates = coordinates + step
@@ -274,17 +282,17 @@ class _Search(PatellaFrame):
             except ComputationError as error:
                 places.append(None)
                 misses.append(_condition(error))
-        found = []
-        for here, there in pairwise(places):
-            if here and there and here.moment > 0.0 >= there.moment:
+        balances = []
+        for first, second in pairwise(places):
+            if first and second and first.moment > 0.0 >= second.moment:
                 try:
-                    found.append(self.between(here, there))
+                    balances.append(self.between(first, second))
                 except ComputationError as error:
                     misses.append(_condition(error))
-        if not found:
+        if not balances:
             misses += [PatellaStatus.MOMENT] * any(places)
             raise _Lost(max(misses, key=_CONDITIONS.index))
-        return min(found, key=lambda b: b.muscle.length), len(found) > 1
+        return min(balances, key=lambda b: b.muscle.length), len(balances) > 1
 
     def first_touch(self, rotation: float) -> PatellaBalance:
         """Return the balance at a rotation, the patella swung in on its ligament from in front.
@@ -293,8 +301,8 @@ class _Search(PatellaFrame):
             ComputationError: it touches nothing, or gap or length do not hold where it does.
         """
         m = self.mechanism
-        turned = m.contact.pose(np.array([0.0, 0.0, rotation]))
-        proximal = transform(turned, m.ligament_proximal)
+        rotated = m.contact.pose(np.array([0.0, 0.0, rotation]))
+        proximal = transform(rotated, m.ligament_proximal)
         radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
 
         def place(lean: float) -> Array:
@@ -309,10 +317,10 @@ class _Search(PatellaFrame):
         for _ in range(6):
             middle = 0.5 * (free + deep)
             free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
-        found = self.at_rotation(place(free), rotation)
-        if np.linalg.norm((found.coordinates - place(free))[:2]) > NEAR:
+        balance = self.at_rotation(place(free), rotation)
+        if np.linalg.norm((balance.coordinates - place(free))[:2]) > PATELLA_SEARCH.max_distance:
             raise _Lost(PatellaStatus.GAP)
-        return found
+        return balance
 
 
 _CONDITIONS = (
@@ -338,7 +346,7 @@ def _slopes_in_plane(balance: PatellaBalance) -> Array:
 def _stable(slopes: Array) -> bool:
     """Say whether a turn with gap and ligament kept is turned back by the moment."""
     plane = slopes[:2, :2]
-    if abs(np.linalg.det(plane)) < FLATTEST:
+    if abs(np.linalg.det(plane)) < PATELLA.least_determinant:
         return False
     return bool(slopes[2, 2] < slopes[2, :2] @ np.linalg.solve(plane, slopes[:2, 2]))
 

@@ -37,27 +37,32 @@ from tkamb.geometry.frames import Array, Index, pose, transform
 from tkamb.geometry.normals import sharp_edges
 from tkamb.geometry.surface import Surface
 
-PATCH_DEPTH = 5e-5
-"""m: tau above; a contact of relative radius R is averaged over about sqrt(R tau)."""
 
-SAMPLE_SPACING = 1e-3
-"""m: spacing of the samples of the button, in the patella's coronal plane."""
+@dataclass(frozen=True)
+class PatellofemoralSettings:
+    """Patellofemoral contact with smoothed gaps."""
 
-REACH = 14.0 * PATCH_DEPTH
-"""m: samples farther than this behind the nearest one weigh nothing (exp(-14) = 8e-7, by which the
-gap of a patch of twenty samples jumps by 3e-11 m)."""
+    patch_depth: float = 5e-5
+    """m: tau of the module's equations. A contact of relative radius R is averaged over about
+    sqrt(R tau)."""
+    sample_spacing: float = 1e-3
+    """m: spacing of the button's samples in the patella's coronal plane."""
+    sample_range: float = 14.0 * patch_depth
+    """m: samples farther than this behind the nearest one get no weight. Their weight is
+    exp(-14) = 8e-7, by which the gap of a patch of twenty samples jumps by 3e-11 m."""
+    coarse_samples: int = 60
+    """Samples of a coarse evaluation."""
+    lateral_compliance: float = 0.01
+    """m: c of the module's equations, the shift if the contact force were purely lateral."""
+    tilt_compliance: float = 10.0
+    """rad/m: d of the module's equations, the tilt (5.7 deg) if the whole force acted 10 mm
+    beside the middle."""
+    least_sagittal_part: float = 1e-9
+    """1: sagittal part of a unit normal below which the normal has no sagittal direction."""
 
-COARSE = 60
-"""Samples that a quick look takes."""
 
-LATERAL_YIELD = 0.01
-"""m: c above, the shift if the contact force were purely lateral."""
+PATELLOFEMORAL = PatellofemoralSettings()
 
-TILT_YIELD = 10.0
-"""rad/m: d above, the tilt (5.7 deg) if the whole force acted 10 mm beside the middle."""
-
-SIDEWAYS = 1e-9
-"""Sagittal part of a unit normal below which there is none."""
 
 STRAIGHT = 1e-12
 """m: where the share changes the gap by less through what yields, all goes to the nearer side."""
@@ -97,7 +102,7 @@ class PatellofemoralContact:
 
     Distances of samples that cannot matter are carried over from the position before, with
     what the samples have moved since as a bound: this saves time and changes nothing, since
-    samples beyond `REACH` have no weight.
+    samples beyond `PATELLOFEMORAL.sample_range` have no weight.
 
     Args:
         femoral: femoral component in the patellar joint's frame; triangles share vertices.
@@ -115,8 +120,8 @@ class PatellofemoralContact:
         femoral: Surface,
         patellar: Surface,
         ml: float = 0.0,
-        lateral_yield: float = LATERAL_YIELD,
-        tilt_yield: float = TILT_YIELD,
+        lateral_yield: float = PATELLOFEMORAL.lateral_compliance,
+        tilt_yield: float = PATELLOFEMORAL.tilt_compliance,
     ) -> None:
         self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
         self._nearest = femoral.nearest
@@ -129,10 +134,10 @@ class PatellofemoralContact:
     def _forget(self) -> None:
         """Have no distance carried over."""
         count = len(self._samples)
-        never, nothing = np.full((count, 3), np.inf), np.zeros(count)
+        never, zeros = np.full((count, 3), np.inf), np.zeros(count)
         places = np.zeros((count, 3)), np.zeros((count, 3))
         # where each was seen, its distance, nearest point, normal there, and whether on an edge
-        self._seen = never, nothing, *places, np.zeros(count)
+        self._seen = never, zeros, *places, np.zeros(count)
 
     def unused(self) -> "PatellofemoralContact":
         """Return the same contact as it was before any position was looked at."""
@@ -152,41 +157,54 @@ class PatellofemoralContact:
         Raises:
             ComputationError: it pushes straight sideways, which no line in the plane can balance.
         """
-        found = np.empty(FIELDS)
-        length = _shared(self._sides_at(coordinates), self.ml, self._yield, found)
-        if length < SIDEWAYS:
+        contact = np.empty(FIELDS)
+        length = _shared(self._sides_at(coordinates), self.ml, self._yield, contact)
+        if length < PATELLOFEMORAL.least_sagittal_part:
             raise ComputationError("the femur pushes the patella straight sideways")
-        gap, left, shift, tilt, on_edge = found[:5].tolist()
-        return PatellarContact(gap, found[5:8], found[8:], left, shift, tilt, on_edge)
+        gap, left_share, shift, tilt, on_edge = contact[:5].tolist()
+        return PatellarContact(gap, contact[5:8], contact[8:], left_share, shift, tilt, on_edge)
 
     def touches(self, coordinates: Array) -> bool:
         """Return whether a few of the samples lie in the femur: a quick look for searches."""
-        few = self._samples[:: max(1, len(self._samples) // COARSE)]
-        here = transform(self.pose(np.asarray(coordinates, float)), few)
+        few = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
+        samples = transform(self.pose(np.asarray(coordinates, float)), few)
         low, high = self._nearest.surface.bounds
-        here = here[((here >= low) & (here <= high)).all(axis=1)]  # beside its box none is in it
-        near = self._nearest.at(here)
-        apart = np.einsum("ij,ij->i", here - near.points, near.normals)
+        # A sample outside the femur's box cannot lie inside the femur.
+        samples = samples[((samples >= low) & (samples <= high)).all(axis=1)]
+        near = self._nearest.at(samples)
+        apart = np.einsum("ij,ij->i", samples - near.points, near.normals)
         return bool((apart < 0.0).any())
 
     def _sides_at(self, coordinates: Array) -> Array:
         """Return gap, point, normal and share on edges (2, 8) of both sides, distances renewed."""
-        here = transform(self.pose(np.asarray(coordinates, float)), self._samples)
+        samples = transform(self.pose(np.asarray(coordinates, float)), self._samples)
         seen_at, distance = self._seen[:2]
-        which = _which_matter(here, self._left, REACH, seen_at, distance)
+        which = _which_matter(samples, self._left, PATELLOFEMORAL.sample_range, seen_at, distance)
         if len(which):
-            found = self._nearest.at(here[which])
+            nearest = self._nearest.at(samples[which])
             _take(
-                which, here, found.distance, found.faces, found.weights, *self._facets, *self._seen
+                which,
+                samples,
+                nearest.distance,
+                nearest.faces,
+                nearest.weights,
+                *self._facets,
+                *self._seen,
             )
         sides = np.empty((2, 8))
-        _mean_over_sides(self._left, PATCH_DEPTH, REACH, *self._seen[1:], sides)
+        _mean_over_sides(
+            self._left,
+            PATELLOFEMORAL.patch_depth,
+            PATELLOFEMORAL.sample_range,
+            *self._seen[1:],
+            sides,
+        )
         return sides
 
 
 @compiled_as_written
 def _which_matter(
-    here: Array, left: NDArray[np.bool_], reach: float, seen_at: Array, distance: Array
+    samples: Array, on_left: NDArray[np.bool_], reach: float, seen_at: Array, distance: Array
 ) -> Index:
     """Return the samples whose distances are out of date and could matter.
 
@@ -194,22 +212,25 @@ def _which_matter(
     what cannot come within reach of its side's nearest keeps what was seen.
 
     Args:
-        here: (n, 3) m, samples at their place.
-        left: (n,) whether they are on the -z side.
+        samples: (n, 3) m, samples at their place.
+        on_left: (n,) whether they are on the -z side.
         reach: m, behind the nearest one, beyond which a sample does not matter.
         seen_at: (n, 3) m, where each was when it was looked at; inf: never.
         distance: (n,) m, signed, there.
     """
-    count, nearest = len(here), np.full(2, np.inf)
-    moved, which, number = np.full(count, np.inf), np.empty(count, np.int64), 0
+    count, nearest = len(samples), np.full(2, np.inf)
+    displacement, which, number = np.full(count, np.inf), np.empty(count, np.int64), 0
     for n in range(count):
         if seen_at[n, 0] < np.inf:
-            moved[n] = np.sqrt(np.sum((here[n] - seen_at[n]) ** 2))
-            side = 0 if left[n] else 1
-            nearest[side] = min(nearest[side], distance[n] + moved[n])
+            displacement[n] = np.sqrt(np.sum((samples[n] - seen_at[n]) ** 2))
+            side = 0 if on_left[n] else 1
+            # Upper bound of the gap of this side: the triangle inequality bounds how far a distance
+            # changes when a sample moves.
+            nearest[side] = min(nearest[side], distance[n] + displacement[n])
     for n in range(count):
-        beyond = distance[n] - moved[n] >= nearest[0 if left[n] else 1] + reach
-        if moved[n] != 0.0 and not beyond:  # nor where it is NaN
+        # Lower bound of this sample's distance against it: beyond the range the weight is zero.
+        beyond = distance[n] - displacement[n] >= nearest[0 if on_left[n] else 1] + reach
+        if displacement[n] != 0.0 and not beyond:  # nor where it is NaN
             which[number] = n
             number += 1
     return which[:number]
@@ -218,7 +239,7 @@ def _which_matter(
 @compiled_as_written
 def _take(
     which: Index,
-    here: Array,
+    samples: Array,
     apart: Array,
     faces: Index,
     weights: Array,
@@ -236,7 +257,7 @@ def _take(
 
     Args:
         which: (m,) samples.
-        here: (n, 3) m, where all of them are.
+        samples: (n, 3) m, where all of them are.
         apart: (m,) m, their distances.
         faces: (m,) triangles of their nearest points.
         weights: (m, 3) barycentrics there.
@@ -255,76 +276,84 @@ def _take(
         n, face, edge = which[m], faces[m], False
         for corner in range(3):
             edge |= sharp[face, corner] and weights[m, corner] < EDGE_MARGIN
+        # On a sharp edge the normal is not that of one face; the vertices' mean turns without a
+        # jump.
         normals = vertex_normals[face] if edge else smooth_normals[face]
         along, length = 0.0, 0.0
         for k in range(3):
-            foot[n, k], outward[k], seen_at[n, k] = 0.0, 0.0, here[n, k]
+            foot[n, k], outward[k], seen_at[n, k] = 0.0, 0.0, samples[n, k]
             for corner in range(3):
                 foot[n, k] += weights[m, corner] * triangles[face, corner, k]
                 outward[k] += weights[m, corner] * normals[corner, k]
-            along += (here[n, k] - foot[n, k]) * outward[k]
+            along += (samples[n, k] - foot[n, k]) * outward[k]
             length += outward[k] ** 2
         for k in range(3):
             normal[n, k] = outward[k] / np.sqrt(length)
+        # The sign comes from the smooth normal: a sample behind the femur's surface is inside.
         distance[n] = -apart[m] if along < 0.0 else apart[m]
         on_edge[n] = 1.0 if edge else 0.0
 
 
 @compiled_as_written
 def _mean_over_sides(
-    left: NDArray[np.bool_],
+    on_left: NDArray[np.bool_],
     depth: float,
     reach: float,
     distance: Array,
     foot: Array,
     normal: Array,
     on_edge: Array,
-    found: Array,
+    means: Array,
 ) -> None:
     """Write g, p, n and the share on edges (2, 8), left and right.
 
     Args:
-        left: (n,) see `_which_matter`.
+        on_left: (n,) see `_which_matter`.
         depth: m, tau of the module's equation.
         reach: m.
         distance: (n,) m.
         foot: (n, 3) m.
         normal: (n, 3).
         on_edge: (n,).
-        found: (2, 8) to be written.
+        means: (2, 8) to be written.
     """
     for side in range(2):
         nearest, total = np.inf, 0.0
-        for n in range(len(left)):
-            if left[n] == (side == 0):
+        for n in range(len(on_left)):
+            if on_left[n] == (side == 0):
                 nearest = min(nearest, distance[n])
-        found[side] = 0.0
-        for n in range(len(left)):
+        means[side] = 0.0
+        for n in range(len(on_left)):
             behind = distance[n] - nearest
-            if left[n] != (side == 0) or behind >= reach:
+            if on_left[n] != (side == 0) or behind >= reach:
                 continue
+            # Boltzmann weights relative to the nearest sample, so that no exponential overflows.
             weight = np.exp(-behind / depth)
             total += weight
-            found[side, 0] += weight * distance[n]
-            found[side, 7] += weight * on_edge[n]
+            means[side, 0] += weight * distance[n]
+            means[side, 7] += weight * on_edge[n]
             for k in range(3):
-                found[side, 1 + k] += weight * foot[n, k]
-                found[side, 4 + k] += weight * normal[n, k]
-        found[side] /= total
-        found[side, 0] -= depth
+                means[side, 1 + k] += weight * foot[n, k]
+                means[side, 4 + k] += weight * normal[n, k]
+        means[side] /= total
+        # The weighted mean over a paraboloid exceeds its smallest distance by tau; that is taken
+        # off.
+        means[side, 0] -= depth
 
 
 @compiled_as_written
-def _shared(sides: Array, middle: float, yields: Array, found: Array) -> float:
+def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float:
     """Share the force by the module's equation, and return the sagittal part of its direction.
 
     Args:
         sides: (2, 8) gap, point, normal and share on edges, left and right.
         middle: m, z of the patella's.
         yields: (2,) c and d.
-        found: (`FIELDS`,) to be written: gap, share of the left, shift, tilt, share on edges,
+        contact: (`FIELDS`,) to be written: gap, share of the left, shift, tilt, share on edges,
             point (3,) and normal (3,) of the line of action in the sagittal plane.
     """
+    # The gap is a parabola in the left side's share of the force; its minimum is where the button
+    # comes to equilibrium in shift and tilt.
     curvature, slope = 0.0, sides[0, 0] - sides[1, 0]
     for k in range(2):
         at, offset = (6, 0.0) if k == 0 else (3, middle)
@@ -332,31 +361,43 @@ def _shared(sides: Array, middle: float, yields: Array, found: Array) -> float:
         curvature += yields[k] * change * change
         slope += yields[k] * change * (sides[1, at] - offset)
     if curvature < STRAIGHT:
-        left = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
+        left_share = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
     else:
-        left = min(max(-slope / curvature, 0.0), 1.0)
-    mean = left * sides[0] + (1.0 - left) * sides[1]
+        # A facet cannot pull, so that the share stays in [0, 1].
+        left_share = min(max(-slope / curvature, 0.0), 1.0)
+    mean = left_share * sides[0] + (1.0 - left_share) * sides[1]
     moment, length = 0.0, np.sqrt(mean[4] ** 2 + mean[5] ** 2)
     for side in range(2):
-        part = left if side == 0 else 1.0 - left
+        part = left_share if side == 0 else 1.0 - left_share
         moment += (sides[side, 1] - mean[1]) * part * sides[side, 5]
         moment -= (sides[side, 2] - mean[2]) * part * sides[side, 4]
+    # Lateral part of the normal, and the distance of the force from the middle.
     aside, lever = mean[6], mean[3] - middle
-    found[0] = mean[0] + 0.5 * (yields[0] * aside**2 + yields[1] * lever**2)
-    found[1], found[2], found[3], found[4] = left, yields[0] * aside, yields[1] * lever, mean[7]
+    contact[0] = mean[0] + 0.5 * (yields[0] * aside**2 + yields[1] * lever**2)
+    contact[1], contact[2], contact[3], contact[4] = (
+        left_share,
+        yields[0] * aside,
+        yields[1] * lever,
+        mean[7],
+    )
     # the mean point, moved in the sagittal plane onto the resultant's line
-    found[5] = mean[1] + moment / length**2 * mean[5]
-    found[6], found[7] = mean[2] - moment / length**2 * mean[4], mean[3]
-    found[8], found[9], found[10] = mean[4] / length, mean[5] / length, 0.0
+    contact[5] = mean[1] + moment / length**2 * mean[5]
+    contact[6], contact[7] = mean[2] - moment / length**2 * mean[4], mean[3]
+    contact[8], contact[9], contact[10] = mean[4] / length, mean[5] / length, 0.0
     return length
 
 
 def _joint_side(patellar: Surface) -> Array:
     """Return samples (n, 3) of the surface that a view along the patella's +x shows."""
     low, high = patellar.bounds
-    axes = [np.arange(low[k] + 0.5 * SAMPLE_SPACING, high[k], SAMPLE_SPACING) for k in (1, 2)]
+    axes = [
+        np.arange(
+            low[k] + 0.5 * PATELLOFEMORAL.sample_spacing, high[k], PATELLOFEMORAL.sample_spacing
+        )
+        for k in (1, 2)
+    ]
     y, z = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
-    start = np.column_stack([np.full(len(y), low[0] - SAMPLE_SPACING), y, z])
+    start = np.column_stack([np.full(len(y), low[0] - PATELLOFEMORAL.sample_spacing), y, z])
     distance, _ = patellar.rays.first(start, np.array([1.0, 0.0, 0.0]))
     hit = np.isfinite(distance)
     samples = start[hit] + distance[hit, None] * np.array([1.0, 0.0, 0.0])

@@ -1,5 +1,6 @@
 """The knee drawn in a user's own MeshCat window."""
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +19,20 @@ if TYPE_CHECKING:
 
 COLOURS = {"femoral": 0xB8C4CE, "insert": 0xEFEBDD, "patella": 0xEFEBDD}
 LIGAMENT, MUSCLE, ARROW = 0x2E7D32, 0xB71C1C, 0x1A1A1A
-ARROW_RADIUS = 1.5e-3
-"""m."""
-STRAND_RADIUS = 8e-4
-"""m, of ligaments, muscles and the patellar ligament."""
+
+
+@dataclass(frozen=True)
+class KneeDrawingSettings:
+    """Drawing of the knee in the viewer."""
+
+    arrow_radius: float = 1.5e-3
+    """m: radius of the arrows of forces."""
+    strand_radius: float = 8e-4
+    """m: radius of ligaments, muscles and the patellar ligament."""
+
+
+KNEE_DRAWING = KneeDrawingSettings()
+
 PRESSURE_COLOURS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])
 """RGB from no pressure to the peak: three colours of viridis, even in lightness."""
 
@@ -93,7 +104,7 @@ def show_knee(
             own = contact.nodal_force[_side(contact, knee, side)].sum(axis=0)
             start = condyle.centre_of_pressure
             path = in_world(np.array([start, start - newton * own]))
-            _strand(tree["force"][side], path, ARROW, ARROW_RADIUS)
+            _strand(tree["force"][side], path, ARROW, KNEE_DRAWING.arrow_radius)
 
 
 def _window(viewer: Any) -> tuple[Any, str]:
@@ -117,11 +128,11 @@ def _side(contact: "ContactResult", knee: "Knee", side: str) -> Any:
 
 
 def _solid(
-    node: Any, surface: "Surface | None", pose: Array, left: bool, part: str, opacity: float
+    node: Any, surface: "Surface | None", pose: Array, is_left: bool, part: str, opacity: float
 ) -> None:
     if surface is None:
         return
-    own = mirrored_surface(surface) if left else surface
+    own = mirrored_surface(surface) if is_left else surface
     material = geometry.MeshPhongMaterial(
         color=COLOURS[part], opacity=opacity, transparent=opacity < 1.0
     )
@@ -129,7 +140,9 @@ def _solid(
     node.set_transform(pose)
 
 
-def _strand(node: Any, points: Array, colour: int, radius: float = STRAND_RADIUS) -> None:
+def _strand(
+    node: Any, points: Array, colour: int, radius: float = KNEE_DRAWING.strand_radius
+) -> None:
     """Draw a polyline (n, 3) of the world as cylinders."""
     for k, (start, end) in enumerate(pairwise(points)):
         along = end - start

@@ -100,12 +100,12 @@ def condyle_slip(
     lowest = LowestPoints(femoral, split)
     poses, profile = knee_pose(coordinates), InsertProfile(insert)
     centre = transform(poses, femoral.bounds.mean(axis=0))
-    found = [lowest.at(pose) for pose in poses]
+    gaps = [lowest.at(pose) for pose in poses]
     slips: list[CondyleSlip] = []
     for side in (0, 1):
-        if found[0][side] is None:
+        if gaps[0][side] is None:
             return slips[0], None
-        points = np.array([pair[side] for pair in found])
+        points = np.array([pair[side] for pair in gaps])
         slips.append(slip_of_points(points, poses, coordinates[:, 3], centre[:, 2], profile))
     return slips[0], slips[1]
 
@@ -125,7 +125,10 @@ def slip_of_points(
     height, slope = profile.at(points)
     on_insert = np.column_stack([points[:, 0], height])
     travelled = arc(np.diff(on_insert, axis=0), np.diff(slope))
+    # x is anterior; an arc counts as positive when the contact moves backwards, as in roll-back.
     backwards = -np.sign(np.diff(points[:, 0]))
+    # Axial rotation moves the contact point forwards by the lateral distance from the femoral
+    # centre, along the slope of the insert.
     lever = _mean(points[:, 2] - centre_z) / np.cos(_mean(slope))
     return CondyleSlip(
         _cumulate(femoral_arcs(points, poses)),
@@ -145,11 +148,13 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
         points: (f, 3) m, lowest points, insert frame.
         poses: (f, 4, 4) pose_femoral_in_insert.
     """
+    # Femoral axes, in which a contact point's path is the arc that has rolled.
     back = inverse(poses)
-    here = transform(back, points[:, None])[:, 0]
+    in_femur = transform(back, points[:, None])[:, 0]
+    # The angle of the downward normal in femoral axes is the turn of the arc.
     normal = rotate(back, -UP)
     angle = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
-    chord = np.diff(here, axis=0)
+    chord = np.diff(in_femur, axis=0)
     middle = np.einsum("fij,fj->fi", poses[1:, :3, :3] + poses[:-1, :3, :3], chord)
     size, twice = np.linalg.norm(chord, axis=1), np.linalg.norm(middle, axis=1)
     middle *= np.divide(size, twice, out=np.zeros_like(size), where=twice > 0.0)[:, None]
@@ -158,6 +163,7 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
 
 def arc(chord: Array, turn: Array) -> Array:
     """Return the length (n,) of circular arcs over chords (n, 2) whose tangent turns (n,) rad."""
+    # Arc over chord of a circle: (turn / 2) / sin(turn / 2).
     half = 0.5 * np.abs(turn)
     stretch = np.where(half > 1e-6, half / np.where(half > 1e-6, np.sin(half), 1.0), 1.0)
     return np.asarray(np.linalg.norm(chord, axis=1) * stretch)
@@ -217,21 +223,21 @@ def roll_slip_motion(
     Returns:
         (f, 6) knee coordinates; NaN from where the femur leaves the insert.
     """
-    moved = np.array(coordinates, float)
-    poses, profile = knee_pose(moved), InsertProfile(insert)
+    changed = np.array(coordinates, float)
+    poses, profile = knee_pose(changed), InsertProfile(insert)
     touch = FirstTouch(femoral, insert, split)
     arms, arcs = _mean_condyle(LowestPoints(femoral, split), poses)
     centre_z = transform(poses, femoral.bounds.mean(axis=0))[:, 2]
-    axial = np.diff(moved[:, 3]) * _mean(arms[:, 2] + poses[:, 2, 3] - centre_z)
+    axial = np.diff(changed[:, 3]) * _mean(arms[:, 2] + poses[:, 2, 3] - centre_z)
     backwards = arcs - np.diff(np.asarray(slip, float))
-    contact = moved[0, 0] + arms[0, 0]
-    moved[0, 1] -= touch.travel(knee_pose(moved[0]))
-    for k in range(1, len(moved)):
+    contact = changed[0, 0] + arms[0, 0]
+    changed[0, 1] -= touch.travel(knee_pose(changed[0]))
+    for k in range(1, len(changed)):
         contact = _roll(profile, contact, poses[k, 2, 3] + arms[k, 2], backwards[k - 1])
         contact -= axial[k - 1]
-        moved[k, 0] = contact - arms[k, 0]
-        moved[k, 1] -= touch.travel(knee_pose(moved[k])) if np.isfinite(contact) else np.nan
-    return moved
+        changed[k, 0] = contact - arms[k, 0]
+        changed[k, 1] -= touch.travel(knee_pose(changed[k])) if np.isfinite(contact) else np.nan
+    return changed
 
 
 def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
@@ -239,8 +245,8 @@ def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
 
     Both depend on the rotations alone: arms (f, 3) m and femoral arcs (f-1,) m.
     """
-    found = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
-    points = np.array(found).swapaxes(0, 1)
+    condyle_points = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
+    points = np.array(condyle_points).swapaxes(0, 1)
     arcs = np.mean([femoral_arcs(side, poses) for side in points], axis=0)
     return points.mean(axis=0) - poses[:, :3, 3], np.asarray(arcs)
 
@@ -248,6 +254,7 @@ def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
 def _roll(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
     """Return x after an arc backwards along the insert's surface at z (midpoint rule)."""
     _, slope = profile.at(np.array([[x, 0.0, z]]))
+    # Midpoint rule: the slope half-way along the arc decides its projection on x.
     middle = x - 0.5 * backwards * np.cos(slope[0])
     _, slope = profile.at(np.array([[middle, 0.0, z]]))
     return float(x - backwards * np.cos(slope[0]))

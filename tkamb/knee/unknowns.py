@@ -18,14 +18,19 @@ from tkamb.geometry.frames import Array, cross
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.load import PointForces
 
-LARGEST_CONDITION = 1e4
-"""Above this condition number (unit columns) a frame counts as singular.
 
-It grows as one over the arm d at which the patellar ligament passes the femorotibial contact:
-7 to 9 m/d on the shipped knee, which has d = 43-45 mm and 148-218, and 9e2 at d = 9 mm.
-1e4 is d = 0.8 mm, where an error of a millimetre in a line of action, which nobody excludes,
-is more than the whole force.
-"""
+@dataclass(frozen=True)
+class UnknownsSettings:
+    """Solvability of the equations for the unknown forces."""
+
+    max_condition: float = 1e4
+    """1: condition number (unit columns) above which a frame counts as singular. It grows as
+    one over the arm d at which the patellar ligament passes the femorotibial contact: 7 to
+    9 m / d. The shipped knee has d = 43 to 45 mm and 148 to 218. The limit is d = 0.8 mm,
+    where an error of 1 mm in a line of action exceeds the whole force."""
+
+
+UNKNOWNS = UnknownsSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +75,11 @@ def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
     if columns.shape != (len(right), len(right)):
         raise ValueError(f"{columns.shape[1]} unknown loads for {len(right)} equations")
     size = np.linalg.norm(columns, axis=0)
+    # Unit columns: the condition number then measures the geometry, not newtons against newton
+    # metres.
     scaled = columns / np.where(size > 0, size, 1.0)
     condition = float(np.linalg.cond(scaled))
-    regular = bool(np.isfinite(condition) and condition < LARGEST_CONDITION)
+    regular = bool(np.isfinite(condition) and condition < UNKNOWNS.max_condition)
     magnitudes = np.linalg.solve(scaled, right) / size if regular else np.full(len(right), np.nan)
     return Solution(dict(zip(names, magnitudes.tolist(), strict=True)), condition, regular)
 
@@ -93,10 +100,10 @@ def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces
 
 def moment_pair(link: str, other: str, moment: Array) -> tuple[PointForces, ...]:
     """Return a free `moment` (3,) on `link` and its opposite on `other`."""
-    nothing = np.zeros((1, 3))
+    zero = np.zeros((1, 3))
     return (
-        PointForces(link, nothing, nothing, moment),
-        PointForces(other, nothing, nothing, -moment),
+        PointForces(link, zero, zero, moment),
+        PointForces(other, zero, zero, -moment),
     )
 
 
@@ -107,13 +114,13 @@ def muscle_load(name: str) -> str:
 
 def hip(point: Array) -> list[Unknown]:
     """Return hip force and moment on the femur at the hip centre (3,)."""
-    nothing = np.zeros((1, 3))
+    zero = np.zeros((1, 3))
     forces = [
         Unknown(f"hip_force_{name}", (PointForces("femur", point[None], axis[None]),))
         for name, axis in AXES.items()
     ]
     moments = [
-        Unknown(f"hip_moment_{name}", (PointForces("femur", nothing, nothing, axis),))
+        Unknown(f"hip_moment_{name}", (PointForces("femur", zero, zero, axis),))
         for name, axis in AXES.items()
     ]
     return forces + moments
@@ -145,6 +152,8 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
         normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
         femur_ml: (3,) the femur's ML axis.
     """
+    # The second component, along the groove: frictionless contact needs it to be zero, and its size
+    # shows how far the place is from equilibrium.
     tangent = cross(femur_ml, normal)
     return [
         Unknown("patellofemoral", pair("patella", "femur", point, normal)),
@@ -159,6 +168,8 @@ def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
         point: (3,) where it rests on the femur.
         femur_ml: (3,) the femur's ML axis, normal to the patella's plane.
     """
+    # Any two directions across the medial-lateral axis span what holds an unloaded patella in its
+    # plane.
     first = cross(femur_ml, AXES["ap"])
     first /= np.linalg.norm(first)
     return [
@@ -182,13 +193,13 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
         lifted: one condyle is off, a coronal moment takes the place of its force.
         extensor: muscles act; without them the flexion moment joins the residuals.
     """
-    found = [
+    unknowns = [
         Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
         Unknown("residual_ml", pair("tibia", "femur", point, AXES["ml"])),
         Unknown("residual_axial", moment_pair("tibia", "femur", AXES["si"])),
     ]
     if lifted:
-        found.append(Unknown("residual_coronal", moment_pair("tibia", "femur", AXES["ap"])))
+        unknowns.append(Unknown("residual_coronal", moment_pair("tibia", "femur", AXES["ap"])))
     if not extensor:
-        found.append(Unknown("residual_flexion", moment_pair("tibia", "femur", AXES["ml"])))
-    return found
+        unknowns.append(Unknown("residual_flexion", moment_pair("tibia", "femur", AXES["ml"])))
+    return unknowns

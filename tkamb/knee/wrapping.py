@@ -112,6 +112,7 @@ def path_in_link(
     if outline is None:
         return straight_path(np.asarray(start, float), np.asarray(end, float))
     origin = pose_link_in_here[:3, 3]
+    # The outline is given in the link's axes, so that the path is found there.
     back = pose_link_in_here[:3, :3].T
     path = taut_path(back @ (start - origin), back @ (end - origin), outline)
     return path.moved(pose_link_in_here)
@@ -120,9 +121,9 @@ def path_in_link(
 @compiled_as_written
 def _height(point: Array, outline: Array, edge: int) -> float:
     """Return twice the area that an edge spans with a point: negative if it is seen from there."""
-    there = (edge + 1) % len(outline)
+    following = (edge + 1) % len(outline)
     x, y = point[0] - outline[edge, 0], point[1] - outline[edge, 1]
-    return float(x * (point[1] - outline[there, 1]) - y * (point[0] - outline[there, 0]))
+    return float(x * (point[1] - outline[following, 1]) - y * (point[0] - outline[following, 0]))
 
 
 @compiled_as_written
@@ -136,6 +137,7 @@ def _is_inside(point: Array, outline: Array) -> bool:
 @compiled_as_written
 def _sweep(start: Array, end: Array, outline: Array) -> float:
     """Return the clockwise angle (rad) from start to end about the outline's centre."""
+    # The centroid of a convex outline lies inside it, so that the angle about it is defined.
     x, y = np.mean(outline[:, 0]), np.mean(outline[:, 1])
     ax, ay, bx, by = start[0] - x, start[1] - y, end[0] - x, end[1] - y
     return float(-np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
@@ -144,16 +146,17 @@ def _sweep(start: Array, end: Array, outline: Array) -> float:
 @compiled_as_written
 def _crosses(start: Array, end: Array, outline: Array) -> bool:
     """Clip the straight segment by the outline's half planes (Cyrus-Beck)."""
-    entered, left = 0.0, 1.0
+    # Clipping of a segment by the half-planes of a convex polygon (Cyrus and Beck).
+    entry_at, exit_at = 0.0, 1.0
     for edge in range(len(outline)):
         above, below = _height(start, outline, edge), _height(end, outline, edge)
         if above <= 0.0 and below <= 0.0:
             return False
         if above < 0.0 and below > 0.0:
-            entered = max(entered, above / (above - below))
+            entry_at = max(entry_at, above / (above - below))
         elif above > 0.0 and below < 0.0:
-            left = min(left, above / (above - below))
-    return entered < left
+            exit_at = min(exit_at, above / (above - below))
+    return entry_at < exit_at
 
 
 @compiled_as_written
@@ -174,8 +177,12 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
         return ends, straight, 0.0, START
     if _is_inside(end, outline):
         return ends, straight, 0.0, END
+    # A straight line is taut where it misses the bone. The swept angle is taken between -90 and 270
+    # deg: more than 90 deg backwards means around the front.
     if _sweep(start, end, outline) >= -0.5 * np.pi and not _crosses(start, end, outline):
         return ends, straight, 0.0, NEITHER
+    # The path leaves the bone at the corners that the ends see as its tangents: there the outline's
+    # edges change from visible to hidden.
     count, first, last = len(outline), -1, -1
     for edge in range(count):
         before, after = (edge - 1) % count, (edge + 1) % count
@@ -187,6 +194,8 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
     points, turn, along = np.empty((corners + 2, 3)), 0.0, np.zeros(corners + 2)
     points[0], points[-1] = start, end
     for corner in range(corners):
+        # The outline is counter-clockwise and the string runs over its front, so against that
+        # order.
         points[corner + 1, :2] = outline[(first - corner) % count]
     for k in range(1, corners + 2):
         x, y = points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1]
@@ -194,6 +203,8 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
         if k <= corners:
             ahead = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
             turn -= np.arctan2(x * ahead[1] - y * ahead[0], x * ahead[0] + y * ahead[1])
+    # On the unrolled cylinder a geodesic is a straight line: z grows in proportion to the length in
+    # the plane.
     for k in range(1, corners + 1):
         points[k, 2] = start[2] + (end[2] - start[2]) * along[k] / along[-1]
     return points, np.hypot(along[-1], end[2] - start[2]), turn, NEITHER

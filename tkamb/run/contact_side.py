@@ -93,12 +93,12 @@ class ContactSide:
         self.released = None
         if table.released:
             from tkamb.knee.equilibrium.released import ReleasedKnee
-            from tkamb.knee.equilibrium.starts import Starts
+            from tkamb.knee.equilibrium.starts import InitialPoses
 
             probe = self._probe if self.post is None else self.post.probe_with(self._probe)
             self.released = ReleasedKnee(mechanics, probe, table.released)
             recorded = case.motion.coordinates
-            self.starts = Starts(recorded, self.released, self.state.pair, self.post)
+            self.starts = InitialPoses(recorded, self.released, self.state.pair, self.post)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, as coupled as the scene asks.

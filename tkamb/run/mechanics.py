@@ -13,7 +13,7 @@ from tkamb.geometry.frames import SIDES, Array, cross, knee_pose, knee_twist
 from tkamb.io.scene.case import Case
 from tkamb.knee.chain import ChainMotion, ChainState
 from tkamb.knee.contact_points import (
-    FARTHEST_GAP,
+    CONTACT_POINT,
     NO_CONTACT,
     CondylePoint,
     ContactPoints,
@@ -109,7 +109,7 @@ class Mechanics:
         nearest: list[float] = []
         for k in (middle, 0, last):
             nearest.append(nearest_gap(self.query.at(self.poses[k])))
-            if abs(nearest[-1]) <= FARTHEST_GAP:
+            if abs(nearest[-1]) <= CONTACT_POINT.max_gap:
                 break
         else:
             gap = min(nearest, key=abs)

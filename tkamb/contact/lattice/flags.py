@@ -6,6 +6,7 @@ for the cells the peak is an average over more than the contact.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,25 +14,40 @@ from numpy.typing import NDArray
 from tkamb.contact.lattice.problem import LatticeState, SurfaceFromBelow
 from tkamb.contact.lattice.solver import Solution
 from tkamb.contact.narrow import narrow_flags
-from tkamb.contact.pressing import HALF
+from tkamb.contact.pressing import PRESS
 from tkamb.contact.result import ContactResult, medial_points
 from tkamb.geometry.frames import Array
 from tkamb.units import DEGREE, MILLIMETRE
 
-REACH = 2.0
-"""Cells from the peak to where the normal is looked at: a peak lies just inside its edge."""
-LEAST_REACH = 2.0 * MILLIMETRE
-"""And at least so far: an edge of 6 mm radius is an edge for any cell."""
-SHARPEST = 20.0 * DEGREE
-"""Turn of the femoral normal over that way from which a peak is flagged: a radius of 6 cells."""
+
+@dataclass(frozen=True)
+class LatticeFlagSettings:
+    """When a result of the lattice gets a flag."""
+
+    edge_distance_cells: float = 2.0
+    """Cells: distance from the peak at which the femoral normal is looked at. A peak at an
+    edge lies one or two cells inside it."""
+    least_edge_distance: float = 2.0 * MILLIMETRE
+    """m: smallest distance from the peak at which the femoral normal is looked at, so that an
+    edge of 6 mm radius counts as an edge with fine cells too."""
+    sharp_edge_angle: float = 20.0 * DEGREE
+    """rad: turn of the femoral normal over that distance from which a peak is flagged. It is
+    the turn of a radius of 6 cells."""
+    strain_flag: float = -0.4
+    """1: principal strain below which a result is flagged. The material law has no barrier at
+    -1, and measured curves end before -0.4."""
+    max_unseen_height: float = 0.2e-3
+    """m: height of the femoral surface between nodes that may stay unseen. A node of a 3 mm
+    cell misses the bottom of a ball of 15 mm radius by 0.15 mm."""
+    collapse_strain: float = -1.0
+    """1: principal strain at which a cell is compressed to nothing; the result is out of
+    range."""
+
+
+LATTICE_FLAG = LatticeFlagSettings()
+
 
 AROUND = np.array([(x, 0.0, z) for x in (-1, 0, 1) for z in (-1, 0, 1)], float)
-STRAIN_FLAG = -0.4
-"""Principal strain below which a result is flagged: the law has no barrier at -100 %."""
-MOST_UNSEEN = 0.2e-3
-"""m; a node of a 3 mm cell misses the bottom of a ball of 15 mm by 0.15 mm."""
-COLLAPSE = -1.0
-"""Principal strain at which a cell is compressed to nothing: out of range."""
 
 
 def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, ...]:
@@ -57,10 +73,12 @@ def edge_flags(
     spacing: Array,
     peaks: Mapping[str, Array],
 ) -> tuple[str, ...]:
-    """Return a flag for each peak where the femoral normal turns by more than `SHARPEST`.
+    """Return a flag for each peak that lies at an edge of the femoral component.
 
-    The normal under the peak is compared with those `REACH` cells, at least `LEAST_REACH`, away
-    along x, z and both diagonals; where there is no femoral surface any more it ends.
+    There the femoral normal turns by more than `LATTICE_FLAG.sharp_edge_angle`. The normal under
+    the peak is compared with normals along x, z and both diagonals. Their distance from the peak is
+    `LATTICE_FLAG.edge_distance_cells`, and at least `LATTICE_FLAG.least_edge_distance`. Each
+    direction ends where the femoral surface ends.
 
     Args:
         femoral: the femoral component seen from below.
@@ -68,7 +86,8 @@ def edge_flags(
         spacing: (3,) m, edges of a cell.
         peaks: side -> (3,) m, where its pressure is highest, insert frame.
     """
-    reach = np.maximum(REACH * spacing, LEAST_REACH)
+    reach = np.maximum(LATTICE_FLAG.edge_distance_cells * spacing, LATTICE_FLAG.least_edge_distance)
+    # Eight directions at equal distance; the diagonals are shortened to it.
     around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None] * reach
     sites = (np.array(list(peaks.values())).reshape(-1, 1, 3) + around).reshape(-1, 3)
     normals = femoral.over(sites, pose)[1].reshape(len(peaks), len(AROUND), 3)
@@ -85,9 +104,10 @@ def _sharpness(normals: NDArray[np.float64]) -> str:
     """Return in words how sharply the surface turns around the middle point, if it does."""
     if not np.isfinite(normals).all():
         return "ends"
+    # The middle row is the place of the peak itself.
     cosine = normals @ normals[len(AROUND) // 2]
     turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
-    return f"turns by {turn / DEGREE:.0f} deg" if turn > SHARPEST else ""
+    return f"turns by {turn / DEGREE:.0f} deg" if turn > LATTICE_FLAG.sharp_edge_angle else ""
 
 
 def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ...], bool]:
@@ -97,11 +117,17 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
         least = solid.least_principal_strain(solution.field, solution.noticed)
         kind = "principal strain"
     else:
+        # A linear solver keeps no field of displacements: the mean strain of a column stands for
+        # it.
         sunk = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]
         least, kind = float(sunk.min(initial=0.0)), "mean strain of a column"
-    if least <= COLLAPSE:
+    if least <= LATTICE_FLAG.collapse_strain:
         return (f"{kind} {least:.2f}: the insert is compressed to nothing",), True
-    return ((f"{kind} {least:.2f} is below {STRAIN_FLAG}",) if least < STRAIN_FLAG else ()), False
+    return (
+        (f"{kind} {least:.2f} is below {LATTICE_FLAG.strain_flag}",)
+        if least < LATTICE_FLAG.strain_flag
+        else ()
+    ), False
 
 
 def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
@@ -113,7 +139,9 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
         depth: m, how far the femoral component went below the first contact node.
     """
     unseen = result.approach - depth
-    if unseen > max(MOST_UNSEEN, HALF * result.approach):
+    if unseen > max(
+        LATTICE_FLAG.max_unseen_height, PRESS.flagged_thickness_share * result.approach
+    ):
         yield (
             f"the meshes first touch {unseen / MILLIMETRE:.2g} mm before any node does (cells of "
             f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from there: "

@@ -23,7 +23,7 @@ def result_of(
     gaps: Array,
     solution: Solution,
     rule: PressureRule,
-    sketch: bool = False,
+    forces_only: bool = False,
 ) -> ContactResult:
     """Return the contract's result.
 
@@ -34,15 +34,17 @@ def result_of(
         gaps: (c,) vertical gaps at that pose, m.
         solution: what the solver found.
         rule: how a nodal force becomes a pressure.
-        sketch: forces alone count: no areas within nodes, no gaps beside the contact, no flags.
+        forces_only: no areas within nodes, no gaps beside the contact and no flags are computed.
     """
+    # `evaluate` gets the final pose, `press` the pose of first touch, from which the solver's
+    # approach is taken off.
     depth = solution.forces.approach if load is not None else 0.0
     pose = pose.copy()
     pose[1, 3] -= depth
     if solution.field is not None and not np.isfinite(solution.field).all():
         return ContactResult.failed(state, pose, "the solver left the range of numbers")
     force, pressure, area = _pressures(state, gaps - depth, solution, rule)
-    made = partial(
+    with_fields = partial(
         ContactResult.of,
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
@@ -53,8 +55,8 @@ def result_of(
         flags, collapsed = strain_flags(state, solution)
         if collapsed:
             return ContactResult.failed(state, pose, *flags)
-    if sketch:
-        return made(state, pose, pressure, gaps - depth, force, area, area)
+    if forces_only:
+        return with_fields(state, pose, pressure, gaps - depth, force, area, area)
     if not solution.converged:
         flags = (*flags, unsettled_flag(solution))
     gap = _gaps(state, pose, gaps - depth, force, solution)
@@ -64,7 +66,7 @@ def result_of(
             surface.points, surface.triangles, surface.triangle_area,
             pressure, gap, state.pair.material,
         )  # fmt: skip
-    result = made(state, pose, pressure, gap, force, area, covered, flags=flags)
+    result = with_fields(state, pose, pressure, gap, force, area, covered, flags=flags)
     return replace(result, flags=(*result.flags, *unresolved_flags(state, result)))
 
 
@@ -84,6 +86,7 @@ def _pressures(
     size[solution.candidates] = solution.forces.force
     area = _areas(state, gaps, size > 0, rule)
     if rule == "source":
+        # Sharma's pressure counts the part of a nodal force along the insert's normal.
         size = np.maximum(-np.einsum("ij,ij->i", force, state.surface.normals), 0.0)
     return force, size / area, area
 
@@ -103,6 +106,8 @@ def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution:
         solution: what the solver found.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
+    # The edge of contact depends on the deformed gaps of the neighbours only; farther away the
+    # undeformed gap is near enough.
     close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)
     own = solution.candidates[close[solution.candidates]]
     gap = gaps.copy()
@@ -118,13 +123,14 @@ def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Sol
     """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
     problem = state.problem
     if solution.field is not None:
-        moved = solution.field[problem.contact_nodes[nodes]]
+        displacement = solution.field[problem.contact_nodes[nodes]]
     else:
         loaded = solution.forces.force != 0.0
         force = solution.forces.force[loaded, None] * solution.planes.normals[loaded]
-        moved = state.compliance.moved(nodes, solution.candidates[loaded], force)
-    positions = problem.surface_points[nodes] + moved
+        displacement = state.compliance.moved(nodes, solution.candidates[loaded], force)
+    positions = problem.surface_points[nodes] + displacement
     planes = tangent_planes(problem, positions, pose, None)
+    # A femoral normal that does not point down cannot be loaded by a vertical press.
     return np.where(planes.normal_y < LEAST_NORMAL_Y, planes.gap(positions), np.inf)
 
 
@@ -142,6 +148,6 @@ def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -
 
 def beside(triangles: Index, touched: Mask) -> Mask:
     """Return which nodes (n,) share a triangle with one in contact and are not in contact."""
-    found = np.zeros_like(touched)
-    found[triangles[touched[triangles].any(axis=1)]] = True
-    return found & ~touched
+    neighbours = np.zeros_like(touched)
+    neighbours[triangles[touched[triangles].any(axis=1)]] = True
+    return neighbours & ~touched

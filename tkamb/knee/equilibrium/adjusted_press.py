@@ -80,14 +80,16 @@ def _check(
     medial, lateral = touches(query, result.pose)
     penetration, angle = -min(medial, lateral), (medial - lateral) / distance
     deeper = penetration - abs(adjustment.translation)
-    turned = (abs(angle) - abs(adjustment.coronal_angle)) * distance
+    angle_excess = (abs(angle) - abs(adjustment.coronal_angle)) * distance
     margin = settings.input_change
     # Where the angle passes the turn, the turn is as small as the angle: if the mesh calls that
     # level, restoring changes nothing.
     tilted = abs(angle) * distance > settings.level_difference
     outcomes = {
         _restored(settings.restore_when, *exceeded)
-        for exceeded in product(_either_side(deeper, margin), _either_side(turned, margin * tilted))
+        for exceeded in product(
+            _either_side(deeper, margin), _either_side(angle_excess, margin * tilted)
+        )
     }
     doubts: tuple[str, ...] = ()
     if len(outcomes) > 1:
@@ -95,7 +97,7 @@ def _check(
             f"femoral adjustment: {margin / MILLIMETRE:g} mm of the recorded pose decides whether "
             "the recorded rotation is restored, and the split with it",
         )
-    restore = _restored(settings.restore_when, deeper > 0, turned > 0)
+    restore = _restored(settings.restore_when, deeper > 0, angle_excess > 0)
     checked = replace(adjustment, penetration=penetration, final_angle=angle)
     return checked, restore, doubts
 
@@ -105,5 +107,5 @@ def _either_side(excess: float, margin: float) -> set[bool]:
     return {excess - margin > 0, excess > 0, excess + margin > 0}
 
 
-def _restored(rule: RestoreRule, deeper: bool, turned: bool) -> bool:
-    return (deeper and turned) if rule == "both" else (deeper or turned)
+def _restored(rule: RestoreRule, deeper: bool, rotated: bool) -> bool:
+    return (deeper and rotated) if rule == "both" else (deeper or rotated)

@@ -28,25 +28,38 @@ import numpy as np
 
 from tkamb.geometry.frames import Array
 
-FORCE_TOLERANCE = 0.05
-"""N (moments over the lever arm): what may be left of a converged coordinate's force, or as much
-as the forces are known to."""
-STEP_TOLERANCE = 2e-6
-"""m: the Newton step that is left of a converged coordinate."""
-SMALLEST_STIFFNESS = 100.0
-"""N/m: a state that gives way by more than 10 mm per newton is indeterminate."""
+
+@dataclass(frozen=True)
+class BalanceSettings:
+    """The iteration that finds the released coordinates."""
+
+    force_tolerance: float = 0.05
+    """N (moments are divided by the lever arm): residual below which a coordinate has
+    converged. The noise of the forces counts instead where it is larger."""
+    step_tolerance: float = 2e-6
+    """m: Newton step below which a coordinate has converged."""
+    least_stiffness: float = 100.0
+    """N/m: a state with a smaller stiffness is indeterminate; it gives way by more than 10 mm
+    per newton."""
+    narrow_radius: float = 1e-6
+    """m: trust radius below which an approximate stiffness is replaced by finite differences,
+    because the steps that it proposes do not reduce the residual."""
+    max_travel: float = 20e-3
+    """m: a coordinate this far from its initial guess is held by nothing."""
+    difference_step: float = 2e-6
+    """m: step of the finite differences where the stiffness is not given."""
+    max_prediction_error: float = 0.5
+    """1: an approximate stiffness is not used along a step if the change of force differs from
+    the predicted one by more than this share."""
+    max_steps: int = 200
+    """Steps at most. A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs
+    80."""
+
+
+BALANCE = BalanceSettings()
+
 FIRST_RADIUS, WIDEST_RADIUS, NARROWEST_RADIUS = 0.5e-3, 3e-3, 1e-9
 """m: the trust region at the start, and its limits."""
-NARROW_RADIUS = 1e-6
-"""m: where guides to the stiffness still do not help, it is looked at by differences."""
-LONGEST_TRAVEL = 20e-3
-"""m: a coordinate this far from its start is held by nothing."""
-PROBE_STEP = 2e-6
-"""m: of the finite differences where the stiffness is not known."""
-KNOWN = 0.5
-"""A guide that misses more than this part of what it expects along a step says nothing of it."""
-MOST_STEPS = 200
-"""A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs 80."""
 
 
 class BalanceStatus(Enum):
@@ -68,13 +81,13 @@ class Trial:
         force: (n,) N, drives each coordinate along its positive direction; NaN if unknown.
         stiffness: (n, n) N/m, -d force / d coordinates; None: by finite differences.
         exact: it is that; else a guide, and what it misses is learnt from step to step.
-        known_to: N, a smaller force is not told from none.
+        force_noise: N, error of the force; a smaller force counts as zero.
     """
 
     force: Array
     stiffness: Array | None = None
     exact: bool = True
-    known_to: float = 0.0
+    force_noise: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,28 +124,30 @@ def find_balance(
     forces: Forces,
     start: Array,
     stiffness: Array | None = None,
-    left: float = 0.0,
+    residual_share: float = 0.0,
     reach: float = np.inf,
 ) -> Balance:
-    """Find coordinates at which no force is left.
+    """Find the coordinates at which all forces are in equilibrium.
 
     Args:
         forces: the trial at coordinates (n,), m.
         start: (n,) m.
         stiffness: (n, n) N/m of an earlier search near by, a guess that saves trials where
             `forces` does not bring its own.
-        left: share of the way from the start that may be left of a search which is repeated
-            under other forces; 0: none.
-        reach: m, such a search ends where a coordinate is farther from the start.
+        residual_share: share of the distance from the initial guess that may remain, for a search
+            that is repeated under other forces; 0: the tolerances alone decide.
+        reach: m, such a search ends where a coordinate is farther from the initial guess.
     """
-    found = _Search(forces, np.array(start, float), stiffness, left, reach).run()
-    if found.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
-        return found
+    result = _Search(forces, np.array(start, float), stiffness, residual_share, reach).run()
+    if result.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
+        return result
     # Newton's direction may lead off over the facets of a contact; the way downhill may not.
-    again = _Search(forces, np.array(start, float), stiffness, left, reach, downhill=True).run()
+    again = _Search(
+        forces, np.array(start, float), stiffness, residual_share, reach, downhill=True
+    ).run()
     if again.status is not BalanceStatus.OK:
-        return found
-    return replace(again, trials=found.trials + again.trials, steps=found.steps + again.steps)
+        return result
+    return replace(again, trials=result.trials + again.trials, steps=result.steps + again.steps)
 
 
 class _Search:
@@ -141,19 +156,19 @@ class _Search:
         forces: Forces,
         start: Array,
         stiffness: Array | None,
-        left: float,
+        residual_share: float,
         reach: float,
         downhill: bool = False,
     ) -> None:
         self._forces, self._start, self._downhill = forces, start, downhill
-        self._left, self._reach = left, reach
+        self._left, self._reach = residual_share, reach
         self._trials, self._steps = 0, 0
         self._fresh, self._since, self._unknown = False, 0, False
         self._radius, self._refused = FIRST_RADIUS, False
         self._work: list[float] = []
         self.x = start
         first = self._at(start)
-        self.force, self._known_to = first.force, first.known_to
+        self.force, self._force_noise = first.force, first.force_noise
         self.known = bool(np.isfinite(first.force).all())
         if self.known:
             self._own, self._guide = first.stiffness is not None and first.exact, first.stiffness
@@ -166,14 +181,14 @@ class _Search:
         """Return the end of the search."""
         if not self.known:
             return self._end(BalanceStatus.OUT_OF_RANGE)
-        while self._steps < MOST_STEPS:
+        while self._steps < BALANCE.max_steps:
             if not np.isfinite(self.stiffness).all():  # a neighbour of this place is out of range
                 return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
                 return self._end(self._kind())
             if self._near() or self._travel() > self._reach:
                 return replace(self._end(BalanceStatus.OK), at_rest=False)
-            if self._travel() > LONGEST_TRAVEL:
+            if self._travel() > BALANCE.max_travel:
                 return self._end(BalanceStatus.RUNS_AWAY)
             if self._radius < NARROWEST_RADIUS and (self._own or self._fresh):
                 break
@@ -181,37 +196,45 @@ class _Search:
                 self._refresh()
             else:
                 self._step()
-        lost = self._radius < NARROWEST_RADIUS and self._unknown
-        return self._end(BalanceStatus.OUT_OF_RANGE if lost else BalanceStatus.NOT_CONVERGED)
+        out_of_range = self._radius < NARROWEST_RADIUS and self._unknown
+        return self._end(
+            BalanceStatus.OUT_OF_RANGE if out_of_range else BalanceStatus.NOT_CONVERGED
+        )
 
     def _step(self) -> None:
         step, part = self._next()
         trial = self._at(self.x + step)
         self._steps, self._since = self._steps + 1, self._since + 1
         length = float(np.linalg.norm(step))
+        # Work that the linear model predicts along the step. The forces need not have a potential,
+        # so that the trust region compares work and not energy.
         predicted = float(self.force @ step - 0.5 * step @ self.stiffness @ step)
+        # Trapezoidal rule: the work that the forces at both ends say was done.
         work = float(0.5 * (self.force + trial.force) @ step)
         self._unknown = not np.isfinite(work)
         if self._unknown:
+            # Out of the contact model's range: the step is refused and a shorter one tried.
             self._radius = 0.25 * length
             return
         fall = 1.0 - float(np.linalg.norm(trial.force) / np.linalg.norm(self.force))
+        # A Newton step of length `part` should reduce the residual by that share; half of it is
+        # enough to accept the step whatever the work says.
         helps = part > 0 and fall > 0.5 * part
         ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
-        taken = ratio > 0.05
-        self._refused = part > 0 and not taken  # across a kink |r| may rise: the other step next
+        accepted = ratio > 0.05
+        self._refused = part > 0 and not accepted  # across a kink |r| may rise: the other step next
         if not self._own:
             self._learn(step, trial)
         if ratio < 0.25:
             self._radius = 0.25 * length
-            lost = self._guide is None or self._radius < NARROW_RADIUS
-            if not (self._own or self._fresh) and lost and ratio < 0.05:
+            guide_fails = self._guide is None or self._radius < BALANCE.narrow_radius
+            if not (self._own or self._fresh) and guide_fails and ratio < 0.05:
                 self._refresh()
         elif ratio > 0.7 and length > 0.8 * self._radius:
             self._radius = min(2.0 * self._radius, WIDEST_RADIUS)
-        if taken:
+        if accepted:
             self._work.append(work)
-            self.x, self.force, self._known_to = self.x + step, trial.force, trial.known_to
+            self.x, self.force, self._force_noise = self.x + step, trial.force, trial.force_noise
             self._fresh = False
             if trial.stiffness is not None:
                 self._guide, self.stiffness = trial.stiffness, trial.stiffness + self._missing
@@ -221,6 +244,7 @@ class _Search:
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
         if symmetric > 0 or smallest_stiffness <= 0 or self._refused:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
+        # The stiffness is K = -dr/dx, so that K dx = r is Newton's step.
         newton = np.linalg.solve(self.stiffness, self.force)
         part = min(1.0, self._radius / float(np.linalg.norm(newton)))
         if self._downhill and part < 1.0:
@@ -238,8 +262,10 @@ class _Search:
 
     def _differences(self) -> Array:
         self._fresh, self._since = True, 0
-        columns = [self._at(self.x + d).force for d in PROBE_STEP * np.eye(len(self.x))]
-        return (self.force[:, None] - np.array(columns).T) / PROBE_STEP
+        columns = [
+            self._at(self.x + d).force for d in BALANCE.difference_step * np.eye(len(self.x))
+        ]
+        return (self.force[:, None] - np.array(columns).T) / BALANCE.difference_step
 
     def _refresh(self) -> None:
         self.stiffness = self._differences()
@@ -255,21 +281,25 @@ class _Search:
         """
         expected = self.stiffness @ step
         if self._guide is not None and trial.stiffness is not None:
+            # With a stiffness at both ends their mean predicts the change of force to second order.
             expected = expected + 0.5 * (trial.stiffness - self._guide) @ step
         missing = (self.force - trial.force) - expected
+        # Broyden's rank-one update: the smallest change of the stiffness that explains this step.
         learnt = np.outer(missing, step) / (step @ step)
-        strange = np.linalg.norm(missing) > KNOWN * np.linalg.norm(expected)
+        strange = np.linalg.norm(missing) > BALANCE.max_prediction_error * np.linalg.norm(expected)
         if self._guide is not None and strange and not self._fresh:
             learnt = -self._missing
         self._missing, self.stiffness = self._missing + learnt, self.stiffness + learnt
 
     def _converged(self) -> bool:
-        if np.abs(self.force).max() > max(FORCE_TOLERANCE, self._known_to):
+        if np.abs(self.force).max() > max(BALANCE.force_tolerance, self._force_noise):
             return False
-        left, values, right = np.linalg.svd(self.stiffness)
-        held = values > SMALLEST_STIFFNESS
-        step = right[held].T @ ((left.T @ self.force)[held] / values[held])
-        return bool((np.abs(step) < STEP_TOLERANCE).all())
+        # Directions without stiffness are left out: there the Newton step says nothing, and `_kind`
+        # reports them.
+        left_vectors, values, right_vectors = np.linalg.svd(self.stiffness)
+        stiff = values > BALANCE.least_stiffness
+        step = right_vectors[stiff].T @ ((left_vectors.T @ self.force)[stiff] / values[stiff])
+        return bool((np.abs(step) < BALANCE.step_tolerance).all())
 
     def _travel(self) -> float:
         return float(np.abs(self.x - self._start).max())
@@ -277,22 +307,22 @@ class _Search:
     def _near(self) -> bool:
         """Return whether the step that is left is short against the way from the start."""
         way = self._left * float(np.linalg.norm(self.x - self._start))
-        if way == 0.0 or self._smallest_stiffness() <= SMALLEST_STIFFNESS:
+        if way == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
             return False
         step = float(np.linalg.norm(np.linalg.solve(self.stiffness, self.force)))
         return step < min(way, self._radius)
 
     def _kind(self) -> BalanceStatus:
-        if not (self._own or self._fresh) and self._smallest_stiffness() <= SMALLEST_STIFFNESS:
+        if not (self._own or self._fresh) and self._smallest_stiffness() <= BALANCE.least_stiffness:
             self._refresh()
         smallest_stiffness = self._smallest_stiffness()
         if np.isnan(smallest_stiffness):
             return BalanceStatus.OUT_OF_RANGE
-        if smallest_stiffness < -SMALLEST_STIFFNESS:
+        if smallest_stiffness < -BALANCE.least_stiffness:
             return BalanceStatus.UNSTABLE
         return (
             BalanceStatus.OK
-            if smallest_stiffness > SMALLEST_STIFFNESS
+            if smallest_stiffness > BALANCE.least_stiffness
             else BalanceStatus.INDETERMINATE
         )
 
@@ -327,6 +357,8 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
         step = np.linalg.solve(stiffness, force)
         if np.linalg.norm(step) <= radius:
             return np.asarray(step)
+    # Levenberg's shift: large enough that the shifted matrix is positive definite, and found by
+    # bisection so that the step has the trust region's length.
     low = 1.0 + 1.001 * max(0.0, -symmetric)
     high = low + float(np.linalg.norm(force)) / radius + 1.0
     for _ in range(50):
@@ -352,5 +384,7 @@ def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
 def _smallest_eigenvalues(entries: bytes, count: int) -> tuple[float, float]:
     """Return those of one stiffness: each step of a search asks more than once."""
     stiffness = np.frombuffer(entries).reshape(count, count)
+    # The stiffness of contact with a moving normal is not symmetric. Its symmetric part decides
+    # about a descent direction, its own eigenvalues about stability.
     symmetric = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])
     return symmetric, float(np.linalg.eigvals(stiffness).real.min())

@@ -66,6 +66,6 @@ class FrameContact:
         if condyle is None:
             return NAN
         own = self.medial if side == "medial" else ~self.medial
-        carried = np.where(own, self.result.pressure, 0.0)
-        above = area_above(self.result.points, self.triangles, carried, pressure)
+        own_pressure = np.where(own, self.result.pressure, 0.0)
+        above = area_above(self.result.points, self.triangles, own_pressure, pressure)
         return min(above / condyle.area, 1.0)

@@ -1,6 +1,6 @@
 """The post of a case: prepared where the scene asks for it, and looked at at a pose."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +15,17 @@ if TYPE_CHECKING:
     from tkamb.io.scene.case import Case
     from tkamb.io.scene.tables import ContactTable
 
-POSE_KNOWN = 0.5 * MILLIMETRE
-"""How well fluoroscopy knows a position: a deeper overlap of cam and post is asked about."""
+
+@dataclass(frozen=True)
+class PostSideSettings:
+    """On which side of the post the cam is."""
+
+    pose_error: float = 0.5 * MILLIMETRE
+    """m: error of a position from fluoroscopy. A deeper overlap of cam and post becomes a
+    question to the user."""
+
+
+POST_SIDE = PostSideSettings()
 
 
 def cam_on_post(
@@ -53,7 +62,7 @@ def post_contact(
     if cam_post is None:
         return None
     post = cam_post.at(pose)
-    if "ap" in table.released or post.problem or not post.gap < -POSE_KNOWN:
+    if "ap" in table.released or post.problem or not post.gap < -POST_SIDE.pose_error:
         return post
     question = (
         f"cam and post overlap by {-post.gap / MILLIMETRE:.1f} mm as recorded, which makes "

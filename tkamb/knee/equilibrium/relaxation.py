@@ -18,26 +18,38 @@ References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.knee.equilibrium.released_forces import LEVER
+from tkamb.knee.equilibrium.released_forces import RELEASED_FORCE
 
 if TYPE_CHECKING:
     from tkamb.knee.crossing import MuscleShare
 
-AGREED = 1.0
-"""N: no muscle's force asked for differs by more from the one held where both agree."""
+
+@dataclass(frozen=True)
+class MuscleIterationSettings:
+    """The iteration between muscle forces and knee equilibrium."""
+
+    muscle_force_tolerance: float = 1.0
+    """N: largest difference, over the muscles, of the force that is needed from the force that
+    is applied, at which the iteration has converged."""
+
+
+MUSCLE_ITERATION = MuscleIterationSettings()
+
 LEAST, MOST = 0.05, 1.0
 """The limits of omega."""
 
 
 STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
 """Until so many passes are made, how the knee yields goes that part of the way to what is found."""
-TURNS = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+TURNS = np.array(
+    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
+)
 """Makes answers to forces and to moments comparable."""
 
 
@@ -57,45 +69,46 @@ class Relaxation:
         self._yields: Array | None = None
         self._passes, self.doubt = 0, 0.0
 
-    def yielding(self, found: Array | None) -> Array | None:
+    def yielding(self, measured: Array | None) -> Array | None:
         """Return how the knee is taken to yield.
 
         Args:
-            found: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
+            measured: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
         """
         self._passes, self.doubt = self._passes + 1, 0.0
-        last, self._yields = self._yields, found
+        last, self._yields = self._yields, measured
         step = next((part for until, part in STEPS if self._passes <= until), 0.0)
-        if last is None or found is None or step == 1.0:
-            return found
-        taken = last + step * (found - last)
-        away, size = (float(np.linalg.norm(part * TURNS)) for part in (found - taken, taken))
+        if last is None or measured is None or step == 1.0:
+            return measured
+        relaxed = last + step * (measured - last)
+        away, size = (float(np.linalg.norm(part * TURNS)) for part in (measured - relaxed, relaxed))
         if away > 0.0:
             self.doubt = away / size if size > 0.0 else np.inf
-        self._yields = taken
-        return taken
+        self._yields = relaxed
+        return relaxed
 
-    def mixed(self, asked: "MuscleShare") -> "MuscleShare":
+    def mixed(self, required: "MuscleShare") -> "MuscleShare":
         """Return the forces to hold next.
 
         Args:
-            asked: the sharing where the knee rested under those held before.
+            required: the sharing where the knee rested under those held before.
         """
-        held, self._held, self.settled = self._held, asked, False
-        if held is None:
-            return asked
-        away = asked.force - held.force
+        applied, self._held, self.settled = self._held, required, False
+        if applied is None:
+            return required
+        away = required.force - applied.force
         if self._last is not None:
             change = away - self._last
             part = -self._part * float(self._last @ change) / max(float(change @ change), 1e-12)
             self._part = float(np.clip(part, LEAST, MOST))
         self._last = away
-        self.settled = bool(np.abs(away).max() < AGREED)
+        self.settled = bool(np.abs(away).max() < MUSCLE_ITERATION.muscle_force_tolerance)
         if not self.settled:
             self._held = replace(
-                asked,
-                activation=held.activation + self._part * (asked.activation - held.activation),
-                force=held.force + self._part * away,
-                reserve=held.reserve + self._part * (asked.reserve - held.reserve),
+                required,
+                activation=applied.activation
+                + self._part * (required.activation - applied.activation),
+                force=applied.force + self._part * away,
+                reserve=applied.reserve + self._part * (required.reserve - applied.reserve),
             )
         return self._held

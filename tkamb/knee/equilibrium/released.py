@@ -41,25 +41,39 @@ if TYPE_CHECKING:
     from tkamb.knee.patella import PatellaState
     from tkamb.run.muscles.shared_muscles import SharedMuscles
 
-KNEE_CHANGE = 2e-6
-"""m: the knee moves less than this when the patella is found anew."""
-FORCE_CHANGE = 0.1
-"""N: neither does the contact force,"""
-FORCE_SHARE = 2e-4
-"""of it: or this part of it, by which the patella's jumps from facet to facet change it."""
-MOST_PASSES = 24
-"""Passes by which knee and patella settle; each halves what is left where the knee is soft."""
-LEFT = 0.1
-"""Share of its way that a pass may leave to the next, where muscles make it a few passes anyway."""
-REACH = 3e-3
-"""m: and so far it may go from a contact like the last frame's, from which the muscles' forces are
-known: they hold near by only."""
-ABOUT, MOST_HEIGHTS = 0.5, 4
-"""Where a search begins the load is to differ by less than this share from the last frame's, at one
-of so many heights."""
+
+@dataclass(frozen=True)
+class ReleasedKneeSettings:
+    """The knee with released coordinates and its patella."""
+
+    knee_tolerance: float = 2e-6
+    """m: the iteration between knee and patella has converged when the knee moves by less."""
+    contact_force_tolerance: float = 0.1
+    """N: and when the contact force changes by less than this, or by less than
+    `contact_force_share` of it."""
+    contact_force_share: float = 2e-4
+    """1: see `contact_force_tolerance`. The patella's changes from facet to facet alter the
+    force by about as much."""
+    max_passes: int = 24
+    """Passes between knee and patella at most; each halves the remaining change where the knee
+    is soft."""
+    inner_tolerance_share: float = 0.1
+    """1: share of its own change that a pass may leave to the next one. Muscles make it a few
+    passes anyway."""
+    muscle_force_range: float = 3e-3
+    """m: distance from a contact like the last frame's within which extrapolated muscle forces
+    hold."""
+    slack_force: float = 1e-3
+    """N: an extensor group with a smaller tension is slack."""
+    initial_load_error: float = 0.5
+    """1: largest relative difference between the load at an initial guess and the last frame's."""
+    max_height_steps: int = 4
+    """Heights at most that are tried to reach it."""
+
+
+RELEASED_KNEE = ReleasedKneeSettings()
+
 SUPERIOR = KNEE_COORDINATES.index("si")
-SLACK = 1e-3
-"""N: an extensor group of muscles that pulls with less is slack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,17 +191,17 @@ class ReleasedKnee:
         touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
         if self._mechanics.muscles and before:
             place, touch = self._carrying(place, before.contact)
-        reach = REACH if touch else np.inf
-        while passes < MOST_PASSES:
+        reach = RELEASED_KNEE.muscle_force_range if touch else np.inf
+        while passes < RELEASED_KNEE.max_passes:
             knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing, reach)
             touch = knee.contact
             passes, trials = passes + 1, trials + knee.balance.trials
             change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
             knee = replace(knee, passes=passes, trials=trials, change=change)
-            moved = np.abs((knee.coordinates - place) * SCALE).max()
+            travel = np.abs((knee.coordinates - place) * SCALE).max()
             place, force, last = knee.coordinates, knee.contact.wrench[:3], middle
             middle = _middle(knee.contact, points, place)
-            ways.append(max(moved, np.abs(middle - last).max() if self._keeps else 0.0))
+            ways.append(max(travel, np.abs(middle - last).max() if self._keeps else 0.0))
             if pushes:
                 # a line that pushes drives the knee away: slack, it begins where this began
                 slack, knee, touch = True, before, None
@@ -196,9 +210,12 @@ class ReleasedKnee:
             elif knee.problem or (
                 mixing.settled
                 and knee.balance.at_rest
-                and ahead(ways[-3:]) * ways[-1] < KNEE_CHANGE
+                and ahead(ways[-3:]) * ways[-1] < RELEASED_KNEE.knee_tolerance
                 and ahead(ways[-3:]) * change
-                < max(FORCE_CHANGE, FORCE_SHARE * float(np.linalg.norm(force)))
+                < max(
+                    RELEASED_KNEE.contact_force_tolerance,
+                    RELEASED_KNEE.contact_force_share * float(np.linalg.norm(force)),
+                )
             ):
                 return replace(knee, doubt=mixing.doubt)
         assert knee is not None
@@ -214,16 +231,20 @@ class ReleasedKnee:
             model does not know its tangent.
         """
         load = float(like.wrench[1])
-        for _ in range(MOST_HEIGHTS):
-            here = self._probe.at(knee_pose(place))
-            if not here.tangent or not here.condyles or set(here.condyles) != set(like.condyles):
+        for _ in range(RELEASED_KNEE.max_height_steps):
+            contact = self._probe.at(knee_pose(place))
+            if (
+                not contact.tangent
+                or not contact.condyles
+                or set(contact.condyles) != set(like.condyles)
+            ):
                 break
-            more = float(here.wrench[1]) - load
-            if abs(more) < ABOUT * abs(load):
-                return place, here
+            more = float(contact.wrench[1]) - load
+            if abs(more) < RELEASED_KNEE.initial_load_error * abs(load):
+                return place, contact
             twist = knee_axes(place)[SUPERIOR]
             slope = sum(
-                float(c.stiffness[1] @ twist) for c in here.loads if c.stiffness is not None
+                float(c.stiffness[1] @ twist) for c in contact.loads if c.stiffness is not None
             )
             if not slope > 0.0:
                 break
@@ -248,15 +269,17 @@ class ReleasedKnee:
         joint = self._joint(k, geometry, middle, slack)
         muscles = self._mechanics.muscles
         if muscles is not None and not geometry.problems:
-            held = None if touch is None or before is None else before.geometry.share
-            held = None if held is None else muscles.at(k, held)
-            share = mixing.mixed(self._share(k, geometry, joint, touch, held, mixing))
+            applied = None if touch is None or before is None else before.geometry.share
+            applied = None if applied is None else muscles.at(k, applied)
+            share = mixing.mixed(self._share(k, geometry, joint, touch, applied, mixing))
             geometry, joint = replace(geometry, share=share), replace(joint, share=share)
-            if slack := muscles.tension(share) < SLACK:
+            if slack := muscles.tension(share) < RELEASED_KNEE.slack_force:
                 joint = self._joint(k, geometry, middle, slack)
         forces = self._forces(k, joint, place, touch)
         stiffness = before.balance.stiffness if before else None
-        balance = forces.balance(stiffness, *((LEFT, reach) if muscles else ()))
+        balance = forces.balance(
+            stiffness, *((RELEASED_KNEE.inner_tolerance_share, reach) if muscles else ())
+        )
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
@@ -283,7 +306,7 @@ class ReleasedKnee:
         geometry: KneeGeometry,
         joint: JointEquilibrium,
         touch: "ProbedContact | None",
-        held: "MuscleShare | None",
+        applied: "MuscleShare | None",
         mixing: Relaxation,
     ) -> "MuscleShare":
         """Return what each muscle carries, the released coordinates yielding to it.
@@ -298,7 +321,7 @@ class ReleasedKnee:
             joint: its equations, the extensor mechanism taut.
             touch: the contact there; None where the search begins without one like the last
                 frame's.
-            held: what was held last, in this frame or the one before.
+            applied: what was held last, in this frame or the one before.
             mixing: keeps how the knee yields.
 
         Raises:
@@ -307,19 +330,19 @@ class ReleasedKnee:
         mechanics, place = self._mechanics, geometry.coordinates
         muscles, friction = mechanics.muscles, mechanics.friction
         assert muscles is not None
-        here = self._probe.at(knee_pose(place)) if touch is None else touch
+        contact = self._probe.at(knee_pose(place)) if touch is None else touch
         gain = None
-        if held is not None:
-            forces = self._forces(k, replace(joint, share=held), place)
-            smooth = self._probe.smoothed(knee_pose(place), here)
+        if applied is not None:
+            forces = self._forces(k, replace(joint, share=applied), place)
+            smooth = self._probe.smoothed(knee_pose(place), contact)
             gain = mixing.yielding(forces.tension_per_wrench(smooth))
-        if held is not None and gain is not None:
-            pull = held.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
-            base = forces.tension_at_rest(here, gain) - float(gain @ pull)
+        if applied is not None and gain is not None:
+            pull = applied.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
+            base = forces.tension_at_rest(contact, gain) - float(gain @ pull)
             share = muscles.share_of_yielding_knee(k, geometry, base, gain)
         else:
-            points = mechanics.resultants(k, place, here.condyles)
-            geometry = replace(geometry, post=mechanics.post_loads(k, place, here.post))
+            points = mechanics.resultants(k, place, contact.condyles)
+            geometry = replace(geometry, post=mechanics.post_loads(k, place, contact.post))
             off = frozenset(mechanics.sides - set(points)) if points else frozenset[str]()
             share = muscles.share(k, replace(geometry, condyles=points), friction, off)
             if touch is None and share.status != "ok":
@@ -380,5 +403,7 @@ def ahead(ways: Sequence[float]) -> float:
 
 
 def _middle(contact: "ProbedContact", points: dict[str, Array] | None, place: Array) -> Array:
-    known = (points or {}) | {side: c.point for side, c in contact.condyles.items()}
-    return np.asarray(np.mean(list(known.values()), axis=0)) if known else place[:3]
+    contact_points = (points or {}) | {side: c.point for side, c in contact.condyles.items()}
+    return (
+        np.asarray(np.mean(list(contact_points.values()), axis=0)) if contact_points else place[:3]
+    )

@@ -1,6 +1,7 @@
 """What drives free knee coordinates at trial places, in a leg or in a machine."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -14,11 +15,23 @@ from tkamb.knee.load import wrench_of
 if TYPE_CHECKING:
     from tkamb.contact.probe import Probe, ProbedContact
 
-LEVER = 0.025
-"""m: half the usual distance of the condyles; makes rotations comparable to translations."""
-SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
-TINY = 1e-7
-"""m: step of the finite differences of axes and ligaments."""
+
+@dataclass(frozen=True)
+class ReleasedForceSettings:
+    """The forces on released coordinates."""
+
+    lever_arm: float = 0.025
+    """m: arm that makes rotations comparable to translations; half the usual distance of the
+    condyles."""
+    difference_step: float = 1e-7
+    """m: step of the finite differences of joint axes and ligaments."""
+
+
+RELEASED_FORCE = ReleasedForceSettings()
+
+SCALE = np.array(
+    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
+)
 
 Sliding = Callable[[Array, Array], Array]
 
@@ -78,16 +91,16 @@ class FreeForces(Generic[J]):
             self.seen[self._start.tobytes()] = touch
 
     def balance(
-        self, stiffness: Array | None = None, left: float = 0.0, reach: float = np.inf
+        self, stiffness: Array | None = None, residual_share: float = 0.0, reach: float = np.inf
     ) -> Balance:
         """Return where the free coordinates come to rest, from the given place.
 
         Args:
             stiffness: (n, n) N/m of a search near by.
-            left: share of the way that may be left, see `find_balance`.
+            residual_share: share of the way that may be left, see `find_balance`.
             reach: m, likewise, how far it may go.
         """
-        return find_balance(self.trial, self._start, stiffness, left, reach)
+        return find_balance(self.trial, self._start, stiffness, residual_share, reach)
 
     def contact(self, balance: Balance) -> "ProbedContact":
         """Return the contact of a balance."""
@@ -102,18 +115,18 @@ class FreeForces(Generic[J]):
         if not contact.known:
             return Trial(np.full(len(x), np.nan))
         wrench, stiffness = self._with_friction(place, contact)
-        known_to = contact.accuracy * float(np.linalg.norm(wrench[:3]))
+        force_noise = contact.accuracy * float(np.linalg.norm(wrench[:3]))
         if stiffness is None:
             force = self._joint.imbalance(place, wrench) / self._scale
-            return Trial(force, known_to=known_to)
+            return Trial(force, force_noise=force_noise)
         steps = np.zeros((len(x) + 1, 6))
-        steps[np.arange(len(x)), self._rows] = TINY / self._scale
+        steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
         forces = self._joint.imbalance(place + steps, wrench) / self._scale
-        change = (forces[:-1] - forces[-1]).T / TINY
+        change = (forces[:-1] - forces[-1]).T / RELEASED_FORCE.difference_step
         twists = knee_axes(place)[self._rows] / self._scale[:, None]
         gain = self._joint.contact_gain(place) / self._scale[:, None]
         tangent = -(change + gain @ stiffness @ twists.T)
-        return Trial(forces[-1], tangent, contact.exact, known_to)
+        return Trial(forces[-1], tangent, contact.exact, force_noise)
 
     def at(self, balance: Balance) -> Array:
         """Return the knee coordinates (6,) of a balance."""
@@ -161,11 +174,13 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         if stiffness is None:
             return None
         steps = np.zeros((len(self._rows) + 1, 6))
-        steps[np.arange(len(self._rows)), self._rows] = TINY / self._scale
+        steps[np.arange(len(self._rows)), self._rows] = RELEASED_FORCE.difference_step / self._scale
         forces = self._joint.whole(place + steps, wrench)
         axes = knee_axes(place)
         twists = axes[self._rows] / self._scale[:, None]
-        change = (forces[:-1] - forces[-1]).T / TINY - axes @ stiffness @ twists.T
+        change = (
+            forces[:-1] - forces[-1]
+        ).T / RELEASED_FORCE.difference_step - axes @ stiffness @ twists.T
         matrix = np.hstack([-change, axes @ self._joint.columns(place)])
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 
@@ -179,8 +194,8 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
             per_wrench: (6,), see `tension_per_wrench`.
         """
         wrench, _ = self._with_friction(self._place, contact)
-        kept, left = self._joint.kept_and_left(self._place, wrench)
-        return float(kept[-1] + per_wrench @ left)
+        reactions, remainder = self._joint.kept_and_left(self._place, wrench)
+        return float(reactions[-1] + per_wrench @ remainder)
 
     def pushes(self, balance: Balance) -> bool:
         """Return whether the patellar ligament, where it is taut, would have to push."""

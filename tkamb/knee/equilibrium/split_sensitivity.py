@@ -1,5 +1,6 @@
 """How the split between the condyles answers to the adduction, at a constant load."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +12,19 @@ from tkamb.units import DEGREE
 if TYPE_CHECKING:
     from tkamb.contact.probe import Probe
 
-ADDUCTION_STEP = 0.02 * DEGREE
-"""Small against the 0.2 to 0.5 deg that unload a condyle, and it moves some 60 N, thirty times
-what the lattice's tolerance leaves open; steps of 0.005 to 0.1 deg agree within 5 to 15 %."""
+
+@dataclass(frozen=True)
+class SplitSensitivitySettings:
+    """How the medial share of the force changes with adduction."""
+
+    adduction_step: float = 0.02 * DEGREE
+    """rad: step of the finite difference. It is small against the 0.2 to 0.5 deg that unload a
+    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to
+    0.1 deg agree within 5 to 15 %."""
+
+
+SPLIT_SENSITIVITY = SplitSensitivitySettings()
+
 
 ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "si"))
 
@@ -38,11 +49,11 @@ def split_sensitivity(
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
-    place[ADDUCTION] += ADDUCTION_STEP
-    turned = probe.pressed(load, knee_pose(place), result, like)
-    if turned.status is not ContactStatus.OK:
+    place[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
+    rotated = probe.pressed(load, knee_pose(place), result, like)
+    if rotated.status is not ContactStatus.OK:
         return float("nan"), None
-    return (_medial(turned) - _medial(result)) / ADDUCTION_STEP, turned
+    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step, rotated
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:

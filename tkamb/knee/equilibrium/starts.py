@@ -1,6 +1,7 @@
 """Where a search for released coordinates begins, and what it finds from there."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -22,19 +23,29 @@ ASTRAY = (
     BalanceStatus.RUNS_AWAY,  # as far from a bad start as from a good one
 )
 """Ends of a search that another start may mend."""
-FARTHEST_AHEAD = 2e-3
-"""m: a search begins at most so far ahead of the last frame."""
-FIRST_DEPTH = 5e-5
-"""m: how deep the search for released coordinates begins."""
+
+
+@dataclass(frozen=True)
+class InitialPoseSettings:
+    """Initial guesses of the released coordinates."""
+
+    max_extrapolation: float = 2e-3
+    """m: an initial guess is extrapolated at most this far from the last frame."""
+    first_penetration: float = 5e-5
+    """m: penetration of the initial guess of a first frame."""
+
+
+INITIAL_POSE = InitialPoseSettings()
+
 AP = KNEE_COORDINATES.index("ap")
 
 
-class Starts:
-    """The starts of the frames of a motion, from the likeliest on.
+class InitialPoses:
+    """The initial guesses of the frames of a motion, the likeliest first.
 
     Args:
         recorded: (f, 6) knee coordinates of the motion, m and rad.
-        knee: searches from a start.
+        knee: it searches from an initial guess.
         pair: femoral component and insert.
         post: cam and post, if they are modelled.
     """
@@ -45,24 +56,24 @@ class Starts:
         self._recorded, self._knee, self._pair, self._post = recorded, knee, pair, post
 
     def rest(
-        self, k: int, found: Sequence[KneeEquilibrium], points: dict[str, Array]
+        self, k: int, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
     ) -> KneeEquilibrium:
         """Return the knee at rest, from the first start that leads there.
 
         Args:
             k: frame.
-            found: the last three frames that were found.
+            previous: the last three frames that were found.
             points: side -> where a condyle that carries nothing is nearest to the insert.
 
         Raises:
             ComputationError: no start lies over the insert, or no muscle forces carry the frame.
         """
         knee, failure = None, "the femoral component does not lie over the insert"
-        for place in self._starts(k, [knee.coordinates for knee in found]):
+        for place in self._starts(k, [knee.coordinates for knee in previous]):
             if not np.isfinite(place).all():
                 continue
             try:
-                knee = self._knee.find(k, place, points, found[-1] if found else None)
+                knee = self._knee.find(k, place, points, previous[-1] if previous else None)
             except ComputationError as error:
                 failure = error.what
                 continue
@@ -72,13 +83,13 @@ class Starts:
             raise ComputationError(failure)
         return knee
 
-    def _starts(self, k: int, found: list[Array]) -> Iterator[Array]:
+    def _starts(self, k: int, previous: list[Array]) -> Iterator[Array]:
         """Yield where a search may begin: as the last frames went on, as the last, as recorded.
 
         The first keeps its height, the others just touch.
         """
         recorded, rows = self._recorded[k], list(self._knee.released)
-        for number, place in enumerate([carried_on(found), found[-1]] if found else []):
+        for number, place in enumerate([carried_on(previous), previous[-1]] if previous else []):
             start = recorded.copy()
             start[rows] = place[rows]
             yield start if number == 0 else self.on_the_insert(start)
@@ -95,22 +106,24 @@ class Starts:
         gap = self._post.clearance(knee_pose(touching))
         if not gap < 0:
             return touching
-        return self._on_the_dishes(np.array([place[0] + gap + FIRST_DEPTH, *place[1:]]))
+        return self._on_the_dishes(
+            np.array([place[0] + gap + INITIAL_POSE.first_penetration, *place[1:]])
+        )
 
     def _on_the_dishes(self, place: Array) -> Array:
         height = self._pair.first_touch_height(knee_pose(place))
-        return np.array([place[0], height - FIRST_DEPTH, *place[2:]])
+        return np.array([place[0], height - INITIAL_POSE.first_penetration, *place[2:]])
 
 
-def carried_on(found: list[Array]) -> Array:
+def carried_on(previous: list[Array]) -> Array:
     """Return the coordinates (6,) after those of up to three frames.
 
     The last step is made again, or that part of it by which the step before foretold it, and no
-    farther than `FARTHEST_AHEAD`: a lightly loaded knee wanders to and fro.
+    farther than `INITIAL_POSE.max_extrapolation`: a lightly loaded knee wanders to and fro.
     """
-    if len(found) < 3:
-        return found[-1]
-    before, step = ((b - a) * SCALE for a, b in pairwise(found))
+    if len(previous) < 3:
+        return previous[-1]
+    before, step = ((b - a) * SCALE for a, b in pairwise(previous))
     part = float(before @ step) / max(float(before @ before), 1e-18)
-    longest = FARTHEST_AHEAD / max(float(np.linalg.norm(step)), 1e-9)
-    return found[-1] + min(max(part, 0.0), 1.0, longest) * (found[-1] - found[-2])
+    longest = INITIAL_POSE.max_extrapolation / max(float(np.linalg.norm(step)), 1e-9)
+    return previous[-1] + min(max(part, 0.0), 1.0, longest) * (previous[-1] - previous[-2])

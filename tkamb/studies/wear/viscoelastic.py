@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from tkamb.contact.foundation import THINNEST
+from tkamb.contact.foundation import FOUNDATION
 from tkamb.contact.samples import SurfaceSamples, gaps_along_normals
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
@@ -135,7 +135,7 @@ class ViscoelasticBed:
         moved = np.array(pose, float)
         moved[1, 3] -= fall
         gap = gaps_along_normals(self._bed, self._femoral, moved)
-        asked = -gap / np.maximum(self._bed.thickness, THINNEST)
+        asked = -gap / np.maximum(self._bed.thickness, FOUNDATION.least_thickness)
         slope, decay, kept = self._series.response(step)
         carried = decay @ self._memory - kept.sum() * self._strain
         free = -carried / slope  # strain at which the stress is zero

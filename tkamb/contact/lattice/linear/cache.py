@@ -29,6 +29,7 @@ import tempfile
 import time as clock
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -52,16 +53,29 @@ PREFIX = len(MAGIC) + SUMS + 8
 """Bytes before the header."""
 BOUNDARY = 64
 """Bytes; every array begins at a multiple of it."""
-LONGEST_HEADER = 1_000_000
-"""Bytes; a header has some hundreds."""
-LEAST_UNKNOWNS = 20_000
-"""Smaller operators are not kept."""
-SIZE_LIMIT = 6e9
-"""Bytes that the folder may hold."""
-LARGEST_ERROR = 2e-3
-"""Of an operator that is read (`operator_error`): 16 bits leave 5e-4, whatever nu or bearing."""
-ORPHAN_SECONDS = 60.0
-"""A half-written file that nobody has locked is an orphan after this time."""
+
+
+@dataclass(frozen=True)
+class FactorCacheSettings:
+    """The folder of factorised lattices on disk."""
+
+    longest_header: int = 1_000_000
+    """Bytes: a file whose header claims more is not one of ours; a real header has some
+    hundreds."""
+    least_unknowns: int = 20_000
+    """Unknowns: smaller operators are not stored, as factorising them is faster than reading."""
+    size_limit: float = 6e9
+    """Bytes that the folder may hold; the files used longest ago are removed first."""
+    largest_error: float = 2e-3
+    """1: largest relative error of an operator that is read (`operator_error`). Storage in 16
+    bits leaves 5e-4 for every Poisson's ratio and bearing; four times that is a damaged
+    file."""
+    orphan_seconds: float = 60.0
+    """s: age from which a half-written file that nobody has locked is removed."""
+
+
+FACTOR_CACHE = FactorCacheSettings()
+
 
 _log = logging.getLogger("tkamb")
 
@@ -76,7 +90,7 @@ def cache_folder() -> Path:
 
 
 def operator_key(
-    solid: Solid, held: NDArray[Any], contact_nodes: NDArray[Any], coarse: bool = True
+    solid: Solid, fixed: NDArray[Any], contact_nodes: NDArray[Any], coarse: bool = True
 ) -> str:
     """Return the content hash of an operator: of all that it depends on, and of the code."""
     material = solid.material
@@ -84,18 +98,18 @@ def operator_key(
     kind = (type(solid).__name__, "16 bits" if coarse else "single")
     words = (made_by, *kind, material.young_modulus, material.poisson_ratio)
     digest = hashlib.sha256(repr(words).encode())
-    for array in (solid.nodes, solid.spacing, solid.cells, held, contact_nodes):
+    for array in (solid.nodes, solid.spacing, solid.cells, fixed, contact_nodes):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
 def cached_operator(
     solid: Solid,
-    held: Mask,
+    fixed: Mask,
     contact_nodes: Index,
     make: Callable[[], ElasticOperator],
     coarse: bool = True,
-    limit: float = SIZE_LIMIT,
+    limit: float = FACTOR_CACHE.size_limit,
 ) -> ElasticOperator:
     """Return a solid's operator, from disk or newly made and kept.
 
@@ -103,31 +117,31 @@ def cached_operator(
 
     Args:
         solid: cells and material.
-        held: (3n,) unknowns held by the boundary.
+        fixed: (3n,) unknowns held by the boundary.
         contact_nodes: (c,) nodes that can be touched.
         make: makes the operator.
         coarse: whether that has a factor of 16-bit integers.
         limit: bytes that the folder may hold; a larger operator is not kept.
     """
-    if int((~held).sum()) < LEAST_UNKNOWNS:
+    if int((~fixed).sum()) < FACTOR_CACHE.least_unknowns:
         return make()
-    key = operator_key(solid, held, contact_nodes, coarse)
+    key = operator_key(solid, fixed, contact_nodes, coarse)
     path = cache_folder() / f"{key}.operator"
     try:
-        found = read_operator(path, key, limit)
-        if found is not None:
-            check_operator(*found, solid, held, contact_nodes)
-            return found[0]
+        stored = read_operator(path, key, limit)
+        if stored is not None:
+            check_operator(*stored, solid, fixed, contact_nodes)
+            return stored[0]
     except DamagedOperator as damage:
         _log.warning("%s: %s; the operator is made again", path, damage)
-    made = make()
-    if sum(part.nbytes for part in _parts(made)) <= limit:
+    fresh = make()
+    if sum(part.nbytes for part in _parts(fresh)) <= limit:
         try:
-            write_operator(path, key, made)
+            write_operator(path, key, fresh)
             prune(path.parent, limit)
         except OSError as error:
             _log.warning("%s: not kept (%s)", path, error.strerror or error)
-    return made
+    return fresh
 
 
 class DamagedOperator(Exception):
@@ -138,7 +152,7 @@ def check_operator(
     operator: ElasticOperator,
     mapped: mmap.mmap,
     solid: Solid,
-    held: Mask,
+    fixed: Mask,
     contact_nodes: Index,
 ) -> None:
     """Hold an operator that was read against the solid that it is to be of.
@@ -149,14 +163,14 @@ def check_operator(
     Raises:
         DamagedOperator: it is of other unknowns, or does not invert the solid's stiffness.
     """
-    same = np.array_equal(operator.free, ~held)
+    same = np.array_equal(operator.free, ~fixed)
     if not same or not np.array_equal(operator.contact_nodes, contact_nodes):
         raise DamagedOperator("is of another boundary")
     try:
         error = operator_error(operator, solid, lambda: mapped.madvise(mmap.MADV_DONTNEED))
     except (ValueError, IndexError) as broken:  # indices that lead nowhere
         raise DamagedOperator(f"is not an operator ({broken})") from None
-    if not error <= LARGEST_ERROR:
+    if not error <= FACTOR_CACHE.largest_error:
         raise DamagedOperator(f"is off the assembled stiffness by {100 * error:.2g} %")
 
 
@@ -214,7 +228,7 @@ def _parts(operator: ElasticOperator) -> list[NDArray[Any]]:
 
 
 def read_operator(
-    path: Path, key: str, limit: float = SIZE_LIMIT
+    path: Path, key: str, limit: float = FACTOR_CACHE.size_limit
 ) -> tuple[ElasticOperator, mmap.mmap] | None:
     """Return the operator in a file, and the file in memory; None if there is no file.
 
@@ -246,7 +260,7 @@ def _arrays(file: BinaryIO, size: int, key: str) -> tuple[mmap.mmap, list[NDArra
     """Return a file of that size in memory and its arrays, after a look at key and sums."""
     start = file.read(PREFIX)
     length = int.from_bytes(start[-8:], "little")
-    if len(start) < PREFIX or start[: len(MAGIC)] != MAGIC or length > LONGEST_HEADER:
+    if len(start) < PREFIX or start[: len(MAGIC)] != MAGIC or length > FACTOR_CACHE.longest_header:
         raise ValueError("no such header")
     text = file.read(length)
     header = json.loads(text)
@@ -354,7 +368,7 @@ def _remove_orphans(folder: Path) -> int:
             with os.fdopen(open_regular(path, float("inf"), follow=False), "rb") as file:
                 status = os.fstat(file.fileno())
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if clock.time() - status.st_mtime < ORPHAN_SECONDS:
+                if clock.time() - status.st_mtime < FACTOR_CACHE.orphan_seconds:
                     raise BlockingIOError
                 path.unlink(missing_ok=True)
             removed, freed = removed + 1, freed + status.st_size

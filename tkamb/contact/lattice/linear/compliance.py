@@ -9,10 +9,18 @@ import numpy as np
 from tkamb.contact.lattice.linear.response import SINGLE, HalfResponse, unknowns_of
 from tkamb.geometry.frames import Array, Index
 
-MOST_STORED = 1500
-"""Nodes of the stored compliance: 80 MB."""
-SPACE = 100
-"""Nodes that may come before the stored compliance has to grow."""
+
+@dataclass(frozen=True)
+class ComplianceSettings:
+    """The stored compliance of candidate nodes."""
+
+    max_nodes: int = 1500
+    """Nodes of the stored compliance. Its matrix then takes 80 MB."""
+    spare_nodes: int = 100
+    """Nodes that may be added before the arrays have to grow. It trades memory against copies."""
+
+
+COMPLIANCE = ComplianceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,17 +92,17 @@ class ComplianceCache:
     stored: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0), SINGLE))
     _lock: Lock = field(default_factory=Lock)
 
-    def among(self, wanted: Index, spare: Index) -> ContactResponse:
+    def among(self, needed: Index, spare: Index) -> ContactResponse:
         """Return the response among contact nodes.
 
         Args:
-            wanted: (m,) increasing positions among the contact nodes.
-            spare: a superset that is worked out when `wanted` is not at hand, if not too many.
+            needed: (m,) increasing positions among the contact nodes.
+            spare: a superset that is worked out when `needed` is not at hand, if not too many.
         """
         with self._lock:
-            at = self._at(wanted, spare)
+            at = self._at(needed, spare)
             compliance = _taken(_taken(self.stored, at, 1), at, 3)
-        return ContactResponse(self.whole, wanted, compliance)
+        return ContactResponse(self.whole, needed, compliance)
 
     def moved(self, nodes: Index, pushed: Index, force: Array) -> Array:
         """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
@@ -106,29 +114,31 @@ class ComplianceCache:
         """
         with self._lock:
             both = self._at(np.concatenate([nodes, pushed]), np.union1d(nodes, pushed))
-            here, there = both[: len(nodes)], both[len(nodes) :]
-            compliance = _taken(_taken(self.stored, here, 1), there, 3)
+            columns, rows = both[: len(nodes)], both[len(nodes) :]
+            compliance = _taken(_taken(self.stored, columns, 1), rows, 3)
         return np.einsum("aibj,jb->ia", compliance, force)
 
-    def _at(self, wanted: Index, spare: Index) -> Index:
+    def _at(self, needed: Index, spare: Index) -> Index:
         """Return where nodes (m,) are stored; what is not at hand is worked out, spare and all."""
         place = np.full(len(self.whole.rank) // 3, -1)
         place[self.nodes] = np.arange(len(self.nodes))
-        if (place[wanted] < 0).any():
-            if len(spare) > MOST_STORED:
-                spare = np.unique(wanted)
-            if len(self.nodes) + np.count_nonzero(place[spare] < 0) > MOST_STORED:
+        if (place[needed] < 0).any():
+            if len(spare) > COMPLIANCE.max_nodes:
+                spare = np.unique(needed)
+            if len(self.nodes) + np.count_nonzero(place[spare] < 0) > COMPLIANCE.max_nodes:
                 self.nodes, place[:] = self.nodes[:0], -1
             self._take(spare[place[spare] < 0])
             place[self.nodes] = np.arange(len(self.nodes))
-        return place[wanted]
+        return place[needed]
 
     def _take(self, nodes: Index) -> None:
         """Take more nodes."""
         had, new = len(self.nodes), len(nodes)
         count = had + new
         if count > self.stored.shape[1]:
-            larger: Array = np.empty((3, count + SPACE, 3, count + SPACE), SINGLE)
+            larger: Array = np.empty(
+                (3, count + COMPLIANCE.spare_nodes, 3, count + COMPLIANCE.spare_nodes), SINGLE
+            )
             larger[:, :had, :, :had] = self.stored[:, :had, :, :had]
             self.stored = larger
         self.nodes = np.concatenate([self.nodes, nodes])

@@ -4,6 +4,8 @@ The fronts' sizes follow from the dissection and the pattern alone (symbolic fac
 nodes instead of unknowns). Nothing is known of a machine here but what it has left.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.sparse as sparse
 
@@ -13,21 +15,30 @@ from tkamb.geometry.frames import Index, Mask
 from tkamb.memory import available_memory
 from tkamb.units import MILLIMETRE
 
-UNKNOWNS = 3
-"""Of a node; each boundary is counted as if all were free."""
-CELL_BYTES = 20_000
-"""Of a cell, while its stiffness is put into the global matrix (measured: 9 to 22 kB)."""
-MATRIX_BYTES = 36
-"""Of an entry of the global matrix: itself and its lower half in elimination order, 20; the rest
-stands for what the response is made of meanwhile (measured: without it 12 % too little)."""
-SPARE = 1.1
-"""For what the count leaves out."""
-LEAST_POWER = 3.0
-"""Memory falls at least with this power of the cells' size (measured: 3.7)."""
-STEP = 0.05e-3
-"""m; sizes that are proposed are multiples of it."""
-COARSEST = 5e-3
-"""m; larger cells are no answer."""
+
+@dataclass(frozen=True)
+class MemoryNeedSettings:
+    """The estimate of a lattice's memory before it is made."""
+
+    unknowns_per_node: int = 3
+    """Unknowns of a node: each boundary is counted as if all of its displacements were free."""
+    cell_bytes: int = 20_000
+    """Bytes of a cell while its stiffness is put into the global matrix. Measured: 9 to 22 kB."""
+    entry_bytes: int = 36
+    """Bytes of an entry of the global matrix: 20 for itself and its lower half in elimination
+    order; the rest stands for what the compliance is made of meanwhile. Measured: without
+    it the estimate is 12 % low."""
+    safety_factor: float = 1.1
+    """1: factor for what the estimate leaves out."""
+    memory_exponent: float = 3.0
+    """1: memory falls at least with this power of the cell size. Measured: 3.7."""
+    cell_size_step: float = 0.05e-3
+    """m: proposed cell sizes are multiples of it."""
+    largest_cell_size: float = 5e-3
+    """m: larger cells are not proposed, as a condyle's contact would be two cells wide."""
+
+
+MEMORY_NEED = MemoryNeedSettings()
 
 
 class TooLittleMemoryError(ComputationError):
@@ -39,17 +50,22 @@ class TooLittleMemoryError(ComputationError):
         likely: bytes that it will come to in the end, where more follows.
     """
 
-    def __init__(self, need: float, left: float, likely: float) -> None:
-        self.left, self.likely = left, max(need, likely)
-        what = f"{need / 1e9:.2g} GB of memory are needed, {max(left, 0) / 1e9:.2g} GB are left"
+    def __init__(self, need: float, available: float, likely: float) -> None:
+        self.left, self.likely = available, max(need, likely)
+        what = (
+            f"{need / 1e9:.2g} GB of memory are needed, {max(available, 0) / 1e9:.2g} GB are left"
+        )
         super().__init__(what, "lattice", "take a coarser resolution")
 
     def hint(self, size: float) -> str:
         """Return what to do about it: the cells that fit, for those of a size (m) that do not."""
-        fits = size * (self.likely / max(self.left, 1.0)) ** (1.0 / LEAST_POWER)
-        if fits > COARSEST:
+        fits = size * (self.likely / max(self.left, 1.0)) ** (1.0 / MEMORY_NEED.memory_exponent)
+        if fits > MEMORY_NEED.largest_cell_size:
             return "free some memory"
-        return f"take {np.ceil(fits / STEP * (1.0 - 1e-9)) * STEP / MILLIMETRE:g} mm or coarser"
+        step = MEMORY_NEED.cell_size_step
+        # Rounded up, so that the proposed size fits; 1e-9 keeps a size that is a multiple already.
+        proposal = np.ceil(fits / step * (1.0 - 1e-9)) * step
+        return f"take {proposal / MILLIMETRE:g} mm or coarser"
 
 
 def check_memory(need: float, likely: float = 0.0) -> None:
@@ -62,9 +78,11 @@ def check_memory(need: float, likely: float = 0.0) -> None:
     Raises:
         TooLittleMemoryError: they are not left.
     """
-    left = available_memory()
-    if SPARE * need > left:
-        raise TooLittleMemoryError(SPARE * need, left, SPARE * likely)
+    available = available_memory()
+    if MEMORY_NEED.safety_factor * need > available:
+        raise TooLittleMemoryError(
+            MEMORY_NEED.safety_factor * need, available, MEMORY_NEED.safety_factor * likely
+        )
 
 
 def check_assembly_memory(cells: int) -> None:
@@ -73,7 +91,7 @@ def check_assembly_memory(cells: int) -> None:
     Raises:
         TooLittleMemoryError: the memory is not left.
     """
-    need = CELL_BYTES * cells
+    need = MEMORY_NEED.cell_bytes * cells
     # A factor grows as cells^1.25 and overtakes at about 3,000 cells (measured on inserts).
     check_memory(need, likely=1.5 * need * max(cells / 3000, 1.0) ** 0.25)
 
@@ -91,7 +109,7 @@ def factor_memory(
     """
     rank = np.empty(joined.shape[0], np.int64)
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
-    kept = live = peak = response = 0.0
+    stored = live = peak = response = 0.0
     columns = np.zeros(len(tree.own))
     below: dict[int, list[Index]] = {}
     start = 0
@@ -100,18 +118,23 @@ def factor_memory(
         children = below.pop(member, [])
         later = np.unique(np.concatenate([rank[joined[own].indices], *children]))
         boundary = later[later >= stop]
-        k, m = UNKNOWNS * len(own), UNKNOWNS * len(boundary)
+        k, m = (
+            MEMORY_NEED.unknowns_per_node * len(own),
+            MEMORY_NEED.unknowns_per_node * len(boundary),
+        )
         # W in 8 bytes and as it is kept, the update (m, m), and those not taken yet.
         block = float(k + m) * k
-        kept += block
-        peak = max(peak, itemsize * kept + 8.0 * (live + block + float(m) * m))
-        live += float(m) * m - sum((UNKNOWNS * len(child)) ** 2.0 for child in children)
-        columns[member] += UNKNOWNS * touched[own].sum()
+        stored += block
+        peak = max(peak, itemsize * stored + 8.0 * (live + block + float(m) * m))
+        live += float(m) * m - sum(
+            (MEMORY_NEED.unknowns_per_node * len(child)) ** 2.0 for child in children
+        )
+        columns[member] += MEMORY_NEED.unknowns_per_node * touched[own].sum()
         response += k * columns[member]
         if parent >= 0:
             columns[parent] += columns[member]
             if len(boundary):
                 below.setdefault(parent, []).append(boundary)
         start = stop
-    entries = UNKNOWNS**2 * joined.nnz
-    return MATRIX_BYTES * entries + max(peak, itemsize * (kept + response))
+    entries = MEMORY_NEED.unknowns_per_node**2 * joined.nnz
+    return MEMORY_NEED.entry_bytes * entries + max(peak, itemsize * (stored + response))

@@ -523,10 +523,10 @@ def _eliminate(
     while children:  # each is freed when it has been added
         indices, update = children.pop()
         split = int(np.searchsorted(indices, stop))
-        here, there = indices[:split] - start, row[indices[split:]]
-        _extend_add(own, here, here, update[:split, :split], True)
-        _extend_add(mixed, there, here, update[split:, :split], False)
-        _extend_add(rest, there, there, update[split:, split:], True)
+        own_rows, parent_rows = indices[:split] - start, row[indices[split:]]
+        _extend_add(own, own_rows, own_rows, update[:split, :split], True)
+        _extend_add(mixed, parent_rows, own_rows, update[split:, :split], False)
+        _extend_add(rest, parent_rows, parent_rows, update[split:, split:], True)
     lower, info = lapack.dpotrf(own, lower=1, clean=1, overwrite_a=1)
     if info:
         raise ComputationError("the stiffness matrix is not positive definite")

@@ -24,9 +24,20 @@ from tkamb.contact.pair import Bearing
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index, Mask
 
-SEED = 20_240_501
-AHEAD = 128
-"""Fronts that the factorisation may be ahead of the response: they are kept whole so long."""
+
+@dataclass(frozen=True)
+class OperatorSettings:
+    """The linear operator of a lattice."""
+
+    test_vector_seed: int = 20_240_501
+    """Seed of the random vectors by which the operator's error is measured. Fixed, so that a
+    run repeats."""
+    max_fronts_ahead: int = 128
+    """Fronts by which the factorisation may be ahead of the compliance; they stay whole in
+    memory for so long."""
+
+
+OPERATOR = OperatorSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +143,11 @@ def fixed_unknowns(
         bearing: "fixed" or "mobile".
         piece: (n,) of each node; None: all belong together.
     """
-    held = np.zeros((len(nodes), 3), bool)
+    fixed = np.zeros((len(nodes), 3), bool)
     if bearing == "fixed":
-        held[bottom] = True
-        return held.ravel()
-    held[bottom, 1] = True
+        fixed[bottom] = True
+        return fixed.ravel()
+    fixed[bottom, 1] = True
     pieces = [bottom]
     if piece is not None:
         pieces = [bottom[piece[bottom] == each] for each in np.unique(piece[bottom])]
@@ -145,14 +156,14 @@ def fixed_unknowns(
         tolerance = 1e-9 + 1e-6 * np.ptp(z)
         for end in (z.min(), z.max()):
             at_end = own[np.abs(z - end) <= tolerance]
-            held[at_end[np.argmin(x[np.abs(z - end) <= tolerance])], [0, 2]] = True
-    return held.ravel()
+            fixed[at_end[np.argmin(x[np.abs(z - end) <= tolerance])], [0, 2]] = True
+    return fixed.ravel()
 
 
 def prepare_operator(
     stiffness: sparse.csr_matrix,
     index: Index,
-    held: Mask,
+    fixed: Mask,
     contact_nodes: Index,
     precision: type[np.floating] = np.float64,
     coarse: bool = False,
@@ -162,7 +173,7 @@ def prepare_operator(
     Args:
         stiffness: symmetric, positive definite on the free unknowns.
         index: (n, 3) lattice index of each node.
-        held: (3n,) unknowns that are zero.
+        fixed: (3n,) unknowns that are zero.
         contact_nodes: (c,).
         precision: in which the numbers are kept, and the response is worked out; the factor is
             worked out in float64.
@@ -173,7 +184,7 @@ def prepare_operator(
         TooLittleMemoryError: they do not fit into the memory that is left.
         ComputationError: the matrix is not positive definite.
     """
-    free = ~held
+    free = ~fixed
     number = np.cumsum(free) - 1
     some = np.flatnonzero(free.reshape(-1, 3).any(axis=1))
     joined = stiffness.tobsr((3, 3))
@@ -187,15 +198,15 @@ def prepare_operator(
     check_memory(factor_memory(tree, joined, touched, np.dtype(precision).itemsize))
     unknowns = []
     for own in tree.own:
-        wanted = (3 * some[own][:, None] + np.arange(3)).ravel()
-        unknowns.append(number[wanted[free[wanted]]])
+        unknown = (3 * some[own][:, None] + np.arange(3)).ravel()
+        unknowns.append(number[unknown[free[unknown]]])
     order = np.concatenate(unknowns)
     rank = np.full(len(free), -1)
     rank[np.flatnonzero(free)[order]] = np.arange(len(order))
-    wanted = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
+    unknown = rank[(3 * contact_nodes[:, None] + np.arange(3)).ravel()]
     starts = np.cumsum([0, *map(len, unknowns)])
-    half = HalfSolves(starts, tree.parent, wanted, precision)
-    made = fronts_of(stiffness, rank, starts, tree.parent, precision)
+    half = HalfSolves(starts, tree.parent, unknown, precision)
+    fronts = fronts_of(stiffness, rank, starts, tree.parent, precision)
     del stiffness, joined  # as large as half of the factor, and not needed any more
 
     def taken(member: int, front: Front) -> tuple[NDArray[Any], Array]:
@@ -206,11 +217,11 @@ def prepare_operator(
     with ThreadPoolExecutor(1) as other:
         waiting: list[Future[tuple[NDArray[Any], Array]]] = []
         boundaries = []
-        for member, front in enumerate(made):
+        for member, front in enumerate(fronts):
             boundaries.append(front.boundary)
             waiting.append(other.submit(taken, member, front))
-            if member >= AHEAD:
-                waiting[member - AHEAD].result()
+            if member >= OPERATOR.max_fronts_ahead:
+                waiting[member - OPERATOR.max_fronts_ahead].result()
     rows = [one.result() for one in waiting]
     del waiting
     factor = CholeskyFactor.of(order, starts, tree.parent, boundaries, rows)
@@ -239,7 +250,7 @@ def operator_error(
         solid: that it should be of.
         response_read: called when all of the response has been read, and nothing of the factor.
     """
-    chance = np.random.default_rng(SEED)
+    chance = np.random.default_rng(OPERATOR.test_vector_seed)
     nodes, shape = operator.contact_nodes, solid.nodes.shape
     pressed, touched = np.zeros(shape), np.zeros(shape)
     pressed[nodes, 1] = -1.0
@@ -248,8 +259,8 @@ def operator_error(
     operator.half.apply(touched[nodes].ravel(), stored)
     if response_read is not None:
         response_read()
-    moved = np.where(operator.free.reshape(-1, 3), chance.normal(size=shape), 0.0)
-    force = _carried(operator, solid, moved)
+    displacement = np.where(operator.free.reshape(-1, 3), chance.normal(size=shape), 0.0)
+    force = _carried(operator, solid, displacement)
     missing = _carried(operator, solid, operator.solve(force)) - force
     sunk = operator.solve(pressed)
     work, energy = (float((f * sunk).sum()) for f in (pressed, _carried(operator, solid, sunk)))

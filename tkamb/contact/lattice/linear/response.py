@@ -27,10 +27,18 @@ SINGLE: Precision = np.float32
 """What a stored operator is kept in: it halves what every solve has to read."""
 
 
-GATHERED = 512
-"""Columns that are copied for BLAS at a time: 3 MB."""
-FEW = 12
-"""Columns up to which products with others are taken where these lie: no copy for BLAS."""
+@dataclass(frozen=True)
+class ResponseSettings:
+    """Products of the factor with columns of forces."""
+
+    gathered_columns: int = 512
+    """Columns that are copied for BLAS at a time, 3 MB: about the size of a processor's cache."""
+    few_columns: int = 12
+    """Columns up to which products are taken in place, because a copy for BLAS costs more than
+    it gains."""
+
+
+RESPONSE = ResponseSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,18 +86,20 @@ class HalfResponse:
 
     def among(self, unknowns: Index) -> "HalfResponse":
         """Return the response of some of the unknowns (u,) alone; it shares the columns."""
-        wanted = self.rank[unknowns]
-        live = np.flatnonzero(wanted >= 0)
-        order = live[np.argsort(wanted[live])]
+        ranks = self.rank[unknowns]
+        live = np.flatnonzero(ranks >= 0)
+        order = live[np.argsort(ranks[live])]
         rank = np.full(len(unknowns), -1)
         rank[order] = np.arange(len(order))
-        blocks, places = _of_columns(*self._parts[:3], wanted[order])
+        blocks, places = _of_columns(*self._parts[:3], ranks[order])
         return HalfResponse(rank, blocks, self.values, places)
 
     def compliance(self, some: Index | None = None) -> Array:
         """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
+        # C = H Hᵀ with H the half solves: the compliance is summed block by block of the
+        # elimination tree.
         inner = np.zeros((len(rows), self.columns))
         firsts, lasts = np.searchsorted(rows, self.blocks[:, 2:]).T
         for block in np.flatnonzero(lasts > firsts):
@@ -97,12 +107,16 @@ class HalfResponse:
             places = self.places[self._edges[block] : self._edges[block + 1]]
             a, b = int(firsts[block]), int(lasts[block])
             few = _gathered(self.values, places[rows[a:b] - first], stop - start)
-            if len(few) <= FEW:
+            if len(few) <= RESPONSE.few_columns:
                 inner[a:b, first:last] += _products(self.values, places, few)
                 continue
-            for part in range(0, last - first, GATHERED):
-                others = _gathered(self.values, places[part : part + GATHERED], stop - start)
-                inner[a:b, first + part : min(first + part + GATHERED, last)] += few @ others.T
+            for part in range(0, last - first, RESPONSE.gathered_columns):
+                others = _gathered(
+                    self.values, places[part : part + RESPONSE.gathered_columns], stop - start
+                )
+                inner[a:b, first + part : min(first + part + RESPONSE.gathered_columns, last)] += (
+                    few @ others.T
+                )
         result = np.zeros((len(rank), len(self.rank)))
         index = np.searchsorted(rows, rank[rank >= 0])
         result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
@@ -130,6 +144,7 @@ class HalfResponse:
     @cached_property
     def _middle(self) -> int:
         """How many of the blocks hold half of the numbers."""
+        # Blocks are halved by their work, which is rows times columns, for two threads.
         sizes = (self.blocks[:, 1] - self.blocks[:, 0]) * (self.blocks[:, 3] - self.blocks[:, 2])
         return int(np.searchsorted(np.cumsum(sizes), sizes.sum() / 2))
 
@@ -189,10 +204,10 @@ def _add_products(
 def _of_columns(blocks: Index, edges: Index, places: Index, columns: Index) -> tuple[Index, Index]:
     """Return blocks and places of some columns (u,), increasing, in their numbers."""
     firsts, lasts = np.searchsorted(columns, blocks[:, 2]), np.searchsorted(columns, blocks[:, 3])
-    kept = np.flatnonzero(lasts > firsts)
-    some, at = blocks[kept], 0
+    nonempty = np.flatnonzero(lasts > firsts)
+    some, at = blocks[nonempty], 0
     chosen = np.empty((lasts - firsts).sum(), np.int64)
-    for number, block in enumerate(kept):
+    for number, block in enumerate(nonempty):
         first, last = firsts[block], lasts[block]
         for k in range(first, last):
             chosen[at] = places[edges[block] + columns[k] - blocks[block, 2]]
@@ -271,6 +286,7 @@ class HalfSolves:
         right = self._of(member)
         del self._waiting[member]
         a, b = np.searchsorted(self._rows, [front.start, front.stop])
+        # Unit forces at the contact unknowns that this front eliminates.
         right[np.arange(a, b) - first, self._rows[a:b] - front.start] += 1.0
         count = front.stop - front.start
         if len(front.boundary):

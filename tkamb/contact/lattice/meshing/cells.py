@@ -101,6 +101,8 @@ class Springs:
 def join_springs(cells: Index, node_count: int) -> Springs:
     """Return the springs of cells (c, 8), each once; no sorting, the grid gives the keys."""
     offset = CORNERS[PAIRS[:, 1]] - CORNERS[PAIRS[:, 0]]
+    # A spring between two nodes is shared by all cells that hold both; it has one direction out of
+    # thirteen.
     forward = (offset[:, None, :] == DIRECTIONS).all(axis=2)
     backward = (-offset[:, None, :] == DIRECTIONS).all(axis=2)
     family = (forward | backward).argmax(axis=1)
@@ -133,6 +135,7 @@ def scaled_jacobians(points: Array) -> Array:
             for d in range(3):
                 e, f = (d + 1) % 3, (d + 2) % 3
                 volume += edges[2, d] * (edges[0, e] * edges[1, f] - edges[0, f] * edges[1, e])
+            # Volume of three unit edges: 1 at a right-angled corner, 0 at a flat one.
             result[cell] = min(result[cell], volume / length if length > 0 else 0.0)
     return result
 
@@ -150,6 +153,7 @@ def cell_volumes(points: Array) -> Array:
 
 def shape_gradients(at: Array) -> Array:
     """Return reference gradients (8, 3) of the trilinear shape functions at a point of [0, 1]³."""
+    # Trilinear shape functions: products of x or 1 - x along the three axes.
     factor = np.where(CORNERS == 1, at, 1 - at)
     sign = np.where(CORNERS == 1, 1.0, -1.0)
     return np.stack(
@@ -177,6 +181,7 @@ def gauss_gradients(corners: Array) -> tuple[Array, Array]:
         cell's volume. A weight that is not positive marks an inverted cell.
     """
     jacobian = _jacobians(corners)
+    # Eight Gauss points of equal weight in a unit cube.
     weights = np.linalg.det(jacobian) / 8
     gradients = np.einsum("sgxd,gnd->sgnx", np.linalg.inv(jacobian), REFERENCE_GRADIENTS)
     return gradients, weights

@@ -16,18 +16,28 @@ from tkamb.geometry.surface import Surface
 
 Nodes = tuple[Index, ...]
 
-TIE = 1e-6
-"""Cells: a distance this near half a cell counts as half a cell."""
-WALL = 0.02
-"""Cells: vertices this near the bounding box are on its side; what they differ by is noise."""
+
+@dataclass(frozen=True)
+class ColumnSettings:
+    """The columns of nodes that a lattice stands on."""
+
+    tie: float = 1e-6
+    """Cells: a distance this near half a cell counts as half a cell, so that rounding does not
+    decide."""
+    side_tolerance: float = 0.02
+    """Cells: vertices this near the bounding box lie on its side; the difference is noise of
+    the mesh."""
+    wall_normal_y: float = 0.05
+    """1: a triangle whose normal has a smaller superior component (87 deg) belongs to a wall."""
+    wall_inset: float = 0.02
+    """Cells: distance that a node stays inside a wall, because rays along y miss a wall at its
+    hit."""
+    max_height_change: float = 0.75
+    """Cells: a surface whose height changes by more from one column to the next is another
+    surface."""
 
 
-WALL_NORMAL_Y = 0.05
-"""y of the normal of a triangle that is steeper (87 deg) belongs to a wall."""
-INSIDE_WALL = 0.02
-"""Cells; a node stays this far inside a wall that rays along y miss at its hit."""
-REACH = 0.75
-"""Cells: a surface farther than this from where it was is another surface."""
+COLUMN = ColumnSettings()
 
 
 @dataclass(eq=False)
@@ -112,18 +122,20 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
         high: (m,) upper ends.
         count: number of nodes of a line.
     """
-    first = np.floor(low + 0.5 + TIE).astype(np.int64)
-    last = np.ceil(high - 0.5 - TIE).astype(np.int64)
-    inside = np.ceil(high - TIE) - np.floor(low + TIE) - 1
-    thick = high - low > 0.5 + TIE
+    first = np.floor(low + 0.5 + COLUMN.tie).astype(np.int64)
+    last = np.ceil(high - 0.5 - COLUMN.tie).astype(np.int64)
+    inside = np.ceil(high - COLUMN.tie) - np.floor(low + COLUMN.tie) - 1
+    thick = high - low > 0.5 + COLUMN.tie
     single = ~thick & (inside <= 1)
-    held = single & (inside == 1)
+    thin = single & (inside == 1)
     joined = thick & (first >= last)
     upwards = (np.abs(low - first) <= np.abs(high - first)) & (first < count - 1)
     last = np.where(joined, first + upwards, last)
     first = np.where(joined, last - 1, first)
-    middle = np.where(held, np.floor(low + TIE) + 1, np.round(0.5 * (low + high))).astype(np.int64)
-    return Ends(np.where(single, middle, first), np.where(single, middle, last), single, held)
+    middle = np.where(thin, np.floor(low + COLUMN.tie) + 1, np.round(0.5 * (low + high))).astype(
+        np.int64
+    )
+    return Ends(np.where(single, middle, first), np.where(single, middle, last), single, thin)
 
 
 def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
@@ -131,8 +143,8 @@ def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
     lower, upper = surface.bounds[:, axis]
     line = np.linspace(lower, upper, round((upper - lower) / spacing) + 1)
     values = surface.vertices[:, axis]
-    line[0] = values[values <= lower + WALL * spacing].max()
-    line[-1] = values[values >= upper - WALL * spacing].min()
+    line[0] = values[values <= lower + COLUMN.side_tolerance * spacing].max()
+    line[-1] = values[values >= upper - COLUMN.side_tolerance * spacing].min()
     return line
 
 
@@ -161,7 +173,7 @@ def _without_narrow_gaps(
 ) -> tuple[Intervals, Array, Array, int]:
     """Join neighbouring intervals of a line whose facing ends fall on the same node."""
     same = (np.diff(intervals.first) == 0) & (np.diff(intervals.second) == 0)
-    joined = same & (np.floor(low[1:] + 0.5 + TIE) <= np.ceil(high[:-1] - 0.5 - TIE))
+    joined = same & (np.floor(low[1:] + 0.5 + COLUMN.tie) <= np.ceil(high[:-1] - 0.5 - COLUMN.tie))
     begins = np.flatnonzero(np.append(True, ~joined))
     ends = np.append(begins[1:], len(low)) - 1
     merged = Intervals(
@@ -216,7 +228,7 @@ def refired_inwards(
     missed = np.flatnonzero(~np.isfinite(height))
     if missed.size:
         step = inward[missed] / np.linalg.norm(inward[missed], axis=1, keepdims=True)
-        target[missed[:, None], [0, 2]] += INSIDE_WALL * field.spacing[[0, 2]] * step
+        target[missed[:, None], [0, 2]] += COLUMN.wall_inset * field.spacing[[0, 2]] * step
         again = tuple(index[missed] for index in nodes)
         height[missed] = refired(field, again, target[missed], rays)
     return height
@@ -229,17 +241,17 @@ def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> A
     """
     height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):
-        here = np.flatnonzero(end)
-        base = target[here].copy()
+        rows = np.flatnonzero(end)
+        base = target[rows].copy()
         base[:, 1] = rays.surface.bounds[0, 1] - field.spacing[1]
         ray, t, face = rays.all(base, (0.0, 1.0, 0.0))
-        right = rays.surface.face_normals[face, 1] * facing > WALL_NORMAL_Y
+        right = rays.surface.face_normals[face, 1] * facing > COLUMN.wall_normal_y
         ray, y = ray[right], base[ray[right], 1] + t[right]
-        off = np.abs(y - height[here[ray]])
+        off = np.abs(y - height[rows[ray]])
         order = np.lexsort((off, ray))
-        found, head = np.unique(ray[order], return_index=True)
-        value = np.full(len(here), np.nan)
-        close = off[order][head] <= REACH * field.spacing[1]
-        value[found[close]] = y[order][head][close]
-        height[here] = value
+        with_hit, head = np.unique(ray[order], return_index=True)
+        value = np.full(len(rows), np.nan)
+        close = off[order][head] <= COLUMN.max_height_change * field.spacing[1]
+        value[with_hit[close]] = y[order][head][close]
+        height[rows] = value
     return height

@@ -12,10 +12,20 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
-ABOVE = 1e-4
-"""m: rays that ask which triangle a node lies on start so far above it."""
-ON_MESH = 1e-6
-"""m: a node this near to a triangle lies on it."""
+
+@dataclass(frozen=True)
+class ContactMapSettings:
+    """Which triangle of the insert a contact node lies on."""
+
+    ray_start_height: float = 1e-4
+    """m: height above a node at which the ray that looks for its triangle begins."""
+    on_mesh_distance: float = 1e-6
+    """m: a node this near to a triangle lies on it. Meshes in single precision round by some
+    1e-9 m."""
+
+
+CONTACT_MAP = ContactMapSettings()
+
 GAUSS_POINTS = 0.5 + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / (2 * np.sqrt(3.0))
 """The 2 x 2 Gauss points of a face, in [0, 1]², of equal weight."""
 
@@ -113,8 +123,8 @@ def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
 def _lift(points: Array, rays: RayCaster) -> Array:
     """Return how far the smooth surface is above the points, m; 0 for one not on the mesh."""
     up = np.array([0.0, 1.0, 0.0])
-    distance, face, weights = rays.first_in_face(points + ABOVE * up, -up)
-    on = np.abs(distance - ABOVE) < ON_MESH
+    distance, face, weights = rays.first_in_face(points + CONTACT_MAP.ray_start_height * up, -up)
+    on = np.abs(distance - CONTACT_MAP.ray_start_height) < CONTACT_MAP.on_mesh_distance
     lift = np.zeros(len(points))
     lift[on], _ = CurvedSurface.of(rays.surface).shift(face[on], weights[on], up)
     return lift

@@ -33,16 +33,28 @@ _log = logging.getLogger("tkamb")
 INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
 """Node classes: inside, top surface, flat bottom, any other surface (walls, underside)."""
 
-MAX_EDGE_RATIO = 1.4
-"""Longest over shortest edge of a grid cell."""
-FLATNESS = 5e-5
-"""m: nodes this near the plane of the flat bottom lie in it."""
-MOST_CELLS = 1_000_000
-"""Of a grid over the bounding box: a knee's at 0.35 mm, more than fifty gigabytes."""
-LEAST_JACOBIAN = 0.05
-"""A surface cell with a smaller scaled Jacobian is left out."""
-LEAST_EDGE = 0.2
-"""A surface cell with an edge shorter than this share of the spacing is left out."""
+
+@dataclass(frozen=True)
+class GridSettings:
+    """The regular grid of a lattice."""
+
+    max_edge_ratio: float = 1.4
+    """1: longest over shortest edge of a grid cell. Flatter hexahedra are too stiff in
+    bending."""
+    bottom_tolerance: float = 5e-5
+    """m: nodes this near the plane of the flat bottom lie in it. It is what meshes of flat
+    bottoms vary by."""
+    max_cells: int = 1_000_000
+    """Cells of a grid over the bounding box: a knee's at 0.35 mm, which takes more than fifty
+    gigabytes."""
+    least_jacobian: float = 0.05
+    """1: a surface cell with a smaller scaled Jacobian is left out; its stiffness would be
+    ill-conditioned."""
+    least_edge: float = 0.2
+    """Share of the spacing, 1: a surface cell with a shorter edge is left out."""
+
+
+GRID = GridSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +138,7 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
 
     Raises:
         InputError: the surface is open beyond mending, thinner than the cells, or they are
-            more than `MOST_CELLS`.
+            more than `GRID.max_cells`.
     """
     lattice = make_grid(insert, target_size)
     tell_repairs(lattice, insert)
@@ -148,12 +160,13 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
     """Return what `build_grid` does, and log nothing."""
     extent = insert.bounds[1] - insert.bounds[0]
     spacing = grid_spacing(extent, target_size)
+    # Checked before any array is made: a mesh in millimetres would ask for 1e9 times as many cells.
     count = float((extent / spacing).prod())
-    if count > MOST_CELLS:
+    if count > GRID.max_cells:
         raise InputError(
             f"cells of {target_size / MILLIMETRE:g} mm make {count:.2g} of them",
             insert.name,
-            f"take larger ones ({MOST_CELLS:.0e} at most), and check the mesh's unit",
+            f"take larger ones ({GRID.max_cells:.0e} at most), and check the mesh's unit",
         )
     field = settle_columns(insert, spacing)
     settle_walls(field, insert)
@@ -177,10 +190,11 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
         raise InputError(
             f"a cell size of {target_size / MILLIMETRE:g} mm", mend="give a positive size"
         )
+    # Sizes are tried outwards from the target until all three spacings fit near-cubic cells.
     for percent in range(400):
         for size in (target_size / 1.01**percent, target_size * 1.01**percent):
             spacing = extent / np.maximum(np.round(extent / size), 1.0)
-            if spacing.max() / spacing.min() <= MAX_EDGE_RATIO:
+            if spacing.max() / spacing.min() <= GRID.max_edge_ratio:
                 return spacing
     raise InputError(
         f"a box of {np.round(extent / MILLIMETRE, 3)} mm cannot be divided into near-cubic cells"
@@ -193,14 +207,14 @@ def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
     corner = np.argwhere(_all_corners(field.member))
     grid = corner[:, None, :] + CORNERS
     cells = np.ravel_multi_index(tuple(np.moveaxis(grid, -1, 0)), shape)
-    found = len(cells)
+    total = len(cells)
     cells = cells[~_bridges_gap(field, cells)]
     points = field.points.reshape(-1, 3)
-    cells = cells[scaled_jacobians(points[cells]) > LEAST_JACOBIAN]
-    cells = cells[shortest_edges(points[cells]) > LEAST_EDGE * field.spacing.min()]
+    cells = cells[scaled_jacobians(points[cells]) > GRID.least_jacobian]
+    cells = cells[shortest_edges(points[cells]) > GRID.least_edge * field.spacing.min()]
     cells = cells[insert.winding.inside(points[cells].mean(axis=1))]
     cells = cells[standing_pieces(cells, _on_bottom(field))]
-    return cells, found - len(cells)
+    return cells, total - len(cells)
 
 
 def _all_corners(member: Mask) -> Mask:
@@ -252,7 +266,7 @@ def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
 def _on_bottom(field: NodeField) -> Mask:
     """Say which grid nodes (flat) lie in the flat bottom."""
     height = field.points[..., 1].ravel()
-    flat = np.abs(height) <= max(FLATNESS, 0.02 * field.spacing[1])
+    flat = np.abs(height) <= max(GRID.bottom_tolerance, 0.02 * field.spacing[1])
     return field.lower_end.ravel() & flat
 
 

@@ -20,12 +20,20 @@ from scipy.sparse.linalg import spsolve
 
 from tkamb.geometry.frames import Array, Index
 
-MAX_EDGE_RATIO = 1.4
-"""Longest over shortest edge of a cell, before its nodes are moved onto the surface."""
-MAX_SLOPE = 1.0
-"""Steepest slope that the layers follow."""
-LOW_STEPS = 0.01
-"""Largest share of the columns that may be too low for the layers."""
+
+@dataclass(frozen=True)
+class LayerSettings:
+    """The layers of cells below the articular surface."""
+
+    max_edge_ratio: float = 1.4
+    """1: longest over shortest edge of a cell before its nodes are moved onto the surface."""
+    max_slope: float = 1.0
+    """1: steepest slope, rise over run, that the layers follow (45 deg)."""
+    max_low_share: float = 0.01
+    """1: largest share of the columns that may be too low for the layers."""
+
+
+LAYER = LayerSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +78,7 @@ def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
         spacing: (3,) m, of the grid.
     """
     across = spacing[[0, 2]]
-    thinnest, thickest = across.max() / MAX_EDGE_RATIO, across.min() * MAX_EDGE_RATIO
+    thinnest, thickest = across.max() / LAYER.max_edge_ratio, across.min() * LAYER.max_edge_ratio
     layers = _reference_layers(top[np.isfinite(top)], thinnest, thickest, spacing[1])
     clipped = np.clip(top, layers * thinnest, layers * thickest)
     reference = _filled(_slope_limited(_smooth_part(clipped, across), across))
@@ -89,7 +97,7 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
-    candidates = candidates[stepped <= max(LOW_STEPS, stepped.min())]
+    candidates = candidates[stepped <= max(LAYER.max_low_share, stepped.min())]
     covered = [np.mean((top >= n * thinnest) & (top <= n * thickest)) for n in candidates]
     best = candidates[np.isclose(covered, np.max(covered), atol=1e-3)]
     return int(best[np.argmin(np.abs(best - np.median(top) / spacing))])
@@ -100,16 +108,16 @@ def _smooth_part(height: Array, across: Array) -> Array:
     number = np.arange(height.size).reshape(height.shape)
     links = []
     for axis in range(2):
-        gentle = np.abs(np.diff(height, axis=axis)) <= MAX_SLOPE * across[axis] * (1.0 + 1e-9)
+        gentle = np.abs(np.diff(height, axis=axis)) <= LAYER.max_slope * across[axis] * (1.0 + 1e-9)
         low = np.delete(number, -1, axis=axis)[gentle]
         high = np.delete(number, 0, axis=axis)[gentle]
         links.append(np.stack([low, high]))
     a, b = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(height.size, height.size))
     label = connected_components(graph, directed=False)[1].reshape(height.shape)
-    known = np.isfinite(height)
-    largest = np.bincount(label[known]).argmax()
-    return np.where(known & (label == largest), height, np.nan)
+    finite = np.isfinite(height)
+    largest = np.bincount(label[finite]).argmax()
+    return np.where(finite & (label == largest), height, np.nan)
 
 
 def _slope_limited(height: Array, across: Array) -> Array:
@@ -118,10 +126,10 @@ def _slope_limited(height: Array, across: Array) -> Array:
     while True:
         before = result.copy()
         for axis in range(2):
-            rise = MAX_SLOPE * across[axis]
-            moved = np.moveaxis(result, axis, 0)
-            moved[1:] = np.minimum(moved[1:], moved[:-1] + rise)
-            moved[:-1] = np.minimum(moved[:-1], moved[1:] + rise)
+            rise = LAYER.max_slope * across[axis]
+            along_axis = np.moveaxis(result, axis, 0)
+            along_axis[1:] = np.minimum(along_axis[1:], along_axis[:-1] + rise)
+            along_axis[:-1] = np.minimum(along_axis[:-1], along_axis[1:] + rise)
         if np.array_equal(before, result):
             return np.where(np.isfinite(height), result, np.nan)
 

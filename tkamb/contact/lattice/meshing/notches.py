@@ -13,14 +13,26 @@ from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, refired
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.rays import RayCaster
 
-BULGE = 0.1
-"""How far the node stays short of the line: on it the cell's corner would be flat."""
-INSET = 1e-3
-"""Share of the way inwards by which a node keeps inside its corner, where rays along y hit."""
-FIRE_AT = 0.1
-"""Cells below a node on the top, or above one underneath, where it is asked what is inside."""
-REACH = 0.75
-"""Largest move, in diagonals of a cell's face."""
+
+@dataclass(frozen=True)
+class NotchSettings:
+    """Nodes that are moved into notches of the surface."""
+
+    corner_margin: float = 0.1
+    """1: share of the way that a node stays short of the line between its neighbours. On the
+    line the cell's corner would be flat."""
+    corner_inset: float = 1e-3
+    """1: share of the way inwards by which a node stays inside its corner, so that rays along
+    y hit."""
+    ray_start_cells: float = 0.1
+    """Cells below a node on the top, or above one underneath, at which rays ask what is
+    inside."""
+    max_move_diagonals: float = 0.75
+    """Diagonals of a cell's face: largest move of a node. A larger one would turn the cell
+    inside out."""
+
+
+NOTCH = NotchSettings()
 
 
 def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
@@ -85,18 +97,21 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
         second[:, notch.axes[0]],
         first[:, notch.axes[1]],
     )
-    within = np.where(upper, -FIRE_AT, np.where(lower, FIRE_AT, 0.0)) * field.spacing[1]
-    corner = _towards(corner, across, INSET, 0.0)
+    within = (
+        np.where(upper, -NOTCH.ray_start_cells, np.where(lower, NOTCH.ray_start_cells, 0.0))
+        * field.spacing[1]
+    )
+    corner = _towards(corner, across, NOTCH.corner_inset, 0.0)
     winding = rays.surface.winding
     is_corner = winding.inside(_towards(corner, across, 0.0, within))
     keep = is_corner | winding.inside(_towards(middle, across, 0.1, within))
-    target = np.where(is_corner[:, None], corner, middle + BULGE * (own - middle))
+    target = np.where(is_corner[:, None], corner, middle + NOTCH.corner_margin * (own - middle))
     if flat:
         probe = np.where(is_corner[:, None], corner, middle)
         field.points[..., 1][notch.node] = middle[:, 1]
         field.upper_end[notch.node], field.lower_end[notch.node] = upper, lower
         target[:, 1] = refired(field, notch.node, probe, rays)
-    reach = REACH * np.linalg.norm(field.spacing[list(notch.axes)])
+    reach = NOTCH.max_move_diagonals * np.linalg.norm(field.spacing[list(notch.axes)])
     keep &= np.linalg.norm((target - own)[:, notch.axes], axis=1) <= reach
     _settle(field, notch, target, keep, flat)
 

@@ -13,14 +13,25 @@ from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-LEAST_PIECE = 0.01
-"""A piece with a smaller share of the largest one's cells is a crumb of its rim, left out."""
+
+@dataclass(frozen=True)
+class PieceSettings:
+    """Separate pieces of a lattice."""
+
+    least_piece_share: float = 0.01
+    """1: a piece with a smaller share of the largest piece's cells is a crumb of the rim, and
+    left out."""
+    line_spacing: float = 2.5e-4
+    """m: distance of the lines that measure the volume of overlapping bodies. The volume is
+    then within 0.1 %."""
+
+
+PIECE = PieceSettings()
+
 LOWER_FACE = 2
 """Row of `FACES` that holds a cell's lower corners."""
 OUTER_SKIN_TURNED = (0, 3, 4)
 """Rows of `FACES` whose corners run clockwise as seen from outside."""
-VOLUME_LINES = 2.5e-4
-"""m between the lines that measure the volume of overlapping bodies: within 0.1 %."""
 
 
 def connected_pieces(cells: Index) -> Index:
@@ -49,7 +60,7 @@ def standing_pieces(cells: Index, bottom: Mask) -> Mask:
     if not standing.any():
         standing[size.argmax()] = True
     largest = size[standing].max()
-    return (standing & (size >= LEAST_PIECE * largest))[piece]
+    return (standing & (size >= PIECE.least_piece_share * largest))[piece]
 
 
 @dataclass(frozen=True)
@@ -91,13 +102,13 @@ def missing_part(nodes: Array, cells: Index, spacing: Array, insert: Surface) ->
     ]
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
     flat = points.reshape(-1, 3)
-    lost = insert.winding.inside(flat) & ~outer_skin(nodes, cells).winding.inside(flat)
-    regions, count = label_regions(lost.reshape(points.shape[:3]))
+    missing = insert.winding.inside(flat) & ~outer_skin(nodes, cells).winding.inside(flat)
+    regions, count = label_regions(missing.reshape(points.shape[:3]))
     if not count:
         return None
     largest = regions == 1 + int(np.bincount(regions.ravel())[1:].argmax())
-    held = points[largest]
-    low, high = held.min(axis=0) - step / 2.0, held.max(axis=0) + step / 2.0
+    part_points = points[largest]
+    low, high = part_points.min(axis=0) - step / 2.0, part_points.max(axis=0) + step / 2.0
     return MissingPart(
         float(largest.sum() * step.prod()), tuple(high - low), tuple((low + high) / 2.0)
     )
@@ -124,9 +135,11 @@ def solid_volume(insert: Surface, centres: Array) -> float:
     if not (insert.winding.at(centres) > 1).any():
         return insert.volume
     low, high = insert.bounds
-    lines = [np.arange(low[a] + VOLUME_LINES / 2, high[a], VOLUME_LINES) for a in (2, 0)]
-    found = inside_intervals(insert, 1, *lines)
-    return float((found.upper - found.lower).sum() * VOLUME_LINES**2)
+    lines = [
+        np.arange(low[a] + PIECE.line_spacing / 2, high[a], PIECE.line_spacing) for a in (2, 0)
+    ]
+    intervals = inside_intervals(insert, 1, *lines)
+    return float((intervals.upper - intervals.lower).sum() * PIECE.line_spacing**2)
 
 
 def volume_error(nodes: Array, cells: Index, insert: Surface) -> float:

@@ -93,6 +93,7 @@ def _shear(points: Array) -> Array:
     """Return the angle (c,) between a cell's mean upright edge and its layer's normal, rad."""
     edges = points[:, EDGES[:, 1]] - points[:, EDGES[:, 0]]
     along_x, upright, along_z = (edges[:, 4 * a : 4 * a + 4].mean(axis=1) for a in range(3))
+    # Shear is the angle between the upright edges and the normal of the cell's plan.
     normal = np.cross(along_z, along_x)
     cosine = np.einsum("ci,ci->c", normal, upright)
     cosine /= np.linalg.norm(normal, axis=1) * np.linalg.norm(upright, axis=1)

@@ -17,10 +17,20 @@ from tkamb.geometry.surface import Surface
 
 STEPS = ((0, 1), (0, -1), (2, 1), (2, -1))
 """Axis and sign of the four ways sideways."""
-INSET = 1e-6
-"""Cells that a node stays inside the wall it is moved to, so that rays along y still hit."""
-FIRE_AT = 0.1
-"""Rays sideways start this share of a cell inside the surface that the node lies on."""
+
+
+@dataclass(frozen=True)
+class WallSettings:
+    """Nodes that are moved onto side walls."""
+
+    wall_inset: float = 1e-6
+    """Cells: distance that a node stays inside the wall it is moved to, so that rays along y
+    still hit."""
+    ray_start_cells: float = 0.1
+    """Cells: depth below the node's surface at which rays sideways begin."""
+
+
+WALL_NODE = WallSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +58,7 @@ def _firing_points(field: NodeField) -> Array:
     height = field.points[..., 1]
     for end, step in ((field.upper_end, -1), (field.lower_end, 1)):
         i, j, k = np.nonzero(end & ~(field.upper_end & field.lower_end))
-        result[i, j, k, 1] += FIRE_AT * (height[i, j + step, k] - height[i, j, k])
+        result[i, j, k, 1] += WALL_NODE.ray_start_cells * (height[i, j + step, k] - height[i, j, k])
     return result
 
 
@@ -62,14 +72,14 @@ def _filled_cells(field: NodeField, surface: Surface) -> Mask:
         whole &= m[corner]
         centre += y[corner] / 8.0
     x, z = ((line[1:] + line[:-1]) / 2.0 for line in field.lines)
-    found = inside_intervals(surface, 1, z, x)
+    intervals = inside_intervals(surface, 1, z, x)
     filled = np.zeros_like(whole)
-    a, b = found.second, found.first
+    a, b = intervals.second, intervals.first
     rank = np.arange(len(a)) - np.searchsorted(b * len(x) + a, b * len(x) + a)
     for r in range(int(rank.max(initial=-1)) + 1):
         at = rank == r
         low, high = np.full((len(x), len(z)), np.inf), np.full((len(x), len(z)), -np.inf)
-        low[a[at], b[at]], high[a[at], b[at]] = found.lower[at], found.upper[at]
+        low[a[at], b[at]], high[a[at], b[at]] = intervals.lower[at], intervals.upper[at]
         filled |= (centre > low[:, None]) & (centre < high[:, None])
     return whole & filled
 
@@ -111,13 +121,13 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
         chosen = near <= 0.5 * field.spacing[axis]
         move[..., column] = np.where(chosen, np.where(forth <= back, forth, -back), 0.0)
         _leave_far_side(hits[axis : axis + 2], chosen & (forth > back), chosen & (forth <= back))
-    moved: Nodes = np.nonzero((move != 0.0).any(axis=-1))
-    target = _corner_or_wall(firing[moved], move[moved], rays)
-    height = refired_inwards(field, moved, target, -move[moved], rays)
+    nodes: Nodes = np.nonzero((move != 0.0).any(axis=-1))
+    target = _corner_or_wall(firing[nodes], move[nodes], rays)
+    height = refired_inwards(field, nodes, target, -move[nodes], rays)
     good = np.isfinite(height)
-    moved = tuple(index[good] for index in moved)
+    nodes = tuple(index[good] for index in nodes)
     target[:, 1] = height
-    field.points[moved] = target[good]
+    field.points[nodes] = target[good]
 
 
 def _leave_far_side(pair: list[WallHits], forth_left: Mask, back_left: Mask) -> None:
@@ -131,7 +141,7 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
 
     With two walls: the corner, if it is in the part, else the foot on the line between hits.
     """
-    move = move * (1.0 - INSET)
+    move = move * (1.0 - WALL_NODE.wall_inset)
     corner = start.copy()
     corner[:, [0, 2]] += move
     both = np.flatnonzero((move != 0.0).all(axis=1))
@@ -199,7 +209,7 @@ def _admit_at(
 
 def _foot(move: Array) -> Array:
     """Return the foot of the node on the line through its two hits, or its only hit."""
-    move = move * (1.0 + INSET)
+    move = move * (1.0 + WALL_NODE.wall_inset)
     both = (move != 0.0).all(axis=1)
     result = move.copy()
     u, w = move[both].T

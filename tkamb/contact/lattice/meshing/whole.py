@@ -18,20 +18,17 @@ _log = logging.getLogger("tkamb")
 
 @dataclass(frozen=True)
 class VolumeSettings:
-    """How the volume of a lattice is held to that of its mesh.
-
-    Args:
-        tolerance: largest difference, as a share of the mesh's volume. Stiffness and pressure of
-            an insert of 8 mm change by about as much.
-        sizes: cell sizes that are tried in turn, as shares of the wanted one. The last makes twice
-            as many cells.
-        beyond_refinement: a larger difference is a missing part, which smaller cells do not bring
-            back; they are not tried.
-    """
+    """How the volume of a lattice is held to that of its mesh."""
 
     tolerance: float = 0.02
+    """Largest difference, as a share of the mesh's volume. Stiffness and pressure of an insert
+    of 8 mm change by about as much."""
     sizes: tuple[float, ...] = (1.0, 0.95, 0.9, 0.85, 0.8)
+    """Cell sizes that are tried in turn, as shares of the wanted one. The last makes twice as
+    many cells."""
     beyond_refinement: float = 0.1
+    """A larger difference is a missing part, which smaller cells do not bring back; they are
+    not tried."""
 
 
 VOLUME = VolumeSettings()

@@ -36,6 +36,7 @@ class BbarHexahedra(Solid):
         gradients, self.weights = gauss_gradients(self.corners())
         if not (self.weights > 0).all():
             raise InputError("a hexahedron is turned inside out", "lattice", "use finer cells")
+        # The root of the deviatoric form turns strain into five numbers, whose squares sum to 3 e².
         self.shear = np.einsum("rq,cgqj->cgrj", _ROOT, strain_matrix(gradients))
         self.curve = ShearCurve.of(material)
 
@@ -64,6 +65,8 @@ class BbarHexahedra(Solid):
     ) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
+        # The residual is what the elastic operator has too much: (mu - mu_s) times the deviatoric
+        # strain.
         softened = self.material.shear_modulus - self.curve.modulus(equivalent)
         if lost is not None:
             lost[:] = self.curve.lost(equivalent).mean(axis=1)
@@ -84,6 +87,8 @@ class BbarHexahedra(Solid):
                         np.swapaxes(shear, 1, 2) @ shear
                     )
                     force = np.einsum("cri,cr->ci", shear, strain[some, point])
+                    # Rank-one part of the tangent: the derivative of the secant modulus by the
+                    # equivalent strain.
                     scale = weight * softening[some, point] / 3
                     result += scale[:, None, None] * force[:, :, None] * force[:, None, :]
                 yield result

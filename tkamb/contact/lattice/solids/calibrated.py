@@ -33,8 +33,8 @@ from tkamb.contact.lattice.solids.cell_loops import (
     softened_forces,
     strained_cells,
 )
-from tkamb.contact.lattice.solids.curve import LEAST_STRAIN, ShearCurve
-from tkamb.contact.lattice.solids.solid import SMALL_STRAIN, Noticed, Solid, chunks
+from tkamb.contact.lattice.solids.curve import STRESS_CURVE, ShearCurve
+from tkamb.contact.lattice.solids.solid import SOLID, ScreenedElements, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
@@ -98,17 +98,21 @@ def body_diagonal_stiffness(edges: Array) -> float:
     """
     square = edges**2
     pairs = square * np.roll(square, 1)
+    # Beyond it a face diagonal's stiffness would be negative.
     upper = np.prod(edges) * square.sum() / (4 * pairs.max())
     candidates = np.linspace(0, upper, 201)[1:-1]
     none = spring_families(edges, 0.0)
     per_unit = spring_families(edges, 1.0) - none
+    # Family stiffnesses are linear in the body diagonal's, so that two evaluations give all.
     families = none + candidates[:, None] * per_unit
-    kept = families.min(axis=1) >= 0
-    if kept.any():
-        candidates = candidates[kept]
+    complete = families.min(axis=1) >= 0
+    if complete.any():
+        candidates = candidates[complete]
     corners = box_corners(edges)[None]
     matrices = spring_matrix(corners, none)
     matrices = matrices + candidates[:, None, None] * spring_matrix(corners, per_unit)
+    # Six eigenvalues are rigid motions; the seventh is the softest deformation, which hourglassing
+    # would make zero.
     return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
 
 
@@ -151,7 +155,12 @@ class CalibratedNetwork(Solid):
         if self.curve.spline is None:
             lost[:] = 0.0
             return np.zeros((len(cells), 24))
-        curve = self.curve.shear_modulus, self.curve.spline.x, self.curve.spline.c, LEAST_STRAIN
+        curve = (
+            self.curve.shear_modulus,
+            self.curve.spline.x,
+            self.curve.spline.c,
+            STRESS_CURVE.least_strain,
+        )
         forces = np.empty((len(cells), 24))
 
         def softened(some: slice) -> None:
@@ -174,7 +183,7 @@ class CalibratedNetwork(Solid):
             corners, gradients, volume, springs = self._shapes
             work = cell_forces(
                 corners[some], gradients[some], volume[some], springs,
-                shear, bulk, knots, cubic, LEAST_STRAIN,
+                shear, bulk, knots, cubic, STRESS_CURVE.least_strain,
                 self.cells[some], displacement, residuals[some], internal,
             )  # fmt: skip
             return internal, work
@@ -182,7 +191,7 @@ class CalibratedNetwork(Solid):
         (first, work), (second, more) = in_halves(added, len(self.cells))
         return first + second, residuals, work + more
 
-    def noticeable(self, displacement: Array, share: float) -> Noticed | None:
+    def noticeable(self, displacement: Array, share: float) -> ScreenedElements | None:
         """Return the cells whose share of h may exceed `share`, N; see `Solid`.
 
         |(mu - mu_s) K_d u| <= (mu - mu_s) e (3 V lambda)^½, lambda the largest eigenvalue of K_d.
@@ -190,16 +199,18 @@ class CalibratedNetwork(Solid):
         if self.curve.spline is None:
             return None
         corners, gradients, volume, _ = self._shapes
-        strain = min(self.curve.strain_that_softens(share / self._largest), SMALL_STRAIN)
+        strain = min(
+            self.curve.strain_that_softens(share / self._largest), SOLID.always_checked_strain
+        )
 
         def noticed(some: slice) -> tuple[Index, Array]:
             shapes = corners[some], gradients[some], volume[some], self._stiffest
-            limits = strain, 3 * SMALL_STRAIN
-            found, norms = strained_cells(*shapes, self.cells[some], displacement, *limits)
-            return found + some.start, norms
+            limits = strain, 3 * SOLID.always_checked_strain
+            numbers, norms = strained_cells(*shapes, self.cells[some], displacement, *limits)
+            return numbers + some.start, norms
 
         both = in_halves(noticed, len(self.cells))
-        return Noticed(*(np.concatenate(parts) for parts in zip(*both, strict=True)))
+        return ScreenedElements(*(np.concatenate(parts) for parts in zip(*both, strict=True)))
 
     @cached_property
     def _stiffest(self) -> float:

@@ -148,7 +148,7 @@ def strained_cells(
         strain: limit of the equivalent strain e, e² = uᵀ K_d u / (3 V).
         dilatation: limit of |tr G|.
     """
-    found, norms, count = np.empty(len(nodes), np.int64), np.empty(len(nodes)), 0
+    numbers, norms, count = np.empty(len(nodes), np.int64), np.empty(len(nodes)), 0
     u, rest = np.empty((3, 8)), np.empty((3, 8))
     for cell in range(len(nodes)):
         xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(
@@ -166,9 +166,9 @@ def strained_cells(
             size += square - total * total / 8
         small = 2 * volumes[cell] * shear + stiffest * size <= 3 * volumes[cell] * strain**2
         if not (small and abs(3 * mean) <= dilatation):  # NaN is not small
-            found[count], norms[count] = cell, np.sqrt(shear + 3 * mean**2)
+            numbers[count], norms[count] = cell, np.sqrt(shear + 3 * mean**2)
             count += 1
-    return found[:count].copy(), norms[:count].copy()
+    return numbers[:count].copy(), norms[:count].copy()
 
 
 @compiled

@@ -18,8 +18,18 @@ from scipy.interpolate import CubicHermiteSpline
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array
 
-LEAST_STRAIN = 1e-9
-"""Below it the secant modulus is taken as it is there."""
+
+@dataclass(frozen=True)
+class StressCurveSettings:
+    """A measured stress-strain curve."""
+
+    least_strain: float = 1e-9
+    """1: below this strain the secant modulus is that at this strain, because stress over
+    strain is 0/0 at zero."""
+
+
+STRESS_CURVE = StressCurveSettings()
+
 _STRAINS = np.concatenate([[0.0], np.geomspace(1e-7, 20.0, 6000)])
 
 
@@ -42,7 +52,10 @@ class ShearCurve:
             return cls(material.shear_modulus, None)
         stress, tangent = material.stress(_STRAINS), material.tangent(_STRAINS)
         nine_bulk = 9 * material.bulk_modulus
+        # Uniaxial strain minus its volumetric part leaves the equivalent deviatoric strain: e = eps
+        # - s / (9 K).
         strain = _STRAINS - stress / nine_bulk
+        # Chain rule: ds/de from ds/deps.
         spline = CubicHermiteSpline(strain, stress, tangent / (1 - tangent / nine_bulk))
         return cls(material.shear_modulus, spline)
 
@@ -50,7 +63,7 @@ class ShearCurve:
         """Return the secant shear modulus mu_s, Pa, at equivalent strains e >= 0."""
         if self.spline is None:
             return np.full_like(equivalent, self.shear_modulus)
-        floored = np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1])
+        floored = np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1])
         return self.spline(floored) / (3 * floored)
 
     def strain_that_softens(self, stress: float) -> float:
@@ -73,13 +86,14 @@ class ShearCurve:
         """Return 1 - (dq/de)/(3 mu) at equivalent strains e >= 0: of the tangent, what is lost."""
         if self.spline is None:
             return np.zeros_like(equivalent)
-        slope = self.spline(np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1]), 1)
+        slope = self.spline(np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1]), 1)
         return np.asarray(1 - slope / (3 * self.shear_modulus))
 
     def softening(self, equivalent: Array) -> Array:
         """Return (d mu_s / d e) / e, Pa, at equivalent strains e >= 0: never positive."""
         if self.spline is None:
             return np.zeros_like(equivalent)
-        floored = np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1])
+        floored = np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1])
         slope = self.spline(floored, 1) / 3 - self.modulus(floored)
+        # Below this strain the curve is elastic and the quotient is rounding.
         return np.where(equivalent < 1e-7, 0.0, slope / floored**2)

@@ -16,15 +16,24 @@ from tkamb.errors import InputError
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
-CHUNK = 2000
-"""Cells whose matrices are at hand at once: 9 MB."""
+
+@dataclass(frozen=True)
+class SolidSettings:
+    """The elements of a lattice."""
+
+    cells_at_once: int = 2000
+    """Cells whose matrices are in memory at once, 9 MB."""
+    always_checked_strain: float = 0.1
+    """1: elements strained more are always checked for yield, whatever their law says."""
+
+
+SOLID = SolidSettings()
+
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
 """2 dev eps : dev eps as a form (6, 6) in [xx, yy, zz, 2xy, 2yz, 2zx]."""
 DIFFERENCE = 1e-5
 """Relative step of the displacement in a finite difference of the internal forces."""
-SMALL_STRAIN = 0.1
-"""Elements strained more are always noticed, whatever their law makes of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,9 +179,9 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: I
         gradient[:] = 0.0
         for corner in range(8):
             for a in range(3):
-                moved = displacement[cells[cell, corner], a]
+                component = displacement[cells[cell, corner], a]
                 for b in range(3):
-                    gradient[a, b] += moved * gradients[cell, corner, b]
+                    gradient[a, b] += component * gradients[cell, corner, b]
         for a in range(3):
             for b in range(3):
                 strains[k, a, b] = (gradient[a, b] + gradient[b, a]) / 2
@@ -180,7 +189,7 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: I
 
 
 @dataclass(frozen=True, eq=False)
-class Noticed:
+class ScreenedElements:
     """Elements that a bound does not pass over.
 
     Args:
@@ -211,6 +220,8 @@ class Solid(ABC):
 
     def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
         self.nodes, self.cells, self.spacing, self.material = nodes, cells, spacing, material
+        # The mean gradient makes the volumetric part constant in a cell (B-bar), so that nearly
+        # incompressible material does not lock.
         self.gradients, self.volume = mean_gradient(self.corners())
         if not (self.volume > 0).all():
             raise InputError(
@@ -258,16 +269,17 @@ class Solid(ABC):
         """
         residuals = self.nonlinear_residual(displacement)
         internal = self.linear_force(displacement) - self.scatter.sum(residuals)
+        # Directional derivative along the displacement itself: one more evaluation gives u K u.
         further = (1 + DIFFERENCE) * displacement
         beyond = self.linear_force(further) - self.residual_force(further)
         work = float(np.vdot(displacement, beyond - internal)) / DIFFERENCE
         return internal, residuals, work
 
-    def noticeable(self, displacement: Array, share: float) -> Noticed | None:
+    def noticeable(self, displacement: Array, share: float) -> ScreenedElements | None:
         """Return the elements whose share of h may matter; None: all may.
 
         Of no other is the norm of `nonlinear_residual` above `share`, N, or a principal strain of
-        the mean gradient outside of ±2 `SMALL_STRAIN`.
+        the mean gradient outside of ±2 `SOLID.always_checked_strain`.
 
         Args:
             displacement: (n, 3) m.
@@ -295,7 +307,9 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def least_principal_strain(self, displacement: Array, some: Noticed | None = None) -> float:
+    def least_principal_strain(
+        self, displacement: Array, some: ScreenedElements | None = None
+    ) -> float:
         """Return the smallest principal strain of the mean gradients of cells, by default of all.
 
         It is no smaller than minus the norm of its tensor: where the cell of largest norm is
@@ -304,11 +318,13 @@ class Solid(ABC):
         if some is None:
             strain = self.strain(displacement)
             norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
-            some = Noticed(np.arange(len(strain)), norms)
+            some = ScreenedElements(np.arange(len(strain)), norms)
         if not len(some.elements):
             return 0.0
         most = int(some.strain.argmax())
         largest = self.strain(displacement, some.elements[[most]])
+        # The norm of a strain bounds its principal values, so that elements with a smaller norm
+        # than the compression found already cannot have more.
         near = some.strain >= -np.linalg.eigvalsh(largest)[0, 0]
         near[most] = True  # compressed along one axis its norm is its compression, but for rounding
         return float(np.linalg.eigvalsh(self.strain(displacement, some.elements[near])).min())
@@ -316,6 +332,7 @@ class Solid(ABC):
     def bulk(self, cells: slice) -> Array:
         """Return K V g gᵀ of some cells (k, 24, 24), N/m, g · u their mean dilatation."""
         g = self.gradients[cells].reshape(-1, 24)
+        # Volumetric stiffness K V g gᵀ, with g the mean gradient of the dilatation.
         scale = self.material.bulk_modulus * self.volume[cells]
         return (scale[:, None] * g)[:, :, None] * g[:, None, :]
 
@@ -333,8 +350,8 @@ class Solid(ABC):
 
 def chunks(count: int) -> Iterator[slice]:
     """Yield stretches of so many cells."""
-    for first in range(0, count, CHUNK):
-        yield slice(first, min(first + CHUNK, count))
+    for first in range(0, count, SOLID.cells_at_once):
+        yield slice(first, min(first + SOLID.cells_at_once, count))
 
 
 def strain_matrix(gradients: Array) -> Array:

@@ -31,16 +31,16 @@ VERTICAL = 1
 
 @dataclass(frozen=True)
 class ConjugateGradientSettings:
-    """When a linear system counts as solved.
-
-    Args:
-        tolerance: residual relative to the right-hand side. A Newton step need not be exact:
-            its own error is of the order of what the step leaves.
-        max_iterations: a solution is given up to the next Newton step there.
-    """
+    """When a linear system counts as solved."""
 
     tolerance: float = 0.02
+    """Residual relative to the right-hand side. A Newton step need not be exact: its own error
+    is of the order of what the step leaves."""
     max_iterations: int = 60
+    """A solution is given up to the next Newton step there."""
+
+
+CONJUGATE_GRADIENT = ConjugateGradientSettings()
 
 
 class CandidateResponse:
@@ -76,7 +76,7 @@ class HeldNodes:
         self,
         response: CandidateResponse,
         active: Mask,
-        settings: ConjugateGradientSettings = ConjugateGradientSettings(),
+        settings: ConjugateGradientSettings = CONJUGATE_GRADIENT,
     ) -> None:
         self._response, self._active, self._settings = response, active, settings
         self._operator = response.problem.operator
@@ -88,27 +88,29 @@ class HeldNodes:
     @cached_property
     def _factor(self) -> tuple[Array, bool]:
         """Cholesky factor of ZᵀZ, the compliance of the held unknowns."""
+        # Compliance of the active nodes; symmetric and positive definite.
         return cho_factor(self._response.compliance[np.ix_(self._chosen, self._chosen)])
 
     @property
     def slope(self) -> float:
         """Sum of forces (N) that move the active nodes down together, per metre (linear)."""
+        # Forces that move all active nodes by one: their sum is the stiffness of the contact.
         return float(cho_solve(self._factor, np.ones(len(self._chosen))).sum())
 
-    def spread(self, given: Array) -> Array:
+    def spread(self, prescribed: Array) -> Array:
         """Return the displacement (n, 3), m, that given y (a,), m, of the active nodes cause.
 
         It is that of the undeformed lattice; the active nodes have the given y exactly.
         """
         count = len(self._response.problem.solid.nodes)
-        if not len(given):
+        if not len(prescribed):
             return np.zeros((count, 3))
         y = np.zeros(len(self._operator.factor.order))
-        self._push(cho_solve(self._factor, given), y)
+        self._push(cho_solve(self._factor, prescribed), y)
         self._operator.factor.backward(y)
-        moved = self._operator.nodal(y)
-        moved.ravel()[self.unknowns] = given
-        return moved
+        field = self._operator.nodal(y)
+        field.ravel()[self.unknowns] = prescribed
+        return field
 
     def solve(self, tangent: Tangent, force: Array) -> Array:
         """Return the displacement (n, 3), m, of the free unknowns under a force (n, 3), N.
@@ -128,14 +130,16 @@ class HeldNodes:
             return self._free(self._solve_linear(x.reshape(shape)))
 
         size = (force.size, force.size)
-        found, _ = cg(
+        # The elastic factor is the preconditioner: near to the tangent, so that few iterations are
+        # needed.
+        solution, _ = cg(
             LinearOperator(size, matvec=stiffness, dtype=float),
             self._free(force),
             rtol=settings.tolerance,
             maxiter=settings.max_iterations,
             M=LinearOperator(size, matvec=inverse, dtype=float),
         )
-        return np.asarray(found.reshape(shape))
+        return np.asarray(solution.reshape(shape))
 
     def _free(self, values: Array) -> Array:
         """Return values (3n,) with zeros at the held unknowns."""
@@ -145,8 +149,9 @@ class HeldNodes:
         """Return P f (n, 3) of a force (n, 3)."""
         y = self._operator.start(force)
         if len(self._chosen):
-            held = self._response.half.project(y)[self._chosen]
-            self._push(-cho_solve(self._factor, held), y)
+            projection = self._response.half.project(y)[self._chosen]
+            # Reactions of the active nodes that bring their vertical displacement back to zero.
+            self._push(-cho_solve(self._factor, projection), y)
         self._operator.factor.backward(y)
         return self._operator.nodal(y)
 

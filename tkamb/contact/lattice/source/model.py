@@ -36,26 +36,26 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How Sharma's loops begin and end.
-
-    Args:
-        max_loops: most changes of the contact set or of D.
-        max_steps: most tangent steps at one D.
-        first_depth: first D, as a share of the depth that the candidates cover. Candidates
-            reach a quarter deeper than the depth that is expected: 1 / 1.25.
-        load: the load may be missed by this share of the tolerance. One more D costs little, and
-            a load that is missed by the whole tolerance moves the forces by as much.
-        balance: what the free nodes may be out of balance by at one D, as a share of what the
-            load is missed by (or of the tolerance, the larger one).
-        smallest_step: a tangent step is halved down to this share while it raises the imbalance.
-    """
+    """How Sharma's loops begin and end."""
 
     max_loops: int = 60
+    """Most changes of the contact set or of D."""
     max_steps: int = 30
+    """Most tangent steps at one D."""
     first_depth: float = 0.8
+    """First D, as a share of the depth that the candidates cover. Candidates reach a quarter
+    deeper than the depth that is expected: 1 / 1.25."""
     load: float = 0.1
+    """The load may be missed by this share of the tolerance. One more D costs little, and a
+    load that is missed by the whole tolerance moves the forces by as much."""
     balance: float = 0.01
+    """What the free nodes may be out of balance by at one D, as a share of what the load is
+    missed by (or of the tolerance, the larger one)."""
     smallest_step: float = 0.05
+    """A tangent step is halved down to this share while it raises the imbalance."""
+
+
+LOOP = LoopSettings()
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def solve_by_loops(
     load: float | None,
     guess: InitialGuess,
     solver: LatticeSolverSettings,
-    settings: LoopSettings = LoopSettings(),
+    settings: LoopSettings = LOOP,
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None.
 
@@ -136,46 +136,48 @@ def solve_by_loops(
     sliding = SlidingNodes(problem, points, np.zeros_like(points), pose, guess.planes)
     depth = 0.0 if load is None else settings.first_depth * float(guess.reach)
     field, loops, missed = np.zeros_like(problem.solid.nodes), 0, 1.0
-    active, seen = sliding.planes.gap(points) < depth, []
+    active, history = sliding.planes.gap(points) < depth, []
     while True:
         loops += 1
         planes = sliding.planes
         target = settings.balance * max(solver.force_tolerance, missed)
         pressed = _press(response, points, planes, active, depth, field, target, settings)
-        field, moved = pressed.field, pressed.field[nodes]
+        field, displacement = pressed.field, pressed.field[nodes]
         reaction = float(pressed.force.sum())
         missed = 0.0 if load is None else abs(reaction - load) / load
-        changed = _next_active(points + moved, planes, active, pressed.force, depth)
-        opening = np.where(active, 0.0, planes.gap(points + moved) - depth)
+        changed = _next_active(points + displacement, planes, active, pressed.force, depth)
+        opening = np.where(active, 0.0, planes.gap(points + displacement) - depth)
         force = np.where(active, np.maximum(pressed.force, 0), 0.0)
         forces = ContactForces(force, opening, depth, active, loops, True)
         last = loops == settings.max_loops
-        settled = sliding.follow(moved, forces) <= solver.gap_tolerance
+        settled = sliding.follow(displacement, forces) <= solver.gap_tolerance
         still = bool((changed == active).all())
-        carried = missed <= settings.load * solver.force_tolerance
-        done = still and settled and carried and pressed.residual <= solver.force_tolerance
-        if done or last:
-            return _solution(guess, forces, planes, pressed, nodes, loops, missed, done)
+        load_reached = missed <= settings.load * solver.force_tolerance
+        converged = (
+            still and settled and load_reached and pressed.residual <= solver.force_tolerance
+        )
+        if converged or last:
+            return _solution(guess, forces, planes, pressed, nodes, loops, missed, converged)
         if load is not None and still:
-            seen.append((depth, reaction))
-            depth = _next_depth(problem, seen, load, pressed.slope)
-            changed = changed | (sliding.planes.gap(points + moved) < depth) & ~active
-        if not carried or not (changed == active).all():
+            history.append((depth, reaction))
+            depth = _next_depth(problem, history, load, pressed.slope)
+            changed = changed | (sliding.planes.gap(points + displacement) < depth) & ~active
+        if not load_reached or not (changed == active).all():
             # Another set or depth moves the nodes anew: that they do is no sign of swinging.
-            sliding = SlidingNodes(problem, points, moved, pose, planes)
+            sliding = SlidingNodes(problem, points, displacement, pose, planes)
         active = changed
 
 
 def _next_depth(
-    problem: ContactProblem, seen: list[tuple[float, float]], load: float, slope: float
+    problem: ContactProblem, history: list[tuple[float, float]], load: float, slope: float
 ) -> float:
     """Return D by the dummy displacement's slope (linear) or by the secant (nonlinear)."""
-    depth, reaction = seen[-1]
+    depth, reaction = history[-1]
     if problem.solid.material.is_linear:
         return depth + (load - reaction) / slope
     growth = 1.0
-    if len(seen) > 1 and depth != seen[-2][0] and min(reaction, seen[-2][1]) > 0:
-        growth = np.log(reaction / seen[-2][1]) / np.log(depth / seen[-2][0])
+    if len(history) > 1 and depth != history[-2][0] and min(reaction, history[-2][1]) > 0:
+        growth = np.log(reaction / history[-2][1]) / np.log(depth / history[-2][0])
     ratio = (load / max(reaction, 1e-12)) ** (1 / max(growth, 1.0))
     return depth * float(np.clip(ratio, 0.25, 4.0))
 
@@ -205,34 +207,38 @@ def _press(
     """
     solid = response.problem.solid
     assert isinstance(solid, SourceNetwork)
-    held = HeldNodes(response, active)
-    asked = planes.points[active, 1] - depth - points[active, 1]
-    asked -= field.ravel()[held.unknowns]
-    u = field + held.spread(asked)
-    force, residual, internal = _balance(solid, u, held)
+    active_nodes = HeldNodes(response, active)
+    prescribed = planes.points[active, 1] - depth - points[active, 1]
+    prescribed -= field.ravel()[active_nodes.unknowns]
+    u = field + active_nodes.spread(prescribed)
+    force, residual, internal = _balance(solid, u, active_nodes)
     steps = 0
     while residual > target and steps < settings.max_steps:
         steps += 1
-        step = -held.solve(solid.spring_tangent(u), internal)
+        step = -active_nodes.solve(solid.spring_tangent(u), internal)
         share, last = 1.0, residual
         while True:
-            force, residual, internal = _balance(solid, u + share * step, held)
+            force, residual, internal = _balance(solid, u + share * step, active_nodes)
             if residual < last or share < settings.smallest_step:
                 break
             share /= 2
         u = u + share * step
     everywhere = np.zeros(len(active))
     everywhere[active] = force
-    return _Pressed(everywhere, u, held.slope if solid.material.is_linear else np.nan, residual)
+    return _Pressed(
+        everywhere, u, active_nodes.slope if solid.material.is_linear else np.nan, residual
+    )
 
 
-def _balance(solid: SourceNetwork, u: Array, held: HeldNodes) -> tuple[Array, float, Array]:
+def _balance(solid: SourceNetwork, u: Array, active_nodes: HeldNodes) -> tuple[Array, float, Array]:
     """Return the forces on the active nodes, the relative imbalance and internal forces."""
     internal = solid.internal_force(u)
-    force = -internal.ravel()[held.unknowns]
+    force = -internal.ravel()[active_nodes.unknowns]
     size = max(float(np.abs(force).sum()), 1e-300)
-    lost = float(np.abs(internal.ravel()[~held.held]).sum()) / size if len(force) else 0.0
-    return force, lost, internal
+    residual = (
+        float(np.abs(internal.ravel()[~active_nodes.held]).sum()) / size if len(force) else 0.0
+    )
+    return force, residual, internal
 
 
 def _solution(
@@ -243,10 +249,10 @@ def _solution(
     nodes: Index,
     loops: int,
     missed: float,
-    done: bool,
+    converged: bool,
 ) -> Solution:
     ended = ContactForces(
-        forces.force, forces.gap, forces.approach, forces.active, forces.sets, done
+        forces.force, forces.gap, forces.approach, forces.active, forces.sets, converged
     )
     residual = max(missed, pressed.residual)
     return Solution(

@@ -35,7 +35,10 @@ def source_factor(spacing: Array) -> float:
     length = np.linalg.norm(lines, axis=1)
     n = lines / length[:, None]
     strain = np.column_stack([n**2, n[:, 0] * n[:, 1], n[:, 1] * n[:, 2], n[:, 2] * n[:, 0]])
+    # Stiffness of a cell of unit springs under uniform strain: sum of l² (n n) (n n) over the
+    # volume.
     unit = np.einsum("s,si,sj->ij", length**2, strain, strain) / np.prod(spacing)
+    # Scaled so that a free bar along y has the material's Young's modulus (Sharma 2008).
     return float(np.linalg.inv(unit)[VERTICAL, VERTICAL])
 
 
@@ -99,6 +102,8 @@ class SourceNetwork(Solid):
         straight = self.lines[springs] / self.lengths[springs, None]
         longer = np.einsum("sd,sd->s", straight, displacement[b] - displacement[a])
         linear = self.material.young_modulus * longer[:, None] * straight
+        # Springs turn with the displacement, so that force and direction are those of the deformed
+        # network.
         now = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
         softened = self.factor * (linear - now)
         if lost is not None:
@@ -153,6 +158,8 @@ class SourceNetwork(Solid):
 
     def _assembled(self, stiffness: Array, direction: Array) -> sparse.csr_matrix:
         block = stiffness[:, None, None] * direction[:, :, None] * direction[:, None, :]
+        # Stiffness of a spring along its direction; transversal terms are left out, as in a tangent
+        # of small turns.
         matrices = np.block([[block, -block], [-block, block]])
         return self._spring_pattern.assemble([matrices])
 
