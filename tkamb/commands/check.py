@@ -40,8 +40,8 @@ def _check(options: argparse.Namespace) -> int:
     from tkamb.show.check.scene_check import check_scene
 
     if options.out and options.out.suffix.lower() not in PICTURES:
-        mend = f"name it like check{PICTURES[0]}"
-        raise InputError(f"is none of {', '.join(PICTURES)}", options.out, mend)
+        hint = f"name it like check{PICTURES[0]}"
+        raise InputError(f"is none of {', '.join(PICTURES)}", options.out, hint)
     check_output_file(options.out, options.force)
     with Stages(4 if options.out else 3) as stages:
         found = check_scene(options.scene, dict(options.set), stages.begin)

@@ -3,11 +3,20 @@
 import argparse
 import re
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SHOWN = 10
-"""Failed runs that are printed."""
+
+@dataclass(frozen=True)
+class CohortOutputSettings:
+    """What `tkamb cohort` prints."""
+
+    max_failed_runs: int = 10
+    """Failed runs that are printed; the folder has them all."""
+
+
+COHORT_OUTPUT = CohortOutputSettings()
 
 
 def add_cohort(commands: Any) -> None:
@@ -59,10 +68,13 @@ def _cohort(options: argparse.Namespace) -> int:
         progress=lambda runs, count: tqdm(runs, total=count, unit="run", disable=None),
     )
     failed = [n for n, one in outcomes.items() if one.reason]
-    for n in failed[:SHOWN]:
+    for n in failed[: COHORT_OUTPUT.max_failed_runs]:
         print(f"tkamb: run {n} ({cohort.runs[n].words()}): {outcomes[n].reason}", file=sys.stderr)
-    if len(failed) > SHOWN:
-        print(f"tkamb: {len(failed) - SHOWN} more failed runs: see runs.csv", file=sys.stderr)
+    if len(failed) > COHORT_OUTPUT.max_failed_runs:
+        print(
+            f"tkamb: {len(failed) - COHORT_OUTPUT.max_failed_runs} more failed runs: see runs.csv",
+            file=sys.stderr,
+        )
     print(f"{len(outcomes) - len(failed)} of {len(outcomes)} runs computed")
     if part is None:
         print(f"report: {directory / REPORT_NAME}")

@@ -50,8 +50,8 @@ def _export_deck(options: argparse.Namespace) -> int:
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")
     if options.resolution is not None and not 0 < options.resolution <= COARSEST_MM:
-        mend = f"give more than 0, at most {COARSEST_MM:g} mm"
-        raise InputError(f"resolution {options.resolution} mm", "--resolution", mend)
+        hint = f"give more than 0, at most {COARSEST_MM:g} mm"
+        raise InputError(f"resolution {options.resolution} mm", "--resolution", hint)
     check_output_file(options.out, options.force)
     found = frame_press(options.folder, options.frame, options.resolution)
     write_text(options.out, found.deck(options.deck))

@@ -145,8 +145,8 @@ class CamPost:
         material: Material,
     ) -> None:
         if model.name in NO_LINE_CONTACT:
-            mend = "take foundation, lattice or fe"
-            raise InputError(f"contact model '{model.name}' has no line contact", WHERE, mend)
+            hint = "take foundation, lattice or fe"
+            raise InputError(f"contact model '{model.name}' has no line contact", WHERE, hint)
         low, high = post.bounds
         front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
         self.in_turned = np.eye(4)
@@ -292,8 +292,8 @@ def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
         InputError: nothing lies there.
     """
     if split is None:
-        mend = "leave the key out, or give a component with two condyles"
-        raise InputError("one condyle has no cam", WHERE, mend)
+        hint = "leave the key out, or give a component with two condyles"
+        raise InputError("one condyle has no cam", WHERE, hint)
     across = femoral.triangles[:, :, 2] - split
     behind = femoral.triangles[:, :, 0].max(axis=1) < femoral.bounds[:, 0].mean()
     own = behind & (across.min(axis=1) < reach) & (across.max(axis=1) > -reach)

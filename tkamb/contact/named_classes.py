@@ -44,14 +44,14 @@ class NamedClasses(Generic[Base]):
         """
         offers = self._offers()
         if name not in offers:
-            raise InputError(f"no {self.kind} '{name}'", mend=names_near(name, offers))
+            raise InputError(f"no {self.kind} '{name}'", hint=names_near(name, offers))
         where = f"{self.kind} '{name}' ({offers[name]})"
         module, _, attribute = offers[name].partition(":")
         try:
             found = getattr(import_module(module), attribute)
         except (ImportError, AttributeError) as error:
-            mend = "install what it needs"
-            raise InputError(f"cannot be loaded ({error})", where, mend) from error
+            hint = "install what it needs"
+            raise InputError(f"cannot be loaded ({error})", where, hint) from error
         if not (isinstance(found, type) and issubclass(found, self.base)):
             base = f"{self.base.__module__}.{self.base.__name__}"
             raise InputError(f"is not a subclass of {base}", where)
@@ -65,7 +65,7 @@ class NamedClasses(Generic[Base]):
             if known != point.value:
                 raise InputError(
                     f"two {self.kind}s are called '{point.name}': {known} and {_origin(point)}",
-                    mend="uninstall or rename one",
+                    hint="uninstall or rename one",
                 )
         return offers
 

@@ -83,16 +83,16 @@ def contact_model(
     else:
         words, spacing = f"resolution {resolution} m", resolution
     if not (math.isfinite(spacing) and 0 < spacing <= COARSEST_MM * MILLIMETRE):
-        mend = f"give more than 0, at most {COARSEST_MM:g} mm ({COARSEST_MM / 1e3:g} m)"
-        raise InputError(words, where, mend)
+        hint = f"give more than 0, at most {COARSEST_MM:g} mm ({COARSEST_MM / 1e3:g} m)"
+        raise InputError(words, where, hint)
     own = _options(found)
     for option, value in options.items():
         if option not in own:
             raise InputError(f"has no option '{option}'", where, names_near(option, own))
         choices = _words(found, option)
         if choices and value not in choices:
-            mend = f"one of {', '.join(map(str, choices))}"
-            raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
+            hint = f"one of {', '.join(map(str, choices))}"
+            raise InputError(f"option '{option}' cannot be {value!r}", where, hint)
         _check_kind(found, option, value, where)
     return found(resolution=spacing, **options)  # type: ignore[call-arg]
 
@@ -123,8 +123,8 @@ def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) 
         TypeAdapter(kind).validate_python(value, strict=True)
     except ValidationError:
         name = kind.__name__ if isinstance(kind, type) else str(kind)
-        mend = f"give a value of type {name}"
-        raise InputError(f"option '{option}' cannot be {value!r}", where, mend) from None
+        hint = f"give a value of type {name}"
+        raise InputError(f"option '{option}' cannot be {value!r}", where, hint) from None
 
 
 def contact_descriptions() -> dict[str, str]:

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_json, read_text
+from tkamb.files import FILE_LIMITS, read_json, read_text
 
 WRITTEN = {
     "uncertainty": ("bands.csv",),
@@ -70,7 +70,7 @@ def _rows_of(folder: Path) -> tuple[str, str]:
     if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
         return "", name
     try:
-        first = read_text(folder / name, TABLE_LIMIT).partition("\n")[0]
+        first = read_text(folder / name, FILE_LIMITS.table_bytes).partition("\n")[0]
     except InputError:
         return "", name
     if not first.startswith('{"key": '):

@@ -162,10 +162,10 @@ def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
     """Return a frame by name; of several of one name the body's."""
     if not model.existFrame(name):
         known = [frame.name for frame in model.frames]
-        mend = names_near(name, known)
+        hint = names_near(name, known)
         if part is not None:
-            mend = f"name it: frames={{'{part}': ...}}; {mend}"
-        raise InputError(f"no frame '{name}' in the model", "frames", mend)
+            hint = f"name it: frames={{'{part}': ...}}; {hint}"
+        raise InputError(f"no frame '{name}' in the model", "frames", hint)
     same = [frame for frame in model.frames if frame.name == name]
     bodies = [frame for frame in same if frame.type == pin.FrameType.BODY]
     frame = (bodies or same)[0]

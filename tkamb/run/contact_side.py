@@ -11,7 +11,7 @@
 
 import time as clock
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,13 +43,23 @@ if TYPE_CHECKING:
 
 NAN = float("nan")
 
-LOAD_CHANGE = 0.1
-"""N, between the last two iterations of a coupled frame."""
-POINT_CHANGE = 1e-6
-"""m, of the centres of pressure between them."""
-MOST_ITERATIONS = 20
-OPEN = 0.02
-"""Share of how the knee yields to the muscles that a settled search leaves open."""
+
+@dataclass(frozen=True)
+class CouplingSettings:
+    """The iteration between contact and muscles of one frame."""
+
+    force_tolerance: float = 0.1
+    """N; the iteration has converged when the load changes by less. A ten-thousandth of a body
+    weight is not resolved by any contact model."""
+    point_tolerance: float = 1e-6
+    """m; and when the centres of pressure move by less."""
+    max_iterations: int = 20
+    """Iterations after which a frame without convergence gets a status."""
+    stiffness_error: float = 0.02
+    """Share of the stiffness of the muscles that a converged search may neglect."""
+
+
+COUPLING = CouplingSettings()
 
 
 class ContactSide:
@@ -170,7 +180,7 @@ class ContactSide:
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact once the one's resultants and post act in the other."""
         seconds, place = contact.seconds, self.case.motion.coordinates[k]
-        for iteration in range(1, MOST_ITERATIONS + 1):
+        for iteration in range(1, COUPLING.max_iterations + 1):
             if contact.result is None:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
@@ -197,7 +207,7 @@ class ContactSide:
                 point_change=moved if coupled else NAN,
                 post=post,
             )
-            if change < LOAD_CHANGE and moved < POINT_CHANGE:
+            if change < COUPLING.force_tolerance and moved < COUPLING.point_tolerance:
                 return body, contact
         problem = "body and contact do not come to agree"
         return replace(body, loads=unsolved([problem])), replace(
@@ -306,7 +316,7 @@ def insert_material_as_json(scene: Scene) -> dict[str, Any]:
 
 def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
     """Return a flag where it hangs on the search how the knee yields to the muscles."""
-    if knee.doubt <= OPEN:
+    if knee.doubt <= COUPLING.stiffness_error:
         return ()
     return (
         f"how the knee yields to the muscles does not settle ({100 * knee.doubt:.0f} % of it is "

@@ -32,8 +32,16 @@ PER_FRAME = (
 )
 
 
-WAITING = 4e6
-"""Bytes of maps that wait to be written together: a write costs as much as the maps of a frame."""
+@dataclass(frozen=True)
+class MapWriteSettings:
+    """How pressure maps are written."""
+
+    buffer_bytes: float = 4e6
+    """Bytes of maps that are collected for one write: a write costs as much as the maps of a
+    frame."""
+
+
+MAP_WRITE = MapWriteSettings()
 
 
 class MapWriter:
@@ -118,7 +126,7 @@ class MapWriter:
             for value, shape in zip(values, shapes, strict=True)
         )
         self._waiting.append(frame)
-        if len(self._waiting) * sum(values.nbytes for values in frame) > WAITING:
+        if len(self._waiting) * sum(values.nbytes for values in frame) > MAP_WRITE.buffer_bytes:
             self.flush()
 
     def flush(self) -> None:

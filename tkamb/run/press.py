@@ -37,8 +37,17 @@ from tkamb.memory import peak_rss
 from tkamb.run.known_errors import KnownError, as_json, known_error, known_error_words, left_out
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
-LARGEST_LOAD = 1e5
-"""N, over a hundred body weights."""
+
+@dataclass(frozen=True)
+class PressLimitSettings:
+    """Which loads are accepted."""
+
+    max_load: float = 1e5
+    """N; over a hundred body weights."""
+
+
+PRESS_LIMITS = PressLimitSettings()
+
 Side = Literal["right", "left"]
 
 _CONDYLE = (
@@ -278,9 +287,9 @@ def press_meshes(
 
 def _check_load(load: float) -> None:
     check_load(load)
-    if load > LARGEST_LOAD:
-        limit = f"no knee carries more than {LARGEST_LOAD:g} N"
-        raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
+    if load > PRESS_LIMITS.max_load:
+        limit = f"no knee carries more than {PRESS_LIMITS.max_load:g} N"
+        raise InputError(f"impossible load {load:g} N", hint=f"{limit}; is it in N?")
 
 
 def _adjustment_settings(

@@ -3,6 +3,7 @@
 import hashlib
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.metadata import version
@@ -37,8 +38,17 @@ POST_HELD = (
     "friction as of the condyles; the column force_si_N and its like hold the post's force too."
 )
 
-MUCH_RESERVE = 0.05
-"""Of the coordinate's largest moment."""
+
+@dataclass(frozen=True)
+class SummarySettings:
+    """What a summary warns of."""
+
+    notable_reserve: float = 0.05
+    """Share of a coordinate's largest moment; more reserve than this is a warning."""
+
+
+SUMMARY = SummarySettings()
+
 
 LIBRARIES = ("pin", "numpy", "scipy", "trimesh", "python-fcl")
 
@@ -335,7 +345,7 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
         found[name] = {
             "largest_Nm": float(np.nanmax(reserve)),
             "percent_of_largest_moment": 100.0 * float(np.nanmax(reserve)) / largest,
-            "frames_above_5_percent": int((reserve > MUCH_RESERVE * largest).sum()),
+            "frames_above_5_percent": int((reserve > SUMMARY.notable_reserve * largest).sum()),
         }
     return found
 

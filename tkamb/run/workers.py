@@ -21,7 +21,17 @@ from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.geometry import threads
 from tkamb.run.guard import log_to_stderr
 
-MOST_WORKERS = 256
+
+@dataclass(frozen=True)
+class WorkerLimitSettings:
+    """How many processes a run may start."""
+
+    max_workers: int = 256
+    """Number of worker processes; no machine for which tkamb is meant has more cores."""
+
+
+WORKER_LIMITS = WorkerLimitSettings()
+
 Numbered = tuple[int, Any]
 Progress = Callable[[Iterable[Numbered], int], Iterable[Numbered]]
 ENDED = "a worker process ended before its job was done"
@@ -62,8 +72,10 @@ class Crew:
     dask: str | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.workers <= MOST_WORKERS:
-            raise InputError(f"{self.workers} is not within 1 to {MOST_WORKERS}", "--workers")
+        if not 1 <= self.workers <= WORKER_LIMITS.max_workers:
+            raise InputError(
+                f"{self.workers} is not within 1 to {WORKER_LIMITS.max_workers}", "--workers"
+            )
 
     def check(self) -> None:
         """Raise an InputError where a cluster that is asked for is not there."""

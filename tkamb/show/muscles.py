@@ -42,8 +42,18 @@ HELD = (
     "equilibrium. What a muscle alone leaves unbalanced in flexion is carried by a moment. "
     "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
 )
-HIGHEST = 1.02
-"""Of the activations' axis."""
+
+
+@dataclass(frozen=True)
+class MuscleFigureSettings:
+    """Pictures of muscle activations."""
+
+    axis_top: float = 1.02
+    """Upper end of the axis of activations; lines at 1 stay visible."""
+
+
+MUSCLE_FIGURE = MuscleFigureSettings()
+
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
 """Inches: width and height of a small plot; how many stand beside each other; for the labels."""
 BETWEEN, LABELS = (11.5, 20.0), 10.0
@@ -159,7 +169,7 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
             _draw_cell(axes, cell, results, axis)
             below = k + CELLS_ACROSS >= len(cells)
             axes.tick_params(labelbottom=below, labelleft=k % CELLS_ACROSS == 0)
-        first.set_ylim(0, HIGHEST)
+        first.set_ylim(0, MUSCLE_FIGURE.axis_top)
         first.set_yticks([0, 0.5, 1])
         low = LABEL_PLACE.edge_points / 72 / figure.get_figheight()
         figure.supxlabel(axis.label, fontsize=LABEL_PLACE.tick_label_points, y=low, va="bottom")
@@ -209,7 +219,7 @@ def _beyond(results: "Results", cell: Cell) -> str:
         return ""
     envelope = results[family_column(ENVELOPE, cell.envelope)]
     largest = float(np.nan_to_num(envelope).max(initial=0.0))
-    return f"EMG to {largest:.2g}" if largest > HIGHEST else ""
+    return f"EMG to {largest:.2g}" if largest > MUSCLE_FIGURE.axis_top else ""
 
 
 def _agreement(results: "Results", cell: Cell) -> str:

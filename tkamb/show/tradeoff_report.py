@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from tkamb.show.style import CYCLE, GREY, new_figure, settings
 from tkamb.studies.quantities import SIDES
 from tkamb.studies.references import Reference
-from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING_NOISE, Row
+from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING, Row
 
 MARKERS = "osD^vPX*<>"
 
@@ -64,7 +64,7 @@ def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
         lines.append("")
     names = ", ".join(name.replace("_", " ") for name in FRONT_ERRORS)
     lines.append("* on the Pareto front of warm time against the largest of the errors in")
-    tie = f"medians of time within {100 * (TIMING_NOISE - 1):.0f} % count as equal"
+    tie = f"medians of time within {100 * (TIMING.equal_ratio - 1):.0f} % count as equal"
     return [*lines, f"  {names}; {tie}. One thread."]
 
 

@@ -26,9 +26,18 @@ from tkamb.studies.kept_rows import KeptRows, row_key
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-RECORDED = 101
-STEP = 10
-"""Every so many of the recorded frames are compared: those that all frame rates have."""
+
+@dataclass(frozen=True)
+class BodyTradeSettings:
+    """The study of the frame rate of a motion."""
+
+    recorded_frames: int = 101
+    """Frames of the shipped motion."""
+    stride: int = 10
+    """Every so many of the recorded frames are compared: those that all frame rates have."""
+
+
+BODY_TRADE = BodyTradeSettings()
 
 
 @dataclass(frozen=True)
@@ -123,7 +132,7 @@ def _run(change: Change) -> _Run:
         path = copied_scene(Path(folder))
         if change.every > 1:
             thin_out(Path(folder), change.every)
-        frames = slice(0, None, STEP // change.every)
+        frames = slice(0, None, BODY_TRADE.stride // change.every)
         start = clock.perf_counter()
         scene = load_scene(path, change.keys)
         results = simulate(scene, frames=frames)

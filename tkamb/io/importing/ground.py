@@ -31,8 +31,18 @@ from tkamb.io.recordings.plate_loads import PLATE_LOAD, around_load, unloaded_le
 from tkamb.io.recordings.recordings import ForceRecording
 from tkamb.io.recordings.tables import Table, read_table
 
-UNLOADED_N = 40.0
-"""Vertical force below which a scene that an import writes holds the centre of pressure."""
+
+@dataclass(frozen=True)
+class ImportedForceSettings:
+    """What an imported scene says about its measured ground reaction."""
+
+    hold_below: float = 40.0
+    """N; vertical force below which the imported scene holds the centre of pressure. The shipped
+    imports use it: below 40 N the quotient of moment and force is noise."""
+
+
+IMPORTED_FORCE = ImportedForceSettings()
+
 COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
 """Of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
 Interval = tuple[float, float]
@@ -196,7 +206,16 @@ def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
     """Return a table's force with its wrench in the laboratory."""
     columns = {"time": "time", **force.columns}
     source = ForceRecording(
-        table.path, "none", None, (), columns, "m", axes, "on the foot", UNLOADED_N, 0.0
+        table.path,
+        "none",
+        None,
+        (),
+        columns,
+        "m",
+        axes,
+        "on the foot",
+        IMPORTED_FORCE.hold_below,
+        0.0,
     )
     time, wrench, level = recorded_wrench(source)
     on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
@@ -224,7 +243,7 @@ def _summed(recorded: list[RecordedForce], path: Path) -> str:
         on = around_load(np.linalg.norm(one.wrench[:, :3], axis=1), time)
         wrenches.append(np.where(on[:, None], one.wrench, 0.0))
     level = float(np.mean(levels))
-    point, moment, force = summed_reaction(time, wrenches, level, UNLOADED_N, path)
+    point, moment, force = summed_reaction(time, wrenches, level, IMPORTED_FORCE.hold_below, path)
     rows = np.column_stack([time, force, point, moment])
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
     return "\n".join([",".join(COLUMNS), *lines, ""])

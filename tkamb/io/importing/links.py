@@ -10,8 +10,17 @@ from tkamb.io.importing.anatomy import Leg
 from tkamb.io.recordings.meshes import axes_rotation
 from tkamb.units import DEGREE
 
-MOST_TURNED = 35.0 * DEGREE
-"""An implant's axes lie within this of the bone's; a wrong axis is 90 deg off."""
+
+@dataclass(frozen=True)
+class LinkFitSettings:
+    """How the links of the URDF are laid into the bodies of an OpenSim model."""
+
+    max_implant_rotation: float = 35.0 * DEGREE
+    """rad; largest rotation between the implant's axes and the bone's. A wrong axis is off by 90
+    deg, a real implantation by a few degrees."""
+
+
+LINK_FIT = LinkFitSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +219,7 @@ def _anatomical(
     there = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(there[:3, :3])
     angle = np.arccos(np.clip((np.trace(there[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
-    if not np.allclose(nearest, np.eye(3)) or angle > MOST_TURNED:
+    if not np.allclose(nearest, np.eye(3)) or angle > LINK_FIT.max_implant_rotation:
         raise InputError(
             f"the {part} stands turned by {angle / DEGREE:.0f} deg on '{body}' with these axes "
             f"({frame.why})",

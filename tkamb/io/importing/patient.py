@@ -9,7 +9,7 @@ import numpy as np
 
 from tkamb.atomic import CHOOSE_OUT, claim_directory, write_new_text
 from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg
@@ -31,16 +31,27 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.units import DEGREE, MILLIMETRE
 
-LEG_ALONE = 0.6
-"""Share of a model's mass above which thigh, shank and foot are a model of one leg."""
-LEG_SHARE = 0.161
-"""Of the body's mass, thigh 0.100, shank 0.0465, foot 0.0145 (Winter, Biomechanics, 2009)."""
+
+@dataclass(frozen=True)
+class ModelMassSettings:
+    """How the mass of an OpenSim model becomes the mass of a patient."""
+
+    one_leg_share: float = 0.6
+    """Share of the mass of a model that thigh, shank and foot have at least where it is a model of
+    one leg."""
+    leg_mass_share: float = 0.161
+    """Share of the body's mass in one leg: thigh 0.100, shank 0.0465, foot 0.0145 (Winter,
+    Biomechanics, 2009)."""
+    max_reasons: int = 3
+    """Parts that were not read of which the report of an import gives the reason."""
+    same_mass_share: float = 0.01
+    """Share of the subject's mass; a model whose mass differs by less is not scaled."""
+
+
+MODEL_MASS = ModelMassSettings()
+
 LEG_SHARES = (0.10, 0.25)
 """Of the body's mass: from Winter's 0.161 to de Leva's 0.20 (1996), with room for other people."""
-MAX_REASONS = 3
-"""Parts that were not read of which the report gives the reason."""
-SAME_MASS = 0.01
-"""A model whose mass is within this share of the subject's is not scaled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +210,7 @@ def _same_there(path: Path, text: str) -> bool:
     if not os.path.lexists(path):
         return False
     with suppress(InputError):
-        if read_bytes(path, TABLE_LIMIT) == text.encode("utf-8", "backslashreplace"):
+        if read_bytes(path, FILE_LIMITS.table_bytes) == text.encode("utf-8", "backslashreplace"):
             return True
     what = "is there already with another content; another scene may need it"
     raise InputError(what, path, CHOOSE_OUT)
@@ -246,10 +257,14 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
         raise InputError(
             "gives thigh, shank and foot no mass", request.model, "give its bodies their masses"
         )
-    if own > LEG_ALONE * model:
+    if own > MODEL_MASS.one_leg_share * model:
         return _leg_scale(request, own)
     ratio = subject / model
-    scaled = abs(ratio - 1.0) > SAME_MASS if request.scale_mass is None else request.scale_mass
+    scaled = (
+        abs(ratio - 1.0) > MODEL_MASS.same_mass_share
+        if request.scale_mass is None
+        else request.scale_mass
+    )
     said = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
     if not 0.5 < ratio < 2.0:
         raise InputError(
@@ -264,13 +279,13 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
     """Return the factor on the masses of a model that is little more than one leg, and a line.
 
     Such a model holds the leg's own mass, or, where a scaling tool was told the subject's mass,
-    the whole body's. The leg's own is `LEG_SHARE` of the subject.
+    the whole body's. The leg's own is `MODEL_MASS.leg_mass_share` of the subject.
 
     Raises:
         InputError: neither of the two.
     """
     subject = request.mass_kg
-    share, wanted = own / subject, LEG_SHARE * subject
+    share, wanted = own / subject, MODEL_MASS.leg_mass_share * subject
     low, high = LEG_SHARES
     whole_body = 0.5 < share < 2.0
     said = (
@@ -287,7 +302,8 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
         )
     why = ", the whole body's" if whole_body else ""
     return wanted / own, (
-        f"{said}{why}: scaled to {wanted:.2f} kg, the {LEG_SHARE:.1%} of a leg (Winter 2009)"
+        f"{said}{why}: scaled to {wanted:.2f} kg, "
+        f"the {MODEL_MASS.leg_mass_share:.1%} of a leg (Winter 2009)"
     )
 
 
@@ -297,7 +313,7 @@ def _model_lines(model: OpenSimModel) -> list[str]:
     unread = [f"{one.kind} '{one.name}'" for one in model.unread]
     if unread:
         lines.append(f"not read, and not needed for this knee: {some_names(unread)}")
-        lines += [f"  {one.reason}" for one in model.unread[:MAX_REASONS]]
+        lines += [f"  {one.reason}" for one in model.unread[: MODEL_MASS.max_reasons]]
     return lines
 
 

@@ -27,8 +27,17 @@ from tkamb.io.importing.shank import ShankMarkers, shank_markers
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.tables import Table
 
-FRAMES_PER_CUTOFF = 5.0
-"""Frames per period of the cut-off: what is low-passed holds nothing between them."""
+
+@dataclass(frozen=True)
+class TrialFrameSettings:
+    """How many frames of a trial an imported scene holds."""
+
+    frames_per_period: float = 5.0
+    """Frames per period of the cut-off frequency. A low-pass-filtered motion has no content between
+    them."""
+
+
+TRIAL_FRAMES = TrialFrameSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +173,7 @@ def _thinned(
             f"has no two frames between {start:g} and {end:g} s", "--interval", "choose another"
         )
     rate = 1.0 / float(np.median(np.diff(inside)))
-    every = max(int(rate / (FRAMES_PER_CUTOFF * cutoff_Hz) + 1e-9), 1)
+    every = max(int(rate / (TRIAL_FRAMES.frames_per_period * cutoff_Hz) + 1e-9), 1)
     count = (len(inside) - 1) // every + 1
     even = np.ptp(np.diff(inside)) < 1e-6
     if every == 1 or not even or count < 8:

@@ -7,6 +7,7 @@ element with `file="other.xml"` is replaced by the element that the other file h
 
 import copy
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from tkamb.errors import InputError
@@ -14,8 +15,18 @@ from tkamb.files import parse_xml, read_bytes
 from tkamb.io.opensim.elements import Element
 
 WHAT = "OpenSim model"
-MAX_NESTED_FILES = 5
-"""Files that name files that name files; OpenSim's own models nest one deep."""
+
+
+@dataclass(frozen=True)
+class DocumentSettings:
+    """What is read of an OpenSim file."""
+
+    max_nested_files: int = 5
+    """Files that name files in turn; OpenSim's own models nest one deep."""
+
+
+DOCUMENT = DocumentSettings()
+
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
 """Sets of which tkamb reads nothing but the names: their file may be absent."""
 
@@ -106,7 +117,7 @@ def _replace(
     if not other.is_file() and element.tag in NOT_NEEDED:
         notices.append(f"{element.tag} left out: its file {name} is not there")
         return path, opened
-    if other.resolve() in opened or len(opened) > MAX_NESTED_FILES:
+    if other.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
         raise InputError("names a file that leads back to it", where)
     if not other.exists():
         raise InputError(

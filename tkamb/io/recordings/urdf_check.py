@@ -6,6 +6,7 @@ attribute becomes zero, a joint without limits another type. Here each is an err
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -61,8 +62,17 @@ _CHILDREN = {
 _MANY = {"visual", "collision"}
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _ANKLE_JOINT = "ankle"
-_MOST_TURNS = 8.0 * np.pi
-"""rad: angles are below one turn; a larger number is in degrees."""
+
+
+@dataclass(frozen=True)
+class UrdfAngleSettings:
+    """Which angles of a URDF are in radians."""
+
+    max_angle: float = 8.0 * np.pi
+    """rad; a larger number is in degrees: angles in a URDF are below one turn."""
+
+
+URDF_ANGLE = UrdfAngleSettings()
 
 
 def check_elements(robot: ElementTree.Element, path: Path) -> None:
@@ -99,9 +109,9 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
         if not _finite(text, known[key]):
             numbers = "a number" if known[key] == 1 else f"{known[key]} numbers"
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
-        if key == "rpy" and np.abs(numbers_of(element, key)).max() > _MOST_TURNS:
-            mend = "rpy is in radians: is it in degrees?"
-            raise InputError(f'<origin rpy="{text}"> turns by several turns', where, mend)
+        if key == "rpy" and np.abs(numbers_of(element, key)).max() > URDF_ANGLE.max_angle:
+            hint = "rpy is in radians: is it in degrees?"
+            raise InputError(f'<origin rpy="{text}"> turns by several turns', where, hint)
 
 
 def _finite(text: str, count: int) -> bool:
@@ -135,8 +145,8 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
         where = f"{path}: joint '{joint.get('name')}'"
         for end in (parent, child):
             if end not in links:
-                mend = f"add it, or {names_near(end, links)}"
-                raise InputError(f"names a link '{end}' that is not there", where, mend)
+                hint = f"add it, or {names_near(end, links)}"
+                raise InputError(f"names a link '{end}' that is not there", where, hint)
         if child in parents:
             raise InputError(f"link '{child}' hangs on a second joint", where, "keep one")
         parents[child] = parent
@@ -240,8 +250,8 @@ def _check_limit(joint: ElementTree.Element, path: Path) -> None:
     """Raise unless a joint states all its limits, in order; they bound nothing here."""
     limit, name = joint.find("limit"), joint.get("name")
     if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
-        mend = "give lower, upper, effort and velocity"
-        raise InputError(f"joint '{name}' has no complete <limit>", path, mend)
+        hint = "give lower, upper, effort and velocity"
+        raise InputError(f"joint '{name}' has no complete <limit>", path, hint)
     low, high = (float(numbers_of(limit, key)[0]) for key in ("lower", "upper"))
     if low >= high:
         raise InputError(f"joint '{name}' has limits {low:g} to {high:g}", path, "exchange them")
@@ -267,12 +277,12 @@ def _check_order(
         moved = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
         if name != names[0] and moved.any():
             shown = " ".join(f"{value:g}" for value in moved)
-            mend = f"only '{names[0]}' is placed: give it the identity"
-            raise InputError(f"joint '{name}' has an origin {shown} in the chain", path, mend)
+            hint = f"only '{names[0]}' is placed: give it the identity"
+            raise InputError(f"joint '{name}' has an origin {shown} in the chain", path, hint)
         mass = masses.get(child)
         if name != names[-1] and mass is not None and numbers_of(mass, "value", "0").any():
-            mend = "links inside the chain have none: put it on tibia or femur"
-            raise InputError(f"link '{child}' has a mass", path, mend)
+            hint = "links inside the chain have none: put it on tibia or femur"
+            raise InputError(f"link '{child}' has a mass", path, hint)
     if place != between[1]:
         raise InputError(f"joint '{names[-1]}' leads to '{place}'", path, order)
 

@@ -192,8 +192,8 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
     try:
         import daqp
     except ImportError:
-        mend = "install it: pip install 'tkamb[muscles]'"
-        raise InputError("the solver DAQP is not installed", "muscles", mend) from None
+        hint = "install it: pip install 'tkamb[muscles]'"
+        raise InputError("the solver DAQP is not installed", "muscles", hint) from None
     scale = _row_scale(problem)
     bounded = np.isfinite(problem.lower) | np.isfinite(problem.upper)
     rows = problem.gain[bounded] / scale[bounded, None]

@@ -1,6 +1,7 @@
 """All questions of a case, and what they say about a frame."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,8 +29,17 @@ if TYPE_CHECKING:
     from tkamb.run.mechanics import FrameLoads, Mechanics
 
 ANSWERS = "[output] answers"
-FORCE_BW = 8.0
-"""BW: instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
+
+
+@dataclass(frozen=True)
+class ForceLimitSettings:
+    """Which contact forces are plausible."""
+
+    max_force_BW: float = 8.0
+    """BW; instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
+
+
+FORCE_LIMITS = ForceLimitSettings()
 
 
 class Plausibility:
@@ -73,12 +83,14 @@ class Plausibility:
             question.flag for question in self.questions if question.flag and question.concerns(k)
         ]
         if self._mechanics.ligaments:
-            from tkamb.run.plausibility.lines import STRAIN, torn_bundles
+            from tkamb.run.plausibility.lines import LINE_LIMITS, torn_bundles
 
             if torn := torn_bundles(self._mechanics.ligaments, body.geometry.tensions):
-                words.append(f"ligament strain above {100 * STRAIN:.0f} %: {some(torn)}")
+                words.append(
+                    f"ligament strain above {100 * LINE_LIMITS.max_strain:.0f} %: {some(torn)}"
+                )
         force = float(np.linalg.norm(body.loads.contact_force)) / self._mechanics.case.body_weight
-        if force > FORCE_BW:
+        if force > FORCE_LIMITS.max_force_BW:
             words.append(
                 f"contact force of {force:.1f} BW, more than any knee was measured to bear"
             )
@@ -99,8 +111,8 @@ def _answered(
         own = [question for question in left if words and words.lower() in question.text.lower()]
         if not own:
             texts = "; ".join(question.text for question in left) or "there is none"
-            mend = f"leave it out, or take words of one that is asked: {texts}"
-            raise InputError(f"no question holds '{words}'", ANSWERS, mend)
+            hint = f"leave it out, or take words of one that is asked: {texts}"
+            raise InputError(f"no question holds '{words}'", ANSWERS, hint)
         if not answer.strip():
             raise InputError(f"'{words}' has no answer", ANSWERS, "say why the input is right")
         told += [f"Answered: {question.text} {answer}" for question in own]

@@ -23,8 +23,17 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.measured_force import MeasuredForce
 
 ANGLES = ("flexion", "adduction", "axial_rotation")
-TORN = 0.1
-"""Strain at which a bundle is named: docs/results.md."""
+
+
+@dataclass(frozen=True)
+class InventorySettings:
+    """What `tkamb check` lists."""
+
+    high_strain: float = 0.1
+    """Strain from which a bundle is named; ligaments of the knee tear at 12 to 20 %."""
+
+
+INVENTORY = InventorySettings()
 
 
 @dataclass(frozen=True)
@@ -154,7 +163,7 @@ def _ligaments(mechanics: Mechanics) -> Entry:
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
         for name, values in strains.items()
         for flexion, value in zip(STRAIN_FLEXIONS, values, strict=True)
-        if value > TORN
+        if value > INVENTORY.high_strain
     ]
     text = f"{len(mechanics.ligaments)} bundles: {_listed([b.name for b in mechanics.ligaments])}"
     known = np.array([v for values in strains.values() for v in values if np.isfinite(v)])

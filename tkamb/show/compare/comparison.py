@@ -30,8 +30,17 @@ SETTINGS = {
 }
 """Keys of summary.json that are said where they differ."""
 VERSIONS = "identity"
-LARGEST_COUNT = 8
-"""Runs that one picture can hold apart by colour."""
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """How many runs are compared."""
+
+    max_runs: int = 8
+    """Number of runs that a picture can tell apart by colour."""
+
+
+COMPARE = CompareSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +141,9 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
         InputError: fewer than two or too many folders, one that holds no results, or runs that
             ask for different axes.
     """
-    if not 2 <= len(folders) <= LARGEST_COUNT:
+    if not 2 <= len(folders) <= COMPARE.max_runs:
         what = f"{len(folders)} folders of results"
-        raise InputError(what, "compare", f"give two to {LARGEST_COUNT}")
+        raise InputError(what, "compare", f"give two to {COMPARE.max_runs}")
     paths = [Path(folder) for folder in folders]
     read = [read_results(path) for path in paths]
     for path, results in zip(paths, read, strict=True):

@@ -11,8 +11,16 @@ from tkamb.show.axis import HorizontalAxis
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-SAME_PLACE = 1e-6
-"""deg, per cent or s: as near on the axis as two runs of one recording are."""
+
+@dataclass(frozen=True)
+class PairingSettings:
+    """When frames of two runs are the same instant."""
+
+    tolerance: float = 1e-6
+    """deg, per cent or s; frames nearer on the axis are the same instant of one recording."""
+
+
+PAIRING = PairingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,5 +89,5 @@ def _same_frames(
     paired = found >= 0
     if paired.sum() < min(len(first_time), len(other_time)):
         return None
-    near = np.abs(first_place[paired] - other_place[found[paired]]) <= SAME_PLACE
+    near = np.abs(first_place[paired] - other_place[found[paired]]) <= PAIRING.tolerance
     return found if near.all() else None

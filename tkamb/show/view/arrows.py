@@ -1,6 +1,7 @@
 """The forces of a drawing: magnitudes from results.csv, lines of action from the geometry."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +17,17 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 NOTHING = np.full(3, np.nan)
-CONTACT_POINT = 0.6 * MILLIMETRE
-"""m, radius."""
+
+
+@dataclass(frozen=True)
+class ArrowSettings:
+    """Arrows of the viewer."""
+
+    contact_point_radius: float = 0.6 * MILLIMETRE
+    """m; radius of the sphere at a centre of pressure."""
+
+
+ARROW = ArrowSettings()
 
 
 def force_arrows(
@@ -66,7 +76,7 @@ def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
             "patella" if name == patella else "contact points",
             BLACK,
             np.stack(points),
-            CONTACT_POINT,
+            ARROW.contact_point_radius,
         )
         for name, points in found.items()
         if np.isfinite(points).any()

@@ -5,7 +5,7 @@ Every function returns {id of `published.toml`: our value in the unit named ther
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,19 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 Values = dict[str, float]
 UPRIGHT = knee_pose([0.0] * 6)
-SENSEL = 1.27 * MILLIMETRE
-COARSE_MM = 2.0
-"""Of every press on an implant, so that the whole page takes minutes."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """Presses on implants that are compared with publications."""
+
+    sensel: float = 1.27 * MILLIMETRE
+    """m; edge of a sensel of the pressure film in the publications."""
+    resolution_mm: float = 2.0
+    """mm; resolution of every press on an implant, so that the whole page takes minutes."""
+
+
+BENCHMARK = BenchmarkSettings()
 
 
 def _model(name: str, resolution_mm: float, **options: Any) -> Any:
@@ -137,8 +147,8 @@ def against_fe(
     designs: Path,
     name: str = "nkii_cp",
     flexions: Sequence[float] = (15.0, 60.0, 105.0),
-    size_mm: float = COARSE_MM,
-    fe_size_mm: float = COARSE_MM,
+    size_mm: float = BENCHMARK.resolution_mm,
+    fe_size_mm: float = BENCHMARK.resolution_mm,
 ) -> Values:
     """Return the source's lattice and ours against finite elements on an implant.
 
@@ -172,7 +182,7 @@ def _pressed(
     name: str,
     flexions: Iterable[float],
     load: float = 1200.0,
-    size_mm: float = COARSE_MM,
+    size_mm: float = BENCHMARK.resolution_mm,
     **options: Any,
 ) -> list[tuple[float, CondyleContact]]:
     """Return approach (m) and medial condyle of one contact model at flexions (deg)."""
@@ -202,8 +212,8 @@ def foundation(designs: Path) -> Values:
 
 def _both(design: Design, name: str) -> Array:
     """Peak pressures (2,) Pa of the medial condyle at 15 and 60 deg, whole component."""
-    pressed = PressedDesign(design, COARSE_MM)
-    pressed.model = _model(name, COARSE_MM)
+    pressed = PressedDesign(design, BENCHMARK.resolution_mm)
+    pressed.model = _model(name, BENCHMARK.resolution_mm)
     results = [pressed.press_both(flexion * DEGREE, 2400.0) for flexion in (15.0, 60.0)]
     return np.array([_only(result).peak_pressure for result in results])
 
@@ -232,7 +242,7 @@ def film() -> Values:
     for area in (100.0, 150.0, 200.0):
         for aspect in (1.0, 2.0, 3.0):
             a = np.sqrt(area / np.pi * aspect) * MILLIMETRE
-            found.append(worst_errors((a, a / aspect), SENSEL))
+            found.append(worst_errors((a, a / aspect), BENCHMARK.sensel))
     return {f"film_{k}": 100.0 * float(np.median([row[k] for row in found])) for k in found[0]}
 
 
@@ -264,7 +274,8 @@ def _variant(designs: Path, dish: float, coronal: float, thickness: float = 9.0)
         post=None,
     )
     return PressedDesign(
-        replace(design, articulation=replace(design.articulation, insert=insert)), COARSE_MM
+        replace(design, articulation=replace(design.articulation, insert=insert)),
+        BENCHMARK.resolution_mm,
     )
 
 

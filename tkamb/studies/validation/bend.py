@@ -1,5 +1,6 @@
 """The shipped deep knee bend beside what the dissertation reports of its subjects' forces."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -7,13 +8,22 @@ import numpy as np
 from tkamb.io.scene import load_scene
 from tkamb.run.simulation import simulate
 
-EVERY = 10
-"""Of the 101 frames; contact by Hertz, since only the body's forces are compared."""
+
+@dataclass(frozen=True)
+class BendStudySettings:
+    """The shipped bend beside publications."""
+
+    stride: int = 10
+    """Every so many of the 101 frames are computed; contact by Hertz, since only the forces of the
+    leg are compared."""
+
+
+BEND_STUDY = BendStudySettings()
 
 
 def bend(scene: Path) -> dict[str, float]:
     """Return {id of published.toml: value} of the shipped knee bend, from first to last frame."""
-    found = simulate(scene, contact="hertz", frames=slice(0, 101, EVERY))
+    found = simulate(scene, contact="hertz", frames=slice(0, 101, BEND_STUDY.stride))
     total, si = (np.asarray(found[f"force_{name}_N"]) for name in ("total", "si"))
     tension, ligament, patella = (
         np.asarray(found[f"{name}_N"])
@@ -41,5 +51,5 @@ def bend(scene: Path) -> dict[str, float]:
 def alignment(scene: Path) -> dict[str, float]:
     """Return how much the femoral adjustment changes the total force of that bend, BW at most."""
     adjusted = load_scene(scene, {"contact.adjust": True, "contact.model": "foundation"})
-    found = simulate(adjusted, resolution_mm=2.0, frames=slice(0, 101, EVERY))
+    found = simulate(adjusted, resolution_mm=2.0, frames=slice(0, 101, BEND_STUDY.stride))
     return {"alignment": float(np.nanmax(np.abs(found["adjust_force_change_BW"])))}

@@ -1,6 +1,7 @@
 """Tables D-3 to D-6 beside parametric designs that are pressed at the tables' own forces."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,25 @@ FOLDERS = {
 CONDYLES: tuple[Condyle, Condyle] = ("medial", "lateral")
 QUANTITIES = ("area_mm2", "overlap_mm2", "mean_pressure_MPa", "overlap_pressure_MPa")
 """Contact area, the source's area, and force over each."""
-SAMPLES = 6
-"""Besides the nominal case."""
+
+
+@dataclass(frozen=True)
+class DesignTableSettings:
+    """Tables of designs."""
+
+    samples: int = 6
+    """Samples besides the nominal case."""
+
+
+DESIGN_TABLE = DesignTableSettings()
 
 
 def pressed_row(
-    pressed: PressedDesign, name: str, condyle: Condyle, row: int, samples: int = SAMPLES
+    pressed: PressedDesign,
+    name: str,
+    condyle: Condyle,
+    row: int,
+    samples: int = DESIGN_TABLE.samples,
 ) -> dict[str, Any]:
     """Press one condyle at one percentage of the bend over all assumptions.
 

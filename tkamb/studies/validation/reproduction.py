@@ -5,6 +5,7 @@ that docs/validation.json has already are taken from there by the page.
 """
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,18 @@ TILTED = (0.3, (30.5, 30.7, 31.2), -6.9)
 """deg coronal, mm of recorded heights, mm AP: where the adjustment is shown."""
 LIFTED = (0.45, (15.0, 30.0))
 """deg coronal error put in, deg of flexion: the positions of section 5.2.2."""
-EVERY = 10
-"""Of the 101 frames of the shipped bend: 0, 10, ... 100 % as in appendix D."""
+
+
+@dataclass(frozen=True)
+class ReproductionSettings:
+    """The reproduction of the dissertation."""
+
+    stride: int = 10
+    """Every so many of the 101 frames of the shipped bend: 0, 10, ... 100 % as in appendix D."""
+
+
+REPRODUCTION = ReproductionSettings()
+
 
 Values = dict[str, float]
 
@@ -148,7 +159,7 @@ def bend(scene: Path) -> tuple[Values, list[dict[str, float]]]:
     Returns:
         Values of sections 4.4, 5.2.1 to 5.2.3, and a row for each 10 % of the bend.
     """
-    found = simulate(load_scene(scene, preset=PRESET), frames=slice(0, 101, EVERY))
+    found = simulate(load_scene(scene, preset=PRESET), frames=slice(0, 101, REPRODUCTION.stride))
     weight = float(found["force_total_N"][0] / found["force_total_BW"][0])
     columns = {
         1: found["medial_force_N"] / weight,
@@ -166,7 +177,10 @@ def bend(scene: Path) -> tuple[Values, list[dict[str, float]]]:
     }
     rows: list[dict[str, Any]] = []
     for k in range(len(found)):
-        row: dict[str, Any] = {"percent": EVERY * k, "flexion_deg": float(found["flexion_deg"][k])}
+        row: dict[str, Any] = {
+            "percent": REPRODUCTION.stride * k,
+            "flexion_deg": float(found["flexion_deg"][k]),
+        }
         row |= {f"D-{number}": round(float(values[k]), 4) for number, values in columns.items()}
         rows.append(row | {"status": found.status[k]})
     total, ratio = found["force_total_BW"], found["lateral_force_N"] / found["medial_force_N"]

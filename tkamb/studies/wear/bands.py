@@ -14,9 +14,10 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.results import STATISTICS_LIMITS
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.workers import Crew, Numbered, Task
-from tkamb.studies.uncertainty.bands import FEWEST, percentiles
+from tkamb.studies.uncertainty.bands import percentiles
 from tkamb.studies.uncertainty.correlation import correlation_root
 from tkamb.studies.uncertainty.inputs import VariedInput
 from tkamb.studies.uncertainty.sampling import normal_samples
@@ -24,8 +25,19 @@ from tkamb.studies.wear.sample import BANDED, Rows, WearSampler, varied_wear_inp
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase
 
-SAMPLES = 32
-MOST_SAMPLES = 10_000
+
+@dataclass(frozen=True)
+class WearBandSettings:
+    """Bands of wear from samples."""
+
+    samples: int = 32
+    """Samples unless the user asks for another number."""
+    max_samples: int = 10_000
+    """Largest number of samples that is accepted."""
+
+
+WEAR_BAND = WearBandSettings()
+
 SAID = (
     ("volume_mm3", "volume", "mm3"),
     ("max_depth_mm", "depth", "mm"),
@@ -196,6 +208,10 @@ def _bands(
 
 def check_samples(samples: int) -> None:
     """Raise an InputError for a number of samples that gives no band; 0: none is wanted."""
-    if samples and not FEWEST <= samples <= MOST_SAMPLES:
-        mend = "or 0, for no bands"
-        raise InputError(f"{samples} is not within {FEWEST} to {MOST_SAMPLES}", "--samples", mend)
+    if samples and not STATISTICS_LIMITS.min_samples <= samples <= WEAR_BAND.max_samples:
+        hint = "or 0, for no bands"
+        raise InputError(
+            f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {WEAR_BAND.max_samples}",
+            "--samples",
+            hint,
+        )

@@ -21,8 +21,18 @@ from tkamb.studies.wear.motion import CycleMotion
 
 GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
 """m along x where the search for the dwell position begins."""
-GRID_ACROSS = 0.002
-"""m along z, likewise."""
+
+
+@dataclass(frozen=True)
+class WearGridSettings:
+    """Grid on which wear is summed."""
+
+    spacing_z: float = 0.002
+    """m; spacing along z (medial to lateral)."""
+
+
+WEAR_GRID = WearGridSettings()
+
 SEARCH = {"xatol": 1e-5, "fatol": 1e-9, "maxfev": 120}
 """The search ends within 10 µm."""
 
@@ -113,7 +123,7 @@ class ContactEngine:
             np.array([x, z]) - start
             for start in (np.zeros(2), middle[[0, 2]])
             for x in GRID
-            for z in (-GRID_ACROSS, 0.0, GRID_ACROSS)
+            for z in (-WEAR_GRID.spacing_z, 0.0, WEAR_GRID.spacing_z)
         ]
         heights = [height(start) for start in starts]
         best = starts[int(np.argmin(heights))]

@@ -11,7 +11,7 @@ import numpy as np
 from tkamb.atomic import replaced_file
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
-from tkamb.files import MESH_LIMIT, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.run.plug_ins import foreign_code
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase, WearState
@@ -61,7 +61,7 @@ def kept_state(folder: Path, identity: str) -> WearState | None:
     if not path.is_file():
         return None
     try:
-        with np.load(BytesIO(read_bytes(path, MESH_LIMIT)), allow_pickle=False) as file:
+        with np.load(BytesIO(read_bytes(path, FILE_LIMITS.mesh_bytes)), allow_pickle=False) as file:
             content = dict(file)
     except (ValueError, OSError, EOFError, KeyError) as error:
         raise InputError(f"cannot be read ({error})", path, "leave --resume out") from None

@@ -25,8 +25,17 @@ from tkamb.units import MEGAPASCAL
 
 PER_NEWTON_METRE = 1e-9
 """m³/(N m) per mm³/(N m)."""
-LARGEST_WEAR_FACTOR = 1e-3
-"""mm³/(N m), a hundred times what any polyethylene in a joint was measured at."""
+
+
+@dataclass(frozen=True)
+class WearLawSettings:
+    """Which wear factors are accepted."""
+
+    max_wear_factor: float = 1e-3
+    """mm³/(N m); a hundred times the largest that was measured for polyethylene in a joint."""
+
+
+WEAR_LAW = WearLawSettings()
 
 
 class WearLaw(ABC):
@@ -202,9 +211,9 @@ def check_factor(value: Any, where: str) -> float:
         InputError: it is negative, not finite, or beyond all that was measured.
     """
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and math.isfinite(value) and 0 <= value <= LARGEST_WEAR_FACTOR):
-        mend = f"give a number from 0 to {LARGEST_WEAR_FACTOR:g}; is the unit mm³/(N m)?"
-        raise InputError(f"cannot be {value}", where, mend)
+    if not (number and math.isfinite(value) and 0 <= value <= WEAR_LAW.max_wear_factor):
+        hint = f"give a number from 0 to {WEAR_LAW.max_wear_factor:g}; is the unit mm³/(N m)?"
+        raise InputError(f"cannot be {value}", where, hint)
     return float(value)
 
 
@@ -292,4 +301,4 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
     try:
         return found(**parameters)
     except InputError as error:
-        raise InputError(error.what, f"{table}: {error.where}", error.mend) from None
+        raise InputError(error.what, f"{table}: {error.where}", error.hint) from None

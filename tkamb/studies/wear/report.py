@@ -34,15 +34,26 @@ FIRST = (
 """What is said before any number."""
 PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
 """Columns that follow the wear factor in proportion, but for what the worn shape changes."""
-LARGEST_FRAMES_CHANGE = 0.02
-"""Of a cycle's volume by half as many frames, beyond which they are too few."""
-DEAREST_CORRECTION = 0.05
-"""Correction of a map's force beyond which the map is too coarse."""
+
+
+@dataclass(frozen=True)
+class WearReportSettings:
+    """What a wear report asks about."""
+
+    max_frame_change: float = 0.02
+    """Share of a cycle's volume by which it may change with half as many frames; beyond that the
+    frames are too few."""
+    max_map_correction: float = 0.05
+    """Share of a map's force; where its correction is larger the map is too coarse."""
+    max_published_ratio: float = 3.0
+    """Times the published rates; a higher rate is asked about."""
+
+
+WEAR_REPORT = WearReportSettings()
+
 PUBLISHED_RATES = (1.6, 4.4)
 """mm³ per million cycles of one whole knee in two tests: Dreyer et al. (2023),
 doi:10.1101/2023.05.09.23289712."""
-FAR_FROM_PUBLISHED = 3.0
-"""Times the published rates beyond which a rate is asked about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,12 +186,12 @@ class WearReport:
         """Return what a reader must know before using the numbers."""
         asked = [] if not self.material.caution else [self.material.caution]
         asked += self.case.motion.questions
-        if self.first.frames_change > LARGEST_FRAMES_CHANGE:
+        if self.first.frames_change > WEAR_REPORT.max_frame_change:
             asked.append(
                 f"half as many frames per cycle move its volume by {self.first.frames_change:.1%}: "
                 "take more with --frames-per-cycle"
             )
-        if self.state.map_error > DEAREST_CORRECTION:
+        if self.state.map_error > WEAR_REPORT.max_map_correction:
             asked.append(
                 f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
                 "take a finer resolution"
@@ -191,7 +202,11 @@ class WearReport:
                 "however short they were: take more --updates"
             )
         low, high = PUBLISHED_RATES
-        if not low / FAR_FROM_PUBLISHED <= self.rate <= high * FAR_FROM_PUBLISHED:
+        if (
+            not low / WEAR_REPORT.max_published_ratio
+            <= self.rate
+            <= high * WEAR_REPORT.max_published_ratio
+        ):
             asked.append(
                 f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
                 f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"

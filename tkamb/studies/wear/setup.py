@@ -191,8 +191,8 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
 
 def _refuse_post(case: Case) -> None:
     if case.post is not None:
-        mend = "leave the key out: the dishes' wear alone is modelled"
-        raise InputError("the post does not wear", "[contact] post", mend)
+        hint = "leave the key out: the dishes' wear alone is modelled"
+        raise InputError("the post does not wear", "[contact] post", hint)
 
 
 def _cycle_of_maps(maps: ContactMaps, scene: Scene, most: int) -> CycleMotion:

@@ -175,7 +175,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
     """
     if target_size <= 0.0:
         raise InputError(
-            f"a cell size of {target_size / MILLIMETRE:g} mm", mend="give a positive size"
+            f"a cell size of {target_size / MILLIMETRE:g} mm", hint="give a positive size"
         )
     for percent in range(400):
         for size in (target_size / 1.01**percent, target_size * 1.01**percent):
