@@ -2,8 +2,9 @@
 
 import difflib
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -80,3 +81,21 @@ def names_near(name: str, names: Iterable[str], title: str = "there are") -> str
     listed = f"{title}: {', '.join(all_names[: MESSAGE.max_names]) or 'none'}{more}"
     guess = f"did you mean {', '.join(lower[each] for each in close)}? " if close else ""
     return guess + listed
+
+
+def renamed(module: str, name: str, names: Mapping[str, Any]) -> Any:
+    """Return what a module has under a former name, with a DeprecationWarning.
+
+    Args:
+        module: its dotted name.
+        name: that was asked for.
+        names: former name -> what it names.
+
+    Raises:
+        AttributeError: the module has nothing of that name.
+    """
+    if name not in names:
+        raise AttributeError(f"module '{module}' has no attribute '{name}'")
+    message = f"'{name}' of {module} is now called '{names[name].__name__}'"
+    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    return names[name]

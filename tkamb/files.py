@@ -172,7 +172,7 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
 
 
 def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
-    """Return how to mend what stopped the parser, from the bytes about the place."""
+    """Return what to do about what stopped the parser, from the bytes about the place."""
     at = max(parser.ErrorByteIndex, 0)
     near = content[max(at - 1, 0) : at + 12]
     if re.search(rb"&(?!\w{1,8};|#)", near):
@@ -181,7 +181,7 @@ def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
         return SAVE_AS_UTF8
     if not content.strip() or at >= len(content.rstrip()) - 1:
         return "the file ends too early: get it anew"
-    return "mend that line, or open and save the file in the program that wrote it"
+    return "correct that line, or open and save the file in the program that wrote it"
 
 
 class _ShallowBuilder(TreeBuilder):

@@ -26,7 +26,9 @@ def add_cohort(commands: Any) -> None:
         commands: the parser's subcommands.
     """
     command = commands.add_parser("cohort", help="subjects, trials and designs as one table")
-    command.add_argument("file", type=Path, metavar="FILE.toml", help="see docs/cohort.md")
+    command.add_argument(
+        "file", type=Path, metavar="FILE.toml", help="subjects, trials, designs and contact models"
+    )
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
     command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
     command.add_argument("--shard", type=_part, metavar="I/N", help="every n-th run, for a queue")
@@ -49,13 +51,13 @@ def _part(text: str) -> tuple[int, int]:
 def _cohort(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from tkamb.run.workers import Crew
+    from tkamb.run.workers import PoolOptions
     from tkamb.studies.cohort.folder import REPORT_NAME
     from tkamb.studies.cohort.plan import load_cohort
     from tkamb.studies.cohort.run import Part, run_cohort
 
     part = None if options.shard is None else Part(*options.shard)
-    crew = Crew(options.workers, options.dask)
+    crew = PoolOptions(options.workers, options.dask)
     cohort = load_cohort(options.file, options.frames)
     directory = options.out or Path("out") / options.file.resolve().stem
     outcomes = run_cohort(

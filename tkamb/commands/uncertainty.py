@@ -80,7 +80,7 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
     from tkamb.io.scene import load_scene
     from tkamb.io.scene.case import load_case
-    from tkamb.run.workers import Crew
+    from tkamb.run.workers import PoolOptions
     from tkamb.studies.uncertainty.screening import screen, screen_lines
 
     scene, said = load_scene(options.scene, overrides), []
@@ -96,7 +96,7 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     rows = screen(
         scene,
         frames=frames,
-        crew=Crew(options.workers, options.dask),
+        crew=PoolOptions(options.workers, options.dask),
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
     said.append("one input at a time by one standard deviation: minus, plus; no interactions")

@@ -315,13 +315,13 @@ def insert_material_as_json(scene: Scene) -> dict[str, Any]:
 
 
 def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
-    """Return a flag where it hangs on the search how the knee yields to the muscles."""
+    """Return a flag where the response of the coordinates to the muscles has not converged."""
     if knee.doubt <= COUPLING.stiffness_error:
         return ()
     return (
-        f"how the knee yields to the muscles does not settle ({100 * knee.doubt:.0f} % of it is "
-        "open): begun elsewhere, such frames came out up to 3 % apart in the total force and "
-        "60 N in a condyle's (docs/muscles.md)",
+        "the response of the knee's coordinates to the muscles has not converged "
+        f"({100 * knee.doubt:.0f} % of it is open): from other initial guesses such frames "
+        "differed by up to 3 % in the total force and 60 N in the force of one condyle",
     )
 
 

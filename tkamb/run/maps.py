@@ -324,7 +324,9 @@ class ContactMaps:
             return np.asarray(self.source[name])
         with _opened(self.source) as file:
             if name not in file:
-                raise InputError(f"has no '{name}'", self.source, "is it a contact.h5 of tkamb?")
+                raise InputError(
+                    f"has no '{name}'", self.source, "give a contact.h5 that tkamb wrote"
+                )
             return file[name][:frames]
 
 

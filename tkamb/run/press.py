@@ -289,7 +289,7 @@ def _check_load(load: float) -> None:
     check_load(load)
     if load > PRESS_LIMITS.max_load:
         limit = f"no knee carries more than {PRESS_LIMITS.max_load:g} N"
-        raise InputError(f"impossible load {load:g} N", hint=f"{limit}; is it in N?")
+        raise InputError(f"impossible load {load:g} N", hint=f"{limit}, in N")
 
 
 def _adjustment_settings(

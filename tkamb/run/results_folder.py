@@ -70,7 +70,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
     path = directory / SUMMARY_NAME
     found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
     if not isinstance(found, dict):
-        raise InputError("is no JSON object", path, "is it a folder that `tkamb run` wrote?")
+        raise InputError("is no JSON object", path, "give a folder that `tkamb run` wrote")
     return found
 
 

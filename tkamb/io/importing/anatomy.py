@@ -200,7 +200,7 @@ def _check_lengths(leg: Leg) -> None:
             raise InputError(
                 f"has a {name} of {length * 1e3:.0f} mm with joint '{leg.knee.name}' as the knee",
                 leg.model.name,
-                "give the femorotibial joint with --knee, or mend the model's lengths",
+                "give the femorotibial joint with --knee, or correct the model's lengths",
             )
 
 

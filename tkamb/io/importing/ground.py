@@ -271,7 +271,7 @@ def common_interval(
             f"the motion lasts from {start:.4f} to {end:.4f} s, the ground reaction from "
             f"{span[0]:.4f} to {span[1]:.4f} s",
             "--grf",
-            "do they belong to one trial, on one clock?",
+            "give files of one trial, recorded on one clock",
         )
     common = (float(inside[0]), float(inside[-1]))
     return common, [

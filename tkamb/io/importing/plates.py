@@ -233,7 +233,7 @@ def known_interval(
         raise InputError(
             f"has no two frames while the foot is loaded, {start:.3f} to {end:.3f} s",
             feet.path,
-            "do the force and the markers belong to one trial?",
+            "give force and markers of one trial",
         )
     return float(inside[0]), float(inside[-1])
 

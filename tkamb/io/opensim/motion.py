@@ -107,7 +107,7 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
             f"says inDegrees=no, but '{worst}' reaches {largest:.4g}, which no joint does in "
             "radians",
             recorded.path,
-            "is it in degrees? then write inDegrees=yes",
+            "write inDegrees=yes where it is in degrees",
         )
     return DEGREE if recorded.in_degrees else 1.0
 

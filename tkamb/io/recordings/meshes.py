@@ -233,7 +233,7 @@ def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
     return text if more == 0 else f"{text}, and {more} more"
 
 
-_NO_TRIANGLES = "holds no triangles: is it cut short, or text?"
+_NO_TRIANGLES = "holds no triangles; it is cut short or no mesh: export it again"
 _FORMATS = "give an STL, OBJ, PLY or VTP file of triangles"
 _CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are closed for you"
 

@@ -143,7 +143,7 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
             raise InputError(
                 f"{name} is at ({shown}) m in '{link}', {away:.4g} m from its origin",
                 path,
-                f"it must lie {low:g} to {high:g} m above it, along y: is it in metres?",
+                f"it must lie {low:g} to {high:g} m above it, along y, in metres",
             )
     turn = _origin(joints["knee_ap"])[:3, :3]
     if min(turn[0, 0], turn[1, 1]) < np.cos(MOST_TURNED):

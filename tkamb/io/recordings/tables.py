@@ -212,7 +212,9 @@ def read_storage(path: Path) -> Table:
     lines = read_lines(path)
     ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
     if not ends:
-        raise InputError("has no 'endheader' line", path, "is it an OpenSim storage file?")
+        raise InputError(
+            "has no 'endheader' line", path, "give an OpenSim storage file (.mot or .sto)"
+        )
     header = {}
     for line in lines[: ends[0]]:
         key, _, value = line.partition("=")
@@ -403,7 +405,7 @@ def _number(cell: str, path: Path, line: int) -> float:
         raise InputError(f"line {line} holds '{text}', which is not finite", path, hint)
     if abs(number) > TABLE_VALUE.max_value:
         raise InputError(
-            f"line {line} holds '{text}', which nothing measures", path, "is it a typing mistake?"
+            f"line {line} holds '{text}', which is no measurement", path, "correct the cell"
         )
     return number
 
@@ -411,12 +413,12 @@ def _number(cell: str, path: Path, line: int) -> float:
 def _why_uneven(cells: list[str], names: list[str]) -> str:
     """Return what may make a row longer or shorter than the header."""
     if len(cells) < len(names):
-        return "is a cell missing, or a comma?"
+        return "add the missing cell or comma"
     # a decimal comma cuts every number in two: whole parts alone, and rows about twice as long
     whole = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
     if whole and 4 * len(cells) > 5 * len(names):
         return "are there decimal commas? write points"
-    return "has the header a name for every column?"
+    return "give every column a name in the header"
 
 
 READERS: dict[str, Callable[[Path], Table]] = {

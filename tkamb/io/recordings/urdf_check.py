@@ -110,7 +110,7 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
             numbers = "a number" if known[key] == 1 else f"{known[key]} numbers"
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
         if key == "rpy" and np.abs(numbers_of(element, key)).max() > URDF_ANGLE.max_angle:
-            hint = "rpy is in radians: is it in degrees?"
+            hint = "give rpy in radians, not in degrees"
             raise InputError(f'<origin rpy="{text}"> turns by several turns', where, hint)
 
 
@@ -133,7 +133,9 @@ def check_links(robot: ElementTree.Element, path: Path, with_patella: bool) -> N
     links = [str(link.get("name")) for link in robot.findall("link")]
     for name in ("tibia", "femur", "hip") + (("patella",) if with_patella else ()):
         if name not in links:
-            raise InputError(f"has no link '{name}'", path, f"{names_near(name, links)} {_PAGE}")
+            raise InputError(
+                f"has no link '{name}'", path, f"add it, or rename one: {names_near(name, links)}"
+            )
 
 
 def check_tree(robot: ElementTree.Element, path: Path) -> None:
@@ -155,7 +157,11 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
-        raise InputError(f"has {found}", path, "a leg is one tree: docs/patient.md")
+        raise InputError(
+            f"has {found}",
+            path,
+            "connect all links by joints to one tree with one root, without a loop",
+        )
     for name in links:
         place, steps = name, 0
         while place in parents and steps <= len(links):
@@ -193,7 +199,7 @@ def check_chain(
             continue
         for name in wanted:
             if name not in joints:
-                near = f"{names_near(name, joints)} {_PAGE}"
+                near = f"add it, or rename one: {names_near(name, joints)}"
                 raise InputError(f"has no joint '{name}'", path, near)
         _check_axes(joints, wanted, path, side)
         _check_order(robot, joints, list(wanted), (start, end), path)
@@ -207,9 +213,6 @@ def check_chain(
                 path,
                 f"only ankle and knee move: make it fixed, or {names_near(name, known)}",
             )
-
-
-_PAGE = "(docs/patient.md)"
 
 
 def _check_axes(
@@ -230,7 +233,7 @@ def _check_axes(
         raise InputError(
             f"its axes of knee_axial_rotation and knee_adduction are those of a {other} knee",
             path,
-            f"is [patient] side = '{side}' right?",
+            f"correct [patient] side, which is '{side}', or the axes",
         )
     for name, (kind, axis) in wanted.items():
         joint = joints[name]

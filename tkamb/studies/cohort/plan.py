@@ -256,7 +256,9 @@ def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
         scene = _scene(scene_path, overrides, labels, path)
         found.append(CohortRun(len(found), labels, scene_path, overrides, scene))
     if not found:
-        raise InputError("makes no run", path, "does any subject do any trial?")
+        raise InputError(
+            "makes no run", path, "give every subject at least one trial in [[trial]] subjects"
+        )
     return found
 
 
@@ -305,8 +307,22 @@ def _complaint(error: ValidationError, path: Path) -> InputError:
     first = min(error.errors(), key=lambda one: rank.get(one["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        return InputError(f"unknown key '{key}'", path, "docs/cohort.md lists the keys")
+        near = names_near(str(first["loc"][-1]), _keys_beside(first["loc"]))
+        return InputError(f"unknown key '{key}'", path, f"remove it, or rename it: {near}")
     if first["type"] == "missing":
-        return InputError(f"missing key '{key}'", path, "docs/cohort.md lists the keys")
+        return InputError(f"missing key '{key}'", path, "add it")
     message = first["msg"].removeprefix("Value error, ")
     return InputError(f"'{key}': {message}" if key else message, path)
+
+
+def _keys_beside(location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table that a key of a cohort file stands in."""
+    tables: dict[int | str, type[SceneTable]] = {
+        "subject": SubjectTable,
+        "trial": TrialTable,
+        "design": DesignTable,
+        "contact": ContactModelTable,
+        "wear": CohortWearTable,
+    }
+    table = tables.get(location[0], CohortTable) if len(location) > 1 else CohortTable
+    return list(table.model_fields)

@@ -14,7 +14,7 @@ from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.shards import Shards, remove_shards
-from tkamb.run.workers import Crew, Progress, Task
+from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.cohort.folder import write_cohort
 from tkamb.studies.cohort.outcome import CohortWorker, Outcome
 from tkamb.studies.cohort.plan import Cohort, load_cohort
@@ -60,7 +60,7 @@ def run_cohort(
     cohort: Cohort | str | Path,
     directory: str | Path,
     *,
-    crew: Crew | None = None,
+    crew: PoolOptions | None = None,
     part: Part | None = None,
     resume: bool = False,
     force: bool = False,
@@ -90,7 +90,7 @@ def run_cohort(
         KeyboardInterrupt: what is finished is kept in the folder.
     """
     cohort = cohort if isinstance(cohort, Cohort) else load_cohort(cohort)
-    crew = crew or Crew()
+    crew = crew or PoolOptions()
     crew.check()
     identity = _identity(cohort)
     directory = Path(directory)

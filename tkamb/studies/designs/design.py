@@ -78,7 +78,7 @@ def load_design(folder: str | Path) -> Design:
     try:
         rows = tomllib.loads(read_text(file, what="design file"))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"is no TOML ({error})", file, "mend the line it names") from None
+        raise InputError(f"is no TOML ({error})", file, "correct the line it names") from None
     unknown = set(rows) - {"title", "bearing", "femoral", "cam", "insert", "post", "sources"}
     if unknown:
         raise InputError(f"unknown key '{min(unknown)}'", file, "see models/designs/README.md")

@@ -18,7 +18,7 @@ from tkamb.run.guard import interrupt_as_such
 from tkamb.run.results import STATISTICS_LIMITS, Results
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import chosen_frames, simulate
-from tkamb.run.workers import Crew, Progress, Task, Team
+from tkamb.run.workers import PoolOptions, Progress, Task, WorkerPool
 from tkamb.studies.uncertainty.bands import (
     Influence,
     band_columns,
@@ -119,7 +119,7 @@ def estimate_uncertainty(
     """
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
-    crew = Crew(workers, dask)
+    crew = PoolOptions(workers, dask)
     if not STATISTICS_LIMITS.min_samples <= samples <= MOST_SAMPLES:
         raise InputError(
             f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
@@ -181,7 +181,7 @@ class _Job:
     points: list[Point]
     crossed: int
     method: str
-    team: Team
+    team: WorkerPool
     progress: Progress
 
     @property

@@ -16,7 +16,7 @@ from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.results import STATISTICS_LIMITS
 from tkamb.run.shards import Shard, Shards
-from tkamb.run.workers import Crew, Numbered, Task
+from tkamb.run.workers import Numbered, PoolOptions, Task
 from tkamb.studies.uncertainty.bands import percentiles
 from tkamb.studies.uncertainty.correlation import correlation_root
 from tkamb.studies.uncertainty.inputs import VariedInput
@@ -142,7 +142,7 @@ class Sampling:
         self,
         simulation: tuple[WearCase, int, int],
         rows: Sequence[Mapping[str, float]],
-        crew: Crew | None = None,
+        crew: PoolOptions | None = None,
         shards: Shards | None = None,
         progress: Progress = lambda samples, count: samples,
     ) -> WearBands:
@@ -166,7 +166,9 @@ class Sampling:
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
         try:
             with interrupt_as_such():
-                for number, sample in progress((crew or Crew()).answers(task, left), len(left)):
+                for number, sample in progress(
+                    (crew or PoolOptions()).answers(task, left), len(left)
+                ):
                     done[number] = sample
                     if shards is not None:
                         shards.put(number, Shard({}, dict(sample)))

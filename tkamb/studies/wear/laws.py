@@ -212,7 +212,7 @@ def check_factor(value: Any, where: str) -> float:
     """
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and math.isfinite(value) and 0 <= value <= WEAR_LAW.max_wear_factor):
-        hint = f"give a number from 0 to {WEAR_LAW.max_wear_factor:g}; is the unit mm³/(N m)?"
+        hint = f"give a number from 0 to {WEAR_LAW.max_wear_factor:g} in mm³/(N m)"
         raise InputError(f"cannot be {value}", where, hint)
     return float(value)
 

@@ -82,7 +82,7 @@ class WearMaterial:
             law_class(name)  # a name that there is not is another mistake
             raise InputError(
                 f"material '{self.name}' has no parameters for the law '{name}'",
-                hint=f"it has: {', '.join(self.laws)}; others in a material file (docs/wear.md)",
+                hint=f"it has: {', '.join(self.laws)}; give the others in a material file",
             )
         return wear_law(name, parameters, self.name)
 
@@ -123,7 +123,9 @@ def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial
             raise InputError(f"unknown key '{key}'", where, names_near(key, own))
     for key in ("density_kg_per_m3", "law", "laws", "sources"):
         if key not in content:
-            raise InputError(f"'{key}' is missing", where, "see docs/wear.md")
+            raise InputError(
+                f"'{key}' is missing", where, f"add it; a material has the keys {', '.join(own)}"
+            )
     density, laws = content["density_kg_per_m3"], content["laws"]
     low, high = DENSITY_RANGE
     if not (isinstance(density, int | float) and low <= density <= high):

@@ -208,7 +208,7 @@ def _check_range(name: str, values: Array, path: str | Path) -> None:
     if wrong.size:
         row = int(wrong[0])
         what = f"'{name}' is {values[row]:g} in data row {row + 1}"
-        raise InputError(what, path, f"it lies within {low:g} to {high:g}; unit and sign?")
+        raise InputError(what, path, f"give {low:g} to {high:g}; check unit and sign")
 
 
 def _check_closed(name: str, values: Array, path: str | Path) -> None:

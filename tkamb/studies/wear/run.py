@@ -13,7 +13,7 @@ from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.results import Results
 from tkamb.run.shards import Shards
-from tkamb.run.workers import Crew
+from tkamb.run.workers import PoolOptions
 from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
 from tkamb.studies.wear.kept import keep_state, kept_state, wear_identity
 from tkamb.studies.wear.laws import WearLaw
@@ -56,7 +56,7 @@ class WearRun:
         *,
         resume: bool = False,
         progress: Callable[[float], None] = lambda cycles: None,
-        crew: Crew | None = None,
+        crew: PoolOptions | None = None,
         sample_progress: Progress = lambda samples, count: samples,
     ) -> WearReport:
         """Simulate and return the report.
