@@ -9,7 +9,6 @@ import pinocchio as pin
 import pytest
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
-from tkamb.scene import Scene, load_scene
 
 from scenes import MODEL, write_scene
 from tkamb.geometry import closest, condyles
@@ -18,6 +17,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.scene import lines
 from tkamb.io.scene.case import Case, load_case
+from tkamb.io.scene.scene import Scene, load_scene
 from tkamb.io.scene.si import in_si
 from tkamb.knee import contact_points, patellofemoral
 from tkamb.knee import equations as knee

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tkamb.scene import load_scene
 
 from scenes import MODEL, write_scene
 from tkamb.cli import main
@@ -16,6 +15,7 @@ from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, transform
 from tkamb.io.recordings.meshes import load_surface
 from tkamb.io.scene import lines
 from tkamb.io.scene.case import load_case
+from tkamb.io.scene.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 

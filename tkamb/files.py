@@ -216,16 +216,16 @@ def named_files(path: Path) -> list[Path]:
     Raises:
         InputError: as `read_bytes`.
     """
-    found: list[Path] = []
+    result: list[Path] = []
     waiting = [path]
     while waiting:
         here = waiting.pop()
         for name in _NAMED.findall(read_bytes(here)):
             other = here.parent / os.fsdecode(name).replace("\\", "/")
-            if other.is_file() and other not in (path, *found):
-                found.append(other)
+            if other.is_file() and other not in (path, *result):
+                result.append(other)
                 waiting.append(other)
-    return found
+    return result
 
 
 def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:

@@ -153,11 +153,11 @@ def _check_load(
     again = model.evaluate(state, pressed.pose)
     travelled = case.pair.first_touch_height(case.pose) - pressed.pose[1, 3]
     _require(travelled > 0, "pressing moves the femoral component into the insert")
-    for found in (pressed, again):
+    for result in (pressed, again):
         _require(
-            _close(found.approach, travelled, 1e-9, 1.0),
+            _close(result.approach, travelled, 1e-9, 1.0),
             "the approach is the travel since touch",
-            f"{found.approach} m for {travelled} m",
+            f"{result.approach} m for {travelled} m",
         )
     _require(
         _close(again.wrench_on_insert[:3], pressed.wrench_on_insert[:3], case.tolerance, case.load),

@@ -42,10 +42,10 @@ def add_cohort(commands: Any) -> None:
 
 
 def _part(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
-    if not found:
+    result = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if not result:
         raise argparse.ArgumentTypeError(f"'{text}' is not I/N, like 1/8")
-    return int(found.group(1)), int(found.group(2))
+    return int(result.group(1)), int(result.group(2))
 
 
 def _cohort(options: argparse.Namespace) -> int:

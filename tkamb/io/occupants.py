@@ -24,7 +24,7 @@ BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear
 
 def occupants(folder: Path) -> dict[str, str]:
     """Return command -> the file that says that its output, finished or under way, is there."""
-    found = {
+    result = {
         command: name
         for command, names in WRITTEN.items()
         for name in names
@@ -32,10 +32,10 @@ def occupants(folder: Path) -> dict[str, str]:
     }
     for command, name in (_frames_of(folder), _rows_of(folder)):
         if command:
-            found.setdefault(command, name)
-    if "uncertainty" in found:
-        found.pop("run", None)
-    return found
+            result.setdefault(command, name)
+    if "uncertainty" in result:
+        result.pop("run", None)
+    return result
 
 
 def check_occupants(folder: Path, command: str) -> None:
@@ -54,14 +54,14 @@ def _frames_of(folder: Path) -> tuple[str, str]:
     """Return whose finished frames or samples a run under way keeps, and where."""
     name = ".frames/run.json"
     try:
-        found = read_json(folder / name)
+        result = read_json(folder / name)
     except InputError:
         return "", name
-    if not isinstance(found, dict):
+    if not isinstance(result, dict):
         return "", name
-    if "table of runs" in found:
+    if "table of runs" in result:
         return "cohort", name
-    return ("uncertainty" if "method of sampling" in found else "run"), name
+    return ("uncertainty" if "method of sampling" in result else "run"), name
 
 
 def _rows_of(folder: Path) -> tuple[str, str]:

@@ -185,14 +185,14 @@ class ContactSide:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
             coupled = self.table.coupling == "points"
-            found = self.resultants(k, place, contact.result) if coupled else {}
+            result = self.resultants(k, place, contact.result) if coupled else {}
             post = post_contact(self.post, contact.result.pose, self.table)
             if post is not None and post.problem:
                 return replace(body, loads=unsolved([post.problem])), replace(
                     contact, result=None, problem=post.problem, post=post
                 )
             pushed = self.mechanics.post_loads(k, place, post.load if post else None)
-            geometry = replace(body.geometry, condyles=body.geometry.condyles | found, post=pushed)
+            geometry = replace(body.geometry, condyles=body.geometry.condyles | result, post=pushed)
             geometry, loads = self.mechanics.solved(k, geometry)
             body = replace(body, geometry=geometry, loads=loads)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
@@ -288,8 +288,8 @@ class ContactSide:
         query = self.mechanics.query
         assert query is not None
         gaps = query.at(self.mechanics.poses[k])
-        found = {"medial": gaps.medial.centre}
-        return found | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
+        result = {"medial": gaps.medial.centre}
+        return result | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
     def _contact(
         self, result: ContactResult, adjustment: Adjustment | None, seconds: float

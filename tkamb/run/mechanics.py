@@ -257,8 +257,8 @@ class Mechanics:
         from tkamb.knee.slip import condyle_slip
 
         recorded = case.motion.coordinates[: last + 2]
-        found = condyle_slip(case.femoral, case.insert, case.split, recorded)
-        sides = zip(SIDES, found, strict=True)
+        result = condyle_slip(case.femoral, case.insert, case.split, recorded)
+        sides = zip(SIDES, result, strict=True)
         return {side: slip for side, slip in sides if slip is not None}
 
     def chain_motion(

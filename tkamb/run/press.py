@@ -123,17 +123,17 @@ class PressReport:
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        found = self.as_dict()
+        result = self.as_dict()
         lines = [
-            f"{self.contact} at {self.resolution_mm:g} mm, {self.nodes} nodes: {found['status']}",
-            f"load {self.load:g} N, reaction {_text(found['reaction_N'])} N, "
-            f"approach {_text(found['approach_mm'])} mm",
-            f"material {material_in_words(found['material'])}",
+            f"{self.contact} at {self.resolution_mm:g} mm, {self.nodes} nodes: {result['status']}",
+            f"load {self.load:g} N, reaction {_text(result['reaction_N'])} N, "
+            f"approach {_text(result['approach_mm'])} mm",
+            f"material {material_in_words(result['material'])}",
         ]
         for name in ("medial", "lateral"):
-            if found[name] is not None:
+            if result[name] is not None:
                 lines.append(
-                    f"{name:8s}" + _CONDYLE.format(*found[name].pop("cop_mm"), **found[name])
+                    f"{name:8s}" + _CONDYLE.format(*result[name].pop("cop_mm"), **result[name])
                 )
         if self.adjustment is not None:
             done = self.adjustment
@@ -142,8 +142,8 @@ class PressReport:
                 f"adjusted {done.translation / MILLIMETRE:.3f} mm along y, "
                 f"{done.coronal_angle / DEGREE:.3f} deg coronal{restored}"
             )
-        lines.append(known_error_words(found["known_error"], _ERRORS_TOLD))
-        lines += [f"note: {flag}" for flag in found["flags"]]
+        lines.append(known_error_words(result["known_error"], _ERRORS_TOLD))
+        lines += [f"note: {flag}" for flag in result["flags"]]
         took = f"prepared in {self.prepare_seconds:.3g} s, solved in {self.solve_seconds:.3g} s"
         return [*lines, f"{took}, {self.result.iterations} iterations"]
 

@@ -107,8 +107,8 @@ class Results:
     def band(self, name: str) -> Array | None:
         """Return p05, p50 and p95 (3, f) of a column; None where it has no band."""
         ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
-        found = [end for end in ends if end is not None]
-        return np.array(found) if len(found) == len(ends) else None
+        result = [end for end in ends if end is not None]
+        return np.array(result) if len(result) == len(ends) else None
 
     def why_no_band(self, frame: int) -> str:
         """Return why a frame's results have no band, in words."""

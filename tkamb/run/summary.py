@@ -332,7 +332,7 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     Args:
         columns: of results.csv, those of the reserves and the joints' moments among them.
     """
-    found = {}
+    result = {}
     for column in columns:
         if not belongs(column, RESERVE):
             continue
@@ -342,12 +342,12 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
         if not np.isfinite(moment).any():
             continue
         largest = float(np.nanmax(moment))
-        found[name] = {
+        result[name] = {
             "largest_Nm": float(np.nanmax(reserve)),
             "percent_of_largest_moment": 100.0 * float(np.nanmax(reserve)) / largest,
             "frames_above_5_percent": int((reserve > SUMMARY.notable_reserve * largest).sum()),
         }
-    return found
+    return result
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:

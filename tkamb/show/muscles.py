@@ -89,8 +89,8 @@ def muscle_panels(results: "Results") -> tuple[Panel, ...]:
 
 
 def _groups(results: "Results") -> dict[str, tuple[str, ...]]:
-    found: Mapping[str, Any] = results.summary.get("muscle_groups") or {}
-    return {group: tuple(names) for group, names in found.items()}
+    result: Mapping[str, Any] = results.summary.get("muscle_groups") or {}
+    return {group: tuple(names) for group, names in result.items()}
 
 
 def _colours(results: "Results") -> dict[str, str]:
@@ -208,9 +208,9 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
         x, activation = axis.broken(results[family_column(ACTIVATION, name)])
         axes.plot(x, activation, color=BLACK, linewidth=1.3)
     axes.set_title(cell.title, loc="left", fontsize=8.5, pad=2)
-    said = ", ".join(filter(None, (_agreement(results, cell), _beyond(results, cell))))
-    if said:
-        axes.set_title(said, loc="right", fontsize=7.5, color=GREY, pad=2)
+    text = ", ".join(filter(None, (_agreement(results, cell), _beyond(results, cell))))
+    if text:
+        axes.set_title(text, loc="right", fontsize=7.5, color=GREY, pad=2)
 
 
 def _beyond(results: "Results", cell: Cell) -> str:
@@ -235,14 +235,14 @@ def _agreement(results: "Results", cell: Cell) -> str:
 
 def reserve_words(summary: Mapping[str, Any]) -> str:
     """Return in a sentence what no muscle carries; empty without reserves."""
-    found: Mapping[str, Any] = summary.get("reserves") or {}
-    if not found:
+    result: Mapping[str, Any] = summary.get("reserves") or {}
+    if not result:
         return ""
     parts = [
         f"{name.replace('_', ' ')} {one['largest_Nm']:.1f} N·m "
         f"({one['percent_of_largest_moment']:.0f} %"
         + (f", above 5 % in {n} frames)" if (n := one["frames_above_5_percent"]) else ")")
-        for name, one in found.items()
+        for name, one in result.items()
     ]
     return (
         "Reserves, which no muscle carries, at most (share of the coordinate's largest moment): "

@@ -82,13 +82,13 @@ def _line(row: Row) -> str:
 
 
 def _uncertainty(reference: Reference) -> str:
-    found = []
+    result = []
     for key in ("approach", "force", "mean_pressure", "peak_pressure", "area"):
         names = [name for name in reference.values if name.endswith(key)]
         scale = max(abs(reference.values[name]) for name in names)
         worst = max(reference.uncertainty[name] for name in names)
-        found.append(f"{key.replace('_', ' ')} {100 * worst / scale:.1f} %")
-    return ", ".join(found)
+        result.append(f"{key.replace('_', ' ')} {100 * worst / scale:.1f} %")
+    return ", ".join(result)
 
 
 def picture(rows: Sequence[Row]) -> Figure:
@@ -112,10 +112,10 @@ def picture(rows: Sequence[Row]) -> Figure:
             if number + columns >= len(cases):
                 axis.set_xlabel("time per warm press, ms")
                 axis.tick_params(labelbottom=True)
-        found = {text: line for axis in axes.ravel() for line, text in _legend(axis)}
+        result = {text: line for axis in axes.ravel() for line, text in _legend(axis)}
         figure.legend(
-            list(found.values()),
-            list(found),
+            list(result.values()),
+            list(result),
             loc="outside upper left",
             ncols=2 * columns,
             title="numbers at the points: cell size, mm; "
@@ -198,12 +198,12 @@ def recommendations(rows: Sequence[Row]) -> list[str]:
 
 def _settings_on_all_bodies(rows: Sequence[Row]) -> dict[Setting, list[Row]]:
     bodies = {bodies_of(row.job.case) for row in rows}
-    found: dict[Setting, list[Row]] = {}
+    result: dict[Setting, list[Row]] = {}
     for row in rows:
-        found.setdefault(setting_of(row), []).append(row)
+        result.setdefault(setting_of(row), []).append(row)
     return {
         setting: some
-        for setting, some in found.items()
+        for setting, some in result.items()
         if {bodies_of(row.job.case) for row in some} == bodies
     }
 
@@ -295,5 +295,5 @@ def _apart(own: Row, peer: Row) -> str:
         / peak,
         "condyle force": max(abs(a[f"{s}_force"] - b[f"{s}_force"]) for s in SIDES) / load,
     }
-    said = ", ".join(f"{100 * share:.2g} % in {name}" for name, share in shares.items())
-    return f"the lattice is off it by {said}"
+    text = ", ".join(f"{100 * share:.2g} % in {name}" for name, share in shares.items())
+    return f"the lattice is off it by {text}"

@@ -78,11 +78,11 @@ class ErrorCase:
 
 def error_cases() -> list[ErrorCase]:
     """Return all pairs."""
-    found: list[ErrorCase] = []
+    result: list[ErrorCase] = []
     for situation, rows in (("interior", _interior()), ("flank", _flank()), ("edge", _edge())):
         for number, (name, *given) in enumerate(rows):
             keys = ("femoral", "insert", "load", "shift_mm", "width_mm")
-            found.append(
+            result.append(
                 ErrorCase(
                     f"{situation}: {name}",
                     situation,  # type: ignore[arg-type]
@@ -90,7 +90,7 @@ def error_cases() -> list[ErrorCase]:
                     **dict(zip(keys, given, strict=False)),
                 )
             )
-    return found
+    return result
 
 
 def _interior() -> Iterator[tuple]:

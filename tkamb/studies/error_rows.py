@@ -101,7 +101,7 @@ def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
     Args:
         solved: `solved_key` -> what `solve` returned.
     """
-    found = []
+    result = []
     for case in error_cases():
         for material, models in SETTINGS.items():
             fine, coarse = (
@@ -119,8 +119,10 @@ def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
                 for mm in sizes:
                     answer = solved.get(solved_key(case, material, name, mm))
                     if answer is not None:
-                        found.append(_row(case, material, name, mm, answer, reference, uncertainty))
-    return found
+                        result.append(
+                            _row(case, material, name, mm, answer, reference, uncertainty)
+                        )
+    return result
 
 
 def _row(

@@ -88,14 +88,14 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
     recording = read_c3d(request.recording, request.units)
     unread = recording.unread_plates
     if request.plates == ():
-        said = ["ATTENTION: no ground reaction is modelled, as given"]
-        return FoundGround(None, request.interval, None, said)
+        text = ["ATTENTION: no ground reaction is modelled, as given"]
+        return FoundGround(None, request.interval, None, text)
     if request.plates is not None:
         for number in request.plates:
             recording.plate(number)
-        said = [f"force plates {_listed(request.plates)} under the {side} foot, as given"]
+        text = [f"force plates {_listed(request.plates)} under the {side} foot, as given"]
         ground = GroundFile(request.recording, axes, request.plates, units=request.units)
-        return FoundGround(ground, request.interval, None, said)
+        return FoundGround(ground, request.interval, None, text)
     if not recording.plates:
         if unread:
             raise next(iter(unread.values()))
@@ -166,11 +166,11 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     if int(np.argmax(size)) != 1:
         return axes
     turned = {"x": "+x", "z": "+y", "y": "-z"}
-    found = []
+    result = []
     for axis in axes.split(","):
         own = turned[axis[-1]]
-        found.append(("+" if own[0] == axis[0] else "-") + own[1])
-    return ",".join(found)
+        result.append(("+" if own[0] == axis[0] else "-") + own[1])
+    return ",".join(result)
 
 
 def _named(

@@ -103,7 +103,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         hint = "leave it out, or complete the model"
         what = "is what the quadriceps wraps, and the model gives none"
         raise InputError(what, "--femur-bone", hint)
-    found = _trial(request, leg, links, insert)
+    result = _trial(request, leg, links, insert)
     scene = SceneText(
         _title(request),
         folder,
@@ -112,30 +112,30 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         "patient.urdf",
         request.cutoff_Hz,
         links,
-        found.markers,
-        found.poses,
-        found.shank,
-        found.ground,
+        result.markers,
+        result.poses,
+        result.shank,
+        result.ground,
         meshes,
         tissue,
         request.contact,
         request.activity,
-        (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
+        (*_notes(request, scale, result, bool(tissue.bundles)), *request.notes),
     )
     report = [*_model_lines(model), *_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
-    report += [*found.said, *tissue.said]
+    report += [*result.said, *tissue.said]
     if request.static is not None:
-        if found.markers is None:
+        if result.markers is None:
             raise InputError(
                 "is for a knee whose motion comes from markers", "--static", "leave it out"
             )
-        segments = list(found.markers.segments)
+        segments = list(result.markers.segments)
         unit = request.units.length
         scene, lines = with_static_markers(scene, request.static, segments, unit)
         report += lines
     comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
-    motion = found.motion.text() if found.motion else None
-    ground = found.ground.made if found.ground else None
+    motion = result.motion.text() if result.motion else None
+    ground = result.ground.made if result.ground else None
     return ImportedPatient(
         patient_urdf(links, scale, comment), scene, motion, tuple(report), ground
     )
@@ -218,8 +218,8 @@ def _same_there(path: Path, text: str) -> bool:
 
 def marker_lines(case: Case) -> tuple[str, ...]:
     """Return how well the markers fit, by both readings, and how far the knee centres are apart."""
-    found = case.motion.markers
-    if found is None:
+    result = case.motion.markers
+    if result is None:
         rms = case.tibia.residual if case.tibia else None
         if rms is None:
             return ()
@@ -229,15 +229,17 @@ def marker_lines(case: Case) -> tuple[str, ...]:
         )
     lines = []
     for method, words in (("segments", "rigid fits of shank and thigh"), ("chain", "the chain")):
-        rms = found.at(found.rms[method], case.motion.time) / MILLIMETRE  # type: ignore[index]
-        flexion = found.at(found.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
-        used = ", used" if found.method == method else ""
+        rms = result.at(result.rms[method], case.motion.time) / MILLIMETRE  # type: ignore[index]
+        flexion = result.at(result.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
+        used = ", used" if result.method == method else ""
         lines.append(
             f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most {np.nanmax(rms):.1f})"
             f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
         )
-    apart = found.at(found.centre_distance, case.motion.time) / MILLIMETRE
-    turned = found.at(found.flexion["segments"] - found.flexion["chain"], case.motion.time) / DEGREE
+    apart = result.at(result.centre_distance, case.motion.time) / MILLIMETRE
+    turned = (
+        result.at(result.flexion["segments"] - result.flexion["chain"], case.motion.time) / DEGREE
+    )
     lines.append(
         f"knee centres of shank and thigh markers: {np.nanmedian(apart):.1f} mm apart (at most "
         f"{np.nanmax(apart):.1f}); flexions differ by at most {np.nanmax(np.abs(turned)):.1f} deg"
@@ -265,14 +267,14 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
         if request.scale_mass is None
         else request.scale_mass
     )
-    said = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
+    text = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
     if not 0.5 < ratio < 2.0:
         raise InputError(
             f"weighs {model:.1f} kg, the subject {subject:g} kg",
             request.model,
             "is --mass-kg in kilograms? else scale the model first",
         )
-    return (ratio, said + f"scaled by {ratio:.4f}") if scaled else (1.0, said + "not scaled")
+    return (ratio, text + f"scaled by {ratio:.4f}") if scaled else (1.0, text + "not scaled")
 
 
 def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
@@ -288,11 +290,11 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
     share, wanted = own / subject, MODEL_MASS.leg_mass_share * subject
     low, high = LEG_SHARES
     whole_body = 0.5 < share < 2.0
-    said = (
+    text = (
         f"mass: the model is one leg of {own:.2f} kg, {share:.0%} of the subject's {subject:g} kg"
     )
     if low <= share <= high and not request.scale_mass:
-        return 1.0, said + ": not scaled"
+        return 1.0, text + ": not scaled"
     if not (low <= share <= high or whole_body) or (whole_body and request.scale_mass is False):
         raise InputError(
             f"is one leg of {own:.1f} kg, the subject weighs {subject:g} kg: a leg has "
@@ -302,7 +304,7 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
         )
     why = ", the whole body's" if whole_body else ""
     return wanted / own, (
-        f"{said}{why}: scaled to {wanted:.2f} kg, "
+        f"{text}{why}: scaled to {wanted:.2f} kg, "
         f"the {MODEL_MASS.leg_mass_share:.1%} of a leg (Winter 2009)"
     )
 

@@ -62,12 +62,12 @@ class SoftTissue:
 
 def soft_tissue(links: Links) -> SoftTissue:
     """Return the soft tissue of a leg's knee that the scene can hold."""
-    said: list[str] = []
-    quadriceps = _quadriceps(links, said)
-    ligament, length = _patellar_ligament(links, said)
-    bundles = _bundles(links, said)
-    _name_muscles(links, said)
-    return SoftTissue(quadriceps, ligament, length, bundles, tuple(said))
+    text: list[str] = []
+    quadriceps = _quadriceps(links, text)
+    ligament, length = _patellar_ligament(links, text)
+    bundles = _bundles(links, text)
+    _name_muscles(links, text)
+    return SoftTissue(quadriceps, ligament, length, bundles, tuple(text))
 
 
 def _end(point: PathPoint) -> End:

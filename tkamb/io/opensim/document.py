@@ -84,8 +84,8 @@ def _lenient(content: bytes) -> tuple[str, list[str]]:
         mended.append("its XML declaration")
     if content[:1].isspace():
         mended.append("blanks before its first line")
-    if "<!DOCTYPE" not in text and (found := _BARE_AMPERSAND.search(text)):
-        mended.append(f"a bare & in line {text.count(chr(10), 0, found.start()) + 1}")
+    if "<!DOCTYPE" not in text and (result := _BARE_AMPERSAND.search(text)):
+        mended.append(f"a bare & in line {text.count(chr(10), 0, result.start()) + 1}")
         text = _BARE_AMPERSAND.sub("&amp;", text)
     plain = _COMMENT.sub(lambda m: f"<!--{re.sub('-+', '-', m[1]).strip('-')}-->", text)
     if "--" in "".join(_COMMENT.findall(text)):

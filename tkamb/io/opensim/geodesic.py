@@ -79,19 +79,19 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
     contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)
     rows = np.concatenate([np.arange(count), np.flatnonzero(rival)])
     second = np.append(np.zeros(count, int), np.ones(len(rows) - count, int))
-    found = _taut(start[rows], end[rows], axes, contour[rows, second], pieces[rows, second])
-    converged = found.converged
+    result = _taut(start[rows], end[rows], axes, contour[rows, second], pieces[rows, second])
+    converged = result.converged
     if half is not None:
-        converged = converged & ((found.entry + found.exit) @ half > 0.0)
+        converged = converged & ((result.entry + result.exit) @ half > 0.0)
     lengths = np.full((count, 2), np.inf)
-    lengths[rows, second] = np.where(converged, found.length_m, np.inf)
+    lengths[rows, second] = np.where(converged, result.length_m, np.inf)
     place = np.column_stack([np.arange(count), count + np.cumsum(rival) - 1])
     chosen = np.where(lengths[:, 1] < lengths[:, 0], place[:, 1], place[:, 0])
     return Strings(
-        found.entry[chosen],
-        found.exit[chosen],
-        found.arc_m[chosen],
-        found.length_m[chosen],
+        result.entry[chosen],
+        result.exit[chosen],
+        result.arc_m[chosen],
+        result.length_m[chosen],
         converged[chosen],
     )
 

@@ -59,9 +59,9 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
     """
     model = kinematics.model
     q = np.tile(kinematics.vector({}), (recorded.rows, 1))
-    found = {name: _column_of(name, recorded) for name in model.coordinates}
-    missing = tuple(name for name, column in found.items() if column is None)
-    columns = {name: recorded.complete_column(c) for name, c in found.items() if c is not None}
+    result = {name: _column_of(name, recorded) for name in model.coordinates}
+    missing = tuple(name for name, column in result.items() if column is None)
+    columns = {name: recorded.complete_column(c) for name, c in result.items() if c is not None}
     angles = {name: v for name, v in columns.items() if model.coordinates[name].rotational}
     scale = _angle_scale(angles, recorded) if angles else 1.0
     for name, values in columns.items():

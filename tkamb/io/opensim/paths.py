@@ -238,5 +238,5 @@ class LineSet:
         start, end = work.points[rows, k], work.points[rows, there]
         ends = np.stack([np.full(len(rows), self._body[k]), self._body[there]], axis=1)
         moves = ends[:, None, :] != np.array(bodies)[:, None]
-        found = strings_over(wraps, poses, start, end, allowed, moves)
-        work.pull_wrapped(rows, k, there, found, np.array(bodies))
+        result = strings_over(wraps, poses, start, end, allowed, moves)
+        work.pull_wrapped(rows, k, there, result, np.array(bodies))

@@ -132,10 +132,10 @@ def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element
             "open it in OpenSim 3.3 or 4 and save it",
         )
     for tag, units in UNITS.items():
-        found = (model.findtext(tag) or units[0]).strip()
-        if found.lower() not in (*units, ""):
+        result = (model.findtext(tag) or units[0]).strip()
+        if result.lower() not in (*units, ""):
             hint = "scale the model to metres and newtons in OpenSim"
-            raise InputError(f"has {tag} '{found}', only '{units[0]}' is read", path, hint)
+            raise InputError(f"has {tag} '{result}', only '{units[0]}' is read", path, hint)
     defaults = root.find("defaults")
     defaults = model.find("defaults") if defaults is None else defaults
     by_class = {} if defaults is None else {e.tag: e for e in defaults}

@@ -155,9 +155,9 @@ class _Strings:
             is_end = np.stack([np.full(len(free), gap == 0), last], axis=1)
             back = self.back[free, w]
             moves = self.moves[free, w] & is_end
-            found = touch(self.wraps[w], _moved(back, before), _moved(back, after), moves)
-            self._touch(w, gap, free[found.touches], found)
-            free = free[~found.touches]
+            result = touch(self.wraps[w], _moved(back, before), _moved(back, after), moves)
+            self._touch(w, gap, free[result.touches], result)
+            free = free[~result.touches]
 
     def _touch(self, w: int, gap: int, rows: Index, found: Touch) -> None:
         on, poses = found.touches, self.poses[rows, w]

@@ -188,10 +188,10 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
         frame = np.stack([inward, up, np.cross(inward, up)], axis=1)
         centre = -ring * inward
         here, there = (np.einsum("fij,fj->fi", frame, p - centre) for p in (start, end))
-        found = _cylinder(here, there, tube, np.inf, (0, 1))
-        wrapped = np.linalg.norm(found.entry - here, axis=1) + found.arc_m
-        wrapped += np.linalg.norm(there - found.exit, axis=1)
-        return found, np.where(found.touches, wrapped, -np.inf), frame
+        result = _cylinder(here, there, tube, np.inf, (0, 1))
+        wrapped = np.linalg.norm(result.entry - here, axis=1) + result.arc_m
+        wrapped += np.linalg.norm(there - result.exit, axis=1)
+        return result, np.where(result.touches, wrapped, -np.inf), frame
 
     tried = 2.0 * np.pi * np.arange(WRAP.ring_places) / WRAP.ring_places
     lengths = np.stack([at(np.full(len(start), place))[1] for place in tried])
@@ -202,11 +202,11 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
         left, right = high - golden * (high - low), low + golden * (high - low)
         shorter = at(left)[1] < at(right)[1]
         low, high = np.where(shorter, left, low), np.where(shorter, high, right)
-    found, lengths, frame = at(0.5 * (low + high))
+    result, lengths, frame = at(0.5 * (low + high))
     centre = -ring * frame[rows, 0]
-    entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (found.entry, found.exit))
-    touches = found.touches & np.isfinite(lengths)
-    return Touch(touches, entry, leave, found.arc_m, _no_push(start))
+    entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (result.entry, result.exit))
+    touches = result.touches & np.isfinite(lengths)
+    return Touch(touches, entry, leave, result.arc_m, _no_push(start))
 
 
 def _ellipsoid(

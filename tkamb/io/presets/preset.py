@@ -60,11 +60,11 @@ class AppliedPreset:
             f"(scene: {_words(change.before, 'not given')})"
             for change in self.changes
         )
-        found = [f"Run as {self.name} ({self.source}): {changed or 'the scene says so already'}."]
+        result = [f"Run as {self.name} ({self.source}): {changed or 'the scene says so already'}."]
         if self.overridden:
             kept = ", ".join(self.overridden)
-            found.append(f"Not as {self.name}, since the run was told otherwise: {kept}.")
-        return found + [f"Not as {self.name}: {words}." for words in self.departures]
+            result.append(f"Not as {self.name}, since the run was told otherwise: {kept}.")
+        return result + [f"Not as {self.name}: {words}." for words in self.departures]
 
 
 def _words(value: Any, none: str) -> str:

@@ -85,16 +85,16 @@ def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
     values, normalised_by = {}, {}
     for channel, signal in signals.items():
         try:
-            found = envelope(signal, rate, source.cutoff, source.high_pass)
+            result = envelope(signal, rate, source.cutoff, source.high_pass)
         except InputError as error:
             raise InputError(
                 error.what, f"{source.file}: channel '{channel}'", error.hint
             ) from None
-        by = found.max() if source.normalised_by == "recording" else source.normalised_by[channel]
+        by = result.max() if source.normalised_by == "recording" else source.normalised_by[channel]
         normalised_by[channel] = float(by)
-        if not found.max() > EMG.flat_share * np.abs(signal).max():
+        if not result.max() > EMG.flat_share * np.abs(signal).max():
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
-        values[channel] = found / normalised_by[channel]
+        values[channel] = result / normalised_by[channel]
     muscles = {muscle: channel for channel, own in source.channels.items() for muscle in own}
     return Envelopes(source.file, time + source.offset, values, muscles, normalised_by)
 

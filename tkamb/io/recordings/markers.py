@@ -43,12 +43,12 @@ def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str
     plain: dict[str, list[str]] = {}
     for label in labels:
         plain.setdefault(plain_label(label), []).append(label)
-    found = {}
+    result = {}
     for name in names:
         candidates = [name] if name in labels else plain.get(plain_label(name), [])
         if len(candidates) == 1:
-            found[name] = candidates[0]
-    return found
+            result[name] = candidates[0]
+    return result
 
 
 def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) -> Array:

@@ -172,13 +172,13 @@ def _from_markers(
             "[motion.markers]",
             "add it to coordinates, or let the knee find it: [contact] released",
         )
-    found = load_marker_motion(source, side, insert)
-    knee = found.coordinates.copy()
+    result = load_marker_motion(source, side, insert)
+    knee = result.coordinates.copy()
     for name in unrecorded:
         knee[:, KNEE_COORDINATES.index(name)] = 0.0
     _check_knee(knee, source.file)
-    motion = _differentiate(found.time, knee, None, source, source.file)
-    return replace(motion, unrecorded=unrecorded, markers=found)
+    motion = _differentiate(result.time, knee, None, source, source.file)
+    return replace(motion, unrecorded=unrecorded, markers=result)
 
 
 def _find_unrecorded(

@@ -128,11 +128,11 @@ def _mirror(robot: ElementTree.Element) -> None:
 def _check_places(robot: ElementTree.Element, path: Path) -> None:
     """Raise unless hip and insert lie where a leg has them, above femur and ankle."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
-    found = (
+    result = (
         ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),
         ("the origin of knee_ap", "tibia", _origin(joints["knee_ap"])[:3, 3], SHANK),
     )
-    for name, link, place, (low, high) in found:
+    for name, link, place, (low, high) in result:
         away = float(np.linalg.norm(place))
         if (
             not low <= away <= high

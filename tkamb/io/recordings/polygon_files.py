@@ -88,11 +88,11 @@ def read_ply(path: str | Path) -> Polygons:
     if any(element.name == "tristrips" for element in elements):
         raise ValueError("it holds triangle strips")
     values = _ply_text if order == "" else _ply_binary
-    found = dict(values(content, start, elements, order))
-    if "vertex" not in found:
+    result = dict(values(content, start, elements, order))
+    if "vertex" not in result:
         raise ValueError("it has no vertices")
-    flat, _ = found["vertex"]
-    corners, ends = found.get("face", (np.zeros(0), np.zeros(0, np.int64)))
+    flat, _ = result["vertex"]
+    corners, ends = result.get("face", (np.zeros(0), np.zeros(0, np.int64)))
     return _checked(flat.reshape(-1, 3), corners, ends)
 
 

@@ -373,8 +373,8 @@ def _columns(
             wrong = f"line {number} has {len(cells)} cells, the header {len(names)}"
             raise InputError(wrong, path, _why_uneven(cells, names))
         values[k] = _row(cells, path, number)
-    found = {name: values[:, k].copy() for k, name in enumerate(names) if counts[name] == 1}
-    return found, tuple(sorted(name for name, count in counts.items() if count > 1))
+    result = {name: values[:, k].copy() for k, name in enumerate(names) if counts[name] == 1}
+    return result, tuple(sorted(name for name, count in counts.items() if count > 1))
 
 
 def _of_equal(names: tuple[str, ...]) -> tuple[str, ...]:

@@ -156,9 +156,9 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
         raise InputError(f"has two links '{repeated[0]}'", path, "rename one")
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
-        found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
+        result = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
         raise InputError(
-            f"has {found}",
+            f"has {result}",
             path,
             "connect all links by joints to one tree with one root, without a loop",
         )

@@ -107,11 +107,11 @@ class _PolyData:
 
     def values(self, name: str) -> Array:
         """Return one array of the points' data of all pieces."""
-        found = []
+        result = []
         for piece in self._root.iter("Piece"):
             named = {array.get("Name"): array for array in piece.iterfind("PointData/DataArray")}
-            found.append(self._array(named.get(name), name).astype(float))
-        return np.concatenate(found)
+            result.append(self._array(named.get(name), name).astype(float))
+        return np.concatenate(result)
 
     def _polygons(self, piece: Element, points: Array) -> Indices:
         """Return the polygons of a piece as triangles (k, 3)."""

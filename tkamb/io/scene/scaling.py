@@ -58,9 +58,9 @@ def scaled_case(case: "Case") -> "Case":
 
 
 def _columns(values: Array, columns: list[int], s: float) -> Array:
-    found = values.copy()
-    found[:, columns] *= s
-    return found
+    result = values.copy()
+    result[:, columns] *= s
+    return result
 
 
 def _motion(motion: "KneeMotion", s: float) -> "KneeMotion":

@@ -58,8 +58,8 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
 
     def own(joint: Joint) -> list[str]:
         there = leg.model.coordinates.values()
-        found = [c for c in there if c.joint == joint.name]
-        return [c.name for c in found if not c.locked and c.name not in followers]
+        result = [c for c in there if c.joint == joint.name]
+        return [c.name for c in result if not c.locked and c.name not in followers]
 
     below = [joint for joint in leg.model.joints if joint.inboard == leg.ankle.outboard]
     return (*own(leg.hip), leg.flexion, *own(leg.ankle), *(c for j in below for c in own(j)))

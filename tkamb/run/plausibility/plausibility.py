@@ -59,7 +59,7 @@ class Plausibility:
     def __init__(self, mechanics: "Mechanics") -> None:
         self._mechanics = mechanics
         case = mechanics.case
-        found = [
+        result = [
             *segment_questions(case),
             *motion_questions(case),
             *marker_questions(case),
@@ -74,8 +74,8 @@ class Plausibility:
             *sign_questions(case),
         ]
         if case.ligaments or case.muscles:
-            found += _line_questions(mechanics)
-        self.questions, self.answered = _answered(found, case.scene.output.answers)
+            result += _line_questions(mechanics)
+        self.questions, self.answered = _answered(result, case.scene.output.answers)
 
     def flags(self, k: int, body: "FrameLoads") -> list[str]:
         """Return the words for the status of frame k."""
@@ -106,7 +106,7 @@ def _answered(
         asked: all of them.
         answers: words of a question's text -> its answer.
     """
-    left, told = list(asked), []
+    left, text = list(asked), []
     for words, answer in answers.items():
         own = [question for question in left if words and words.lower() in question.text.lower()]
         if not own:
@@ -115,19 +115,19 @@ def _answered(
             raise InputError(f"no question holds '{words}'", ANSWERS, hint)
         if not answer.strip():
             raise InputError(f"'{words}' has no answer", ANSWERS, "say why the input is right")
-        told += [f"Answered: {question.text} {answer}" for question in own]
+        text += [f"Answered: {question.text} {answer}" for question in own]
         left = [question for question in left if question not in own]
-    return tuple(left), tuple(told)
+    return tuple(left), tuple(text)
 
 
 def _line_questions(mechanics: "Mechanics") -> list[Question]:
     from tkamb.run.plausibility import lines
 
     case = mechanics.case
-    found = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
+    result = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
     poses = mechanics.recorded_poses
-    found += lines.extensor_questions(case, poses)
+    result += lines.extensor_questions(case, poses)
     if not (case.scene.contact and case.scene.contact.released):
         strains = {b.name: b.strain(b.length(poses)) for b in mechanics.ligaments}
-        found += lines.strain_questions(mechanics.ligaments, strains, case.motion.time)
-    return found
+        result += lines.strain_questions(mechanics.ligaments, strains, case.motion.time)
+    return result

@@ -59,27 +59,27 @@ class Entry:
 def inventory(mechanics: Mechanics) -> tuple[Entry, ...]:
     """Return what every file and table of a case gave."""
     case = mechanics.case
-    found = [_patient(case), _motion(case)]
+    result = [_patient(case), _motion(case)]
     if case.scene.tibia or case.motion.markers:
-        found.append(_shank(case))
+        result.append(_shank(case))
     if case.ground is not None:
-        found.append(_ground(case))
-    found += _surfaces(case)
+        result.append(_ground(case))
+    result += _surfaces(case)
     if mechanics.ligaments:
-        found.append(_ligaments(mechanics))
+        result.append(_ligaments(mechanics))
     if case.muscles:
-        found.append(_extensor(case))
+        result.append(_extensor(case))
     if case.scene.muscles:
         file = case.scene.muscles.model
-        found.append(Entry("muscles", file, "all of the leg, by static optimisation"))
+        result.append(Entry("muscles", file, "all of the leg, by static optimisation"))
     if case.emg is not None:
         text = f"channels {', '.join(case.emg.values)}, {_span(case.emg.time)}"
-        found.append(Entry("EMG", case.emg.path, text))
+        result.append(Entry("EMG", case.emg.path, text))
     if case.scene.contact:
-        found.append(_contact(case))
+        result.append(_contact(case))
     if case.measured is not None:
-        found.append(_measured(case.measured, case.body_weight))
-    return tuple(found)
+        result.append(_measured(case.measured, case.body_weight))
+    return tuple(result)
 
 
 def _patient(case: Case) -> Entry:
@@ -174,13 +174,13 @@ def _ligaments(mechanics: Mechanics) -> Entry:
 
 def _listed(names: Sequence[str]) -> str:
     """Return names by commas; three or more that count up one by one as first–last."""
-    said: list[str] = []
+    text: list[str] = []
     for stem, group in groupby(names, lambda name: name.rstrip("0123456789")):
         own = list(group)
         first, last = own[0][len(stem) :], own[-1][len(stem) :]
         counted = [f"{stem}{k}" for k in range(int(first), int(last) + 1)] if first and last else []
-        said += [f"{own[0]}–{last}"] if len(own) > 2 and own == counted else own
-    return ", ".join(said)
+        text += [f"{own[0]}–{last}"] if len(own) > 2 and own == counted else own
+    return ", ".join(text)
 
 
 def _extensor(case: Case) -> Entry:

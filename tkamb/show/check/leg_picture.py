@@ -89,11 +89,11 @@ def shown_frames(mechanics: Mechanics) -> list[int]:
     wanted = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
     if case.ground is not None:
         wanted.insert(1, int(np.argmax(np.linalg.norm(case.ground.force, axis=1))))
-    found: list[int] = []
+    result: list[int] = []
     for k in wanted:
-        if len(found) < 3 and all(abs(k - other) >= max(count // 5, 1) for other in found):
-            found.append(k)
-    return sorted(found)
+        if len(result) < 3 and all(abs(k - other) >= max(count // 5, 1) for other in result):
+            result.append(k)
+    return sorted(result)
 
 
 def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
@@ -125,15 +125,15 @@ def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
 
 def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str]]:
     """Return ligaments, muscle line and patellar ligament with their colours, insert frame."""
-    found = []
+    result = []
     for bundle in mechanics.ligaments:
         poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
-        found.append((np.stack(bundle.ends(poses)), LIGAMENT))
+        result.append((np.stack(bundle.ends(poses)), LIGAMENT))
     if mechanics.extensor is not None:
         with suppress(ComputationError):  # a patella that is lost there: the run says so
             quadriceps, ligament = mechanics.extensor.paths(state)
-            found += [(quadriceps.points, QUADRICEPS), (ligament.points, PATELLAR_LIGAMENT)]
-    return found
+            result += [(quadriceps.points, QUADRICEPS), (ligament.points, PATELLAR_LIGAMENT)]
+    return result
 
 
 @dataclass(frozen=True, eq=False)

@@ -155,8 +155,8 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
         Run(label, path, results, own, pair_frames(read[0], axes[0], results, own))
         for label, path, results, own in zip(_labels(paths), paths, read, axes, strict=True)
     )
-    found = [one for run in runs[1:] for one in differences(runs[0], run)]
-    return Comparison(runs, kind, tuple(_notes(runs)), tuple(found))
+    result = [one for run in runs[1:] for one in differences(runs[0], run)]
+    return Comparison(runs, kind, tuple(_notes(runs)), tuple(result))
 
 
 def _common_axis(paths: Sequence[Path], read: Sequence[Results]) -> str:
@@ -185,7 +185,7 @@ def differences(first: Run, run: Run) -> list[Difference]:
     """
     if run.pairing is None:
         return []
-    found = []
+    result = []
     for column, values in first.results.columns.items():
         if KINDS.get(column, "number") != "number" or column in NOT_COMPARED:
             continue
@@ -196,7 +196,7 @@ def differences(first: Run, run: Run) -> list[Difference]:
             continue
         worst = int(np.nanargmax(np.abs(off)))
         largest = float(np.nanmax(np.abs(values)))
-        found.append(
+        result.append(
             Difference(
                 run.label,
                 column,
@@ -209,7 +209,7 @@ def differences(first: Run, run: Run) -> list[Difference]:
                 int(np.isfinite(off).sum()),
             )
         )
-    return found
+    return result
 
 
 def _notes(runs: Sequence[Run]) -> list[str]:

@@ -85,9 +85,9 @@ def _same_frames(
 ) -> Index | None:
     """Return the other's frame of each frame (f,), -1 without one; None: not one recording."""
     at = {float(time): k for k, time in enumerate(other_time)}
-    found = np.array([at.get(float(time), -1) for time in first_time], np.int64)
-    paired = found >= 0
+    result = np.array([at.get(float(time), -1) for time in first_time], np.int64)
+    paired = result >= 0
     if paired.sum() < min(len(first_time), len(other_time)):
         return None
-    near = np.abs(first_place[paired] - other_place[found[paired]]) <= PAIRING.tolerance
-    return found if near.all() else None
+    near = np.abs(first_place[paired] - other_place[result[paired]]) <= PAIRING.tolerance
+    return result if near.all() else None

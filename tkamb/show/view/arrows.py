@@ -47,7 +47,7 @@ def force_arrows(
         "ground reaction": _vector(results, "ground_reaction_{}_N"),
         "hip": _vector(results, "hip_force_{}_N"),
     }
-    found = [
+    result = [
         _arrow(
             "ground reaction",
             geometries,
@@ -59,17 +59,19 @@ def force_arrows(
         *_extensor(results, geometries),
         *_condyles(results, geometries, friction),
     ]
-    return tuple(arrow for arrow in found if np.isfinite(arrow.forces).any())
+    return tuple(arrow for arrow in result if np.isfinite(arrow.forces).any())
 
 
 def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
     """Return a ball at each condyle's contact point and at the patella's."""
-    found = {
+    result = {
         f"{side} contact point": [_condyle_point(one, side) for one in geometries]
         for side in ("medial", "lateral")
     }
     patella = "patellofemoral contact point"
-    found[patella] = [one.extensor.contact_point if one.extensor else NOTHING for one in geometries]
+    result[patella] = [
+        one.extensor.contact_point if one.extensor else NOTHING for one in geometries
+    ]
     return tuple(
         Marker(
             name,
@@ -78,7 +80,7 @@ def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
             np.stack(points),
             ARROW.contact_point_radius,
         )
-        for name, points in found.items()
+        for name, points in result.items()
         if np.isfinite(points).any()
     )
 

@@ -138,9 +138,9 @@ def _playwright() -> Any:
 
 def _encoder() -> str:
     """Return the path of an ffmpeg: the machine's, or that of the extra."""
-    found = shutil.which("ffmpeg")
-    if found is not None:
-        return found
+    result = shutil.which("ffmpeg")
+    if result is not None:
+        return result
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:

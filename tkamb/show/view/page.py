@@ -93,12 +93,12 @@ def find_browser() -> str:
     Raises:
         ComputationError: there is none.
     """
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
+    result = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if result is None:
         raise ComputationError(
             "no browser found", hint="install chromium (Debian: apt install chromium)"
         )
-    return found
+    return result
 
 
 def screenshot(html: str, size: tuple[int, int]) -> bytes:

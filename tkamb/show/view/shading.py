@@ -75,8 +75,8 @@ def decimate(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
         fewer, kept = simplify(points, faces, target_count=most_triangles, agg=aggressiveness)
         if len(kept) <= most_triangles:
             break
-    found = Surface(fewer.astype(float) * MILLIMETRE, kept.astype(np.int64), surface.name)
-    return found, _distance(found, surface)
+    result = Surface(fewer.astype(float) * MILLIMETRE, kept.astype(np.int64), surface.name)
+    return result, _distance(result, surface)
 
 
 def _distance(one: Surface, other: Surface) -> float:

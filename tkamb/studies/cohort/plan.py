@@ -237,7 +237,7 @@ def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
         count *= len(axis)
     if count > MOST_RUNS:
         raise InputError(f"makes {count} runs, more than {MOST_RUNS}", path, "split it")
-    found: list[CohortRun] = []
+    result: list[CohortRun] = []
     for subject, trial, design, contact in itertools.product(*axes):
         if trial.subjects and (subject is None or subject.name not in trial.subjects):
             continue
@@ -254,12 +254,12 @@ def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
         own = design.scenes.get(trial.name) if design else None
         scene_path = path.parent / (own or trial.scene)
         scene = _scene(scene_path, overrides, labels, path)
-        found.append(CohortRun(len(found), labels, scene_path, overrides, scene))
-    if not found:
+        result.append(CohortRun(len(result), labels, scene_path, overrides, scene))
+    if not result:
         raise InputError(
             "makes no run", path, "give every subject at least one trial in [[trial]] subjects"
         )
-    return found
+    return result
 
 
 def _scene(
@@ -276,22 +276,22 @@ def _overrides(entry: Any, folder: Path) -> dict[str, Any]:
     """Return what an entry of an axis changes, paths made absolute."""
     if entry is None:
         return {}
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     if isinstance(entry, SubjectTable) and entry.scale != 1.0:
-        found["patient.scale"] = entry.scale
+        result["patient.scale"] = entry.scale
     if isinstance(entry, DesignTable):
         meshes = {"femoral": entry.femoral, "insert": entry.insert}
-        found |= {
+        result |= {
             f"implant.{part}.mesh": str((folder / mesh).absolute())
             for part, mesh in meshes.items()
             if mesh is not None
         }
-        found |= {} if entry.bearing is None else {"implant.insert.bearing": entry.bearing}
+        result |= {} if entry.bearing is None else {"implant.insert.bearing": entry.bearing}
     if isinstance(entry, ContactModelTable):
-        found["contact.model"] = entry.model or entry.name
+        result["contact.model"] = entry.model or entry.name
         if entry.resolution_mm is not None:
-            found["contact.resolution_mm"] = entry.resolution_mm
-    return found | entry.set
+            result["contact.resolution_mm"] = entry.resolution_mm
+    return result | entry.set
 
 
 def _slice(text: str, path: Path) -> slice:

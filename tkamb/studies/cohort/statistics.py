@@ -154,11 +154,11 @@ def _computed(outcome: Outcome) -> dict[str, Array]:
 
 def _places(values: Array, axis: str, width: float) -> NDArray[np.int64]:
     """Return the bin of each frame; a cycle's last moment, 100 %, is in its last bin."""
-    found = np.floor(values / width + COHORT_STATISTICS.bin_tolerance).astype(int)
+    result = np.floor(values / width + COHORT_STATISTICS.bin_tolerance).astype(int)
     end = axis == CYCLE and np.isclose(
         values, WHOLE_CYCLE, rtol=0, atol=COHORT_STATISTICS.bin_tolerance * width
     )
-    return np.where(end, found - 1, found)
+    return np.where(end, result - 1, result)
 
 
 def _means(values: Array, place: Array, count: int) -> Array:

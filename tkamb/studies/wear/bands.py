@@ -83,14 +83,14 @@ class WearBands:
 
     def lines(self) -> list[str]:
         """Return the bands after the last cycle as lines of text."""
-        last, found = self.rows[-1], []
+        last, result = self.rows[-1], []
         for name, what, unit in SAID:
             low, high = last.get(f"{name}_p05", math.nan), last.get(f"{name}_p95", math.nan)
             if math.isfinite(low):
-                found.append(f"{what} {low:.4g} to {high:.4g} {unit}")
+                result.append(f"{what} {low:.4g} to {high:.4g} {unit}")
         varied = ", ".join(f"{v.name} ± {v.deviation:g} {v.unit}" for v in self.varied)
-        said = ", ".join(found) or "too few samples for a band"
-        return [f"5 to 95 % of {self.samples} samples: {said}; varied: {varied}"]
+        text = ", ".join(result) or "too few samples for a band"
+        return [f"5 to 95 % of {self.samples} samples: {text}; varied: {varied}"]
 
     def questions(self) -> list[str]:
         """Return what a reader must know before using the bands."""
@@ -190,16 +190,16 @@ def _bands(
     names = [name for name in BANDED if np.isfinite(rows[-1][name])]
     at = np.array([row["cycles"] for row in rows])
     values = np.full((len(samples), len(names), len(at)), np.nan)
-    for sample, found in zip(samples, values, strict=True):
-        for column, name in zip(found, names, strict=True):
+    for sample, result in zip(samples, values, strict=True):
+        for column, name in zip(result, names, strict=True):
             if sample:
                 column[:] = np.interp(at, sample["cycles"], sample[name], right=np.nan)
     bands = percentiles(values, np.isnan(values[:, 0]))
     made = [
         {
-            f"{name}_{end}": float(found[m, r])
+            f"{name}_{end}": float(result[m, r])
             for m, name in enumerate(names)
-            for end, found in bands.items()
+            for end, result in bands.items()
         }
         for r in range(len(at))
     ]

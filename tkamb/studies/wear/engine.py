@@ -114,8 +114,8 @@ class ContactEngine:
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
 
         def height(place: Array) -> float:
-            found = pair.first_touch_height(pose_of(rotation, [place[0], 0.0, place[1]]))
-            return found if np.isfinite(found) else 1.0
+            result = pair.first_touch_height(pose_of(rotation, [place[0], 0.0, place[1]]))
+            return result if np.isfinite(result) else 1.0
 
         middle = self.femoral.moved(pose_of(rotation, [0.0] * 3)).bounds.mean(axis=0)
         # the grid is centred where the bounding boxes' middles meet, and where the origins do
@@ -129,8 +129,8 @@ class ContactEngine:
         best = starts[int(np.argmin(heights))]
         if min(heights) >= 1.0:
             raise InputError("lies over the insert nowhere", self.femoral.name, "check the axes")
-        found = minimize(height, best, method="Nelder-Mead", options=SEARCH)
-        return float(found.x[0]), float(found.x[1])
+        result = minimize(height, best, method="Nelder-Mead", options=SEARCH)
+        return float(result.x[0]), float(result.x[1])
 
 
 def interpolation(map_points: Array, points: Array) -> csr_array:

@@ -289,8 +289,8 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
     Raises:
         InputError: no such law, a parameter that is missing or unknown, or a bad value.
     """
-    found = law_class(name)
-    own = [field.name for field in fields(found)]  # type: ignore[arg-type]
+    result = law_class(name)
+    own = [field.name for field in fields(result)]  # type: ignore[arg-type]
     table = f"[laws.{name}]" if where is None else f"{where}: [laws.{name}]"
     for key in parameters:
         if key not in own:
@@ -299,6 +299,6 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
         if key not in parameters:
             raise InputError(f"does not give '{key}'", table, f"it needs: {', '.join(own)}")
     try:
-        return found(**parameters)
+        return result(**parameters)
     except InputError as error:
         raise InputError(error.what, f"{table}: {error.where}", error.hint) from None

@@ -166,12 +166,12 @@ class WearReport:
 
     def side_by_side(self) -> list[dict[str, Any]]:
         """Return what each law of the material takes off the unworn insert, with its range."""
-        found = []
+        result = []
         for name, law in self.material.all_laws().items():
             if name not in self.first.volumes:
                 continue
             rate = self.first.volumes[name] * MILLION / MILLIMETRE**3
-            found.append(
+            result.append(
                 {
                     "law": name,
                     "first_volume_mm3_per_Mc": rate,
@@ -180,7 +180,7 @@ class WearReport:
                     "geometry": law.geometry,
                 }
             )
-        return found
+        return result
 
     def questions(self) -> list[str]:
         """Return what a reader must know before using the numbers."""
@@ -228,24 +228,24 @@ class WearReport:
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        found = self.as_dict()
-        creep = found["creep_depth_mm"]
-        said = "not modelled" if creep is None else f"{creep:.4g} mm deep"
-        low, high = found["volume_mm3_range"]
-        slow, fast = found["volume_mm3_per_Mc_range"]
+        result = self.as_dict()
+        creep = result["creep_depth_mm"]
+        text = "not modelled" if creep is None else f"{creep:.4g} mm deep"
+        low, high = result["volume_mm3_range"]
+        slow, fast = result["volume_mm3_per_Mc_range"]
         others = [
             f"{one['law']} {one['first_volume_mm3_per_Mc']:.3g} "
             f"({one['first_volume_mm3_per_Mc_range'][0]:.3g} to "
             f"{one['first_volume_mm3_per_Mc_range'][1]:.3g})"
-            for one in found["laws_side_by_side"]
+            for one in result["laws_side_by_side"]
         ]
         return [
             FIRST,
-            f"{found['cycles']:.6g} cycles in {found['blocks']} blocks, {found['law']}, "
-            f"{found['material']}: {found['status']}",
-            f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
-            f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
-            f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
+            f"{result['cycles']:.6g} cycles in {result['blocks']} blocks, {result['law']}, "
+            f"{result['material']}: {result['status']}",
+            f"worn off {result['volume_mm3']:.4g} mm3, {result['mass_mg']:.4g} mg, "
+            f"{result['max_depth_mm']:.4g} mm deep at most, over {result['worn_area_mm2']:.4g} mm2",
+            f"rate {self.rate:.4g} mm3 per million cycles; creep {text}",
             f"range by the wear factor alone: {low:.3g} to {high:.3g} mm3, {slow:.3g} to "
             f"{fast:.3g} mm3 per million cycles ({self.material.range_source})",
             f"geometry: {self.case.law.geometry}",
@@ -256,7 +256,7 @@ class WearReport:
             ),
             *([] if self.bands is None else self.bands.lines()),
             *self._found_lines(),
-            *(f"note: {note}" for note in found["notes"]),
+            *(f"note: {note}" for note in result["notes"]),
         ]
 
     def _found_lines(self) -> list[str]:
@@ -264,9 +264,10 @@ class WearReport:
         drive = self.case.motion.drive
         if drive is None:
             return []
-        found = drive.ranges(self.last.poses, self.last.failed)
+        result = drive.ranges(self.last.poses, self.last.failed)
         places = (
-            f"{name} {found[f'{name}_low_{unit}']:.3g} to {found[f'{name}_high_{unit}']:.3g} {unit}"
+            f"{name} {result[f'{name}_low_{unit}']:.3g} to "
+            f"{result[f'{name}_high_{unit}']:.3g} {unit}"
             for name, unit in ((name, UNITS[name][0]) for name in drive.names)
         )
         return [f"force control: {', '.join(places)}; {len(self.last.failed)} rows failed"]

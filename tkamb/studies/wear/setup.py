@@ -222,8 +222,8 @@ def _of_profile(
     drive = profile.drive(dwell, springs)
     notes = ["a simulator's cycle in displacement control; AP and ML from the dwell position"]
     if drive is not None:
-        found = ", ".join(drive.names)
-        notes = [f"a simulator's cycle in force control: {found} in equilibrium, without friction"]
+        result = ", ".join(drive.names)
+        notes = [f"a simulator's cycle in force control: {result} in equilibrium, without friction"]
         if friction := case.scene.contact.friction:
             notes.append(f"the scene's friction of {friction:g} is left out of force control")
     seconds = np.diff(profile.percent) / 100.0 * period

@@ -87,12 +87,12 @@ class PronySeries:
         """
         strain = np.asarray(strain, float)
         memory = np.multiply.outer(np.array(self.fractions), strain[0])
-        found = [self.equilibrium * strain[0] + memory.sum(axis=0)]
+        result = [self.equilibrium * strain[0] + memory.sum(axis=0)]
         for step, before, after in zip(np.diff(time), strain[:-1], strain[1:], strict=True):
             _, decay, kept = self.response(float(step))
             memory = (memory.T * decay).T + np.multiply.outer(kept, after - before)
-            found.append(self.equilibrium * after + memory.sum(axis=0))
-        return np.array(found)
+            result.append(self.equilibrium * after + memory.sum(axis=0))
+        return np.array(result)
 
 
 class ViscoelasticBed:
@@ -127,8 +127,8 @@ class ViscoelasticBed:
         """
 
         def missing(fall: float) -> float:
-            found = self._pressed(pose, fall, step)[1]
-            return float((found * self._bed.area) @ self._bed.normals[:, 1]) - load
+            result = self._pressed(pose, fall, step)[1]
+            return float((result * self._bed.area) @ self._bed.normals[:, 1]) - load
 
         if (
             missing(-VISCOELASTIC_BED.max_approach) > 0
