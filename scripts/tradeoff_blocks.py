@@ -20,7 +20,7 @@ from tkamb.studies.body_trade import HEADS as BODY_HEADS
 from tkamb.studies.body_trade import BodyRow
 from tkamb.studies.error_cases import SITUATIONS
 from tkamb.studies.error_rows import ErrorRow
-from tkamb.studies.row import KEYS, TIMING_NOISE, Row, beats, on_front
+from tkamb.studies.row import KEYS, TIMING, Row, beats, on_front
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
@@ -220,4 +220,4 @@ def moved(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, fl
 
 
 def _tied(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    return max(one[0], other[0]) <= TIMING_NOISE * min(one[0], other[0])
+    return max(one[0], other[0]) <= TIMING.equal_ratio * min(one[0], other[0])

@@ -15,7 +15,7 @@ from test_uncertainty import SCENE, bodies_alone
 from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
 from tkamb.run import cluster
-from tkamb.run.workers import Crew, Task
+from tkamb.run.workers import PoolOptions, Task
 from tkamb.studies.uncertainty.run import estimate_uncertainty
 
 
@@ -43,9 +43,9 @@ def test_answers_of_a_cluster_are_those_of_this_process_and_preparation_is_done_
     ) as place:
         Adder.made = 0
         task, wanted = Task(Adder, (10,)), [(n, n**2) for n in range(20)]
-        there = dict(Crew(1, place.scheduler_address).answers(task, wanted))
+        there = dict(PoolOptions(1, place.scheduler_address).answers(task, wanted))
         assert Adder.made == 1
-        assert there == dict(Crew(1).answers(task, wanted))
+        assert there == dict(PoolOptions(1).answers(task, wanted))
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
@@ -62,13 +62,13 @@ def test_a_scheduler_that_is_not_there_is_one_line(address, tmp_path, monkeypatc
 def test_without_dask_the_install_line_is_given(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'tkamb\[cluster\]'"):
-        Crew(1, "local").check()
+        PoolOptions(1, "local").check()
 
 
 def test_workers_are_counted():
     for wrong in (0, 1000):
         with pytest.raises(InputError, match="--workers"):
-            Crew(wrong)
+            PoolOptions(wrong)
 
 
 @pytest.mark.slow
@@ -195,7 +195,7 @@ def test_a_scheduler_killed_in_the_middle_is_said_in_one_line(start):
                 scheduler.kill()
             yield one
 
-    answers = Crew(1, address).answers(Task(Adder, (1, 0.1)), [(n, n) for n in range(400)])
+    answers = PoolOptions(1, address).answers(Task(Adder, (1, 0.1)), [(n, n) for n in range(400)])
     with pytest.raises(ComputationError, match="scheduler is gone"):
         list(killing(answers))
     assert 5 <= len(found) < 400

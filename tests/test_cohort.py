@@ -21,7 +21,7 @@ from tkamb.errors import InputError
 from tkamb.io.claim import claimed_directory, settle
 from tkamb.memory import give_back
 from tkamb.run.simulation import simulate
-from tkamb.run.workers import Crew
+from tkamb.run.workers import PoolOptions
 from tkamb.show.cohort_report import _told_apart, cohort_html, draw_groups
 from tkamb.show.design_figure import design_bars, draw_designs, run_error
 from tkamb.studies.cohort.folder import frame_table, write_cohort
@@ -107,7 +107,7 @@ def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path, monke
         computed.append(count)
         return runs
 
-    run_cohort(file, whole, crew=Crew(2), resume=True, progress=counted)
+    run_cohort(file, whole, crew=PoolOptions(2), resume=True, progress=counted)
     assert computed == [5]
     for part in ("1/2", "2/2"):
         assert main(["cohort", str(file), "--out", str(parted), "--shard", part]) in (0, 1)

@@ -7,7 +7,7 @@ from scenes import fast_scene
 from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.contact_side import LOAD_CHANGE, POINT_CHANGE, ContactSide
+from tkamb.run.contact_side import COUPLING, ContactSide
 from tkamb.run.mechanics import Mechanics
 from tkamb.run.simulation import simulate
 
@@ -57,8 +57,8 @@ def test_uncoupled_is_the_body_and_then_a_press():
 
 def test_points_agree_within_five_iterations(uncoupled, coupled):
     assert coupled["coupling_iterations"].max() <= 5
-    assert coupled["coupling_change_N"].max() < LOAD_CHANGE
-    assert coupled["coupling_change_mm"].max() < POINT_CHANGE * 1e3
+    assert coupled["coupling_change_N"].max() < COUPLING.force_tolerance
+    assert coupled["coupling_change_mm"].max() < COUPLING.point_tolerance * 1e3
     assert np.isnan(uncoupled["coupling_iterations"]).all()
     change = np.abs(coupled["force_si_N"] / uncoupled["force_si_N"] - 1)
     assert 0 < change.max() < 0.02

@@ -15,7 +15,7 @@ from tkamb.io.recordings.emg import Envelopes, envelope, load_envelopes
 from tkamb.io.scene.measured import EmgTable
 from tkamb.io.scene.si import in_si
 from tkamb.run.muscles.emg import EmgGuide
-from tkamb.run.muscles.sharing import KKT_LIMIT
+from tkamb.run.muscles.sharing import SHARING
 from tkamb.run.recorded import compare_emg, fitted_normalisation
 
 RATE = 1200.0
@@ -164,7 +164,7 @@ def test_a_target_has_the_optimum_of_its_closed_form():
     multiplier = (MOMENT - d @ (pull / stiff)) / (d @ (d / stiff))
     np.testing.assert_allclose(activation[1:], (pull + multiplier * d) / stiff, rtol=1e-9)
     assert status == "ok"
-    assert residual < KKT_LIMIT
+    assert residual < SHARING.kkt_tolerance
 
 
 def test_bounds_hold_the_activation_near_the_envelope():
@@ -173,7 +173,7 @@ def test_bounds_hold_the_activation_near_the_envelope():
     assert activation[1] == pytest.approx(0.45)  # without EMG it is 0.61
     assert activation[2] == pytest.approx((MOMENT - 0.45 * 0.05 * 1800) / (0.04 * 1200))
     assert status == "ok"
-    assert residual < KKT_LIMIT
+    assert residual < SHARING.kkt_tolerance
 
 
 def test_bounds_never_leave_those_of_every_muscle():

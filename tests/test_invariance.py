@@ -15,8 +15,9 @@ from tkamb.geometry import closest, condyles
 from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.patient import load_urdf
-from tkamb.io.scene import Scene, lines, load_scene
+from tkamb.io.scene import lines
 from tkamb.io.scene.case import Case, load_case
+from tkamb.io.scene.scene import Scene, load_scene
 from tkamb.io.scene.si import in_si
 from tkamb.knee import contact_points, patellofemoral
 from tkamb.knee import equations as knee

@@ -83,7 +83,7 @@ def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_pa
         ([muscle(path=(ORIGIN, {"link": "fibula", "point_mm": [0, 0, 0]}))], "no link 'fibula'"),
         ([muscle(), muscle()], "two muscles have the same name"),
         ([muscle(path=(ORIGIN,))], "muscle.0.path"),
-        ([muscle(force_N=6e4)], "is it in newtons?"),
+        ([muscle(force_N=6e4)], "give it in newtons"),
         ([muscle(insertion=INSERTION)], "unknown key 'muscle.0.insertion'"),
     ],
 )

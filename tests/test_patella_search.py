@@ -16,7 +16,7 @@ from tkamb.io.scene.case import load_case
 from tkamb.knee import extensor
 from tkamb.knee.patella import ExtensorMechanism, PatellaStatus
 from tkamb.knee.patella_search import solve_patella
-from tkamb.run.known import Known, extensor_frames
+from tkamb.run.known import SharedState, extensor_frames
 from tkamb.run.mechanics import Mechanics
 
 FEW = {"motion.frames": 11, "patella.motion": "solved", "contact.resolution_mm": 3.0}
@@ -163,7 +163,7 @@ def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain)
 
 def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
     """A recorded one stays as recorded."""
-    known = Known(None, None, SimpleNamespace(moved=lambda *_: "moved"), range(1))
+    known = SharedState(None, None, SimpleNamespace(moved=lambda *_: "moved"), range(1))
     poses = knee_pose(plain.case.motion.coordinates)
     assert extensor_frames(plain.case, poses, known) == "moved"
     patella = plain.case.scene.patella.model_copy(update={"motion": "recorded"})

@@ -13,7 +13,7 @@ from tkamb.io.scene import load_scene
 from tkamb.run.columns import KINDS
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
-from tkamb.run.workers import Crew, Task
+from tkamb.run.workers import PoolOptions, Task
 
 SCENE = fast_scene()
 EFFORT = ("body_seconds", "query_seconds", "contact_seconds", "iterations")
@@ -67,28 +67,30 @@ def test_a_run_of_two_is_resumed_by_one(tmp_path, monkeypatch):
 
 def test_a_team_prepares_before_it_is_asked_and_ends_with_its_block():
     task, wanted = Task(functools.partial, (max,)), [(n, 10 - n) for n in range(10)]
-    with Crew(2).team(task, len(wanted)) as team:
+    with PoolOptions(2).team(task, len(wanted)) as team:
         found = dict(team.answers(wanted))
     assert found == {n: max(n, 10 - n) for n in range(10)}
-    with suppress(RuntimeError), Crew(2).team(task, len(wanted)) as team:
+    with suppress(RuntimeError), PoolOptions(2).team(task, len(wanted)) as team:
         assert [process.poll() for process in team.processes] == [None, None]
         raise RuntimeError
     assert all(process.poll() is not None for process in team.processes)
-    with Crew(1).team(task, len(wanted)) as team:
+    with PoolOptions(1).team(task, len(wanted)) as team:
         assert not team.processes and dict(team.answers(wanted)) == found
 
 
 def test_what_a_worker_cannot_use_is_the_callers_error(tmp_path, capfd):
     missing = tmp_path / "scene.toml"
     with pytest.raises(InputError, match="no such scene file") as caught:
-        list(Crew(2).answers(Task(load_scene, (missing,)), [(0, None), (1, None)]))
+        list(PoolOptions(2).answers(Task(load_scene, (missing,)), [(0, None), (1, None)]))
     assert caught.value.where == missing
     assert capfd.readouterr().err == ""
 
 
 def test_what_a_job_refuses_is_the_callers_error():
     with pytest.raises(InputError, match="0 is not within"):
-        list(Crew(2).answers(Task(functools.partial, (Crew,)), [(0, None), (0, None)]))
+        list(
+            PoolOptions(2).answers(Task(functools.partial, (PoolOptions,)), [(0, None), (0, None)])
+        )
 
 
 def test_workers_do_not_repeat_what_was_said(tmp_path, caplog, capfd):

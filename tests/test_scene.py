@@ -13,8 +13,9 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, transform
 from tkamb.io.recordings.meshes import load_surface
-from tkamb.io.scene import lines, load_scene
+from tkamb.io.scene import lines
 from tkamb.io.scene.case import load_case
+from tkamb.io.scene.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 

@@ -31,7 +31,7 @@ from tkamb.studies.references import (
     reference_of,
     write_references,
 )
-from tkamb.studies.row import TIMING_NOISE, on_front
+from tkamb.studies.row import TIMING, on_front
 from tradeoff_blocks import moved
 
 ROOT = Path(__file__).parents[1]
@@ -155,7 +155,7 @@ def test_the_front_is_blind_to_noise_in_time():
     assert front[points.index(best)]
     for point, mark in zip(points, front, strict=True):
         if mark:
-            assert not any(t * TIMING_NOISE < point[0] and e <= point[1] for t, e in points)
+            assert not any(t * TIMING.equal_ratio < point[0] and e <= point[1] for t, e in points)
     again = on_front(
         [(t * f, e) for (t, e), f in zip(points, rng.uniform(1, 1.05, 40), strict=True)]
     )

@@ -18,7 +18,7 @@ from tkamb.show.style import PRESSURE_MAP
 from tkamb.show.view import colours
 from tkamb.show.view.draw import draw
 from tkamb.show.view.run import open_run
-from tkamb.show.view.shading import MOST_TRIANGLES, decimate, shade
+from tkamb.show.view.shading import SHADING, decimate, shade
 from tkamb.show.view.solids import box, floor_and_foot, hull, revolved, solids, sphere_points
 from tkamb.show.view.strands import path_strands
 from viewed import MODELS, shipped_run
@@ -89,7 +89,7 @@ def test_a_small_surface_is_left_alone():
 def test_the_shipped_implant_is_drawn_within_a_third_of_a_millimetre(drawing):
     for solid in drawing.solids:
         drawn = shade(solid.surface)
-        assert len(drawn.faces) <= MOST_TRIANGLES
+        assert len(drawn.faces) <= SHADING.max_triangles
         assert drawn.error < 0.35e-3
 
 

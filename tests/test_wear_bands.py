@@ -15,7 +15,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.shards import Shards
-from tkamb.run.workers import Crew
+from tkamb.run.workers import PoolOptions
 from tkamb.studies.uncertainty.inputs import Draw, VariedInput
 from tkamb.studies.wear.bands import Sampling, check_samples
 from tkamb.studies.wear.creep import LogarithmicCreep
@@ -178,7 +178,7 @@ def test_two_workers_give_the_numbers_of_one_with_a_contact_model():
     case = ball_case(shapes.trough(0.03), 20 * MM, swing(0.5, 3, 500.0), 1e-7, 3.0)
     inputs = (VariedInput("ap", 0.5, "mm"), VariedInput("young_modulus", 0.1, "relative"), FACTOR)
     alone, rows = sampled(case, inputs)
-    together, _ = sampled(case, inputs, crew=Crew(2))
+    together, _ = sampled(case, inputs, crew=PoolOptions(2))
     assert together.rows == alone.rows
     low, high = (alone.rows[-1][f"volume_mm3_{end}"] for end in ("p05", "p95"))
     assert 0 < low < rows[-1]["volume_mm3"] < high

@@ -30,10 +30,10 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]*")
 def folder_token(folder: Path) -> str | None:
     """Return what the names of a folder's temporary files begin with; None: it has no marker."""
     try:
-        found = read_json(folder / MARKER)
+        result = read_json(folder / MARKER)
     except InputError:
         return None
-    token = found.get("token") if isinstance(found, dict) else None
+    token = result.get("token") if isinstance(result, dict) else None
     return token if isinstance(token, str) and re.fullmatch("[0-9a-f]{16}", token) else None
 
 

@@ -174,8 +174,10 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         print((directory / "summary.json").read_text(encoding="utf-8"), end="")
     else:
-        found = cards(results, horizontal_axis(results))
-        print("\n".join([*(card.line() for card in found), f"report: {directory / 'report.html'}"]))
+        result = cards(results, horizontal_axis(results))
+        print(
+            "\n".join([*(card.line() for card in result), f"report: {directory / 'report.html'}"])
+        )
     if profile and not options.json:
         print("\n".join(profile_lines(results.summary["profile"])))
     return 1 if failed and (options.strict or len(failed) == len(results)) else 0

@@ -1,10 +1,21 @@
-"""The one error family: what went wrong, where, and how to mend it, in one line."""
+"""The one error family: what went wrong, where, and what to do about it, in one line."""
 
 import difflib
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
-MOST_NAMES = 8
-"""How many names a message lists."""
+
+@dataclass(frozen=True)
+class MessageSettings:
+    """How messages are written."""
+
+    max_names: int = 8
+    """Number of names that a message lists."""
+
+
+MESSAGE = MessageSettings()
 
 
 class TkambError(Exception):
@@ -13,15 +24,37 @@ class TkambError(Exception):
     Args:
         what: what is wrong.
         where: file, key or frame number, if there is one.
-        mend: what the user can do about it.
+        hint: what the user can do about it.
+        mend: former name of `hint`, accepted until release 0.3.
     """
 
     exit_status = 1
 
-    def __init__(self, what: str, where: object = None, mend: str | None = None) -> None:
-        self.what, self.where, self.mend = what, where, mend
+    def __init__(
+        self,
+        what: str,
+        where: object = None,
+        hint: str | None = None,
+        *,
+        mend: str | None = None,
+    ) -> None:
+        if mend is not None:
+            _warn_of_old_name()
+            hint = mend
+        self.what, self.where, self.hint = what, where, hint
         message = what if where is None else f"{where}: {what}"
-        super().__init__(" ".join((message if mend is None else f"{message}; {mend}").split()))
+        super().__init__(" ".join((message if hint is None else f"{message}; {hint}").split()))
+
+    @property
+    def mend(self) -> str | None:
+        """Return `hint` by its former name."""
+        _warn_of_old_name()
+        return self.hint
+
+
+def _warn_of_old_name() -> None:
+    """Warn the caller of an error's method that `mend` is called `hint`."""
+    warnings.warn("'mend' of an error is now called 'hint'", DeprecationWarning, stacklevel=3)
 
 
 class InputError(TkambError):
@@ -41,10 +74,28 @@ def not_installed(package: str, where: object, extra: str) -> InputError:
 
 def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
     """Return "did you mean ..." with the names that resemble one, and the first of all names."""
-    there = list(names)
-    lower = {known.lower(): known for known in there}
+    all_names = list(names)
+    lower = {each.lower(): each for each in all_names}
     close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.6)
-    more = ", …" if len(there) > MOST_NAMES else ""
-    listed = f"{title}: {', '.join(there[:MOST_NAMES]) or 'none'}{more}"
-    guess = f"did you mean {', '.join(lower[known] for known in close)}? " if close else ""
+    more = ", …" if len(all_names) > MESSAGE.max_names else ""
+    listed = f"{title}: {', '.join(all_names[: MESSAGE.max_names]) or 'none'}{more}"
+    guess = f"did you mean {', '.join(lower[each] for each in close)}? " if close else ""
     return guess + listed
+
+
+def renamed(module: str, name: str, names: Mapping[str, Any]) -> Any:
+    """Return what a module has under a former name, with a DeprecationWarning.
+
+    Args:
+        module: its dotted name.
+        name: that was asked for.
+        names: former name -> what it names.
+
+    Raises:
+        AttributeError: the module has nothing of that name.
+    """
+    if name not in names:
+        raise AttributeError(f"module '{module}' has no attribute '{name}'")
+    message = f"'{name}' of {module} is now called '{names[name].__name__}'"
+    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    return names[name]

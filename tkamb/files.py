@@ -9,6 +9,7 @@ import json
 import os
 import re
 import stat
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -17,20 +18,29 @@ from xml.parsers import expat
 from tkamb.errors import InputError
 
 MEGABYTE = 1_000_000
-TEXT_LIMIT = 16 * MEGABYTE
-"""Bytes of a scene, a URDF, a summary: a thousand times what one has."""
-TABLE_LIMIT = 512 * MEGABYTE
-"""Bytes of a recording: an hour of fifty channels at 200 Hz has 500 MB."""
-MESH_LIMIT = 1000 * MEGABYTE
-"""Bytes of a mesh: twenty million triangles in a binary STL."""
+
+
+@dataclass(frozen=True)
+class FileLimitSettings:
+    """The largest files that are read: what is larger is not what it is called."""
+
+    text_bytes: float = 16 * MEGABYTE
+    """Bytes of a scene, a URDF or a summary: a thousand times the size of the shipped ones."""
+    table_bytes: float = 512 * MEGABYTE
+    """Bytes of a recording: an hour of fifty channels at 200 Hz has 500 MB."""
+    mesh_bytes: float = 1000 * MEGABYTE
+    """Bytes of a mesh: twenty million triangles in a binary STL."""
+    xml_depth: int = 100
+    """Nested elements of an XML file; a URDF has 5, an OpenSim model 20."""
+
+
+FILE_LIMITS = FileLimitSettings()
+
 
 SAVE_AS_UTF8 = "save it as UTF-8 text"
 
 HASH_LIMIT = 100_000 * MEGABYTE
 """Bytes of a file of which the SHA-256 is taken: five minutes of reading."""
-
-DEEPEST = 100
-"""Elements of an XML file inside one another; a URDF has 5, an OpenSim model 20."""
 
 
 def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: bool = True) -> int:
@@ -75,7 +85,9 @@ def check_readable(status: os.stat_result, path: str | Path, limit: float) -> No
         raise InputError(f"is {size:.0f} MB large, more than the {most:.0f} MB that are read", path)
 
 
-def read_bytes(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file") -> bytes:
+def read_bytes(
+    path: str | Path, limit: float = FILE_LIMITS.text_bytes, *, what: str = "file"
+) -> bytes:
     """Return the content of a regular file.
 
     Raises:
@@ -89,7 +101,11 @@ def read_bytes(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file
 
 
 def read_text(
-    path: str | Path, limit: float = TEXT_LIMIT, encoding: str = "utf-8", *, what: str = "file"
+    path: str | Path,
+    limit: float = FILE_LIMITS.text_bytes,
+    encoding: str = "utf-8",
+    *,
+    what: str = "file",
 ) -> str:
     """Return the content of a regular text file, with line ends as `\\n`.
 
@@ -103,7 +119,9 @@ def read_text(
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_json(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file") -> Any:
+def read_json(
+    path: str | Path, limit: float = FILE_LIMITS.text_bytes, *, what: str = "file"
+) -> Any:
     """Return what a JSON file holds.
 
     Raises:
@@ -115,12 +133,14 @@ def read_json(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file"
         raise InputError(f"cannot be read as JSON ({error})", path) from None
 
 
-def read_xml(path: str | Path, limit: float = TEXT_LIMIT, *, what: str = "file") -> Element:
+def read_xml(
+    path: str | Path, limit: float = FILE_LIMITS.text_bytes, *, what: str = "file"
+) -> Element:
     """Return the root element of an XML file.
 
     Raises:
         InputError: as `read_bytes`, or not XML, or it declares entities (which could grow without
-            end or name other files), or nested more than `DEEPEST` elements deep.
+            end or name other files), or nested more than `FILE_LIMITS.xml_depth` elements deep.
     """
     return parse_xml(read_bytes(path, limit, what=what), path, what=what)
 
@@ -134,8 +154,8 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
     builder = _ShallowBuilder(path)
 
     def refuse_entity(name: str, *_: object) -> None:
-        mend = "write its text out"
-        raise InputError(f"declares an entity '{name}', which is refused", path, mend)
+        hint = "write its text out"
+        raise InputError(f"declares an entity '{name}', which is refused", path, hint)
 
     parser = expat.ParserCreate()
     parser.buffer_text = True
@@ -155,7 +175,7 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
 
 
 def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
-    """Return how to mend what stopped the parser, from the bytes about the place."""
+    """Return what to do about what stopped the parser, from the bytes about the place."""
     at = max(parser.ErrorByteIndex, 0)
     near = content[max(at - 1, 0) : at + 12]
     if re.search(rb"&(?!\w{1,8};|#)", near):
@@ -164,7 +184,7 @@ def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
         return SAVE_AS_UTF8
     if not content.strip() or at >= len(content.rstrip()) - 1:
         return "the file ends too early: get it anew"
-    return "mend that line, or open and save the file in the program that wrote it"
+    return "correct that line, or open and save the file in the program that wrote it"
 
 
 class _ShallowBuilder(TreeBuilder):
@@ -177,8 +197,8 @@ class _ShallowBuilder(TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str], /) -> Element:
         """Open an element."""
         self._depth += 1
-        if self._depth > DEEPEST:
-            raise InputError(f"nests elements more than {DEEPEST} deep", self._path)
+        if self._depth > FILE_LIMITS.xml_depth:
+            raise InputError(f"nests elements more than {FILE_LIMITS.xml_depth} deep", self._path)
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> Element:
@@ -199,16 +219,16 @@ def named_files(path: Path) -> list[Path]:
     Raises:
         InputError: as `read_bytes`.
     """
-    found: list[Path] = []
+    result: list[Path] = []
     waiting = [path]
     while waiting:
         here = waiting.pop()
         for name in _NAMED.findall(read_bytes(here)):
             other = here.parent / os.fsdecode(name).replace("\\", "/")
-            if other.is_file() and other not in (path, *found):
-                found.append(other)
+            if other.is_file() and other not in (path, *result):
+                result.append(other)
                 waiting.append(other)
-    return found
+    return result
 
 
 def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:

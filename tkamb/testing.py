@@ -22,9 +22,16 @@ SPHERE_RADIUS, SPHERE_OFFSET = 20e-3, 12e-3
 BLOCK = (32e-3, 10e-3, 56e-3)
 
 
-STIFFNESS_TOLERANCE = 0.1
-"""Relative, between finite differences over 10 and 5 % of the approach; contact nodes that
-come in one by one make small steps."""
+@dataclass(frozen=True)
+class ModelCheckSettings:
+    """Checks of a contact model of a plug-in."""
+
+    stiffness_tolerance: float = 0.1
+    """Relative, between finite differences over 10 and 5 % of the approach; contact nodes that come
+    in one by one make small steps."""
+
+
+MODEL_CHECK = ModelCheckSettings()
 
 
 class ConformanceError(TkambError):
@@ -146,11 +153,11 @@ def _check_load(
     again = model.evaluate(state, pressed.pose)
     travelled = case.pair.first_touch_height(case.pose) - pressed.pose[1, 3]
     _require(travelled > 0, "pressing moves the femoral component into the insert")
-    for found in (pressed, again):
+    for result in (pressed, again):
         _require(
-            _close(found.approach, travelled, 1e-9, 1.0),
+            _close(result.approach, travelled, 1e-9, 1.0),
             "the approach is the travel since touch",
-            f"{found.approach} m for {travelled} m",
+            f"{result.approach} m for {travelled} m",
         )
     _require(
         _close(again.wrench_on_insert[:3], pressed.wrench_on_insert[:3], case.tolerance, case.load),
@@ -235,7 +242,7 @@ def _check_stiffness(
     wide = (forces[4] - forces[0]) / (steps[4] - steps[0])
     narrow = (forces[3] - forces[1]) / (steps[3] - steps[1])
     _require(
-        _close(wide, narrow, STIFFNESS_TOLERANCE, narrow),
+        _close(wide, narrow, MODEL_CHECK.stiffness_tolerance, narrow),
         "the stiffness by finite differences settles as the step shrinks",
         f"{wide:.4g} and {narrow:.4g} N/m",
     )

@@ -40,17 +40,17 @@ def _check(options: argparse.Namespace) -> int:
     from tkamb.show.check.scene_check import check_scene
 
     if options.out and options.out.suffix.lower() not in PICTURES:
-        mend = f"name it like check{PICTURES[0]}"
-        raise InputError(f"is none of {', '.join(PICTURES)}", options.out, mend)
+        hint = f"name it like check{PICTURES[0]}"
+        raise InputError(f"is none of {', '.join(PICTURES)}", options.out, hint)
     check_output_file(options.out, options.force)
     with Stages(4 if options.out else 3) as stages:
-        found = check_scene(options.scene, dict(options.set), stages.begin)
+        result = check_scene(options.scene, dict(options.set), stages.begin)
         if options.out:
             stages.begin("drawing the leg")
-            _write_picture(found, options.out)
+            _write_picture(result, options.out)
     written = [f"picture: {options.out}"] if options.out else []
-    lines = [*found.lines(), *written, f"next: tkamb run {options.scene}"]
-    print(json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines))
+    lines = [*result.lines(), *written, f"next: tkamb run {options.scene}"]
+    print(json.dumps(result.as_dict(), indent=2) if options.json else "\n".join(lines))
     return 0
 
 

@@ -3,13 +3,22 @@
 import argparse
 import re
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tkamb.run.guard import say
 
-SHOWN = 10
-"""Failed runs that are printed."""
+
+@dataclass(frozen=True)
+class CohortOutputSettings:
+    """What `tkamb cohort` prints."""
+
+    max_failed_runs: int = 10
+    """Failed runs that are printed; the folder has them all."""
+
+
+COHORT_OUTPUT = CohortOutputSettings()
 
 
 def add_cohort(commands: Any) -> None:
@@ -19,7 +28,9 @@ def add_cohort(commands: Any) -> None:
         commands: the parser's subcommands.
     """
     command = commands.add_parser("cohort", help="subjects, trials and designs as one table")
-    command.add_argument("file", type=Path, metavar="FILE.toml", help="see docs/cohort.md")
+    command.add_argument(
+        "file", type=Path, metavar="FILE.toml", help="subjects, trials, designs and contact models"
+    )
     command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
     command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
     command.add_argument("--shard", type=_part, metavar="I/N", help="every n-th run, for a queue")
@@ -33,22 +44,22 @@ def add_cohort(commands: Any) -> None:
 
 
 def _part(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
-    if not found:
+    result = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if not result:
         raise argparse.ArgumentTypeError(f"'{text}' is not I/N, like 1/8")
-    return int(found.group(1)), int(found.group(2))
+    return int(result.group(1)), int(result.group(2))
 
 
 def _cohort(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
-    from tkamb.run.workers import Crew
+    from tkamb.run.workers import PoolOptions
     from tkamb.studies.cohort.folder import REPORT_NAME
     from tkamb.studies.cohort.plan import load_cohort
     from tkamb.studies.cohort.run import Part, run_cohort
 
     part = None if options.shard is None else Part(*options.shard)
-    crew = Crew(options.workers, options.dask)
+    crew = PoolOptions(options.workers, options.dask)
     cohort = load_cohort(options.file, options.frames)
     directory = options.out or Path("out") / options.file.resolve().stem
     outcomes = run_cohort(
@@ -61,10 +72,13 @@ def _cohort(options: argparse.Namespace) -> int:
         progress=lambda runs, count: tqdm(runs, total=count, unit="run", disable=None),
     )
     failed = [n for n, one in outcomes.items() if one.reason]
-    for n in failed[:SHOWN]:
+    for n in failed[: COHORT_OUTPUT.max_failed_runs]:
         print(f"tkamb: run {n} ({cohort.runs[n].words()}): {outcomes[n].reason}", file=sys.stderr)
-    if len(failed) > SHOWN:
-        print(f"tkamb: {len(failed) - SHOWN} more failed runs: see runs.csv", file=sys.stderr)
+    if len(failed) > COHORT_OUTPUT.max_failed_runs:
+        print(
+            f"tkamb: {len(failed) - COHORT_OUTPUT.max_failed_runs} more failed runs: see runs.csv",
+            file=sys.stderr,
+        )
     print(f"{len(outcomes) - len(failed)} of {len(outcomes)} runs computed")
     if part is None:
         print(f"report: {directory / REPORT_NAME}")

@@ -41,12 +41,12 @@ def _compare(options: argparse.Namespace) -> int:
     from tkamb.show.compare.comparison import compare_folders
     from tkamb.show.compare.page import comparison_html, table_lines
 
-    found = compare_folders(options.folders, options.axis)
-    html = comparison_html(found, options.frame)
+    result = compare_folders(options.folders, options.axis)
+    html = comparison_html(result, options.frame)
     place = options.out or Path("out") / "compare"
     with claimed_directory(place, options.force) as folder:
         write_text(folder / PAGE_NAME, html)
-    lines = [*table_lines(found), f"page: {folder / PAGE_NAME}"]
-    text = json.dumps(found.as_dict(), indent=2) if options.json else "\n".join(lines)
+    lines = [*table_lines(result), f"page: {folder / PAGE_NAME}"]
+    text = json.dumps(result.as_dict(), indent=2) if options.json else "\n".join(lines)
     print(printable(text))
     return 0

@@ -9,7 +9,7 @@ from tkamb.io.datasets.dataset import NAMES, read_dataset
 
 def add_data(commands: Any) -> None:
     """Add the command `data` to the parser's commands."""
-    data = commands.add_parser("data", help="real data for the shipped scenes (docs/data.md)")
+    data = commands.add_parser("data", help="real data for the shipped scenes")
     verbs = data.add_subparsers(required=True, metavar="VERB")
     get = verbs.add_parser("get", help="download a data set, or take it from a folder")
     get.add_argument("name", choices=NAMES, help="dm: Grand Challenge subject DM")

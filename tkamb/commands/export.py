@@ -50,12 +50,12 @@ def _export_deck(options: argparse.Namespace) -> int:
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")
     if options.resolution is not None and not 0 < options.resolution <= MAP_GRID.coarsest_mm:
-        mend = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
-        raise InputError(f"resolution {options.resolution} mm", "--resolution", mend)
+        hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
+        raise InputError(f"resolution {options.resolution} mm", "--resolution", hint)
     check_output_file(options.out, options.force)
-    found = frame_press(options.folder, options.frame, options.resolution)
-    write_text(options.out, found.deck(options.deck))
-    print("\n".join([f"{options.out}: {found.comments()[0]}", *found.comments()[2:]]))
+    result = frame_press(options.folder, options.frame, options.resolution)
+    write_text(options.out, result.deck(options.deck))
+    print("\n".join([f"{options.out}: {result.comments()[0]}", *result.comments()[2:]]))
     return 0
 
 

@@ -137,11 +137,11 @@ def add_mesh(commands: Any) -> None:
 def _mesh_check(options: argparse.Namespace) -> int:
     from tkamb.io.recordings.mesh_check import check_mesh
 
-    found = [check_mesh(path) for path in options.files]
+    result = [check_mesh(path) for path in options.files]
     if options.json:
-        print(json.dumps([health.as_dict() for health in found], indent=2))
+        print(json.dumps([health.as_dict() for health in result], indent=2))
     else:
-        print("\n".join(line for health in found for line in health.lines()))
+        print("\n".join(line for health in result for line in health.lines()))
     return 0
 
 

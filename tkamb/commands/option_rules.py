@@ -201,8 +201,8 @@ def _given(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str
         match = option if option in names else full[0] if len(full) == 1 else None
         if match is not None:
             given.add(names[match])
-    found, _ = parser.parse_known_args(list(arguments))
+    result, _ = parser.parse_known_args(list(arguments))
     for action in parser._actions:
-        if action.nargs == "?" and not action.option_strings and getattr(found, action.dest):
+        if action.nargs == "?" and not action.option_strings and getattr(result, action.dest):
             given.add(str(action.metavar))
     return given

@@ -69,7 +69,7 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     rows, whole = gather(
         study.run_tradeoff(wanted, references, kept), study.expected_seconds(wanted, cases)
     )
-    found = len(rows)
+    result = len(rows)
     if whole and options.peer:
         sizes = {job.resolution_mm for job in wanted if job.label == DEFAULT}
         more, whole = gather(study.run_peer(cases, references, kept, sizes), [1.0] * len(cases))
@@ -80,7 +80,7 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
         planned = len(CHANGES)
         body, whole = gather(run_body_trade(kept), [1.0] * planned)
     rows = with_fronts(rows)
-    lines = [*unfinished(found + len(body), len(wanted) + planned), *table(rows, references)]
+    lines = [*unfinished(result + len(body), len(wanted) + planned), *table(rows, references)]
     lines += ["", *comparison(rows), "", *recommendations(rows)]
     if body:
         lines += ["", *body_table(body)]

@@ -55,7 +55,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
     if options.screen:
         return _screen(options, overrides)
     directory = options.out or Path("out") / f"{options.scene.resolve().parent.name}_uncertainty"
-    found = estimate_uncertainty(
+    result = estimate_uncertainty(
         load_scene(options.scene, overrides),
         samples=options.samples,
         workers=options.workers,
@@ -69,10 +69,10 @@ def _uncertainty(options: argparse.Namespace) -> int:
         force=options.force,
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
-    for line in warnings_of(found):
+    for line in warnings_of(result):
         print(f"tkamb: {line}", file=sys.stderr)
-    print("\n".join([*headline(found), f"bands: {directory / 'bands.csv'}"]))
-    if all(one.failed.all() for one in found.samples):
+    print("\n".join([*headline(result), f"bands: {directory / 'bands.csv'}"]))
+    if all(one.failed.all() for one in result.samples):
         say("every frame of every sample failed")
         return 1
     return 0
@@ -84,30 +84,30 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
     from tkamb.io.scene import load_scene
     from tkamb.io.scene.case import load_case
-    from tkamb.run.workers import Crew
+    from tkamb.run.workers import PoolOptions
     from tkamb.studies.uncertainty.screening import screen, screen_lines
 
-    scene, said = load_scene(options.scene, overrides), []
+    scene, text = load_scene(options.scene, overrides), []
     if scene.contact and not {"contact.model", "contact.resolution_mm"} & set(overrides):
         scene = load_scene(options.scene, overrides | QUICK_CONTACT)
-        said.append("contact by foundation at 2 mm; --contact and --resolution choose another")
+        text.append("contact by foundation at 2 mm; --contact and --resolution choose another")
     frames = options.frames
     if frames is None:
         step = -(-len(load_case(scene).motion.time) // QUICK_FRAMES)
         frames = slice(None, None, step)
         if step > 1:
-            said.append(f"frames ::{step}; --frames chooses others")
+            text.append(f"frames ::{step}; --frames chooses others")
     rows = screen(
         scene,
         frames=frames,
-        crew=Crew(options.workers, options.dask),
+        crew=PoolOptions(options.workers, options.dask),
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
-    said.append("one input at a time by one standard deviation: minus, plus; no interactions")
-    said.append(
+    text.append("one input at a time by one standard deviation: minus, plus; no interactions")
+    text.append(
         "an offset either way may raise a force: it climbs one flank of the insert or other"
     )
-    print("\n".join([*screen_lines(rows), *(f"({line})" for line in said)]))
+    print("\n".join([*screen_lines(rows), *(f"({line})" for line in text)]))
     return 0 if rows else 1
 
 

@@ -95,8 +95,8 @@ def _check(options: argparse.Namespace) -> None:
     """
     check_port(options.port)
     if options.camera not in CAMERAS:
-        mend = f"there are: {', '.join(CAMERAS)}"
-        raise InputError(f"no view '{options.camera}'", "--camera", mend)
+        hint = f"there are: {', '.join(CAMERAS)}"
+        raise InputError(f"no view '{options.camera}'", "--camera", hint)
     if options.contact:
         from tkamb.contact.registry import contact_class
 

@@ -98,11 +98,11 @@ def _wear(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from tkamb.io.claim import claimed_directory
-    from tkamb.run.workers import Crew
+    from tkamb.run.workers import PoolOptions
 
     folder = options.out or Path("out") / f"{_stem(options.case)}_wear"
     with claimed_directory(folder, options.force, "wear") as claimed:
-        crew, run = Crew(options.workers), _prepared(options)
+        crew, run = PoolOptions(options.workers), _prepared(options)
         if crew.workers > 1 and run.sampling is None:
             raise InputError("has no samples to compute", "--workers", "give --samples too")
         with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:

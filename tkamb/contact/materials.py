@@ -291,13 +291,13 @@ def material(name: str, **overrides: float) -> Material:
         InputError: unknown name or override, or a value out of range.
     """
     if name not in MATERIALS:
-        raise InputError(f"no material '{name}'", mend=names_near(name, MATERIALS))
+        raise InputError(f"no material '{name}'", hint=names_near(name, MATERIALS))
     linear = name == "polyethylene-linear"
     allowed = ("young_modulus", "poisson_ratio") if linear else tuple(_POLYETHYLENE)
     for key in overrides:
         if key not in allowed:
             raise InputError(
-                f"material '{name}' has no '{key}'", mend=f"it has: {', '.join(allowed)}"
+                f"material '{name}' has no '{key}'", hint=f"it has: {', '.join(allowed)}"
             )
     values = {**_POLYETHYLENE, **overrides}
     law: StressStrainLaw = LinearElastic()

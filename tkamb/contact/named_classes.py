@@ -44,7 +44,7 @@ class NamedClasses(Generic[Base]):
         """
         offers = self._offers()
         if name not in offers:
-            raise InputError(f"no {self.kind} '{name}'", mend=names_near(name, offers))
+            raise InputError(f"no {self.kind} '{name}'", hint=names_near(name, offers))
         where = f"{self.kind} '{name}' ({offers[name]})"
         module, _, attribute = offers[name].partition(":")
         try:
@@ -65,7 +65,7 @@ class NamedClasses(Generic[Base]):
             if first != point.value:
                 raise InputError(
                     f"two {self.kind}s are called '{point.name}': {first} and {_origin(point)}",
-                    mend="uninstall or rename one",
+                    hint="uninstall or rename one",
                 )
         return offers
 

@@ -26,7 +26,7 @@ from tkamb.atomic import (
     replacement_pending,
 )
 from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_json, read_text
+from tkamb.files import FILE_LIMITS, read_json, read_text
 from tkamb.io.occupants import check_occupants
 
 CHOOSE = "choose another folder with --out"
@@ -200,7 +200,7 @@ def is_ours(path: Path) -> bool:
     if "version of tkamb" in _object(path / ".frames" / "run.json"):
         return True
     try:
-        rows = read_text(path / "rows.jsonl", TABLE_LIMIT)
+        rows = read_text(path / "rows.jsonl", FILE_LIMITS.table_bytes)
     except InputError:
         return False
     return rows.startswith('{"key": ') and '"row": ' in rows.partition("\n")[0]

@@ -194,6 +194,6 @@ def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> St
         strain, stress_MPa = (np.asarray(values[key], float) for key in LAW_KEYS["tabulated"])
         return TabulatedLaw(tuple(strain.tolist()), tuple((stress_MPa * MEGAPASCAL).tolist()))
     except InputError as error:
-        raise InputError(error.what, where, error.mend) from None
+        raise InputError(error.what, where, error.hint) from None
     except (TypeError, ValueError):
         raise InputError("strain and stress_MPa are no lists of numbers", where, EXAMPLE) from None

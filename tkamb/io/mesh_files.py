@@ -80,8 +80,8 @@ def lattice_of_file(
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is no .vtu file", "out", "name it like lattice.vtu")
     if not 0 < resolution_mm <= MAP_GRID.coarsest_mm:
-        mend = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
-        raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", mend)
+        hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
+        raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", hint)
     surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":
         surface = mirrored(surface)

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_json, read_text
+from tkamb.files import FILE_LIMITS, read_json, read_text
 
 WRITTEN = {
     "uncertainty": ("bands.csv",),
@@ -24,7 +24,7 @@ BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear
 
 def occupants(folder: Path) -> dict[str, str]:
     """Return command -> the file that says that its output, finished or under way, is there."""
-    found = {
+    result = {
         command: name
         for command, names in WRITTEN.items()
         for name in names
@@ -32,10 +32,10 @@ def occupants(folder: Path) -> dict[str, str]:
     }
     for command, name in (_frames_of(folder), _rows_of(folder)):
         if command:
-            found.setdefault(command, name)
-    if "uncertainty" in found:
-        found.pop("run", None)
-    return found
+            result.setdefault(command, name)
+    if "uncertainty" in result:
+        result.pop("run", None)
+    return result
 
 
 def check_occupants(folder: Path, command: str) -> None:
@@ -54,14 +54,14 @@ def _frames_of(folder: Path) -> tuple[str, str]:
     """Return whose finished frames or samples a run under way keeps, and where."""
     name = ".frames/run.json"
     try:
-        found = read_json(folder / name)
+        result = read_json(folder / name)
     except InputError:
         return "", name
-    if not isinstance(found, dict):
+    if not isinstance(result, dict):
         return "", name
-    if "table of runs" in found:
+    if "table of runs" in result:
         return "cohort", name
-    return ("uncertainty" if "method of sampling" in found else "run"), name
+    return ("uncertainty" if "method of sampling" in result else "run"), name
 
 
 def _rows_of(folder: Path) -> tuple[str, str]:
@@ -70,7 +70,7 @@ def _rows_of(folder: Path) -> tuple[str, str]:
     if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
         return "", name
     try:
-        first = read_text(folder / name, TABLE_LIMIT).partition("\n")[0]
+        first = read_text(folder / name, FILE_LIMITS.table_bytes).partition("\n")[0]
     except InputError:
         return "", name
     if not first.startswith('{"key": '):

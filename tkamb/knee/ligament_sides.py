@@ -50,7 +50,7 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
                     f"side of this {side} knee, a ligament of the {own} side by its name",
                     f"[[ligament]] {bundle.name}",
                     "turn the sign of z in point_mm (z points to the right on either side), or "
-                    "mend [patient] side or the name",
+                    "correct [patient] side or the name",
                 )
 
 

@@ -97,8 +97,8 @@ def _library() -> Any:
         import dask
         import distributed
     except ImportError:
-        mend = "pip install 'tkamb[cluster]'"
-        raise InputError("Dask is not installed", "--dask", mend) from None
+        hint = "pip install 'tkamb[cluster]'"
+        raise InputError("Dask is not installed", "--dask", hint) from None
     dask.config.set({"distributed.scheduler.allowed-failures": CLUSTER.most_deaths})
     return distributed
 

@@ -11,7 +11,7 @@
 
 import time as clock
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,13 +43,23 @@ if TYPE_CHECKING:
 
 NAN = float("nan")
 
-LOAD_CHANGE = 0.1
-"""N, between the last two iterations of a coupled frame."""
-POINT_CHANGE = 1e-6
-"""m, of the centres of pressure between them."""
-MOST_ITERATIONS = 20
-OPEN = 0.02
-"""Share of how the knee yields to the muscles that a settled search leaves open."""
+
+@dataclass(frozen=True)
+class CouplingSettings:
+    """The iteration between contact and muscles of one frame."""
+
+    force_tolerance: float = 0.1
+    """N; the iteration has converged when the load changes by less. A ten-thousandth of a body
+    weight is not resolved by any contact model."""
+    point_tolerance: float = 1e-6
+    """m; and when the centres of pressure move by less."""
+    max_iterations: int = 20
+    """Iterations after which a frame without convergence gets a status."""
+    stiffness_error: float = 0.02
+    """Share of the stiffness of the muscles that a converged search may neglect."""
+
+
+COUPLING = CouplingSettings()
 
 
 class ContactSide:
@@ -170,19 +180,19 @@ class ContactSide:
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact once the one's resultants and post act in the other."""
         seconds, place = contact.seconds, self.case.motion.coordinates[k]
-        for iteration in range(1, MOST_ITERATIONS + 1):
+        for iteration in range(1, COUPLING.max_iterations + 1):
             if contact.result is None:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
             coupled = self.table.coupling == "points"
-            found = self.resultants(k, place, contact.result) if coupled else {}
+            result = self.resultants(k, place, contact.result) if coupled else {}
             post = post_contact(self.post, contact.result.pose, self.table)
             if post is not None and post.problem:
                 return replace(body, loads=unsolved([post.problem])), replace(
                     contact, result=None, problem=post.problem, post=post
                 )
             pushed = self.mechanics.post_loads(k, place, post.load if post else None)
-            geometry = replace(body.geometry, condyles=body.geometry.condyles | found, post=pushed)
+            geometry = replace(body.geometry, condyles=body.geometry.condyles | result, post=pushed)
             geometry, loads = self.mechanics.solved(k, geometry)
             body = replace(body, geometry=geometry, loads=loads)
             contact = self.carry(body, self.mechanics.poses[k], contact.result)
@@ -197,7 +207,7 @@ class ContactSide:
                 point_change=moved if coupled else NAN,
                 post=post,
             )
-            if change < LOAD_CHANGE and moved < POINT_CHANGE:
+            if change < COUPLING.force_tolerance and moved < COUPLING.point_tolerance:
                 return body, contact
         problem = "body and contact do not come to agree"
         return replace(body, loads=unsolved([problem])), replace(
@@ -278,8 +288,8 @@ class ContactSide:
         query = self.mechanics.query
         assert query is not None
         gaps = query.at(self.mechanics.poses[k])
-        found = {"medial": gaps.medial.centre}
-        return found | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
+        result = {"medial": gaps.medial.centre}
+        return result | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
     def _contact(
         self, result: ContactResult, adjustment: Adjustment | None, seconds: float
@@ -305,13 +315,13 @@ def insert_material_as_json(scene: Scene) -> dict[str, Any]:
 
 
 def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
-    """Return a flag where it hangs on the search how the knee yields to the muscles."""
-    if knee.doubt <= OPEN:
+    """Return a flag where the response of the coordinates to the muscles has not converged."""
+    if knee.doubt <= COUPLING.stiffness_error:
         return ()
     return (
-        f"how the knee yields to the muscles does not settle ({100 * knee.doubt:.0f} % of it is "
-        "open): begun elsewhere, such frames came out up to 3 % apart in the total force and "
-        "60 N in a condyle's (docs/muscles.md)",
+        "the response of the knee's coordinates to the muscles has not converged "
+        f"({100 * knee.doubt:.0f} % of it is open): from other initial guesses such frames "
+        "differed by up to 3 % in the total force and 60 N in the force of one condyle",
     )
 
 

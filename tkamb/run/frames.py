@@ -15,7 +15,7 @@ from tkamb.run.plausibility.plausibility import Plausibility
 from tkamb.run.shards import Row
 from tkamb.run.status import frame_status
 from tkamb.run.tabulate import frame_row
-from tkamb.run.workers import Team
+from tkamb.run.workers import WorkerPool
 
 if TYPE_CHECKING:
     from tkamb.knee.equilibrium.frame_contact import FrameContact
@@ -145,7 +145,7 @@ class ChunkSolver:
 
 
 def finished_in_order(
-    team: Team, slips: "dict[str, CondyleSlip]", indices: range, left: Sequence[int]
+    team: WorkerPool, slips: "dict[str, CondyleSlip]", indices: range, left: Sequence[int]
 ) -> Iterator[Finished]:
     """Yield frames over worker processes, in order.
 

@@ -1,11 +1,11 @@
 """What a case is prepared with before its first frame, and what a sample of it takes over."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, renamed
 from tkamb.geometry.frames import Array
 from tkamb.io.scene.case import Case
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What a case with moved inputs takes over from the case as it stands.
+class SharedState:
+    """State that a sample, a case with changed inputs, shares with the nominal case.
 
     Args:
-        query: of closest points between the surfaces, which are known to be near each other.
-        muscles: those of [muscles], perhaps with other strengths.
-        extensor: the mechanism; a patella that is to be found is looked for from where it is
-            there.
-        frames: in which it is; it stays elsewhere.
+        query: closest points between the surfaces, which stay near each other in all samples.
+        muscles: those of [muscles]; their strengths may differ from the nominal ones.
+        extensor: extensor mechanism of the nominal case. Its patella is the initial guess of the
+            search for the patella of the sample.
+        frames: frames in which the patella is searched for. In the others it stays where it is.
     """
 
     query: "ClosestPointQuery | None"
@@ -33,7 +33,7 @@ class Known:
     frames: range
 
 
-def extensor_frames(case: Case, poses: Array, known: Known | None = None) -> "ExtensorFrames":
+def extensor_frames(case: Case, poses: Array, known: SharedState | None = None) -> "ExtensorFrames":
     """Return the extensor mechanism of a case with [patella].
 
     Args:
@@ -78,3 +78,8 @@ def contact_query(case: Case) -> "ClosestPointQuery | None":
 
     assert case.femoral is not None and case.insert is not None
     return ClosestPointQuery(case.femoral, case.insert, case.split)
+
+
+def __getattr__(name: str) -> Any:
+    """Return a class by its former name, with a warning; until release 0.3."""
+    return renamed(__name__, name, {"Known": SharedState})

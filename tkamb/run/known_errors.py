@@ -16,8 +16,18 @@ from pathlib import Path
 from typing import Any
 
 STORED = Path(__file__).with_name("known_errors.json")
-LARGE = 0.10
-"""A known error above this is shown in colour."""
+
+
+@dataclass(frozen=True)
+class KnownErrorSettings:
+    """How known errors of the contact settings are shown."""
+
+    notable_share: float = 0.10
+    """Share of the reference; a known error above it is shown in colour."""
+
+
+KNOWN_ERROR = KnownErrorSettings()
+
 NOT_MEASURED = "not measured"
 SAME_ANSWER = ("cache",)
 """Options that change the time of an answer, not the answer."""
@@ -133,4 +143,6 @@ def is_large(said: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
         return False
     situations = said.get("situations") or {}
     smooth = [errors for place, errors in situations.items() if place != "edge"]
-    return any(errors[name] > LARGE for name in names for errors in smooth or [said])
+    return any(
+        errors[name] > KNOWN_ERROR.notable_share for name in names for errors in smooth or [said]
+    )

@@ -35,8 +35,16 @@ PER_FRAME = (
 )
 
 
-WAITING = 4e6
-"""Bytes of maps that wait to be written together: a write costs as much as the maps of a frame."""
+@dataclass(frozen=True)
+class MapWriteSettings:
+    """How pressure maps are written."""
+
+    buffer_bytes: float = 4e6
+    """Bytes of maps that are collected for one write: a write costs as much as the maps of a
+    frame."""
+
+
+MAP_WRITE = MapWriteSettings()
 
 
 class MapWriter:
@@ -130,7 +138,7 @@ class MapWriter:
             for value, shape in zip(values, shapes, strict=True)
         )
         self._waiting.append(frame)
-        if len(self._waiting) * sum(values.nbytes for values in frame) > WAITING:
+        if len(self._waiting) * sum(values.nbytes for values in frame) > MAP_WRITE.buffer_bytes:
             self.flush()
 
     def flush(self) -> None:
@@ -335,7 +343,9 @@ class ContactMaps:
             return np.asarray(self.source[name])
         with _opened(self.source) as file:
             if name not in file:
-                raise InputError(f"has no '{name}'", self.source, "is it a contact.h5 of tkamb?")
+                raise InputError(
+                    f"has no '{name}'", self.source, "give a contact.h5 that tkamb wrote"
+                )
             return np.asarray(file[name][:frames], None if name == "triangles" else float)
 
 

@@ -22,7 +22,7 @@ from tkamb.knee.contact_points import (
 )
 from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.knee.load import PointForces
-from tkamb.run.known import Known, contact_query, extensor_frames
+from tkamb.run.known import SharedState, contact_query, extensor_frames
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Mechanics:
         muscles: those that share the load; None if the quadriceps alone acts.
     """
 
-    def __init__(self, case: Case, known: Known | None = None, near: bool = False) -> None:
+    def __init__(self, case: Case, known: SharedState | None = None, near: bool = False) -> None:
         self.case, self._known = case, known
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
@@ -257,8 +257,8 @@ class Mechanics:
         from tkamb.knee.slip import condyle_slip
 
         recorded = case.motion.coordinates[: last + 2]
-        found = condyle_slip(case.femoral, case.insert, case.split, recorded)
-        sides = zip(SIDES, found, strict=True)
+        result = condyle_slip(case.femoral, case.insert, case.split, recorded)
+        sides = zip(SIDES, result, strict=True)
         return {side: slip for side, slip in sides if slip is not None}
 
     def chain_motion(

@@ -61,12 +61,12 @@ def body_weight(results: "Results") -> float:
 def peak(results: "Results", column: str) -> Peak | None:
     """Return the largest value of a column, or of its two sides for "<side>_..."."""
     sides = SIDES if column.startswith("<side>") else ("",)
-    found = [
+    result = [
         Peak(float(np.nanmax(values)), int(np.nanargmax(values)), side)
         for side in sides
         if np.isfinite(values := results[column.replace("<side>", side)]).any()
     ]
-    return max(found, key=lambda one: one.value, default=None)
+    return max(result, key=lambda one: one.value, default=None)
 
 
 def medial_share(results: "Results", estimate: str) -> Array:

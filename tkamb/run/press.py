@@ -37,8 +37,17 @@ from tkamb.memory import peak_rss
 from tkamb.run.known_errors import KnownError, as_json, known_error, known_error_words, left_out
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
-LARGEST_LOAD = 1e5
-"""N, over a hundred body weights."""
+
+@dataclass(frozen=True)
+class PressLimitSettings:
+    """Which loads are accepted."""
+
+    max_load: float = 1e5
+    """N; over a hundred body weights."""
+
+
+PRESS_LIMITS = PressLimitSettings()
+
 Side = Literal["right", "left"]
 
 _CONDYLE = (
@@ -114,17 +123,17 @@ class PressReport:
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        found = self.as_dict()
+        result = self.as_dict()
         lines = [
-            f"{self.contact} at {self.resolution_mm:g} mm, {self.nodes} nodes: {found['status']}",
-            f"load {self.load:g} N, reaction {_text(found['reaction_N'])} N, "
-            f"approach {_text(found['approach_mm'])} mm",
-            f"material {material_in_words(found['material'])}",
+            f"{self.contact} at {self.resolution_mm:g} mm, {self.nodes} nodes: {result['status']}",
+            f"load {self.load:g} N, reaction {_text(result['reaction_N'])} N, "
+            f"approach {_text(result['approach_mm'])} mm",
+            f"material {material_in_words(result['material'])}",
         ]
         for name in ("medial", "lateral"):
-            if found[name] is not None:
+            if result[name] is not None:
                 lines.append(
-                    f"{name:8s}" + _CONDYLE.format(*found[name].pop("cop_mm"), **found[name])
+                    f"{name:8s}" + _CONDYLE.format(*result[name].pop("cop_mm"), **result[name])
                 )
         if self.adjustment is not None:
             done = self.adjustment
@@ -133,8 +142,8 @@ class PressReport:
                 f"adjusted {done.translation / MILLIMETRE:.3f} mm along y, "
                 f"{done.coronal_angle / DEGREE:.3f} deg coronal{restored}"
             )
-        lines.append(known_error_words(found["known_error"], _ERRORS_TOLD))
-        lines += [f"note: {flag}" for flag in found["flags"]]
+        lines.append(known_error_words(result["known_error"], _ERRORS_TOLD))
+        lines += [f"note: {flag}" for flag in result["flags"]]
         took = f"prepared in {self.prepare_seconds:.3g} s, solved in {self.solve_seconds:.3g} s"
         return [*lines, f"{took}, {self.result.iterations} iterations"]
 
@@ -278,9 +287,9 @@ def press_meshes(
 
 def _check_load(load: float) -> None:
     check_load(load)
-    if load > LARGEST_LOAD:
-        limit = f"no knee carries more than {LARGEST_LOAD:g} N"
-        raise InputError(f"impossible load {load:g} N", mend=f"{limit}; is it in N?")
+    if load > PRESS_LIMITS.max_load:
+        limit = f"no knee carries more than {PRESS_LIMITS.max_load:g} N"
+        raise InputError(f"impossible load {load:g} N", hint=f"{limit}, in N")
 
 
 def _adjustment_settings(

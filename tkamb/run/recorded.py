@@ -57,19 +57,19 @@ def recorded_row(case: Case, k: int) -> dict[str, float]:
 
 def compare_recorded(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
     """Return the summary's keys `measured` and `emg`, as far as the scene has them."""
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     if case.measured is not None:
-        found["measured"] = compare_measured(columns, case.measured.force, case.body_weight)
+        result["measured"] = compare_measured(columns, case.measured.force, case.body_weight)
     if case.emg is not None:
         assert case.scene.muscles is not None and case.scene.muscles.emg is not None
         table = case.scene.muscles.emg
-        found["emg"] = {
+        result["emg"] = {
             "settings": table.model_dump(mode="json", exclude_none=True),
             "muscles": compare_emg(case.emg, columns),
         }
         if table.use == "report":
-            found["emg"]["fitted_normalised_by"] = fitted_normalisation(case.emg, columns)
-    return found
+            result["emg"]["fitted_normalised_by"] = fitted_normalisation(case.emg, columns)
+    return result
 
 
 def measured_column(name: str) -> str:
@@ -96,7 +96,7 @@ def compare_measured(
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
     missing = np.full(len(failed), np.nan)
-    found = {}
+    result = {}
     for name in names:
         predicted = {column: columns.get(column, missing) for column in PREDICTED[name]}
         known = [column for column, values in predicted.items() if np.isfinite(values).any()]
@@ -104,8 +104,8 @@ def compare_measured(
         measured = columns[measured_column(name)]
         counted = _frame_counts(predicted[column], measured, failed)
         error = _force_errors(columns["time_s"], predicted[column], measured, body_weight)
-        found[name] = {"predicted": column} | counted | error
-    return found
+        result[name] = {"predicted": column} | counted | error
+    return result
 
 
 def _frame_counts(predicted: Array, measured: Array, failed: NDArray[np.bool_]) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
         columns: of results.csv.
     """
     time = np.asarray(columns["time_s"])
-    found = {}
+    result = {}
     for muscle, channel in envelopes.channel_of.items():
         activation = np.asarray(
             columns.get(family_column(ACTIVATION, muscle), np.full_like(time, np.nan))
@@ -168,7 +168,7 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
         own = envelopes.at(muscle, time)
         both = np.isfinite(activation) & np.isfinite(own)
         error = activation[both] - own[both]
-        found[muscle] = {
+        result[muscle] = {
             "channel": channel,
             "frames_compared": int(both.sum()),
             "frames_left_out": int((~both).sum()),
@@ -176,7 +176,7 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
             "rmse": float(np.sqrt((error**2).mean())) if both.any() else np.nan,
             "lag_s": _lag(envelopes, muscle, time[both], activation[both]),
         }
-    return found
+    return result
 
 
 def fitted_normalisation(
@@ -193,7 +193,7 @@ def fitted_normalisation(
         envelopes: of the muscles.
         columns: of results.csv of a run that the EMG did not guide.
     """
-    time, found = np.asarray(columns["time_s"]), {}
+    time, result = np.asarray(columns["time_s"]), {}
     for channel, value in envelopes.normalised_by.items():
         own = [name for name, one in envelopes.channel_of.items() if one == channel]
         lost = np.full_like(time, np.nan)
@@ -201,8 +201,8 @@ def fitted_normalisation(
         e = np.array([envelopes.at(name, time) for name in own])
         both = np.isfinite(a) & np.isfinite(e)
         along = float(a[both] @ e[both])
-        found[channel] = value * float(e[both] @ e[both]) / along if along > 0.0 else None
-    return found
+        result[channel] = value * float(e[both] @ e[both]) / along if along > 0.0 else None
+    return result
 
 
 def _pearson(a: Array, b: Array) -> float:

@@ -58,8 +58,8 @@ def run_again(summary: Mapping[str, Any]) -> str:
 
 def same_files(case: Case, summary: Mapping[str, Any]) -> bool:
     """Say whether meshes and tables hold what the run read; a run without a record counts."""
-    found = (summary.get("identity") or {}).get("content of a file")
-    return found is None or found == files_hash(case)
+    result = (summary.get("identity") or {}).get("content of a file")
+    return result is None or result == files_hash(case)
 
 
 def _scene_of(summary: Mapping[str, Any]) -> Scene:

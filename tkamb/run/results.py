@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.errors import InputError, names_near, not_installed
-from tkamb.files import TABLE_LIMIT, read_text
+from tkamb.files import FILE_LIMITS, read_text
 from tkamb.geometry.frames import Array
 from tkamb.run.columns import KINDS, RENAMED, in_a_family, ordered_names
 
@@ -23,10 +23,19 @@ if TYPE_CHECKING:
 
 PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
 """Ending of a column of bands.csv -> per cent of the samples below it."""
-FEWEST = 20
-"""Numbers below which a 5th percentile is not even between the two smallest of them."""
-MOST_FAILED = 0.5
-"""Share of samples: where more fail, the rest says too little."""
+
+
+@dataclass(frozen=True)
+class StatisticsSettings:
+    """When a band of samples is stated."""
+
+    min_samples: int = 20
+    """Number of samples; with fewer, the 5th percentile is not between the two smallest."""
+    max_failed_share: float = 0.5
+    """Share of samples; where more fail, the others say too little."""
+
+
+STATISTICS_LIMITS = StatisticsSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +112,14 @@ class Results:
     def band(self, name: str) -> Array | None:
         """Return p05, p50 and p95 (3, f) of a column; None where it has no band."""
         ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
-        found = [end for end in ends if end is not None]
-        return np.array(found) if len(found) == len(ends) else None
+        result = [end for end in ends if end is not None]
+        return np.array(result) if len(result) == len(ends) else None
 
     def why_no_band(self, frame: int) -> str:
         """Return why a frame's results have no band, in words."""
-        if self.bands["failed_share"][frame] > MOST_FAILED:
+        if self.bands["failed_share"][frame] > STATISTICS_LIMITS.max_failed_share:
             return "more than half of the samples failed"
-        return f"fewer than {FEWEST} samples have it, take more"
+        return f"fewer than {STATISTICS_LIMITS.min_samples} samples have it, take more"
 
     def to_dataframe(self) -> "DataFrame":
         """Return the columns as a pandas DataFrame, frames as rows; NaN where there is no number.
@@ -192,7 +201,7 @@ def read_bands(path: str | Path) -> dict[str, Array]:
 def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
     """Return the cells of a table, column by column, with names of earlier releases made ours."""
     try:
-        rows = list(csv.reader(io.StringIO(read_text(path, TABLE_LIMIT))))
+        rows = list(csv.reader(io.StringIO(read_text(path, FILE_LIMITS.table_bytes))))
     except csv.Error as error:
         raise InputError(f"cannot be read as CSV ({error})", path) from None
     if not rows:

@@ -14,7 +14,7 @@ from tkamb import __version__
 from tkamb.atomic import Replacement, replaced_together, write_synced
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
-from tkamb.files import MEGABYTE, MESH_LIMIT, read_json, sha256_of
+from tkamb.files import FILE_LIMITS, MEGABYTE, read_json, sha256_of
 from tkamb.io.claim import claimed_directory, settle
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.results import Results, csv_text, read_bands, read_csv
@@ -75,7 +75,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
     path = directory / SUMMARY_NAME
     found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
     if not isinstance(found, dict):
-        raise InputError("is no JSON object", path, "is it a folder that `tkamb run` wrote?")
+        raise InputError("is no JSON object", path, "give a folder that `tkamb run` wrote")
     check_summary(found, path)
     return found
 
@@ -246,7 +246,9 @@ def verify_results(directory: str | Path) -> Verdict:
 def _input(path: str, recorded: str) -> str | None:
     """Return in words what is wrong with an input file; None if it is the one that was read."""
     try:
-        same = sha256_of(path, MESH_LIMIT) == recorded  # no larger file is read as input
+        same = (
+            sha256_of(path, FILE_LIMITS.mesh_bytes) == recorded
+        )  # no larger file is read as input
     except InputError as error:
         return f"input {error}"
     return None if same else f"input {path} has changed since it was read"

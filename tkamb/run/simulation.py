@@ -18,7 +18,7 @@ from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.results import Results
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
 from tkamb.run.tabulate import join_rows
-from tkamb.run.workers import Crew, Task, Team
+from tkamb.run.workers import PoolOptions, Task, WorkerPool
 
 if TYPE_CHECKING:
     from tkamb.run.contact_side import ContactSide
@@ -78,7 +78,7 @@ def simulate(
         ComputationError: a worker was killed.
         KeyboardInterrupt: with a folder, what was finished is written there first.
     """
-    crew = Crew(workers)
+    crew = PoolOptions(workers)
     changes = _dotted(overrides or {}, tables)
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene, changes)
@@ -139,7 +139,7 @@ class _Run:
             self.seconds["prepare contact"] = side.prepare_seconds
             self.seconds["read"] -= side.prepare_seconds
 
-    def compute(self, recorder: Recorder, progress: Progress, team: Team | None) -> Results:
+    def compute(self, recorder: Recorder, progress: Progress, team: WorkerPool | None) -> Results:
         """Compute every frame that is not there yet and return the results."""
         self.recorder = recorder
         if self.solver.side is not None:
@@ -181,7 +181,7 @@ class _Run:
         return Results(columns, summary, self.recorder.maps)
 
     def _finished(
-        self, left: Sequence[int], progress: Progress, team: Team | None
+        self, left: Sequence[int], progress: Progress, team: WorkerPool | None
     ) -> Iterator[Finished]:
         """Yield the frames that are left, in order, as they are finished."""
         if team is None:

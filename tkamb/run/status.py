@@ -80,10 +80,10 @@ def frame_status(
 
 def failures_of(body: FrameLoads, contact: "FrameContact | None") -> list[str]:
     """Return why a frame has no force, in words; empty if it has."""
-    found = list(body.loads.problems)
-    if contact and contact.problem and not found:
-        found.append(contact.problem)
-    return found
+    result = list(body.loads.problems)
+    if contact and contact.problem and not result:
+        result.append(contact.problem)
+    return result
 
 
 def _lift_off(body: FrameLoads, side: str, released: bool) -> str:
@@ -97,12 +97,14 @@ def _lift_off(body: FrameLoads, side: str, released: bool) -> str:
 
 def _flank_flags(body: FrameLoads) -> list[str]:
     """Return a flag for each condyle whose contact normal leans far from the vertical."""
-    found = []
+    result = []
     for side, condyle in body.geometry.condyles.items():
         lean = float(np.arccos(np.clip(condyle.normal[1], -1.0, 1.0)))
         if lean > STATUS.flank_angle and side not in body.loads.lifted:
-            found.append(f"{side} contact on a flank, normal {lean / DEGREE:.0f} deg from vertical")
-    return found
+            result.append(
+                f"{side} contact on a flank, normal {lean / DEGREE:.0f} deg from vertical"
+            )
+    return result
 
 
 def _adjustment_flags(case: Case, body: FrameLoads) -> list[str]:
@@ -134,14 +136,14 @@ def _motion_flags(case: Case, k: int) -> list[str]:
     motion = case.motion
     far = motion.deviation_translation[k] > STATUS.filter_translation
     turned = motion.deviation_rotation[k] > STATUS.filter_rotation
-    found = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
+    result = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
     if motion.markers is not None:
         time = motion.time[k : k + 1]
         if motion.markers.at(motion.markers.missing.astype(float), time)[0] > 0:
-            found.append("a marker of shank or thigh is missing")
+            result.append("a marker of shank or thigh is missing")
         apart = motion.markers.at(motion.markers.centre_distance, time)[0]
         if apart > STATUS.marker_distance:
-            found.append(
+            result.append(
                 f"knee centres of shank and thigh markers {apart / MILLIMETRE:.0f} mm apart"
             )
-    return found
+    return result

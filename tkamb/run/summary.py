@@ -3,6 +3,7 @@
 import hashlib
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.metadata import version
@@ -42,8 +43,17 @@ WITHOUT_MUSCLES = "Without [muscles]"
 """How a note begins that holds only while the scene has no table [muscles]; `tkamb import` writes
 one."""
 
-MUCH_RESERVE = 0.05
-"""Of the coordinate's largest moment."""
+
+@dataclass(frozen=True)
+class SummarySettings:
+    """What a summary warns of."""
+
+    notable_reserve: float = 0.05
+    """Share of a coordinate's largest moment; more reserve than this is a warning."""
+
+
+SUMMARY = SummarySettings()
+
 
 LIBRARIES = ("pin", "numpy", "scipy", "trimesh", "python-fcl")
 
@@ -360,7 +370,7 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     Args:
         columns: of results.csv, those of the reserves and the joints' moments among them.
     """
-    found = {}
+    result = {}
     for column in columns:
         if not belongs(column, RESERVE):
             continue
@@ -370,12 +380,12 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
         if not np.isfinite(moment).any():
             continue
         largest = float(np.nanmax(moment))
-        found[name] = {
+        result[name] = {
             "largest_Nm": float(np.nanmax(reserve)),
             "percent_of_largest_moment": 100.0 * float(np.nanmax(reserve)) / largest,
-            "frames_above_5_percent": int((reserve > MUCH_RESERVE * largest).sum()),
+            "frames_above_5_percent": int((reserve > SUMMARY.notable_reserve * largest).sum()),
         }
-    return found
+    return result
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:

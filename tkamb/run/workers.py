@@ -18,11 +18,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, Any
 
-from tkamb.errors import ComputationError, InputError, TkambError
+from tkamb.errors import ComputationError, InputError, TkambError, renamed
 from tkamb.geometry import threads
 from tkamb.run.guard import log_to_stderr, open_streams, unforeseen_words
 
-MOST_WORKERS = 256
+
+@dataclass(frozen=True)
+class WorkerLimitSettings:
+    """How many processes a run may start."""
+
+    max_workers: int = 256
+    """Number of worker processes; no machine for which tkamb is meant has more cores."""
+
+
+WORKER_LIMITS = WorkerLimitSettings()
+
 Numbered = tuple[int, Any]
 Progress = Callable[[Iterable[Numbered], int], Iterable[Numbered]]
 ENDED = "a worker process ended before its job was done"
@@ -48,12 +58,13 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Crew:
-    """Who does the jobs.
+class PoolOptions:
+    """Where jobs are computed: in this process, in worker processes, or on a Dask cluster.
 
     Args:
-        workers: processes; 1 computes in this one.
-        dask: address of a Dask scheduler, or "local" for one with so many workers; None: without.
+        workers: number of processes; with 1 the jobs are computed in this process.
+        dask: address of a Dask scheduler, or "local" to start one with `workers` workers. None:
+            no cluster.
 
     Raises:
         InputError: too few workers, or too many.
@@ -63,8 +74,10 @@ class Crew:
     dask: str | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.workers <= MOST_WORKERS:
-            raise InputError(f"{self.workers} is not within 1 to {MOST_WORKERS}", "--workers")
+        if not 1 <= self.workers <= WORKER_LIMITS.max_workers:
+            raise InputError(
+                f"{self.workers} is not within 1 to {WORKER_LIMITS.max_workers}", "--workers"
+            )
 
     def check(self) -> None:
         """Raise an InputError where a cluster that is asked for is not there."""
@@ -87,7 +100,7 @@ class Crew:
             yield from team.answers(wanted)
 
     @contextmanager
-    def team(self, task: Task, count: int) -> Iterator["Team"]:
+    def team(self, task: Task, count: int) -> Iterator["WorkerPool"]:
         """Give who answers; processes begin to prepare at once, while the caller does other things.
 
         Args:
@@ -95,7 +108,7 @@ class Crew:
             count: of the jobs, at most.
         """
         processes = self.dask is None and self.workers > 1 and count > 1
-        team = Team(self, task, min(self.workers, count) if processes else 0)
+        team = WorkerPool(self, task, min(self.workers, count) if processes else 0)
         try:
             yield team
         finally:
@@ -109,19 +122,20 @@ def _answers_here(task: Task, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
         yield number, work(number, job)
 
 
-class Team:
-    """Those of a crew who do the jobs of one task.
+class WorkerPool:
+    """Worker processes that compute the jobs of one task.
 
     Args:
-        crew: whose.
-        task: what every worker prepares.
-        count: of processes; 0: a cluster's, or this one.
+        crew: options that the pool is made with.
+        task: prepared once by every worker, before its first job.
+        count: number of processes to start. 0: none; the jobs are computed on the cluster of
+            `crew`, or in this process.
 
     Attributes:
-        processes: that were started.
+        processes: the processes that were started.
     """
 
-    def __init__(self, crew: Crew, task: Task, count: int) -> None:
+    def __init__(self, crew: PoolOptions, task: Task, count: int) -> None:
         self._crew, self._task = crew, task
         self._jobs: queue.SimpleQueue[Numbered | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Numbered | TkambError] = queue.SimpleQueue()
@@ -132,7 +146,9 @@ class Team:
             ).start()
 
     def answers(self, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
-        """Yield answers with their numbers as they are finished, in any order; see `Crew.answers`.
+        """Yield answers with their numbers as they are finished, in any order.
+
+        See `PoolOptions.answers`.
 
         Args:
             wanted: numbers and contents of the jobs.
@@ -241,6 +257,11 @@ def _prepared(task: Task) -> Callable[[int, Any], Any]:
         raise wrong
 
     return refuse
+
+
+def __getattr__(name: str) -> Any:
+    """Return a class by its former name, with a warning; until release 0.3."""
+    return renamed(__name__, name, {"Crew": PoolOptions, "Team": WorkerPool})
 
 
 if __name__ == "__main__":

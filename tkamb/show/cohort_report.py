@@ -124,29 +124,29 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
     frames = sum(len(one.status) for one in outcomes.values())
     lost = sum(one.failed_frames for one in outcomes.values())
     detail = f"{failed} failed: listed at the end" if failed else "none failed"
-    found = [
+    result = [
         Card("Runs computed", f"{len(outcomes) - failed} of {len(outcomes)}", detail, failed > 0)
     ]
     words = "no numbers in those that failed" if lost else "none failed"
     if flagged := sum(one.flagged_frames for one in outcomes.values()):
         words += f"; {flagged} to be read with care, see their status in cohort.parquet"
-    found.append(Card("Frames computed", f"{frames - lost} of {frames}", words, lost > 0))
+    result.append(Card("Frames computed", f"{frames - lost} of {frames}", words, lost > 0))
     name = "force_total_BW"
     means = {
         group.name: float(np.nanmean(group.peaks[name])) for group in groups if name in group.peaks
     }
     if not means:
-        return found
+        return result
     low, high = (f(means, key=lambda group: means[group]) for f in (min, max))
     value, detail = f"{means[low]:.2f}–{means[high]:.2f} BW", f"least {low}, most {high}"
     if f"{means[low]:.2f}" == f"{means[high]:.2f}":
         value, detail = f"{means[low]:.2f} BW", "alike in all groups"
-    found.append(Card("Peak contact force", value, f"mean of the runs' peaks: {detail}"))
+    result.append(Card("Peak contact force", value, f"mean of the runs' peaks: {detail}"))
     error = _error_card(cohort, outcomes)
-    found += [] if error is None else [error]
+    result += [] if error is None else [error]
     if cohort.table.wear is not None:
-        found.append(_wear_card(outcomes, groups))
-    return found
+        result.append(_wear_card(outcomes, groups))
+    return result
 
 
 def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:
@@ -166,14 +166,14 @@ def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card
         parts.append(
             f"{group.name} {mean:.3g} ({low:.3g} to {high:.3g} by the wear factor; {laws})"
         )
-    told = "mean of the runs, mm³ per million cycles: " + "; ".join(parts or ["none"])
-    told += (
+    text = "mean of the runs, mm³ per million cycles: " + "; ".join(parts or ["none"])
+    text += (
         ". By archard and cross-shear the contact area cancels: the volume hardly follows the "
         "design's conformity. A difference that only one law shows is that law's"
     )
     if lost:
-        told += f". {lost} runs have none, see wear_failed in runs.csv"
-    return Card("Worn volume", f"{len(outcomes) - lost} of {len(outcomes)} runs", told, lost > 0)
+        text += f". {lost} runs have none, see wear_failed in runs.csv"
+    return Card("Worn volume", f"{len(outcomes) - lost} of {len(outcomes)} runs", text, lost > 0)
 
 
 def _row(group: Group, names: Sequence[str]) -> list[str]:

@@ -101,10 +101,10 @@ def _tiles(
     maps = results.maps
     assert maps is not None
     levels = pressure_levels(maps.pressure_Pa[rows], maps.gap_m[rows], view.triangles, largest)
-    found = view.grid.sample(levels, FRAME_MAP.coarsening)
-    down, over = touched_part(found.max(axis=0) > 0)
+    result = view.grid.sample(levels, FRAME_MAP.coarsening)
+    down, over = touched_part(result.max(axis=0) > 0)
     steps = np.clip(
-        np.round(FRAME_MAP.rim_byte + (255 - FRAME_MAP.rim_byte) * found[:, down, over]), 0, 255
+        np.round(FRAME_MAP.rim_byte + (255 - FRAME_MAP.rim_byte) * result[:, down, over]), 0, 255
     )
     up, across = (
         view.grid.up[:: FRAME_MAP.coarsening][down],

@@ -84,7 +84,7 @@ PEAK_DOUBTS = {
 
 def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     """Return the headline numbers that the run has."""
-    found = (
+    result = (
         _questions(results),
         _peak_force(results, axis),
         _band(results, axis),
@@ -96,7 +96,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
         _residuals(results),
         _frames(results),
     )
-    return [card for card in found if card is not None]
+    return [card for card in result if card is not None]
 
 
 def _where(results: "Results", axis: HorizontalAxis, frame: int) -> str:
@@ -117,25 +117,25 @@ def _questions(results: "Results") -> Card | None:
 
 
 def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
-    found = metrics.peak(results, "force_total_BW")
-    if found is None:
+    result = metrics.peak(results, "force_total_BW")
+    if result is None:
         return None
-    share = results["force_si_N"][found.frame] / results["force_total_N"][found.frame]
+    share = results["force_si_N"][result.frame] / results["force_total_N"][result.frame]
     table, band = results.summary.get("uncertainty"), results.band("force_total_BW")
-    if table and band is not None and np.isfinite(band[0, found.frame]):
-        low, middle, high = band[:, found.frame]
+    if table and band is not None and np.isfinite(band[0, result.frame]):
+        low, middle, high = band[:, result.frame]
         sampled = table.get("peak_force_total_BW") or {}
-        words = sampled.get("words", f"{found.value:.2f} BW as the inputs stand")
+        words = sampled.get("words", f"{result.value:.2f} BW as the inputs stand")
         detail = (
             f"median of {table['samples']} samples and 5 to 95 % of them, "
-            f"{_where(results, axis, found.frame)}; {words}"
+            f"{_where(results, axis, result.frame)}; {words}"
         )
         return Card("Peak contact force", f"{middle:.2f} BW ({low:.2f}–{high:.2f})", detail)
     detail = (
-        f"{results['force_total_N'][found.frame]:.0f} N {_where(results, axis, found.frame)}; "
+        f"{results['force_total_N'][result.frame]:.0f} N {_where(results, axis, result.frame)}; "
         f"{100 * share:.1f} % of it superior–inferior"
     )
-    return Card("Peak contact force", f"{found.value:.2f} BW", detail)
+    return Card("Peak contact force", f"{result.value:.2f} BW", detail)
 
 
 def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
@@ -232,19 +232,19 @@ def _adduction(results: "Results", unknown: int) -> list[str]:
 
 
 def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
-    found = metrics.peak(results, "<side>_peak_pressure_MPa")
-    if found is None:
+    result = metrics.peak(results, "<side>_peak_pressure_MPa")
+    if result is None:
         return None
-    detail = f"{found.side}, {_where(results, axis, found.frame)}"
-    doubt = _doubt_of_peak(results, found.side, found.frame)
+    detail = f"{result.side}, {_where(results, axis, result.frame)}"
+    doubt = _doubt_of_peak(results, result.side, result.frame)
     detail += f", where {doubt}" if doubt else ""
-    detail += _above_yield(results, found.side)
+    detail += _above_yield(results, result.side)
     error = results.summary.get("known_error")
     if error is not None:
         detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
         detail += OTHER_ERRORS
     large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
-    return Card("Peak contact pressure", f"{found.value:.1f} MPa", detail, large)
+    return Card("Peak contact pressure", f"{result.value:.1f} MPa", detail, large)
 
 
 def _above_yield(results: "Results", first: str) -> str:
@@ -280,16 +280,16 @@ def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
     """Return the cam's largest force on the post and the pressure there, with [contact] post."""
-    found = metrics.peak(results, "post_force_N") if "post_force_N" in results.columns else None
-    if found is None:
+    result = metrics.peak(results, "post_force_N") if "post_force_N" in results.columns else None
+    if result is None:
         return None
-    if found.value <= 0:
+    if result.value <= 0:
         return Card("Peak force on the post", "none", "cam and post stay apart")
     pressure = metrics.peak(results, "post_peak_pressure_MPa")
-    detail = f"{found.value:.0f} N {_where(results, axis, found.frame)}"
+    detail = f"{result.value:.0f} N {_where(results, axis, result.frame)}"
     if pressure is not None:
         detail += f"; up to {pressure.value:.1f}\u00a0MPa there, error not measured"
-    value = f"{found.value / metrics.body_weight(results):.2f} BW"
+    value = f"{result.value / metrics.body_weight(results):.2f} BW"
     return Card("Peak force on the post", value, detail)
 
 
@@ -299,20 +299,22 @@ def _model(results: "Results") -> str:
 
 
 def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
-    found = metrics.peak(results, "quadriceps_N")
-    if found is None:
+    result = metrics.peak(results, "quadriceps_N")
+    if result is None:
         return None
-    value = found.value / metrics.body_weight(results)
+    value = result.value / metrics.body_weight(results)
     ligament = _range(metrics.tension_ratio(results, "patellar_ligament_N"), "", 2)
     patella = _range(metrics.tension_ratio(results, "patellofemoral_N"), "", 2)
-    detail = f"{_where(results, axis, found.frame)}; over the quadriceps: patellar ligament (PL/Q) "
+    detail = (
+        f"{_where(results, axis, result.frame)}; over the quadriceps: patellar ligament (PL/Q) "
+    )
     detail += f"{ligament}, patellofemoral force (PF/Q) {patella}"
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
         detail += "; wraps nowhere" if first is None else f"; {_wraps_from(results, first)}"
     slope = results.columns.get("quadriceps_per_dome_mm_N")
-    if slope is not None and np.isfinite(slope[found.frame]) and found.value > 0:
-        percent = 100 * abs(slope[found.frame]) / found.value
+    if slope is not None and np.isfinite(slope[result.frame]) and result.value > 0:
+        percent = 100 * abs(slope[result.frame]) / result.value
         detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 

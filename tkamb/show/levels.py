@@ -126,10 +126,10 @@ class PageGrid:
         chosen[::every, ::every] = True
         corners, weights = corners[chosen[over]], weights[chosen[over]]
         over = over[::every, ::every]
-        found = np.full((*values.shape[:-1], *over.shape), -1.0)
+        result = np.full((*values.shape[:-1], *over.shape), -1.0)
         for here in np.ndindex(values.shape[:-1]):
-            found[here][over] = np.einsum("ij,ij->i", weights, values[here][corners])
-        return found
+            result[here][over] = np.einsum("ij,ij->i", weights, values[here][corners])
+        return result
 
 
 def touched_part(touched: Mask) -> tuple[slice, slice]:

@@ -12,7 +12,17 @@ from typing import Any
 from tkamb.errors import InputError
 from tkamb.io.given_material import material_in_words
 
-WIDTH = 92
+
+@dataclass(frozen=True)
+class MethodsTextSettings:
+    """How `tkamb methods` prints its text."""
+
+    line_width: int = 92
+    """Letters per line: a terminal and a mail show it without breaks."""
+
+
+METHODS_TEXT = MethodsTextSettings()
+
 
 REFERENCES = {
     "Blankevoort 1991": "Blankevoort L et al. (1991). Articular contact in a three-dimensional "
@@ -98,8 +108,11 @@ class Methods:
 
     def text(self) -> str:
         """Return the paragraph and its references as plain text."""
-        paragraph = textwrap.fill(" ".join(self.sentences), WIDTH)
-        cited = [textwrap.fill(line, WIDTH, subsequent_indent="  ") for line in self.references]
+        paragraph = textwrap.fill(" ".join(self.sentences), METHODS_TEXT.line_width)
+        cited = [
+            textwrap.fill(line, METHODS_TEXT.line_width, subsequent_indent="  ")
+            for line in self.references
+        ]
         return "\n".join([paragraph, "", "References", *cited])
 
 

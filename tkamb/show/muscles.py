@@ -42,8 +42,18 @@ HELD = (
     "equilibrium. What a muscle alone leaves unbalanced in flexion is carried by a moment. "
     "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
 )
-HIGHEST = 1.02
-"""Of the activations' axis."""
+
+
+@dataclass(frozen=True)
+class MuscleFigureSettings:
+    """Pictures of muscle activations."""
+
+    axis_top: float = 1.02
+    """Upper end of the axis of activations; lines at 1 stay visible."""
+
+
+MUSCLE_FIGURE = MuscleFigureSettings()
+
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
 """Inches: width and height of a small plot; how many stand beside each other; for the labels."""
 BETWEEN, LABELS = (11.5, 20.0), 10.0
@@ -79,8 +89,8 @@ def muscle_panels(results: "Results") -> tuple[Panel, ...]:
 
 
 def _groups(results: "Results") -> dict[str, tuple[str, ...]]:
-    found: Mapping[str, Any] = results.summary.get("muscle_groups") or {}
-    return {group: tuple(names) for group, names in found.items()}
+    result: Mapping[str, Any] = results.summary.get("muscle_groups") or {}
+    return {group: tuple(names) for group, names in result.items()}
 
 
 def _colours(results: "Results") -> dict[str, str]:
@@ -159,7 +169,7 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
             _draw_cell(axes, cell, results, axis)
             below = k + CELLS_ACROSS >= len(cells)
             axes.tick_params(labelbottom=below, labelleft=k % CELLS_ACROSS == 0)
-        first.set_ylim(0, HIGHEST)
+        first.set_ylim(0, MUSCLE_FIGURE.axis_top)
         first.set_yticks([0, 0.5, 1])
         low = LABEL_PLACE.edge_points / 72 / figure.get_figheight()
         figure.supxlabel(axis.label, fontsize=LABEL_PLACE.tick_label_points, y=low, va="bottom")
@@ -198,9 +208,9 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
         x, activation = axis.broken(results[family_column(ACTIVATION, name)])
         axes.plot(x, activation, color=BLACK, linewidth=1.3)
     axes.set_title(cell.title, loc="left", fontsize=8.5, pad=2)
-    said = ", ".join(filter(None, (_agreement(results, cell), _beyond(results, cell))))
-    if said:
-        axes.set_title(said, loc="right", fontsize=7.5, color=GREY, pad=2)
+    text = ", ".join(filter(None, (_agreement(results, cell), _beyond(results, cell))))
+    if text:
+        axes.set_title(text, loc="right", fontsize=7.5, color=GREY, pad=2)
 
 
 def _beyond(results: "Results", cell: Cell) -> str:
@@ -209,7 +219,7 @@ def _beyond(results: "Results", cell: Cell) -> str:
         return ""
     envelope = results[family_column(ENVELOPE, cell.envelope)]
     largest = float(np.nan_to_num(envelope).max(initial=0.0))
-    return f"EMG to {largest:.2g}" if largest > HIGHEST else ""
+    return f"EMG to {largest:.2g}" if largest > MUSCLE_FIGURE.axis_top else ""
 
 
 def _agreement(results: "Results", cell: Cell) -> str:
@@ -225,14 +235,14 @@ def _agreement(results: "Results", cell: Cell) -> str:
 
 def reserve_words(summary: Mapping[str, Any]) -> str:
     """Return in a sentence what no muscle carries; empty without reserves."""
-    found: Mapping[str, Any] = summary.get("reserves") or {}
-    if not found:
+    result: Mapping[str, Any] = summary.get("reserves") or {}
+    if not result:
         return ""
     parts = [
         f"{name.replace('_', ' ')} {one['largest_Nm']:.1f} N·m "
         f"({one['percent_of_largest_moment']:.0f} %"
         + (f", above 5 % in {n} frames)" if (n := one["frames_above_5_percent"]) else ")")
-        for name, one in found.items()
+        for name, one in result.items()
     ]
     return (
         "Reserves, which no muscle carries, at most (share of the coordinate's largest moment): "

@@ -184,8 +184,8 @@ def _total(results: "Results") -> Panel:
     note = "On the insert; SI positive in compression. Residuals are not included."
     activity, span = results.summary.get("activity"), None
     if activity in PEAKS_BW:
-        found = PEAKS_BW[activity].values()
-        span = (min(found), max(found), "in vivo")
+        result = PEAKS_BW[activity].values()
+        span = (min(result), max(result), "in vivo")
         note += " " + peaks_words(activity)
     return Panel("forces", "Tibiofemoral contact force", "BW", lines, note, span=span)
 

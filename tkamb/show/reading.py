@@ -55,8 +55,8 @@ def _force(results: "Results") -> tuple[list[str], list[str]]:
 
 def _compared(results: "Results") -> dict[str, Any]:
     """Return the comparison of each force that was measured in some frame."""
-    found = results.summary.get("measured") or {}
-    return {name: one for name, one in found.items() if one["frames_compared"]}
+    result = results.summary.get("measured") or {}
+    return {name: one for name, one in result.items() if one["frames_compared"]}
 
 
 def _split(results: "Results") -> tuple[list[str], list[str]]:

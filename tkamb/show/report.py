@@ -198,14 +198,14 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
     """Return what a reader must know, one sentence each, without repeats."""
-    found: list[str] = []
+    result: list[str] = []
     for key in ("residuals", "notes", "assumptions"):
         value = summary.get(key) or []
-        found.extend([value] if isinstance(value, str) else [str(item) for item in value])
+        result.extend([value] if isinstance(value, str) else [str(item) for item in value])
     missing = summary.get("not_modelled")
     if missing:
-        found.append("Not modelled: " + ", ".join(map(str, missing)) + ".")
-    return list(dict.fromkeys(found))
+        result.append("Not modelled: " + ", ".join(map(str, missing)) + ".")
+    return list(dict.fromkeys(result))
 
 
 def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:

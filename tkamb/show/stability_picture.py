@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from tkamb.show.style import BLUE, GREY, ORANGE, VERMILLION, new_figure, settings
-from tkamb.studies.verdict import KINDS, WRONG, Verdict
+from tkamb.studies.verdict import KINDS, VERDICT, Verdict
 
 COLOURS = {"converged": BLUE, "flagged": ORANGE}
 
@@ -29,10 +29,10 @@ def picture(verdicts: Sequence[Verdict]) -> Figure:
                 alpha=0.75,
                 label=f"{kind.replace('_', ' ')} ({len(some)})",
             )
-        axis.axvline(WRONG, color=GREY, lw=1, ls="--")
+        axis.axvline(VERDICT.max_error, color=GREY, lw=1, ls="--")
         top = len(groups) - 0.3
         words = "wrong beyond 2 %; closed forms beyond their own bound "
-        axis.text(WRONG, top, words, color=GREY, fontsize=7.5, ha="right")
+        axis.text(VERDICT.max_error, top, words, color=GREY, fontsize=7.5, ha="right")
         axis.text(1.0, top, "no answer", color=GREY, fontsize=7.5, ha="center")
         axis.set(xscale="log", xlim=(1e-9, 3.0), xlabel="largest distance from the reference")
         axis.set_yticks(range(len(groups)), groups, fontsize=7.5)

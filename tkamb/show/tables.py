@@ -51,14 +51,14 @@ def motion_table(results: "Results", axis: HorizontalAxis) -> Table:
 
 def strain_table(summary: Mapping[str, Any]) -> Table | None:
     """Return the ligaments' strains in per cent, so that a wrong insertion is seen."""
-    found = summary.get("ligament_strain")
-    if not found:
+    result = summary.get("ligament_strain")
+    if not result:
         return None
     return Table(
-        [f"{angle:g}°" for angle in found["flexion_deg"]],
+        [f"{angle:g}°" for angle in result["flexion_deg"]],
         [
             [name, *("–" if one is None else _number(100.0 * one, 1) for one in strain)]
-            for name, strain in found["strain"].items()
+            for name, strain in result["strain"].items()
         ],
     )
 
@@ -76,16 +76,16 @@ def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
 
     Reasons that differ only in a number are one, with the range of the number.
     """
-    found: dict[str, list[tuple[int, str]]] = {}
+    result: dict[str, list[tuple[int, str]]] = {}
     for frame, status in enumerate(statuses):
         failure = status.startswith("failed")
         for position, word in enumerate(status.removeprefix("failed:").split(";")):
             words = word.strip().replace("_", " ")
             if words and words != "ok":
                 words = f"failed: {words}" if failure and position == 0 else words
-                found.setdefault(NUMBER.sub("#", words), []).append((frame, words))
+                result.setdefault(NUMBER.sub("#", words), []).append((frame, words))
     rows = {
-        _with_ranges([words for _, words in one]): [k for k, _ in one] for one in found.values()
+        _with_ranges([words for _, words in one]): [k for k, _ in one] for one in result.values()
     }
     return dict(sorted(rows.items(), key=lambda item: not item[0].startswith("failed")))
 

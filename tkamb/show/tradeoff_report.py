@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from tkamb.show.style import CYCLE, GREY, new_figure, settings
 from tkamb.studies.quantities import SIDES
 from tkamb.studies.references import Reference
-from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING_NOISE, Row
+from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING, Row
 
 MARKERS = "osD^vPX*<>"
 
@@ -64,7 +64,7 @@ def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
         lines.append("")
     names = ", ".join(name.replace("_", " ") for name in FRONT_ERRORS)
     lines.append("* on the Pareto front of warm time against the largest of the errors in")
-    tie = f"medians of time within {100 * (TIMING_NOISE - 1):.0f} % count as equal"
+    tie = f"medians of time within {100 * (TIMING.equal_ratio - 1):.0f} % count as equal"
     return [*lines, f"  {names}; {tie}. One thread."]
 
 
@@ -82,13 +82,13 @@ def _line(row: Row) -> str:
 
 
 def _uncertainty(reference: Reference) -> str:
-    found = []
+    result = []
     for key in ("approach", "force", "mean_pressure", "peak_pressure", "area"):
         names = [name for name in reference.values if name.endswith(key)]
         scale = max(abs(reference.values[name]) for name in names)
         worst = max(reference.uncertainty[name] for name in names)
-        found.append(f"{key.replace('_', ' ')} {100 * worst / scale:.1f} %")
-    return ", ".join(found)
+        result.append(f"{key.replace('_', ' ')} {100 * worst / scale:.1f} %")
+    return ", ".join(result)
 
 
 def picture(rows: Sequence[Row]) -> Figure:
@@ -112,10 +112,10 @@ def picture(rows: Sequence[Row]) -> Figure:
             if number + columns >= len(cases):
                 axis.set_xlabel("time per warm press, ms")
                 axis.tick_params(labelbottom=True)
-        found = {text: line for axis in axes.ravel() for line, text in _legend(axis)}
+        result = {text: line for axis in axes.ravel() for line, text in _legend(axis)}
         figure.legend(
-            list(found.values()),
-            list(found),
+            list(result.values()),
+            list(result),
             loc="outside upper left",
             ncols=2 * columns,
             title="numbers at the points: cell size, mm; "
@@ -198,12 +198,12 @@ def recommendations(rows: Sequence[Row]) -> list[str]:
 
 def _settings_on_all_bodies(rows: Sequence[Row]) -> dict[Setting, list[Row]]:
     bodies = {bodies_of(row.job.case) for row in rows}
-    found: dict[Setting, list[Row]] = {}
+    result: dict[Setting, list[Row]] = {}
     for row in rows:
-        found.setdefault(setting_of(row), []).append(row)
+        result.setdefault(setting_of(row), []).append(row)
     return {
         setting: some
-        for setting, some in found.items()
+        for setting, some in result.items()
         if {bodies_of(row.job.case) for row in some} == bodies
     }
 
@@ -295,5 +295,5 @@ def _apart(own: Row, peer: Row) -> str:
         / peak,
         "condyle force": max(abs(a[f"{s}_force"] - b[f"{s}_force"]) for s in SIDES) / load,
     }
-    said = ", ".join(f"{100 * share:.2g} % in {name}" for name, share in shares.items())
-    return f"the lattice is off it by {said}"
+    text = ", ".join(f"{100 * share:.2g} % in {name}" for name, share in shares.items())
+    return f"the lattice is off it by {text}"

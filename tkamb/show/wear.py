@@ -1,6 +1,7 @@
 """The report's section on wear: what `tkamb wear` wrote into the folder of a run."""
 
 import base64
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
@@ -10,7 +11,18 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
-LARGEST = 64 * MEGABYTE
+
+
+@dataclass(frozen=True)
+class WearPageSettings:
+    """The wear page."""
+
+    max_bytes: float = 64 * MEGABYTE
+    """Bytes of a file of results; those of 10,000 updates have 10 MB."""
+
+
+WEAR_PAGE = WearPageSettings()
+
 ROWS = (
     ("worn volume, mm³", "volume_mm3"),
     ("worn mass, mg", "mass_mg"),
@@ -39,17 +51,19 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
     Raises:
         InputError: wear.json or its picture cannot be read.
     """
-    found, folder = wear_of_run(results), results.directory
-    if found is None or folder is None:
+    result, folder = wear_of_run(results), results.directory
+    if result is None or folder is None:
         return None
-    if not found:
+    if not result:
         return {"other": OTHER}
-    picture = base64.b64encode(read_bytes(folder / PICTURE_NAME, LARGEST)).decode("ascii")
+    picture = base64.b64encode(read_bytes(folder / PICTURE_NAME, WEAR_PAGE.max_bytes)).decode(
+        "ascii"
+    )
     try:
-        return _shown(found, picture)
+        return _shown(result, picture)
     except (KeyError, TypeError, ValueError, AttributeError):
-        mend = "run tkamb wear again, or remove it"
-        raise InputError("is not as tkamb wear writes it", folder / WEAR_NAME, mend) from None
+        hint = "run tkamb wear again, or remove it"
+        raise InputError("is not as tkamb wear writes it", folder / WEAR_NAME, hint) from None
 
 
 def _shown(found: dict[str, Any], picture: str) -> dict[str, Any]:
@@ -86,16 +100,16 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
     folder = results.directory
     if folder is None or not (folder / WEAR_NAME).is_file():
         return None
-    found = read_json(folder / WEAR_NAME, LARGEST, what="wear.json")
-    if not isinstance(found, dict) or not found.get("files_sha256"):
+    result = read_json(folder / WEAR_NAME, WEAR_PAGE.max_bytes, what="wear.json")
+    if not isinstance(result, dict) or not result.get("files_sha256"):
         return {}
-    summary, scenes = results.summary, found.get("scene_sha256")
+    summary, scenes = results.summary, result.get("scene_sha256")
     identity = summary.get("identity") or {}
     files = identity.get("content of a file")
     same = isinstance(scenes, list) and summary.get("scene_sha256") in scenes
-    if found.get("run_frames", ()) not in (None, identity.get("choice of frames")):
+    if result.get("run_frames", ()) not in (None, identity.get("choice of frames")):
         return {}
-    return found if same and files == found["files_sha256"] else {}
+    return result if same and files == result["files_sha256"] else {}
 
 
 def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:

@@ -26,9 +26,18 @@ from tkamb.studies.kept_rows import KeptRows, row_key
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-RECORDED = 101
-STEP = 10
-"""Every so many of the recorded frames are compared: those that all frame rates have."""
+
+@dataclass(frozen=True)
+class BodyTradeSettings:
+    """The study of the frame rate of a motion."""
+
+    recorded_frames: int = 101
+    """Frames of the shipped motion."""
+    stride: int = 10
+    """Every so many of the recorded frames are compared: those that all frame rates have."""
+
+
+BODY_TRADE = BodyTradeSettings()
 
 
 @dataclass(frozen=True)
@@ -102,13 +111,13 @@ def run_body_trade(kept: KeptRows | None = None) -> Iterator[BodyRow]:
     base: _Run | None = None
     for name, change in CHANGES.items():
         key = row_key("body", name, asdict(change))
-        found = kept.get(key) if kept else None
-        if found is None:
+        result = kept.get(key) if kept else None
+        if result is None:
             base = base or _run(CHANGES["as shipped"])
-            found = asdict(_row(name, change, base))
+            result = asdict(_row(name, change, base))
             if kept:
-                kept.put(key, found)
-        yield BodyRow(**found)
+                kept.put(key, result)
+        yield BodyRow(**result)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +132,7 @@ def _run(change: Change) -> _Run:
         path = copied_scene(Path(folder))
         if change.every > 1:
             thin_out(Path(folder), change.every)
-        frames = slice(0, None, STEP // change.every)
+        frames = slice(0, None, BODY_TRADE.stride // change.every)
         start = clock.perf_counter()
         scene = load_scene(path, change.keys)
         results = simulate(scene, frames=frames)
@@ -138,18 +147,18 @@ def _row(name: str, change: Change, base: _Run) -> BodyRow:
         run = base if change == Change() else _run(change)
     except TkambError as error:
         return BodyRow(name, str(error))
-    found = run.results
-    spent = sum(np.nan_to_num(found[column]) for column in CLOCKS)
-    failed = sum(status.startswith("failed") for status in found.status)
-    status = f"{failed} of {len(found)} frames failed" if failed else "ok"
+    result = run.results
+    spent = sum(np.nan_to_num(result[column]) for column in CLOCKS)
+    failed = sum(status.startswith("failed") for status in result.status)
+    status = f"{failed} of {len(result)} frames failed" if failed else "ok"
     outside = run.seconds - float(np.sum(spent))
     return BodyRow(name, status, outside, float(np.median(spent)), _changed(run, base))
 
 
 def _changed(run: _Run, base: _Run) -> dict[str, float]:
-    found, before = run.results, base.results
-    changed = {column: _change(found[column], before[column]) for column in COMPARED}
-    peaks = [float(np.nanmax(results["force_total_N"])) for results in (found, before)]
+    result, before = run.results, base.results
+    changed = {column: _change(result[column], before[column]) for column in COMPARED}
+    peaks = [float(np.nanmax(results["force_total_N"])) for results in (result, before)]
     changed["peak_force"] = abs(peaks[0] / peaks[1] - 1)
     for name in DERIVATIVES:
         changed[name] = _change(run.derivatives[name], base.derivatives[name])

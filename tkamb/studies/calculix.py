@@ -59,10 +59,10 @@ def find_program() -> str:
     Raises:
         InputError: it is not installed.
     """
-    found = shutil.which(PROGRAM)
-    if found is None:
+    result = shutil.which(PROGRAM)
+    if result is None:
         raise InputError("is not installed", "CalculiX", "apt-get install calculix-ccx")
-    return found
+    return result
 
 
 def run_calculix(text: str, longest: float = CALCULIX.longest_seconds) -> PeerRun:

@@ -107,7 +107,7 @@ def study_case(name: str, scene: Path | None = None) -> StudyCase:
     if name in _ANALYTIC:
         return _ANALYTIC[name](name)
     if name not in case_names(scene):
-        raise InputError(f"no case '{name}'", mend=f"there are: {', '.join(case_names(scene))}")
+        raise InputError(f"no case '{name}'", hint=f"there are: {', '.join(case_names(scene))}")
     if name.startswith("knee") or scene is None:
         return _shipped(name)
     return _of_scene(name, scene, float(name.split()[1]))

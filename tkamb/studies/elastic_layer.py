@@ -62,9 +62,9 @@ def sphere_on_layer(
     low, high = 1e-6, 0.5 * thickness + 0.2 * radius
     for _ in range(60):
         middle = 0.5 * (low + high)
-        found, force = _indented(radius, thickness, middle, young_modulus, poisson_ratio)
+        result, force = _indented(radius, thickness, middle, young_modulus, poisson_ratio)
         low, high = (middle, high) if force < load else (low, middle)
-    return found
+    return result
 
 
 def _indented(

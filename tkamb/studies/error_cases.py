@@ -21,10 +21,20 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 Situation = Literal["interior", "flank", "edge"]
 SITUATIONS: tuple[Situation, ...] = ("interior", "flank", "edge")
-INSERT_MM = 16.0
-"""Edge of the inserts: small enough for fine cells, wide enough that contact ends inside."""
-VERTICES_MM = 0.25
-"""Between the vertices of the surfaces."""
+
+
+@dataclass(frozen=True)
+class ErrorCaseSettings:
+    """The cases from which known errors are measured."""
+
+    insert_mm: float = 16.0
+    """mm; edge of the inserts. Small enough for fine cells, wide enough that contact ends
+    inside."""
+    vertex_spacing_mm: float = 0.25
+    """mm; distance between the vertices of the surfaces."""
+
+
+ERROR_CASE = ErrorCaseSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +63,8 @@ class ErrorCase:
 
     def pair(self, material_name: str = "polyethylene") -> ContactPair:
         """Return the two bodies."""
-        size = (INSERT_MM * MILLIMETRE, INSERT_MM * MILLIMETRE)
-        insert = block(self.insert, size, VERTICES_MM * MILLIMETRE)
+        size = (ERROR_CASE.insert_mm * MILLIMETRE, ERROR_CASE.insert_mm * MILLIMETRE)
+        insert = block(self.insert, size, ERROR_CASE.vertex_spacing_mm * MILLIMETRE)
         return ContactPair(
             _upside_down(self.femoral, self.width_mm), insert, material(material_name)
         )
@@ -68,11 +78,11 @@ class ErrorCase:
 
 def error_cases() -> list[ErrorCase]:
     """Return all pairs."""
-    found: list[ErrorCase] = []
+    result: list[ErrorCase] = []
     for situation, rows in (("interior", _interior()), ("flank", _flank()), ("edge", _edge())):
         for number, (name, *given) in enumerate(rows):
             keys = ("femoral", "insert", "load", "shift_mm", "width_mm")
-            found.append(
+            result.append(
                 ErrorCase(
                     f"{situation}: {name}",
                     situation,  # type: ignore[arg-type]
@@ -80,7 +90,7 @@ def error_cases() -> list[ErrorCase]:
                     **dict(zip(keys, given, strict=False)),
                 )
             )
-    return found
+    return result
 
 
 def _interior() -> Iterator[tuple]:
@@ -198,7 +208,9 @@ def _upside_down(height: Height, width_mm: float) -> Surface:
     """Return a body whose underside is at a height over the lowest point, in y = 0."""
     size, top = (width_mm * MILLIMETRE, width_mm * MILLIMETRE), 30.0 * MILLIMETRE
     whole = block(
-        lambda x, z: np.maximum(top - height(x, z), MILLIMETRE), size, VERTICES_MM * MILLIMETRE
+        lambda x, z: np.maximum(top - height(x, z), MILLIMETRE),
+        size,
+        ERROR_CASE.vertex_spacing_mm * MILLIMETRE,
     )
     vertices = whole.vertices * [1.0, -1.0, 1.0] + [0.0, top, 0.0]
     return Surface(vertices, whole.faces[:, ::-1], "femoral")

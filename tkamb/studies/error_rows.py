@@ -1,7 +1,7 @@
 """Errors of the contact models on the pairs of `tkamb.studies.error_cases`.
 
-The reference of a pair is the B-bar finite elements at cells of `REFERENCE_MM`. Half of what
-changes from cells twice as large is its uncertainty.
+The reference of a pair is the B-bar finite elements at cells of
+`ERROR_REFERENCE.resolution_mm`. Half of what changes from cells twice as large is its uncertainty.
 """
 
 import json
@@ -16,7 +16,17 @@ from tkamb.errors import InputError
 from tkamb.studies.error_cases import ErrorCase, error_cases
 from tkamb.studies.quantities import Quantities, errors, quantities
 
-REFERENCE_MM = 0.5
+
+@dataclass(frozen=True)
+class ErrorReferenceSettings:
+    """The reference of the known errors."""
+
+    resolution_mm: float = 0.5
+    """mm; resolution of the reference, half of the finest that is compared with it."""
+
+
+ERROR_REFERENCE = ErrorReferenceSettings()
+
 REFERENCE = "fe"
 SETTINGS: dict[str, dict[str, tuple[float, ...]]] = {
     "polyethylene": {
@@ -67,7 +77,7 @@ class ErrorRow:
 
 def settings() -> Iterator[tuple[str, str, float]]:
     """Yield material, model and resolution (mm), references first."""
-    yield from ((material, REFERENCE, REFERENCE_MM) for material in SETTINGS)
+    yield from ((material, REFERENCE, ERROR_REFERENCE.resolution_mm) for material in SETTINGS)
     for material, models in SETTINGS.items():
         yield from ((material, name, mm) for name, sizes in models.items() for mm in sizes)
 
@@ -91,11 +101,13 @@ def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
     Args:
         solved: `solved_key` -> what `solve` returned.
     """
-    found = []
+    result = []
     for case in error_cases():
         for material, models in SETTINGS.items():
             fine, coarse = (
-                solved.get(solved_key(case, material, REFERENCE, REFERENCE_MM * factor))
+                solved.get(
+                    solved_key(case, material, REFERENCE, ERROR_REFERENCE.resolution_mm * factor)
+                )
                 for factor in (1, 2)
             )
             if fine is None or coarse is None or fine["status"] != "ok":
@@ -107,8 +119,10 @@ def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
                 for mm in sizes:
                     answer = solved.get(solved_key(case, material, name, mm))
                     if answer is not None:
-                        found.append(_row(case, material, name, mm, answer, reference, uncertainty))
-    return found
+                        result.append(
+                            _row(case, material, name, mm, answer, reference, uncertainty)
+                        )
+    return result
 
 
 def _row(

@@ -16,8 +16,16 @@ from tkamb.geometry.surface import Surface
 from tkamb.studies.bodies import Height, balls, block, dishes, flat
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
-SECTORS = 48
-"""Of the condyles' rings: what is compared is on one mesh."""
+
+@dataclass(frozen=True)
+class ExtremeMeshSettings:
+    """Meshes of the study of extreme cases."""
+
+    sectors: int = 48
+    """Sectors of the rings of the condyles; all compared models use the same mesh."""
+
+
+EXTREME_MESH = ExtremeMeshSettings()
 
 
 Shape = Literal["usual", "swapped", "lip", "spike", "subdivided", "slivers"]
@@ -89,7 +97,7 @@ class Extreme:
         size = (26e-3 * self.aspect, 46e-3 if apart else 26e-3)
         insert = block(height, size, 1e-3)
         femoral = _roughened(
-            balls(radius, apart, self.waist, self.facet_deg, SECTORS), self.rough_mm
+            balls(radius, apart, self.waist, self.facet_deg, EXTREME_MESH.sectors), self.rough_mm
         )
         femoral = _shaped(femoral, self.shape)
         if self.shape == "swapped":
@@ -122,7 +130,7 @@ def _shaped(surface: Surface, shape: Shape) -> Surface:
     if shape == "spike":
         vertices[np.argmin(vertices[:, 1])] -= [0.0, 3 * MILLIMETRE, 0.0]
     elif shape == "slivers":
-        first = np.arange(1, len(vertices) - SECTORS - 1, SECTORS)
+        first = np.arange(1, len(vertices) - EXTREME_MESH.sectors - 1, EXTREME_MESH.sectors)
         vertices[first] += 0.98 * (vertices[first + 1] - vertices[first])
     elif shape == "subdivided":
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)

@@ -14,7 +14,7 @@ from typing import Any
 from tkamb.atomic import write_text
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes
 
 FILE_NAME = "rows.jsonl"
 
@@ -67,16 +67,16 @@ def _whole_rows(path: Path) -> dict[str, Row]:
     """Return key -> row of the lines that are whole and as they were written."""
     if not path.exists():
         return {}
-    found: dict[str, Row] = {}
-    for line in read_bytes(path, TABLE_LIMIT).decode(errors="replace").splitlines():
+    result: dict[str, Row] = {}
+    for line in read_bytes(path, FILE_LIMITS.table_bytes).decode(errors="replace").splitlines():
         try:
             content = json.loads(line)
             key, row = str(content["key"]), dict(content["row"])
             if content["sha256"] == _row_hash(key, row):
-                found[key] = row
+                result[key] = row
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
-    return found
+    return result
 
 
 def row_key(*what: Any) -> str:

@@ -193,8 +193,8 @@ def _warm(model: ContactModel, state: Any, case: StudyCase, guess: ContactResult
 
 def _timed(call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
     start = clock.perf_counter()
-    found = call(*given)
-    return clock.perf_counter() - start, found
+    result = call(*given)
+    return clock.perf_counter() - start, result
 
 
 def _main() -> int:

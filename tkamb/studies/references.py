@@ -205,8 +205,8 @@ def reference_of(case: StudyCase, stored: dict[str, Reference]) -> Reference:
     Raises:
         InputError: there is none, or the case has changed since.
     """
-    found = stored.get(case.name)
-    if found is None or found.hash != case.hash:
-        word = "is missing" if found is None else "belongs to an earlier version of the case"
+    result = stored.get(case.name)
+    if result is None or result.hash != case.hash:
+        word = "is missing" if result is None else "belongs to an earlier version of the case"
         raise InputError(f"the reference {word}", f"case '{case.name}'", "use --recompute")
-    return found
+    return result

@@ -16,8 +16,17 @@ FRONT_ERRORS = ("approach", "force", "peak_pressure")
 """The largest of these errors is the one of the front."""
 KEYS = ("approach", "force", "mean_pressure", "peak_pressure", "area", "map")
 TIMES = ("prepare_seconds", "cold_seconds", "warm_seconds", "peak_rss_MB")
-TIMING_NOISE = 1.2
-"""Two medians of time within this factor count as equal."""
+
+
+@dataclass(frozen=True)
+class TimingSettings:
+    """How times are compared."""
+
+    equal_ratio: float = 1.2
+    """Ratio; two medians of time within this factor count as equal."""
+
+
+TIMING = TimingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +127,8 @@ def on_front(points: Sequence[tuple[float, float]]) -> list[bool]:
 
 def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
     """Say whether one (seconds, error) beats another; see `on_front`."""
-    faster = one[0] * TIMING_NOISE < other[0]
-    not_slower = one[0] <= other[0] * TIMING_NOISE
+    faster = one[0] * TIMING.equal_ratio < other[0]
+    not_slower = one[0] <= other[0] * TIMING.equal_ratio
     return (one[1] <= other[1] and faster) or (one[1] < other[1] and not_slower)
 
 

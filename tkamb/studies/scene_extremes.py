@@ -24,7 +24,7 @@ from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
 from tkamb.run.status import FAILED
 from tkamb.studies.cases import SHIPPED_SCENE, change_recording, copied_scene, stretch_time
-from tkamb.studies.verdict import WRONG, Verdict
+from tkamb.studies.verdict import VERDICT, Verdict
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -32,8 +32,19 @@ if TYPE_CHECKING:
 CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 FRAMES = slice(20, 101, 40)
 TIME_SCALES = (1e-3, 1e-2, 0.1, 0.3, 3.0, 20.0, 1e4)
-SLOW = 10.0
-"""Times as slow as recorded: against it and the recorded motion, inertia is known."""
+
+
+@dataclass(frozen=True)
+class InertiaStudySettings:
+    """How the effect of inertia is found."""
+
+    slow_factor: float = 10.0
+    """Times as slow as recorded; the difference from the recorded motion is the effect of
+    inertia."""
+
+
+INERTIA_STUDY = InertiaStudySettings()
+
 NOISES = (1e-3, 1e-2, 0.1, 1.0)
 FRICTIONS = (0.0, 0.2, 0.6, 1.0)
 ARMS_MM = (-20.0, -60.0, -90.0, -98.0, -101.0, -104.0, -108.0, -120.0)
@@ -91,7 +102,7 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     flags = "; ".join(words)
     if any(status.startswith(FAILED) for status in results.status):
         return Verdict(extreme.label, "run", "flagged", flags, seconds=seconds)
-    right = math.isfinite(apart) and apart <= WRONG
+    right = math.isfinite(apart) and apart <= VERDICT.max_error
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
     reason = flags if right or flags else f"{100 * apart:.3g} % from what it must be"
     known = apart if math.isfinite(apart) else None
@@ -132,9 +143,9 @@ def _apart(extreme: SceneExtreme, results: "Results", folder: Path) -> float:
     apart = float(np.max(np.abs(carried - demanded) / np.abs(demanded)))
     if extreme.kind == "time":
         once = _run(SHIPPED_SCENE, {})["force_si_N"]
-        stretch_time(folder, SLOW / extreme.value)
+        stretch_time(folder, INERTIA_STUDY.slow_factor / extreme.value)
         slow = _run(folder / "scene.toml", {})["force_si_N"]
-        inertia = (once - slow) / (1.0 - 1.0 / SLOW**2)
+        inertia = (once - slow) / (1.0 - 1.0 / INERTIA_STUDY.slow_factor**2)
         law = once - inertia + inertia / extreme.value**2
         return max(apart, float(np.max(np.abs(demanded - law) / np.abs(law))))
     if extreme.kind in ("femoral", "insert"):

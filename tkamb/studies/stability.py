@@ -103,8 +103,8 @@ def kept_verdicts(
 ) -> list[Verdict]:
     """Return the verdicts that are kept, in the cases' order: those finished before others, too."""
     rows, stored = (kept.get(_row_key(case, longest)) for case in cases), stored_verdicts()
-    found = [Verdict(**row) for row in rows if row is not None]
-    return [replace(verdict, expected=stored.get(verdict.key)) for verdict in found]
+    result = [Verdict(**row) for row in rows if row is not None]
+    return [replace(verdict, expected=stored.get(verdict.key)) for verdict in result]
 
 
 def _row_key(case: Case, longest: float) -> str:
@@ -135,9 +135,9 @@ class _Judges:
         row = self._kept.get(key)
         if row is not None:
             return Verdict(**row)
-        found = self._judged_apart(case)
-        self._kept.put(key, asdict(found))
-        return found
+        result = self._judged_apart(case)
+        self._kept.put(key, asdict(result))
+        return result
 
     def limit(self, case: Case) -> float:
         """Return after how many seconds a case counts as hanging."""
@@ -174,13 +174,13 @@ class _Judges:
             raise EOFError
         if not receiver.poll(self.limit(case)):
             return _ended(case, "hang", f"no answer in {self.limit(case):g} s")
-        found = receiver.recv()
-        if found == PRESSED:
+        result = receiver.recv()
+        if result == PRESSED:
             if not receiver.poll(STABILITY.longest_reference_seconds):
                 reason = f"no reference in {STABILITY.longest_reference_seconds:g} s"
                 return _ended(case, "unverified", reason)
-            found = receiver.recv()
-        verdict: Verdict = found
+            result = receiver.recv()
+        verdict: Verdict = result
         return verdict
 
 

@@ -96,10 +96,10 @@ def _of(settings: Settings, case: str, full: bool) -> list[tuple[float, dict[str
     grids = settings.everywhere_mm
     if full or case in ONE_OF_EACH:
         grids += settings.fine_mm
-    found: list[tuple[float, dict[str, Any]]] = [(grid, {}) for grid in grids]
+    result: list[tuple[float, dict[str, Any]]] = [(grid, {}) for grid in grids]
     if full or case in TRIED_ON:
-        found += [(settings.variant_mm, options) for options in settings.variants]
-    return found
+        result += [(settings.variant_mm, options) for options in settings.variants]
+    return result
 
 
 def expected_seconds(wanted: Sequence[Job], cases: Sequence[StudyCase]) -> list[float]:
@@ -130,9 +130,9 @@ def run_tradeoff(
         reference = references[job.case]
         code = contact_code(job.contact)
         key = row_key("tradeoff", asdict(job), code, reference.hash, reference.values)
-        found = kept.get(key) if kept else None
-        measured = Measure(**found) if found else measure_apart(job)
-        if kept and not found:
+        result = kept.get(key) if kept else None
+        measured = Measure(**result) if result else measure_apart(job)
+        if kept and not result:
             kept.put(key, asdict(measured))
         yield compared(job, measured, reference)
 
@@ -161,9 +161,9 @@ def run_peer(
             if size not in PEER_GRIDS_MM.get(case.name, ()):
                 continue
             key = row_key("calculix", case.hash, reference.values, size)
-            found = kept.get(key) if kept else None
-            measured = Measure(**found) if found else measure_by_calculix(case, size)
-            if kept and not found:
+            result = kept.get(key) if kept else None
+            measured = Measure(**result) if result else measure_by_calculix(case, size)
+            if kept and not result:
                 kept.put(key, asdict(measured))
             yield compared(Job(case.name, f"calculix {ELEMENT}", size), measured, reference)
 
@@ -183,17 +183,17 @@ def references_for(
         ComputationError: one cannot be computed.
     """
     stored = read_references(STORED)
-    found: dict[str, Reference] = {}
+    result: dict[str, Reference] = {}
     for case in cases:
         if case.name.startswith("scene"):
-            found[case.name] = _own_reference(case, announce, kept)
+            result[case.name] = _own_reference(case, announce, kept)
         elif recompute:
             announce(f"reference of case '{case.name}': {case.label}")
-            stored[case.name] = found[case.name] = compute_reference(case)
+            stored[case.name] = result[case.name] = compute_reference(case)
             write_references(stored, STORED)
         else:
-            found[case.name] = reference_of(case, stored)
-    return found
+            result[case.name] = reference_of(case, stored)
+    return result
 
 
 def _own_reference(
@@ -204,10 +204,10 @@ def _own_reference(
     if row is not None:
         return Reference(**row | {"grids_mm": tuple(row["grids_mm"])})
     announce(f"reference of case '{case.name}': {case.label}")
-    found = compute_reference(case)
+    result = compute_reference(case)
     if kept:
-        kept.put(key, asdict(found))
-    return found
+        kept.put(key, asdict(result))
+    return result
 
 
 def cases_of(wanted: Sequence[Job]) -> list[StudyCase]:

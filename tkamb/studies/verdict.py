@@ -29,8 +29,17 @@ from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_clos
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.quantities import errors, quantities
 
-WRONG = 0.02
-"""Relative distance from the reference that counts as wrong."""
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """When a result of a study is wrong."""
+
+    max_error: float = 0.02
+    """Relative distance from the reference from which a result counts as wrong."""
+
+
+VERDICT = VerdictSettings()
+
 JUDGED = ("approach", "force", "peak_pressure")
 NEWTON_TOLERANCES = (1e-6, 1e-4, 1e-3)
 """Of the reference: the tightest that Newton's method reaches."""
@@ -162,7 +171,7 @@ def compared(
     """Return the verdict on a result that calls itself ok."""
     found = errors(quantities(result), quantities(reference))
     distance = max(found[key] for key in JUDGED)
-    right = math.isfinite(distance) and distance <= WRONG
+    right = math.isfinite(distance) and distance <= VERDICT.max_error
     flags = "; ".join(result.flags)
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
     reason = flags if right or flags else f"{100 * distance:.3g} % from the reference"

@@ -33,7 +33,7 @@ from tkamb.contact.lattice.problem import (
     undeformed,
 )
 from tkamb.contact.lattice.report import PressureRule, gaps_of_others, result_of
-from tkamb.contact.lattice.settings import LatticeSolverSettings
+from tkamb.contact.lattice.settings import LATTICE_SOLVER, LatticeSolverSettings
 from tkamb.contact.lattice.solids.bbar import BbarHexahedra
 from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.lattice.solids.solid import Solid
@@ -87,7 +87,7 @@ class CellContact(ContactModel):
     @property
     def settings(self) -> LatticeSolverSettings:
         """What the solver's tolerances are at this model's tolerance."""
-        usual = LatticeSolverSettings()
+        usual = LATTICE_SOLVER
         scale = self.tolerance / COARSE
         return replace(
             usual,
@@ -144,7 +144,7 @@ class CellContact(ContactModel):
                 raise InputError(
                     f"cells of {size} do not fit: {short.what}",
                     "contact.resolution_mm",
-                    short.hint(self.resolution),
+                    short.advice(self.resolution),
                 ) from None
 
         if not self.cache:

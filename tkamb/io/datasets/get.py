@@ -88,8 +88,8 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
 
     found = {file.name: _found(file, folder) for file in dataset.files}  # all, before any is copied
     if not any(found.values()):
-        mend = f"download or clone {dataset.repository} first"
-        raise InputError("holds none of the files of this data set", folder, mend)
+        hint = f"download or clone {dataset.repository} first"
+        raise InputError("holds none of the files of this data set", folder, hint)
     return _get(dataset, to, lambda file, beside: found[file.name])
 
 
@@ -120,20 +120,20 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
 
     fetch = _LimitedDownload(LARGEST if file.size is None else file.size)
     known = f"sha256:{file.sha256}"
-    mend = "run it again: what is complete is kept; or --from DIR for what you downloaded by hand"
+    hint = "run it again: what is complete is kept; or --from DIR for what you downloaded by hand"
     try:
         return Path(pooch.retrieve(address, known, "whole", folder, downloader=fetch))
     except HTTPError as error:
         status = error.response.status_code if error.response is not None else "unknown"
-        raise InputError(f"cannot be downloaded (HTTP status {status})", address, mend) from None
+        raise InputError(f"cannot be downloaded (HTTP status {status})", address, hint) from None
     except RequestException as error:
         what = type(error).__name__  # its text is a page of nested causes
-        raise InputError(f"cannot be downloaded (no network? {what})", address, mend) from None
+        raise InputError(f"cannot be downloaded (no network? {what})", address, hint) from None
     except OSError as error:
-        raise InputError(f"cannot be downloaded ({error.strerror})", address, mend) from None
+        raise InputError(f"cannot be downloaded ({error.strerror})", address, hint) from None
     except ValueError as error:
         if "hash" not in str(error):
-            raise InputError(f"cannot be downloaded ({error})", address, mend) from None
+            raise InputError(f"cannot be downloaded ({error})", address, hint) from None
         raise _other_content(address, file) from None
 
 
@@ -190,5 +190,5 @@ def _is_there(file: DataFile, to: Path) -> bool:
         return False
     if sha256_of(target) == file.sha256:
         return True
-    mend = "move it away: nothing of yours is replaced"
-    raise InputError("is there with another content than the published file's", target, mend)
+    hint = "move it away: nothing of yours is replaced"
+    raise InputError("is there with another content than the published file's", target, hint)

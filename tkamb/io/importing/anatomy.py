@@ -200,7 +200,7 @@ def _check_lengths(leg: Leg) -> None:
             raise InputError(
                 f"has a {name} of {length * 1e3:.0f} mm with joint '{leg.knee.name}' as the knee",
                 leg.model.name,
-                "give the femorotibial joint with --knee, or mend the model's lengths",
+                "give the femorotibial joint with --knee, or correct the model's lengths",
             )
 
 
@@ -217,10 +217,10 @@ def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
     if not own:  # a model of one side may leave its joints without a suffix
         own = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
     if len(own) != 1:
-        found = f"{len(own)} joints" if own else "no joint"
+        result = f"{len(own)} joints" if own else "no joint"
         listed = ", ".join(j.name for j in named) or ", ".join(there)
         raise InputError(
-            f"has {found} that could be the {side} knee", model.name, f"give --knee, of {listed}"
+            f"has {result} that could be the {side} knee", model.name, f"give --knee, of {listed}"
         )
     return own[0]
 
@@ -260,11 +260,11 @@ def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]
 
 def _carried(model: OpenSimModel, body: str) -> list[str]:
     """Return a body and all that hang on it outwards."""
-    found = [body]
+    result = [body]
     for joint in model.joints:  # from ground outwards
-        if joint.inboard in found:
-            found.append(joint.outboard)
-    return found
+        if joint.inboard in result:
+            result.append(joint.outboard)
+    return result
 
 
 def _is_patella(joint: Joint) -> bool:
@@ -278,9 +278,9 @@ def _ends(joint: Joint) -> tuple[str, str]:
 def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[str]) -> Joint:
     joints = [joint for joint in joints if not _is_patella(joint)]
     if len(joints) != 1:
-        found = ", ".join(j.name for j in joints) or "none"
+        result = ", ".join(j.name for j in joints) or "none"
         raise InputError(
-            f"has not one joint {where} ({', '.join(bodies)}), but {found}",
+            f"has not one joint {where} ({', '.join(bodies)}), but {result}",
             model.name,
             "is the right joint taken for the knee? give --knee",
         )

@@ -64,11 +64,11 @@ def table_forces(table: Table) -> list[TableForce]:
         InputError: a column of moments that belongs to no force, or two for one axis.
     """
     columns = [c for name in table.columns if (c := _taken_apart(name)) is not None]
-    found: dict[str, TableForce] = {}
+    result: dict[str, TableForce] = {}
     for column in columns:
         if column.kind == "force":
-            found.setdefault(column.owner, TableForce(column.stem))
-    forces = {k for k in found if sum(c.owner == k and c.kind == "force" for c in columns) >= 3}
+            result.setdefault(column.owner, TableForce(column.stem))
+    forces = {k for k in result if sum(c.owner == k and c.kind == "force" for c in columns) >= 3}
     strangers = [c for c in columns if c.kind == "moment" and c.owner not in forces]
     alone = len(forces) == 1 and not any(c.kind == "moment" and c.owner in forces for c in columns)
     if strangers and alone and len({c.owner for c in strangers}) == 1:
@@ -80,7 +80,7 @@ def table_forces(table: Table) -> list[TableForce]:
     for column in columns:
         if column.owner not in forces:
             continue
-        role, own = f"{column.kind}_{column.axis}", found[column.owner].columns
+        role, own = f"{column.kind}_{column.axis}", result[column.owner].columns
         if role in own:
             raise InputError(
                 f"has two columns for one axis of one {column.kind}: '{own[role]}' and "
@@ -89,8 +89,8 @@ def table_forces(table: Table) -> list[TableForce]:
                 "rename or remove one",
             )
         own[role] = column.name
-    _refuse_strangers(table, strangers, [found[k] for k in found if k in forces])
-    return [found[k] for k in found if k in forces]
+    _refuse_strangers(table, strangers, [result[k] for k in result if k in forces])
+    return [result[k] for k in result if k in forces]
 
 
 def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[TableForce]) -> None:

@@ -31,8 +31,18 @@ from tkamb.io.recordings.plate_loads import PLATE_LOAD, around_load, unloaded_le
 from tkamb.io.recordings.recordings import ForceRecording
 from tkamb.io.recordings.tables import Table, read_table
 
-UNLOADED_N = 40.0
-"""Vertical force below which a scene that an import writes holds the centre of pressure."""
+
+@dataclass(frozen=True)
+class ImportedForceSettings:
+    """What an imported scene says about its measured ground reaction."""
+
+    hold_below: float = 40.0
+    """N; vertical force below which the imported scene holds the centre of pressure. The shipped
+    imports use it: below 40 N the quotient of moment and force is noise."""
+
+
+IMPORTED_FORCE = ImportedForceSettings()
+
 COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
 """Of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
 Interval = tuple[float, float]
@@ -78,14 +88,14 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
     recording = read_c3d(request.recording, request.units)
     unread = recording.unread_plates
     if request.plates == ():
-        said = ["ATTENTION: no ground reaction is modelled, as given"]
-        return FoundGround(None, request.interval, None, said)
+        text = ["ATTENTION: no ground reaction is modelled, as given"]
+        return FoundGround(None, request.interval, None, text)
     if request.plates is not None:
         for number in request.plates:
             recording.plate(number)
-        said = [f"force plates {_listed(request.plates)} under the {side} foot, as given"]
+        text = [f"force plates {_listed(request.plates)} under the {side} foot, as given"]
         ground = GroundFile(request.recording, axes, request.plates, units=request.units)
-        return FoundGround(ground, request.interval, None, said)
+        return FoundGround(ground, request.interval, None, text)
     if not recording.plates:
         if unread:
             raise next(iter(unread.values()))
@@ -156,11 +166,11 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     if int(np.argmax(size)) != 1:
         return axes
     turned = {"x": "+x", "z": "+y", "y": "-z"}
-    found = []
+    result = []
     for axis in axes.split(","):
         own = turned[axis[-1]]
-        found.append(("+" if own[0] == axis[0] else "-") + own[1])
-    return ",".join(found)
+        result.append(("+" if own[0] == axis[0] else "-") + own[1])
+    return ",".join(result)
 
 
 def _named(
@@ -196,7 +206,16 @@ def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
     """Return a table's force with its wrench in the laboratory."""
     columns = {"time": "time", **force.columns}
     source = ForceRecording(
-        table.path, "none", None, (), columns, "m", axes, "on the foot", UNLOADED_N, 0.0
+        table.path,
+        "none",
+        None,
+        (),
+        columns,
+        "m",
+        axes,
+        "on the foot",
+        IMPORTED_FORCE.hold_below,
+        0.0,
     )
     time, wrench, level = recorded_wrench(source)
     on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
@@ -224,7 +243,7 @@ def _summed(recorded: list[RecordedForce], path: Path) -> str:
         on = around_load(np.linalg.norm(one.wrench[:, :3], axis=1), time)
         wrenches.append(np.where(on[:, None], one.wrench, 0.0))
     level = float(np.mean(levels))
-    point, moment, force = summed_reaction(time, wrenches, level, UNLOADED_N, path)
+    point, moment, force = summed_reaction(time, wrenches, level, IMPORTED_FORCE.hold_below, path)
     rows = np.column_stack([time, force, point, moment])
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
     return "\n".join([",".join(COLUMNS), *lines, ""])
@@ -252,7 +271,7 @@ def common_interval(
             f"the motion lasts from {start:.4f} to {end:.4f} s, the ground reaction from "
             f"{span[0]:.4f} to {span[1]:.4f} s",
             "--grf",
-            "do they belong to one trial, on one clock?",
+            "give files of one trial, recorded on one clock",
         )
     common = (float(inside[0]), float(inside[-1]))
     return common, [

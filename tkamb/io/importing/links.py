@@ -10,8 +10,17 @@ from tkamb.io.importing.anatomy import Leg
 from tkamb.io.recordings.meshes import axes_rotation
 from tkamb.units import DEGREE
 
-MOST_TURNED = 35.0 * DEGREE
-"""An implant's axes lie within this of the bone's; a wrong axis is 90 deg off."""
+
+@dataclass(frozen=True)
+class LinkFitSettings:
+    """How the links of the URDF are laid into the bodies of an OpenSim model."""
+
+    max_implant_rotation: float = 35.0 * DEGREE
+    """rad; largest rotation between the implant's axes and the bone's. A wrong axis is off by 90
+    deg, a real implantation by a few degrees."""
+
+
+LINK_FIT = LinkFitSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,24 +191,24 @@ def find_links(
         InputError: no frame for a mesh, or axes that do not agree with the bone's.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
-    said: list[str] = []
+    text: list[str] = []
     if placement is None:
         femur = pose(np.eye(3), transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre))
     else:
-        found = mesh_frame(leg, "femoral component", frames.get("femoral component"))
-        femur = _anatomical(leg, found, leg.femur[0], turn, "femoral component", said)
+        result = mesh_frame(leg, "femoral component", frames.get("femoral component"))
+        femur = _anatomical(leg, result, leg.femur[0], turn, "femoral component", text)
     body, centre = leg.ankle_centre
     tibia = pose(np.eye(3), transform(leg.in_body(body, leg.tibia[0]), centre))
     if placement is None:
         straight = inverse(leg.neutral[leg.tibia[0]] @ tibia) @ leg.neutral[leg.femur[0]] @ femur
         insert_in_tibia = pose(np.eye(3), straight[:3, 3])
-        said.append("no implant: the 'insert' frame is the tibia's at the knee's centre")
+        text.append("no implant: the 'insert' frame is the tibia's at the knee's centre")
     else:
-        found = mesh_frame(leg, "insert", frames.get("insert"))
-        mesh = _anatomical(leg, found, leg.tibia[0], turn, "insert", said)
+        result = mesh_frame(leg, "insert", frames.get("insert"))
+        mesh = _anatomical(leg, result, leg.tibia[0], turn, "insert", text)
         insert_in_tibia = inverse(tibia) @ mesh @ inverse(placement)
-    patella, button, error = _patella(leg, femur, turn, frames, with_button, said)
-    return Links(leg, femur, tibia, patella, insert_in_tibia, button, error, tuple(said))
+    patella, button, error = _patella(leg, femur, turn, frames, with_button, text)
+    return Links(leg, femur, tibia, patella, insert_in_tibia, button, error, tuple(text))
 
 
 def _anatomical(
@@ -210,7 +219,7 @@ def _anatomical(
     there = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(there[:3, :3])
     angle = np.arccos(np.clip((np.trace(there[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
-    if not np.allclose(nearest, np.eye(3)) or angle > MOST_TURNED:
+    if not np.allclose(nearest, np.eye(3)) or angle > LINK_FIT.max_implant_rotation:
         raise InputError(
             f"the {part} stands turned by {angle / DEGREE:.0f} deg on '{body}' with these axes "
             f"({frame.why})",
@@ -240,9 +249,9 @@ def _patella(
     patella = pose(axes, np.zeros(3))
     if not with_button:
         return patella, None, error
-    found = mesh_frame(leg, "patellar button", frames.get("patellar button"))
-    mesh = patella @ turn if found.pose is None else found.pose
+    result = mesh_frame(leg, "patellar button", frames.get("patellar button"))
+    mesh = patella @ turn if result.pose is None else result.pose
     button = inverse(patella) @ mesh @ inverse(turn)
     place = ", ".join(f"{v * 1e3:.1f}" for v in button[:3, 3])
-    said.append(f"patellar button on the patella at ({place}) mm ({found.why})")
+    said.append(f"patellar button on the patella at ({place}) mm ({result.why})")
     return patella, button, error

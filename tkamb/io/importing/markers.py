@@ -48,9 +48,9 @@ def model_segments(
     Raises:
         InputError: shank or thigh with fewer than three markers in the recording.
     """
-    found = seen_segments(links, recorded, without)
+    result = seen_segments(links, recorded, without)
     for name in ("shank", "thigh"):
-        segment = found[name]
+        segment = result[name]
         if len(segment.points) < 3:
             labels = recorded_labels(recorded)
             if prefixes := _clashing_prefixes(labels, segment.missing):
@@ -67,7 +67,7 @@ def model_segments(
                 f"the model has {', '.join(segment.missing) or 'no others'}; "
                 f"the recording {', '.join(labels[:12])}, …{_equal_line(recorded)}",
             )
-    return [segment for segment in found.values() if len(segment.points) >= 3]
+    return [segment for segment in result.values() if len(segment.points) >= 3]
 
 
 def seen_segments(
@@ -96,7 +96,7 @@ def seen_segments(
         ("pelvis", (leg.pelvis,), "thigh", links.hip, in_pelvis),
     ]
     labels, dropped = _seen_labels(recorded, without)
-    found = {}
+    result = {}
     for name, bodies, joined_to, joint, centre in wanted:
         own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
         match = matched_labels(own, labels)
@@ -109,8 +109,8 @@ def seen_segments(
         }
         left_out = matched_labels(own, dropped)
         missing = tuple(m for m in own if m not in match and m not in left_out)
-        found[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
-    return found
+        result[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
+    return result
 
 
 def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -131,12 +131,12 @@ def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], li
 def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
     """Return the segments with the labels of another recording, those that it holds."""
     labels = recorded_labels(recorded)
-    found = []
+    result = []
     for segment in segments:
         match = matched_labels(segment.points, labels)
         points = {match[name]: p for name, p in segment.points.items() if name in match}
-        found.append(replace(segment, points=points))
-    return found
+        result.append(replace(segment, points=points))
+    return result
 
 
 def _equal_line(recorded: Table) -> str:
@@ -148,11 +148,11 @@ def _equal_line(recorded: Table) -> str:
 def _clashing_prefixes(labels: list[str], wanted: Sequence[str]) -> list[str]:
     """Return the prefixes under which a wanted marker stands more than once."""
     plain = {plain_label(name) for name in wanted}
-    found: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     for label in labels:
         if plain_label(label) in plain:
-            found.setdefault(plain_label(label), []).append(label.rpartition(":")[0])
-    clashing = [prefix for prefixes in found.values() if len(prefixes) > 1 for prefix in prefixes]
+            result.setdefault(plain_label(label), []).append(label.rpartition(":")[0])
+    clashing = [prefix for prefixes in result.values() if len(prefixes) > 1 for prefix in prefixes]
     return list(dict.fromkeys(clashing))
 
 
@@ -251,12 +251,12 @@ def _axis_name(axis: Array) -> str:
 def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
     """Return side -> labels of the recording on that side's foot; the other side if there."""
     labels = recorded_labels(recorded)
-    found = {leg.side: _foot_labels(leg, labels)}
+    result = {leg.side: _foot_labels(leg, labels)}
     try:
-        found[other] = _foot_labels(find_leg(leg.model, other), labels)
+        result[other] = _foot_labels(find_leg(leg.model, other), labels)
     except InputError:
-        found[other] = []  # a model of one leg
-    return found
+        result[other] = []  # a model of one leg
+    return result
 
 
 def _foot_labels(leg: Leg, labels: list[str]) -> list[str]:

@@ -6,6 +6,7 @@ follow. Ranges are not imposed. The same least squares as for a leg
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -20,10 +21,19 @@ from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import marker_trajectories, matched_labels
 from tkamb.io.recordings.tables import Table
 
-BLOCK = 128
-"""Frames that are fitted at once."""
-COARSE = 8
-"""Frames between those that are fitted first."""
+
+@dataclass(frozen=True)
+class ModelFitSettings:
+    """How the poses of a model are fitted to markers."""
+
+    block_frames: int = 128
+    """Frames that are fitted in one call; trades memory for speed and changes no result."""
+    coarse_stride: int = 8
+    """Frames between those that are fitted first; the others begin from their poses. It changes the
+    initial guesses only."""
+
+
+MODEL_FIT = ModelFitSettings()
 
 
 class ModelChain:
@@ -242,7 +252,9 @@ def fit_model(
     first = int(np.argmax(np.isfinite(measured).all(axis=2).sum(axis=1)))
     begin = fit_chain(chain, measured[first : first + 1], values, chain.default(1))
     # some frames first, from the best seen; between them the others are nearly there
-    coarse = np.unique(np.append(np.arange(0, len(measured), COARSE), len(measured) - 1))
+    coarse = np.unique(
+        np.append(np.arange(0, len(measured), MODEL_FIT.coarse_stride), len(measured) - 1)
+    )
     start = np.tile(begin.state, (len(coarse), 1))
     knots = fit_in_blocks(chain, measured[coarse], values, start).state
     between = CubicSpline(coarse, knots)(np.arange(len(measured))) if len(coarse) > 2 else start
@@ -253,7 +265,10 @@ def fit_in_blocks(
     chain: ModelChain, measured: Array, weights: Array, start: Array
 ) -> ChainFit[Array]:
     """Return `fit_chain` of many frames, so many at once as the processor's cache holds."""
-    parts = [slice(k, k + BLOCK) for k in range(0, len(measured), BLOCK)]
+    parts = [
+        slice(k, k + MODEL_FIT.block_frames)
+        for k in range(0, len(measured), MODEL_FIT.block_frames)
+    ]
     fits = [fit_chain(chain, measured[part], weights, start[part]) for part in parts]
     state, rms, distance, solved = (
         np.concatenate([getattr(fit, name) for fit in fits])

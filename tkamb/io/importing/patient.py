@@ -9,7 +9,7 @@ import numpy as np
 
 from tkamb.atomic import CHOOSE_OUT, claim_directory, write_new_text
 from tkamb.errors import InputError
-from tkamb.files import TABLE_LIMIT, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg
@@ -31,16 +31,27 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.units import DEGREE, MILLIMETRE
 
-LEG_ALONE = 0.6
-"""Share of a model's mass above which thigh, shank and foot are a model of one leg."""
-LEG_SHARE = 0.161
-"""Of the body's mass, thigh 0.100, shank 0.0465, foot 0.0145 (Winter, Biomechanics, 2009)."""
+
+@dataclass(frozen=True)
+class ModelMassSettings:
+    """How the mass of an OpenSim model becomes the mass of a patient."""
+
+    one_leg_share: float = 0.6
+    """Share of the mass of a model that thigh, shank and foot have at least where it is a model of
+    one leg."""
+    leg_mass_share: float = 0.161
+    """Share of the body's mass in one leg: thigh 0.100, shank 0.0465, foot 0.0145 (Winter,
+    Biomechanics, 2009)."""
+    max_reasons: int = 3
+    """Parts that were not read of which the report of an import gives the reason."""
+    same_mass_share: float = 0.01
+    """Share of the subject's mass; a model whose mass differs by less is not scaled."""
+
+
+MODEL_MASS = ModelMassSettings()
+
 LEG_SHARES = (0.10, 0.25)
 """Of the body's mass: from Winter's 0.161 to de Leva's 0.20 (1996), with room for other people."""
-MAX_REASONS = 3
-"""Parts that were not read of which the report gives the reason."""
-SAME_MASS = 0.01
-"""A model whose mass is within this share of the subject's is not scaled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +103,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         hint = "leave it out, or complete the model"
         what = "is what the quadriceps wraps, and the model gives none"
         raise InputError(what, "--femur-bone", hint)
-    found = _trial(request, leg, links, insert)
+    result = _trial(request, leg, links, insert)
     scene = SceneText(
         _title(request),
         folder,
@@ -101,33 +112,33 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         "patient.urdf",
         request.cutoff_Hz,
         links,
-        found.markers,
-        found.poses,
-        found.shank,
-        found.ground,
+        result.markers,
+        result.poses,
+        result.shank,
+        result.ground,
         meshes,
         tissue,
         request.contact,
         request.activity,
-        (*_notes(request, scale, found, bool(tissue.bundles)), *request.notes),
+        (*_notes(request, scale, result, bool(tissue.bundles)), *request.notes),
         request.model if request.muscles else None,
-        request.recording if found.motion else None,
+        request.recording if result.motion else None,
         request.cycle,
     )
     report = [*_model_lines(model), *_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
-    report += [*found.said, *tissue.said]
+    report += [*result.said, *tissue.said]
     if request.static is not None:
-        if found.markers is None:
+        if result.markers is None:
             raise InputError(
                 "is for a knee whose motion comes from markers", "--static", "leave it out"
             )
-        segments = list(found.markers.segments)
+        segments = list(result.markers.segments)
         unit = request.units.length
         scene, lines = with_static_markers(scene, request.static, segments, unit)
         report += lines
     comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
-    motion = found.motion.text() if found.motion else None
-    ground = found.ground.made if found.ground else None
+    motion = result.motion.text() if result.motion else None
+    ground = result.ground.made if result.ground else None
     return ImportedPatient(
         patient_urdf(links, scale, comment), scene, motion, tuple(report), ground
     )
@@ -228,7 +239,7 @@ def _same_there(path: Path, text: str) -> bool:
     if not os.path.lexists(path):
         return False
     with suppress(InputError):
-        if read_bytes(path, TABLE_LIMIT) == text.encode("utf-8", "backslashreplace"):
+        if read_bytes(path, FILE_LIMITS.table_bytes) == text.encode("utf-8", "backslashreplace"):
             return True
     what = "is there already with another content; another scene may need it"
     raise InputError(what, path, CHOOSE_OUT)
@@ -236,8 +247,8 @@ def _same_there(path: Path, text: str) -> bool:
 
 def marker_lines(case: Case) -> tuple[str, ...]:
     """Return how well the markers fit, by both readings, and how far the knee centres are apart."""
-    found = case.motion.markers
-    if found is None:
+    result = case.motion.markers
+    if result is None:
         rms = case.tibia.residual if case.tibia else None
         if rms is None:
             return ()
@@ -247,15 +258,17 @@ def marker_lines(case: Case) -> tuple[str, ...]:
         )
     lines = []
     for method, words in (("segments", "rigid fits of shank and thigh"), ("chain", "the chain")):
-        rms = found.at(found.rms[method], case.motion.time) / MILLIMETRE  # type: ignore[index]
-        flexion = found.at(found.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
-        used = ", used" if found.method == method else ""
+        rms = result.at(result.rms[method], case.motion.time) / MILLIMETRE  # type: ignore[index]
+        flexion = result.at(result.flexion[method], case.motion.time) / DEGREE  # type: ignore[index]
+        used = ", used" if result.method == method else ""
         lines.append(
             f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most {np.nanmax(rms):.1f})"
             f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
         )
-    apart = found.at(found.centre_distance, case.motion.time) / MILLIMETRE
-    turned = found.at(found.flexion["segments"] - found.flexion["chain"], case.motion.time) / DEGREE
+    apart = result.at(result.centre_distance, case.motion.time) / MILLIMETRE
+    turned = (
+        result.at(result.flexion["segments"] - result.flexion["chain"], case.motion.time) / DEGREE
+    )
     lines.append(
         f"knee centres of shank and thigh markers: {np.nanmedian(apart):.1f} mm apart (at most "
         f"{np.nanmax(apart):.1f}); flexions differ by at most {np.nanmax(np.abs(turned)):.1f} deg"
@@ -275,38 +288,42 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
         raise InputError(
             "gives thigh, shank and foot no mass", request.model, "give its bodies their masses"
         )
-    if own > LEG_ALONE * model:
+    if own > MODEL_MASS.one_leg_share * model:
         return _leg_scale(request, own)
     ratio = subject / model
-    scaled = abs(ratio - 1.0) > SAME_MASS if request.scale_mass is None else request.scale_mass
-    said = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
+    scaled = (
+        abs(ratio - 1.0) > MODEL_MASS.same_mass_share
+        if request.scale_mass is None
+        else request.scale_mass
+    )
+    text = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
     if not 0.5 < ratio < 2.0:
         raise InputError(
             f"weighs {model:.1f} kg, the subject {subject:g} kg",
             request.model,
             "is --mass-kg in kilograms? else scale the model first",
         )
-    return (ratio, said + f"scaled by {ratio:.4f}") if scaled else (1.0, said + "not scaled")
+    return (ratio, text + f"scaled by {ratio:.4f}") if scaled else (1.0, text + "not scaled")
 
 
 def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
     """Return the factor on the masses of a model that is little more than one leg, and a line.
 
     Such a model holds the leg's own mass, or, where a scaling tool was told the subject's mass,
-    the whole body's. The leg's own is `LEG_SHARE` of the subject.
+    the whole body's. The leg's own is `MODEL_MASS.leg_mass_share` of the subject.
 
     Raises:
         InputError: neither of the two.
     """
     subject = request.mass_kg
-    share, wanted = own / subject, LEG_SHARE * subject
+    share, wanted = own / subject, MODEL_MASS.leg_mass_share * subject
     low, high = LEG_SHARES
     whole_body = 0.5 < share < 2.0
-    said = (
+    text = (
         f"mass: the model is one leg of {own:.2f} kg, {share:.0%} of the subject's {subject:g} kg"
     )
     if low <= share <= high and not request.scale_mass:
-        return 1.0, said + ": not scaled"
+        return 1.0, text + ": not scaled"
     if not (low <= share <= high or whole_body) or (whole_body and request.scale_mass is False):
         raise InputError(
             f"is one leg of {own:.1f} kg, the subject weighs {subject:g} kg: a leg has "
@@ -316,7 +333,8 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
         )
     why = ", the whole body's" if whole_body else ""
     return wanted / own, (
-        f"{said}{why}: scaled to {wanted:.2f} kg, the {LEG_SHARE:.1%} of a leg (Winter 2009)"
+        f"{text}{why}: scaled to {wanted:.2f} kg, "
+        f"the {MODEL_MASS.leg_mass_share:.1%} of a leg (Winter 2009)"
     )
 
 
@@ -326,7 +344,7 @@ def _model_lines(model: OpenSimModel) -> list[str]:
     unread = [f"{one.kind} '{one.name}'" for one in model.unread]
     if unread:
         lines.append(f"not read, and not needed for this knee: {some_names(unread)}")
-        lines += [f"  {one.reason}" for one in model.unread[:MAX_REASONS]]
+        lines += [f"  {one.reason}" for one in model.unread[: MODEL_MASS.max_reasons]]
     return lines
 
 

@@ -16,20 +16,31 @@ from tkamb.io.recordings.markers import marker_trajectories
 from tkamb.io.recordings.plate_loads import around_load, unloaded_level
 from tkamb.io.recordings.tables import Table
 
-LOADED_N = 40.0
-"""Vertical force at which a plate counts as stood upon."""
-SHORTEST_S = 0.1
-"""A load that lasts less is a knock."""
-UNDER_FOOT = 0.25
-"""m; horizontally, between a centre of pressure and the middle of the foot's markers."""
-ON_A_STEP = 0.15
-"""m; a foot whose markers are this far above the plate stands on something."""
-MIDDLE = 0.055
-"""m; the middle of a foot's markers is about as high above what it stands on."""
-SAME_STEP = 0.05
-"""m; heights that differ by less are those of one step."""
-STILL = 0.15
-"""m/s; a foot that moves less, off the plates, stands on something that nobody measured."""
+
+@dataclass(frozen=True)
+class FootContactSettings:
+    """Which force plate carries which foot, from forces and markers."""
+
+    min_force: float = 40.0
+    """N; vertical force at which a plate counts as loaded. The noise of a plate is a few
+    newtons."""
+    min_duration: float = 0.1
+    """s; a load that lasts less is a knock, not a step."""
+    max_foot_distance: float = 0.25
+    """m; horizontal distance from the centre of pressure to the middle of the foot's markers: about
+    the length of a foot."""
+    min_step_height: float = 0.15
+    """m; a foot whose markers are this far above the plate stands on something else. The lowest
+    stair of the data sets is 0.17 m high."""
+    marker_height: float = 0.055
+    """m; height of the middle of a foot's markers above the ground on which it stands."""
+    same_height: float = 0.05
+    """m; heights that differ by less belong to one step."""
+    max_standing_speed: float = 0.15
+    """m/s; a foot off the plates that moves less stands on something that was not measured."""
+
+
+FOOT_CONTACT = FootContactSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +75,7 @@ class RecordedForce:
     @property
     def loaded(self) -> np.ndarray:
         """(k,) whether somebody stands on it."""
-        return np.asarray(self.wrench[:, 1] - self.drift > LOADED_N)
+        return np.asarray(self.wrench[:, 1] - self.drift > FOOT_CONTACT.min_force)
 
 
 @dataclass(frozen=True)
@@ -142,7 +153,7 @@ def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
         middles = {s: _interpolated(m, feet.time, one.time) for s, m in feet.middles.items()}
         point = one.point
         for first, last in _runs(one.loaded):
-            if one.time[last] - one.time[first] >= SHORTEST_S:
+            if one.time[last] - one.time[first] >= FOOT_CONTACT.min_duration:
                 part = slice(first, last + 1)
                 own = {side: middle[part] for side, middle in middles.items()}
                 line = (one.time[part], point[part], one.wrench[part, :3])
@@ -158,13 +169,15 @@ def _load(
     for side, middle in middles.items():
         above = middle[:, 1] - point[:, 1]
         height = float(np.nanmedian(above)) if np.isfinite(above).any() else 0.0
-        surface[side] = height - MIDDLE if height > ON_A_STEP else 0.0
+        surface[side] = (
+            height - FOOT_CONTACT.marker_height if height > FOOT_CONTACT.min_step_height else 0.0
+        )
         there = point + force / force[:, 1:2] * surface[side]
         distance = np.linalg.norm((there - middle)[:, [0, 2]], axis=1)
         away[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
     nearest = min(away, key=lambda side: np.nan_to_num(away[side], nan=np.inf))
     rest = [distance for side, distance in away.items() if side != nearest]
-    whose = nearest if away[nearest] < UNDER_FOOT else ""
+    whose = nearest if away[nearest] < FOOT_CONTACT.max_foot_distance else ""
     start, end = float(time[0]), float(time[-1])
     return Load(one.key, one.title, whose, start, end, away[nearest], rest[0], surface[nearest])
 
@@ -191,7 +204,8 @@ def own_plates(
         if lost:
             what += (
                 f": {lost[0].title} is stood upon from {lost[0].start:.2f} to {lost[0].end:.2f} s, "
-                f"but no foot's markers are within {UNDER_FOOT:g} m of its centre of pressure"
+                f"but no foot's markers are within {FOOT_CONTACT.max_foot_distance:g} m of its "
+                "centre of pressure"
             )
             hint = f"check --laboratory-axes and the foot's labels, or {hint}"
         raise InputError(what, path, f"{hint}, or take another trial")
@@ -201,7 +215,7 @@ def own_plates(
 def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
     """Return how high (m) the foot stands above its plates; zero where that differs."""
     heights = [load.surface for load in loads if load.plate in plates]
-    return float(np.mean(heights)) if np.ptp(heights) < SAME_STEP else 0.0
+    return float(np.mean(heights)) if np.ptp(heights) < FOOT_CONTACT.same_height else 0.0
 
 
 def known_interval(
@@ -219,7 +233,7 @@ def known_interval(
         raise InputError(
             f"has no two frames while the foot is loaded, {start:.3f} to {end:.3f} s",
             feet.path,
-            "do the force and the markers belong to one trial?",
+            "give force and markers of one trial",
         )
     return float(inside[0]), float(inside[-1])
 
@@ -239,7 +253,7 @@ def unmeasured(
         if load.plate in plates:
             on |= (time >= load.start - 0.02) & (time <= load.end + 0.02)
     inside = (time >= interval[0]) & (time <= interval[1])
-    return np.asarray(time[inside & ~on & (speed < STILL)])
+    return np.asarray(time[inside & ~on & (speed < FOOT_CONTACT.max_standing_speed)])
 
 
 def _middle(table: Table, labels: list[str]) -> Array:

@@ -49,17 +49,17 @@ class PoseRecording:
 
     def keys(self) -> dict[str, Any]:
         """Return the keys of the scene's [motion] but its file, cut-off and columns."""
-        found: dict[str, Any] = {
+        result: dict[str, Any] = {
             "interpretation": "pose",
             "sequence": self.sequence,
             "angle_unit": self.angle_unit,
             "length_unit": self.length_unit,
         }
         if self.turned:
-            found["signs_turned"] = list(self.turned)
+            result["signs_turned"] = list(self.turned)
         if self.stride:
-            found["cycle_s"] = list(self.stride)
-        return found
+            result["cycle_s"] = list(self.stride)
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,21 +157,21 @@ def _in_stance(given: PoseRecording, motion: KneeMotion) -> Array:
 def _said(given: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
     flexion = motion.raw_coordinates[:, 5] / DEGREE
     angles, places = ", ".join(given.columns[:3]), ", ".join(given.columns[3:])
-    said = [
+    text = [
         f"knee: {len(flexion)} poses of the femoral mesh in the insert mesh from "
         f"{given.file.name}, rotations {given.sequence} = {angles} in {given.angle_unit}, x, y, z "
         f"= {places} in {given.length_unit}: flexion {flexion.min():.1f} to {flexion.max():.1f} "
         f"deg; all six coordinates as recorded"
     ]
     if given.turned:
-        said.append(f"read with the other sign, as given: {', '.join(given.turned)}")
+        text.append(f"read with the other sign, as given: {', '.join(given.turned)}")
     if given.stride:
         closed = "a closed cycle" if motion.closed_cycle else "not closed"
-        said.append(
+        text.append(
             f"phase: its 0 and 100 % are laid on {given.stride[0]:g} and {given.stride[1]:g} s of "
             f"the recording, as given: an assumption ({closed})"
         )
-    return tuple(said)
+    return tuple(text)
 
 
 def _toml(value: Any) -> str:

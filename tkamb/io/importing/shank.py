@@ -69,9 +69,9 @@ def shank_markers(
     """
     points = segments["shank"].points
     centres: list[JointCentre] = []
-    said: list[str] = []
+    text: list[str] = []
     if len(points) < 3:
-        centres, said = _carried(links, segments, femur)
+        centres, text = _carried(links, segments, femur)
     if len(points) + len(centres) < 3:
         raise InputError(
             f"shows {len(points)} markers of the shank and joint centres for {len(centres)} more; "
@@ -79,7 +79,7 @@ def shank_markers(
             recording,
             "three markers of the foot carry the ankle's centre, three of the thigh the knee's",
         )
-    return ShankMarkers(recording, axes, points, tuple(centres), tuple(said))
+    return ShankMarkers(recording, axes, points, tuple(centres), tuple(text))
 
 
 def _carried(
@@ -87,10 +87,10 @@ def _carried(
 ) -> tuple[list[JointCentre], list[str]]:
     """Return the joint centres that foot and thigh carry, and lines on them."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
-    centres, said = [], []
+    centres, text = [], []
     if len(foot.points) >= 3 and foot.centre is not None:
         centres.append(JointCentre("ankle_centre", foot.points, foot.centre, np.zeros(3)))
-        said.append(f"shank: its ankle centre is carried by the foot's {len(foot.points)} markers")
+        text.append(f"shank: its ankle centre is carried by the foot's {len(foot.points)} markers")
     if len(thigh.points) >= 3:
         own = {name: transform(links.femur, point) for name, point in thigh.points.items()}
         centre = transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre)
@@ -98,8 +98,8 @@ def _carried(
         mean = places.mean(axis=0)
         apart = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
         centres.append(JointCentre("knee_centre", own, centre, mean))
-        said.append(
+        text.append(
             f"shank: its knee centre is carried by the thigh's {len(own)} markers, at the mean of "
             f"{len(places)} recorded poses ({apart:.1f} mm rms about it)"
         )
-    return centres, said
+    return centres, text

@@ -9,8 +9,17 @@ from tkamb.io.importing.links import Links
 from tkamb.io.importing.urdf import body_link
 from tkamb.io.opensim.lines import Ligament, Path, PathPoint
 
-TOE = 0.06
-"""Strain at which the toe of law "quadratic-toe" ends: twice eps1 = 0.03 (Blankevoort 1991)."""
+
+@dataclass(frozen=True)
+class ImportedLigamentSettings:
+    """What an imported ligament has that an OpenSim model does not state."""
+
+    toe_strain: float = 0.06
+    """Strain at which the toe of law \"quadratic-toe\" ends: twice eps1 = 0.03 (Blankevoort
+    1991)."""
+
+
+IMPORTED_LIGAMENT = ImportedLigamentSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +62,12 @@ class SoftTissue:
 
 def soft_tissue(links: Links) -> SoftTissue:
     """Return the soft tissue of a leg's knee that the scene can hold."""
-    said: list[str] = []
-    quadriceps = _quadriceps(links, said)
-    ligament, length = _patellar_ligament(links, said)
-    bundles = _bundles(links, said)
-    _name_muscles(links, said)
-    return SoftTissue(quadriceps, ligament, length, bundles, tuple(said))
+    text: list[str] = []
+    quadriceps = _quadriceps(links, text)
+    ligament, length = _patellar_ligament(links, text)
+    bundles = _bundles(links, text)
+    _name_muscles(links, text)
+    return SoftTissue(quadriceps, ligament, length, bundles, tuple(text))
 
 
 def _end(point: PathPoint) -> End:
@@ -164,8 +173,11 @@ def _reason_against(ligament: Ligament, fixed: int) -> str:
         return "which run by more than two points"
     if ligament.stiffness_N is None:
         return f"of class {ligament.kind}, whose law the scene does not have"
-    if ligament.transition_strain is None or abs(ligament.transition_strain - TOE) > 1e-6:
-        return f"whose toe does not end at a strain of {TOE}"
+    if (
+        ligament.transition_strain is None
+        or abs(ligament.transition_strain - IMPORTED_LIGAMENT.toe_strain) > 1e-6
+    ):
+        return f"whose toe does not end at a strain of {IMPORTED_LIGAMENT.toe_strain}"
     return ""
 
 

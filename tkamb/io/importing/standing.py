@@ -91,8 +91,8 @@ def calibrated_markers(
     neutral = neutral_coordinates(markers, side)
     _, whole = both_fits(chain, segments, measured, neutral, recorded)
     mirror = MIRROR if side == "left" else np.eye(3)
-    found = {}
+    result = {}
     for name, poses in chain.poses(whole.state).items():
         own_axes = np.nanmean(transform(inverse(poses), measured[name]), axis=0) @ mirror
-        found[name] = dict(zip(chain.segments[name].labels, own_axes, strict=True))
-    return found
+        result[name] = dict(zip(chain.segments[name].labels, own_axes, strict=True))
+    return result

@@ -27,8 +27,17 @@ from tkamb.io.importing.shank import ShankMarkers, shank_markers
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.tables import Table
 
-FRAMES_PER_CUTOFF = 5.0
-"""Frames per period of the cut-off: what is low-passed holds nothing between them."""
+
+@dataclass(frozen=True)
+class TrialFrameSettings:
+    """How many frames of a trial an imported scene holds."""
+
+    frames_per_period: float = 5.0
+    """Frames per period of the cut-off frequency. A low-pass-filtered motion has no content between
+    them."""
+
+
+TRIAL_FRAMES = TrialFrameSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +61,9 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     segments = model_segments(links, recorded, request.without)
     seen = _facing(request, segments, recorded)
     feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
-    found = find_ground(request, leg.side, seen.axes, feet_there)
+    result = find_ground(request, leg.side, seen.axes, feet_there)
     time = recorded.time()
-    interval, joined = common_interval(time, found.interval, found.span)
+    interval, joined = common_interval(time, result.interval, result.span)
     interval, frames, thinned = _thinned(time, interval, request.cutoff_Hz)
     markers = MarkerFile(
         request.recording,
@@ -68,8 +77,8 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
         request.prefix is not None,
     )
     matched = [*_notices(request, recorded), *_segment_lines(segments, request.without)]
-    said = (*matched, _facing_line(request, seen), *found.said, *joined, thinned)
-    return Trial(found.ground, said, markers)
+    text = (*matched, _facing_line(request, seen), *result.said, *joined, thinned)
+    return Trial(result.ground, text, markers)
 
 
 def from_poses(
@@ -86,10 +95,10 @@ def from_poses(
     shank = shank_markers(links, segments, stance, request.recording, seen.axes)
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
     feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
-    found = find_ground(covered, leg.side, seen.axes, feet_there)
+    result = find_ground(covered, leg.side, seen.axes, feet_there)
     matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
-    said = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *found.said)
-    return Trial(found.ground, said, poses=poses, shank=shank)
+    text = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *result.said)
+    return Trial(result.ground, text, poses=poses, shank=shank)
 
 
 def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
@@ -102,19 +111,19 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
         if joint.unread:
             raise InputError(joint.unread)
     motion = model_motion(links, recorded)
-    said = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
+    text = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
     if motion.missing:
-        said.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
-    said += [*_notices(request, recorded), *motion.said]
+        text.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
+    text += [*_notices(request, recorded), *motion.said]
     there = model_feet(links, recorded) if request.grf is not None else None
-    found = find_ground(request, leg.side, "+x,+y,+z", there)
-    said += found.said
-    if found.ground is not None:
-        said.append("laboratory: the model's ground, x forward, y up")
-    interval, joined = common_interval(motion.time, found.interval, found.span)
+    result = find_ground(request, leg.side, "+x,+y,+z", there)
+    text += result.said
+    if result.ground is not None:
+        text.append("laboratory: the model's ground, x forward, y up")
+    interval, joined = common_interval(motion.time, result.interval, result.span)
     if interval is not None:
         motion = motion.part(*interval)
-    return Trial(found.ground, (*said, *joined), motion=motion)
+    return Trial(result.ground, (*text, *joined), motion=motion)
 
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
@@ -164,7 +173,7 @@ def _thinned(
             f"has no two frames between {start:g} and {end:g} s", "--interval", "choose another"
         )
     rate = 1.0 / float(np.median(np.diff(inside)))
-    every = max(int(rate / (FRAMES_PER_CUTOFF * cutoff_Hz) + 1e-9), 1)
+    every = max(int(rate / (TRIAL_FRAMES.frames_per_period * cutoff_Hz) + 1e-9), 1)
     count = (len(inside) - 1) // every + 1
     even = np.ptp(np.diff(inside)) < 1e-6
     if every == 1 or not even or count < 8:

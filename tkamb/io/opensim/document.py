@@ -7,6 +7,7 @@ element with `file="other.xml"` is replaced by the element that the other file h
 
 import copy
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from tkamb.errors import InputError
@@ -14,8 +15,18 @@ from tkamb.files import parse_xml, read_bytes
 from tkamb.io.opensim.elements import Element
 
 WHAT = "OpenSim model"
-MAX_NESTED_FILES = 5
-"""Files that name files that name files; OpenSim's own models nest one deep."""
+
+
+@dataclass(frozen=True)
+class DocumentSettings:
+    """What is read of an OpenSim file."""
+
+    max_nested_files: int = 5
+    """Files that name files in turn; OpenSim's own models nest one deep."""
+
+
+DOCUMENT = DocumentSettings()
+
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
 """Sets of which tkamb reads nothing but the names: their file may be absent."""
 
@@ -73,8 +84,8 @@ def _lenient(content: bytes) -> tuple[str, list[str]]:
         mended.append("its XML declaration")
     if content[:1].isspace():
         mended.append("blanks before its first line")
-    if "<!DOCTYPE" not in text and (found := _BARE_AMPERSAND.search(text)):
-        mended.append(f"a bare & in line {text.count(chr(10), 0, found.start()) + 1}")
+    if "<!DOCTYPE" not in text and (result := _BARE_AMPERSAND.search(text)):
+        mended.append(f"a bare & in line {text.count(chr(10), 0, result.start()) + 1}")
         text = _BARE_AMPERSAND.sub("&amp;", text)
     plain = _COMMENT.sub(lambda m: f"<!--{re.sub('-+', '-', m[1]).strip('-')}-->", text)
     if "--" in "".join(_COMMENT.findall(text)):
@@ -106,7 +117,7 @@ def _replace(
     if not other.is_file() and element.tag in NOT_NEEDED:
         notices.append(f"{element.tag} left out: its file {name} is not there")
         return path, opened
-    if other.resolve() in opened or len(opened) > MAX_NESTED_FILES:
+    if other.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
         raise InputError("names a file that leads back to it", where)
     if not other.exists():
         raise InputError(

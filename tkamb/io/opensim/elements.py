@@ -58,9 +58,9 @@ class Document:
         """Return the first child with one of these tags, here or in the defaults."""
         for source in (element, self.defaults.get(element.tag)):
             for tag in tags if source is not None else ():
-                found = source.find(tag)  # type: ignore[union-attr]
-                if found is not None:
-                    return found
+                result = source.find(tag)  # type: ignore[union-attr]
+                if result is not None:
+                    return result
         return None
 
     def text(self, element: Element, *tags: str, default: str | None = None) -> str:
@@ -69,8 +69,8 @@ class Document:
         Raises:
             InputError: there is none and no default.
         """
-        found = self.find(element, *tags)
-        text = "" if found is None else (found.text or "").strip()
+        result = self.find(element, *tags)
+        text = "" if result is None else (result.text or "").strip()
         if text or default is not None:
             return text or str(default)
         raise InputError(f"has no <{tags[0]}>", self.where(element))

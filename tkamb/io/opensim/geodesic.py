@@ -28,11 +28,20 @@ from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array
 from tkamb.io.opensim.plane_strings import dot, planar_starts
 
-ITERATIONS = 30
-TOLERANCE = 1e-11
-"""Of the direction in which the string arrives, rad."""
-PAST = 0.05
-"""Of the same: below, a string that arrives backwards is one that has gone too far."""
+
+@dataclass(frozen=True)
+class GeodesicSettings:
+    """The Newton iteration for a geodesic between two points."""
+
+    max_iterations: int = 30
+    """Newton steps, after which a string without convergence fails."""
+    tolerance: float = 1e-11
+    """rad; error of the direction in which the string arrives."""
+    overshoot_below: float = 0.05
+    """rad; at a smaller error, a string that arrives backwards has gone too far."""
+
+
+GEODESIC = GeodesicSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,19 +79,19 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
     contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)
     rows = np.concatenate([np.arange(count), np.flatnonzero(rival)])
     second = np.append(np.zeros(count, int), np.ones(len(rows) - count, int))
-    found = _taut(start[rows], end[rows], axes, contour[rows, second], pieces[rows, second])
-    converged = found.converged
+    result = _taut(start[rows], end[rows], axes, contour[rows, second], pieces[rows, second])
+    converged = result.converged
     if half is not None:
-        converged = converged & ((found.entry + found.exit) @ half > 0.0)
+        converged = converged & ((result.entry + result.exit) @ half > 0.0)
     lengths = np.full((count, 2), np.inf)
-    lengths[rows, second] = np.where(converged, found.length_m, np.inf)
+    lengths[rows, second] = np.where(converged, result.length_m, np.inf)
     place = np.column_stack([np.arange(count), count + np.cumsum(rival) - 1])
     chosen = np.where(lengths[:, 1] < lengths[:, 0], place[:, 1], place[:, 0])
     return Strings(
-        found.entry[chosen],
-        found.exit[chosen],
-        found.arc_m[chosen],
-        found.length_m[chosen],
+        result.entry[chosen],
+        result.exit[chosen],
+        result.arc_m[chosen],
+        result.length_m[chosen],
         converged[chosen],
     )
 
@@ -103,7 +112,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
     limit = 0.3 * axes.max()
     entry, leave = np.empty_like(start), np.empty_like(start)
     waiting = np.arange(len(p))
-    for _ in range(ITERATIONS):
+    for _ in range(GEODESIC.max_iterations):
         turned = angle[waiting]
         shot = _Shot(
             start[waiting], end[waiting], axes, hub[waiting], radial[waiting], sideways[waiting]
@@ -112,13 +121,13 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
             turned, arc[waiting, None] * shares[waiting]
         )
         small = np.abs(residual).max(axis=1)
-        done = (small < TOLERANCE) & (ahead > 0.0)
+        done = (small < GEODESIC.tolerance) & (ahead > 0.0)
         converged[waiting[done]] = True
         if done.all():
             break
         step = -np.linalg.solve(jacobian[~done], residual[~done][..., None])[..., 0]
         # a string that would turn back has gone past where it leaves, by as far as it must return
-        past = ((small < PAST) & (ahead <= 0.0))[~done]
+        past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~done]
         step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~done][past]])
         waiting = waiting[~done]
         # A long step is cut short: far from the solution the derivatives mislead.
@@ -126,7 +135,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
         share = np.minimum(share, limit / np.maximum(np.abs(step[:, 1]), 1e-300))
         angle[waiting] += share * step[:, 0]
         arc[waiting] = np.maximum(arc[waiting] + share * step[:, 1], -limit)
-    converged &= arc > -TOLERANCE
+    converged &= arc > -GEODESIC.tolerance
     straight = np.linalg.norm(entry - start, axis=1) + np.linalg.norm(end - leave, axis=1)
     return Strings(entry, leave, arc, straight + arc, converged)
 

@@ -11,10 +11,21 @@ from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates
 from tkamb.io.recordings.tables import Table
 from tkamb.units import DEGREE
 
-MOST_RADIANS = 6.5
-"""A joint's angle never exceeds a whole turn, 6.28; in degrees most movements do."""
-LEAST_TURN_DEG = 0.2
-"""What turns by less in a whole recording stands still, in degrees and in radians."""
+
+@dataclass(frozen=True)
+class AngleUnitSettings:
+    """How angles in degrees are told from angles in radians."""
+
+    max_radians: float = 6.5
+    """rad; largest joint angle that is read as radians. A joint never exceeds a whole turn, 6.28;
+    in degrees most movements do."""
+    min_rotation_deg: float = 0.2
+    """deg; a joint that rotates by less in a whole recording stands still, in either unit."""
+    max_angle: float = 2.0 * np.pi
+    """rad; no joint of a leg rotates further."""
+
+
+ANGLE_UNIT = AngleUnitSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +45,6 @@ class CoordinateMotion:
     accelerations: Array
 
 
-LARGEST_ANGLE = 2.0 * np.pi
-"""rad; no joint of a leg turns further."""
-
-
 def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tuple[str, ...]]:
     """Return coordinates (f, n) rad and m, and those that a `.mot` or `.sto` does not hold.
 
@@ -52,9 +59,9 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
     """
     model = kinematics.model
     q = np.tile(kinematics.vector({}), (recorded.rows, 1))
-    found = {name: _column_of(name, recorded) for name in model.coordinates}
-    missing = tuple(name for name, column in found.items() if column is None)
-    columns = {name: recorded.complete_column(c) for name, c in found.items() if c is not None}
+    result = {name: _column_of(name, recorded) for name in model.coordinates}
+    missing = tuple(name for name, column in result.items() if column is None)
+    columns = {name: recorded.complete_column(c) for name, c in result.items() if c is not None}
     angles = {name: v for name, v in columns.items() if model.coordinates[name].rotational}
     scale = _angle_scale(angles, recorded) if angles else 1.0
     for name, values in columns.items():
@@ -89,18 +96,18 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
     largest = max(float(np.abs(values).max()) for values in angles.values())
     worst = max(angles, key=lambda name: np.abs(angles[name]).max())
     if recorded.in_degrees is None:
-        likely = "yes" if largest > MOST_RADIANS else "no (radians) or inDegrees=yes"
+        likely = "yes" if largest > ANGLE_UNIT.max_radians else "no (radians) or inDegrees=yes"
         raise InputError(
             f"does not say inDegrees ('{worst}' reaches {largest:.3g})",
             recorded.path,
             f"add the line inDegrees={likely} above its endheader",
         )
-    if not recorded.in_degrees and largest > MOST_RADIANS:
+    if not recorded.in_degrees and largest > ANGLE_UNIT.max_radians:
         raise InputError(
             f"says inDegrees=no, but '{worst}' reaches {largest:.4g}, which no joint does in "
             "radians",
             recorded.path,
-            "is it in degrees? then write inDegrees=yes",
+            "write inDegrees=yes where it is in degrees",
         )
     return DEGREE if recorded.in_degrees else 1.0
 
@@ -116,8 +123,8 @@ def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str,
     coordinates = kinematics.model.coordinates
     own = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
     turns = np.ptp(q[:, own], axis=0) / DEGREE
-    small = np.abs(q[:, own]).max() < MOST_RADIANS * DEGREE
-    if recorded.in_degrees and small and turns.max() > LEAST_TURN_DEG:
+    small = np.abs(q[:, own]).max() < ANGLE_UNIT.max_radians * DEGREE
+    if recorded.in_degrees and small and turns.max() > ANGLE_UNIT.min_rotation_deg:
         return (
             "ATTENTION: by inDegrees=yes no joint of the whole motion bends or turns by more than "
             f"{turns.max():.2g} deg: is it in radians?",

@@ -27,11 +27,19 @@ from tkamb.io.opensim.strings import strings_over
 from tkamb.io.opensim.tension import StraightParts, Tension
 from tkamb.io.opensim.wrapping import Index
 
-CONDITION_SLACK = 1e-5
-"""rad or m by which OpenSim widens the range of a conditional point."""
 
-FRAMES_AT_ONCE = 256
-"""Keeps the arrays of one evaluation to some tens of megabytes."""
+@dataclass(frozen=True)
+class PathSettings:
+    """How the paths of muscles and ligaments are evaluated."""
+
+    condition_tolerance: float = 1e-5
+    """rad or m; OpenSim widens the range of a conditional point by as much."""
+    block_frames: int = 256
+    """Frames that are evaluated in one call; keeps arrays to some tens of megabytes and changes no
+    result."""
+
+
+PATH = PathSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +137,8 @@ class LineSet:
     def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
         """Yield (first, q (f, n)) of a few frames at a time."""
         flat = q.reshape(-1, q.shape[-1])
-        for first in range(0, len(flat), FRAMES_AT_ONCE):
-            yield first, flat[first : first + FRAMES_AT_ONCE]
+        for first in range(0, len(flat), PATH.block_frames):
+            yield first, flat[first : first + PATH.block_frames]
 
     def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
         """Return chunks (f, m, ...) put together again, with the leading shape of q."""
@@ -195,7 +203,9 @@ class LineSet:
             if isinstance(point, ConditionalPathPoint):
                 value = q[:, self.kinematics.coordinates[point.coordinate]]
                 low, high = point.range
-                active = (value >= low - CONDITION_SLACK) & (value <= high + CONDITION_SLACK)
+                active = (value >= low - PATH.condition_tolerance) & (
+                    value <= high + PATH.condition_tolerance
+                )
                 follower[:, k] = np.where(active, upcoming, -1)
                 upcoming = np.where(active, k, upcoming)
             else:
@@ -228,5 +238,5 @@ class LineSet:
         start, end = work.points[rows, k], work.points[rows, there]
         ends = np.stack([np.full(len(rows), self._body[k]), self._body[there]], axis=1)
         moves = ends[:, None, :] != np.array(bodies)[:, None]
-        found = strings_over(wraps, poses, start, end, allowed, moves)
-        work.pull_wrapped(rows, k, there, found, np.array(bodies))
+        result = strings_over(wraps, poses, start, end, allowed, moves)
+        work.pull_wrapped(rows, k, there, result, np.array(bodies))

@@ -11,18 +11,31 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 
-STEPS = 6
-"""Runge-Kutta steps along a geodesic."""
 
-RIVAL = 0.1
-"""Share of its arc by which a plane string may be longer and still lead to the shortest one."""
+@dataclass(frozen=True)
+class PlaneStringSettings:
+    """Initial guesses of a string around an ellipsoid or torus, in planes through its end
+    points."""
 
-PLANES = 24
-"""Planes through both points that are tried for the start."""
+    runge_kutta_steps: int = 6
+    """Runge-Kutta steps along a geodesic of an initial guess."""
+    rival_share: float = 0.1
+    """Share of its arc by which a plane string may be longer than the shortest and is still tried:
+    it may lead to the shortest geodesic."""
+    planes: int = 24
+    """Planes through both points that are tried."""
+
+
+PLANE_STRING = PlaneStringSettings()
+
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-_FINE = (((2.0 * np.arange(STEPS) + 1.0)[:, None] + _NODES) / STEPS - 1.0).ravel()
-_FINE_WEIGHTS = _WEIGHTS / STEPS
+_FINE = (
+    ((2.0 * np.arange(PLANE_STRING.runge_kutta_steps) + 1.0)[:, None] + _NODES)
+    / PLANE_STRING.runge_kutta_steps
+    - 1.0
+).ravel()
+_FINE_WEIGHTS = _WEIGHTS / PLANE_STRING.runge_kutta_steps
 _NODES, _COARSE_WEIGHTS = np.polynomial.legendre.leggauss(6)
 _COARSE, _ENDS = _NODES, np.array([-1.0, 1.0])
 """Places on an arc, -1 to 1: for its length in each step, for its whole, and its ends."""
@@ -59,10 +72,10 @@ def planar_starts(
     lower[rows, best] = False
     others = np.where(lower, lengths, np.inf)
     other = others.argmin(axis=1)
-    rival = others[rows, other] - lengths[rows, best] < RIVAL * arcs[rows, other]
+    rival = others[rows, other] - lengths[rows, best] < PLANE_STRING.rival_share * arcs[rows, other]
     chosen = np.column_stack([best, other])
     speeds = planes.chosen(rows[:, None], chosen).speeds(_FINE, axes)
-    pieces = speeds.reshape(len(p), 2, STEPS, -1) @ _FINE_WEIGHTS
+    pieces = speeds.reshape(len(p), 2, PLANE_STRING.runge_kutta_steps, -1) @ _FINE_WEIGHTS
     return points[rows[:, None], chosen, 0], pieces, rival
 
 
@@ -96,7 +109,7 @@ class _Planes:
         spare = spare - dot(spare, along)[:, None] * along
         first = unit(np.where(offset[:, None] > 1e-9, middle, spare))
         second = np.cross(along, first)
-        angles = 2.0 * np.pi * np.arange(PLANES)[:, None] / PLANES
+        angles = 2.0 * np.pi * np.arange(PLANE_STRING.planes)[:, None] / PLANE_STRING.planes
         outward = np.cos(angles) * first[:, None] + np.sin(angles) * second[:, None]
         height = offset[:, None] * np.cos(angles[:, 0])
         radius = np.sqrt(np.maximum(1.0 - (offset[:, None] * np.sin(angles[:, 0])) ** 2, 1e-12))

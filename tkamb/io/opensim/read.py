@@ -8,6 +8,7 @@ and the like that play no part here are listed in `left_out`.
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,12 +37,18 @@ UNITS = {
 }
 """Spellings of metre and newton in public models."""
 
-OLDEST_VERSION = 20302
-"""Of OpenSim 2.3.2; what is older names things differently."""
+
+@dataclass(frozen=True)
+class ModelReadSettings:
+    """Which OpenSim models are read, and how."""
+
+    oldest_version: int = 20302
+    """Version number of OpenSim 2.3.2; older files name things differently."""
+    massless_below: float = 2e-14
+    """kg; a body of less has no inertia, whatever the file says (OpenSim's Body::getInertia)."""
 
 
-MASSLESS = 2e-14
-"""kg; a body of less has no inertia, whatever the file says (OpenSim's Body::getInertia)."""
+MODEL_READ = ModelReadSettings()
 
 
 def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
@@ -117,17 +124,18 @@ def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element
     if root.tag != "OpenSimDocument" or model is None:
         raise InputError(f"is not an OpenSim model: its root is <{root.tag}>", path)
     version = root.get("Version", "")
-    if not version.isdigit() or int(version) < OLDEST_VERSION:
+    if not version.isdigit() or int(version) < MODEL_READ.oldest_version:
         raise InputError(
-            f"has Version '{version}', {OLDEST_VERSION} (OpenSim 2.3.2) is the oldest that is read",
+            f"has Version '{version}'; the oldest that is read is {MODEL_READ.oldest_version} "
+            "(OpenSim 2.3.2)",
             path,
             "open it in OpenSim 3.3 or 4 and save it",
         )
     for tag, units in UNITS.items():
-        found = (model.findtext(tag) or units[0]).strip()
-        if found.lower() not in (*units, ""):
+        result = (model.findtext(tag) or units[0]).strip()
+        if result.lower() not in (*units, ""):
             hint = "scale the model to metres and newtons in OpenSim"
-            raise InputError(f"has {tag} '{found}', only '{units[0]}' is read", path, hint)
+            raise InputError(f"has {tag} '{result}', only '{units[0]}' is read", path, hint)
     defaults = root.find("defaults")
     defaults = model.find("defaults") if defaults is None else defaults
     by_class = {} if defaults is None else {e.tag: e for e in defaults}
@@ -147,7 +155,11 @@ def _bodies(document: Document, model: Element) -> dict[str, Body]:
             centre = document.numbers(element, "mass_center", count=3, default="0 0 0")
             if mass < 0.0:
                 raise InputError(f"has a mass of {mass:g} kg", document.where(element))
-            inertia = _inertia(document, element) if mass > MASSLESS else np.zeros((3, 3))
+            inertia = (
+                _inertia(document, element)
+                if mass > MODEL_READ.massless_below
+                else np.zeros((3, 3))
+            )
             bodies[name] = Body(name, mass, centre, inertia)
     if not bodies:
         raise InputError("has no bodies", document.path)

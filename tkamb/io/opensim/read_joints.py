@@ -120,11 +120,11 @@ def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
 
 def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
     """Return name -> stations and markers of that name, wherever they stand."""
-    found: dict[str, list[Element]] = {}
+    result: dict[str, list[Element]] = {}
     for element in model.iter():
         if element.tag in ("Station", "Marker"):
-            found.setdefault(element.get("name", ""), []).append(element)
-    return found
+            result.setdefault(element.get("name", ""), []).append(element)
+    return result
 
 
 def _station_defined(

@@ -53,14 +53,14 @@ def read_wrap_objects(document: Document, model: Element) -> dict[str, WrapObjec
     Raises:
         InputError: a shape that is not read, a dimension that is not positive.
     """
-    found: dict[str, WrapObject] = {}
+    result: dict[str, WrapObject] = {}
     ground = [] if (element := model.find("Ground")) is None else [element]
     for body in (*ground, *document.objects(model, "BodySet")):
         for entry in document.objects(body, "WrapObjectSet"):
             with document.reading(entry):
                 wrap = _wrap_object(document, entry, document.name(body))
-                found.setdefault(wrap.name, wrap)
-    return found
+                result.setdefault(wrap.name, wrap)
+    return result
 
 
 def _wrap_object(document: Document, entry: Element, body: str) -> WrapObject:

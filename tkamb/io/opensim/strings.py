@@ -13,12 +13,20 @@ from tkamb.geometry.frames import Array, inverse
 from tkamb.io.opensim.lines import WrapObject
 from tkamb.io.opensim.wrapping import Index, Mask, Touch, touch
 
-SWEEPS = 100
-LONGEST_LEAP = 10.0
-"""Times the last step: beyond that two sweeps say little about where they lead."""
 
-TAUT = 1e-10
-"""m: what the last sweep may still move a touching point."""
+@dataclass(frozen=True)
+class StringSettings:
+    """The shortest string over several wrap objects, object by object."""
+
+    max_sweeps: int = 100
+    """Sweeps over all objects, after which a string without convergence is reported as failed."""
+    max_extrapolation: float = 10.0
+    """Times the last step; two sweeps say little about places farther ahead."""
+    tolerance: float = 1e-10
+    """m; a string has converged when the last sweep moves no touching point by more."""
+
+
+STRING = StringSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +73,13 @@ def strings_over(
     live = np.arange(len(start))
     point, order = strings.places(), strings.order.copy()
     value = residual = np.full_like(point, np.nan)
-    for _ in range(SWEEPS):
+    for _ in range(STRING.max_sweeps):
         strings.sweep(live, allowed)
         same = (strings.order == order).all(axis=1)
         order, (last_value, last_residual) = strings.order.copy(), (value, residual)
         value = strings.places()
         residual = np.where(same[:, None], value - point, np.nan)
-        live = live[~(np.abs(residual[live]).max(axis=1) < TAUT)]
+        live = live[~(np.abs(residual[live]).max(axis=1) < STRING.tolerance)]
         if not len(live):
             break
         point = value.copy()
@@ -89,7 +97,7 @@ def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array
     change = residual - last_residual
     squared = np.maximum((change**2).sum(axis=1), 1e-300)
     share = (residual * change).sum(axis=1) / squared
-    sound = np.abs(share) < LONGEST_LEAP
+    sound = np.abs(share) < STRING.max_extrapolation
     leap = -np.where(sound, share, 0.0)[:, None] * (value - last_value)
     return np.where(sound[:, None], leap, 0.0)
 
@@ -147,9 +155,9 @@ class _Strings:
             is_end = np.stack([np.full(len(free), gap == 0), last], axis=1)
             back = self.back[free, w]
             moves = self.moves[free, w] & is_end
-            found = touch(self.wraps[w], _moved(back, before), _moved(back, after), moves)
-            self._touch(w, gap, free[found.touches], found)
-            free = free[~found.touches]
+            result = touch(self.wraps[w], _moved(back, before), _moved(back, after), moves)
+            self._touch(w, gap, free[result.touches], result)
+            free = free[~result.touches]
 
     def _touch(self, w: int, gap: int, rows: Index, found: Touch) -> None:
         on, poses = found.touches, self.poses[rows, w]

@@ -31,12 +31,19 @@ from tkamb.io.opensim.geodesic import shortest_strings
 from tkamb.io.opensim.lines import WrapObject
 from tkamb.io.opensim.plane_strings import dot, unit
 
-RING_PLACES = 48
-"""Places around a torus's ring that are tried for where the string presses it."""
+
+@dataclass(frozen=True)
+class WrapSettings:
+    """How a string is laid around a single wrap object."""
+
+    ring_places: int = 48
+    """Places around a torus's ring that are tried for where the string presses against it."""
+    ellipsoid_clearance: float = 1e-3
+    """Share of its size by which an ellipsoid keeps clear of a point that moves into it."""
 
 
-CLEARANCE = 1e-3
-"""Share of its size by which an ellipsoid keeps clear of a point that moves into it."""
+WRAP = WrapSettings()
+
 
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
@@ -181,12 +188,12 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
         frame = np.stack([inward, up, np.cross(inward, up)], axis=1)
         centre = -ring * inward
         here, there = (np.einsum("fij,fj->fi", frame, p - centre) for p in (start, end))
-        found = _cylinder(here, there, tube, np.inf, (0, 1))
-        wrapped = np.linalg.norm(found.entry - here, axis=1) + found.arc_m
-        wrapped += np.linalg.norm(there - found.exit, axis=1)
-        return found, np.where(found.touches, wrapped, -np.inf), frame
+        result = _cylinder(here, there, tube, np.inf, (0, 1))
+        wrapped = np.linalg.norm(result.entry - here, axis=1) + result.arc_m
+        wrapped += np.linalg.norm(there - result.exit, axis=1)
+        return result, np.where(result.touches, wrapped, -np.inf), frame
 
-    tried = 2.0 * np.pi * np.arange(RING_PLACES) / RING_PLACES
+    tried = 2.0 * np.pi * np.arange(WRAP.ring_places) / WRAP.ring_places
     lengths = np.stack([at(np.full(len(start), place))[1] for place in tried])
     low = tried[lengths.argmax(axis=0)] - tried[1]
     high = low + 2.0 * tried[1]
@@ -195,11 +202,11 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
         left, right = high - golden * (high - low), low + golden * (high - low)
         shorter = at(left)[1] < at(right)[1]
         low, high = np.where(shorter, left, low), np.where(shorter, high, right)
-    found, lengths, frame = at(0.5 * (low + high))
+    result, lengths, frame = at(0.5 * (low + high))
     centre = -ring * frame[rows, 0]
-    entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (found.entry, found.exit))
-    touches = found.touches & np.isfinite(lengths)
-    return Touch(touches, entry, leave, found.arc_m, _no_push(start))
+    entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (result.entry, result.exit))
+    touches = result.touches & np.isfinite(lengths)
+    return Touch(touches, entry, leave, result.arc_m, _no_push(start))
 
 
 def _ellipsoid(
@@ -208,7 +215,7 @@ def _ellipsoid(
     """Return strings around an ellipsoid: geodesics where the straight line would cut it."""
     p, q = start / axes, end / axes
     depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
-    size = np.where(moves, depth / (1.0 + CLEARANCE), 1.0).min(axis=1)
+    size = np.where(moves, depth / (1.0 + WRAP.ellipsoid_clearance), 1.0).min(axis=1)
     size = np.minimum(size, 1.0)
     step = q - p
     share = np.clip(-dot(p, step) / np.maximum(dot(step, step), 1e-300), 0.0, 1.0)
@@ -224,8 +231,10 @@ def _ellipsoid(
         arc[touches] = np.where(strings.converged, k[:, 0] * strings.arc_m, np.nan)
         first, last = (unit(v) for v in (strings.entry - here / k, there / k - strings.exit))
         growth = strings.length_m + (dot(here, first) - dot(there, last)) / k[:, 0]
-        yields = moves & (depth <= size[:, None] * (1.0 + CLEARANCE) * (1.0 + 1e-12))
+        yields = moves & (depth <= size[:, None] * (1.0 + WRAP.ellipsoid_clearance) * (1.0 + 1e-12))
         yields &= (size < 1.0)[:, None]
-        by_point = np.stack([p, q], axis=1) / (depth * (1.0 + CLEARANCE))[..., None] / axes
+        by_point = (
+            np.stack([p, q], axis=1) / (depth * (1.0 + WRAP.ellipsoid_clearance))[..., None] / axes
+        )
         push[touches] = -(growth[:, None] * yields[touches])[..., None] * by_point[touches]
     return Touch(touches, entry, leave, arc, push)

@@ -60,11 +60,11 @@ class AppliedPreset:
             f"(scene: {_words(change.before, 'not given')})"
             for change in self.changes
         )
-        found = [f"Run as {self.name} ({self.source}): {changed or 'the scene says so already'}."]
+        result = [f"Run as {self.name} ({self.source}): {changed or 'the scene says so already'}."]
         if self.overridden:
             kept = ", ".join(self.overridden)
-            found.append(f"Not as {self.name}, since the run was told otherwise: {kept}.")
-        return found + [f"Not as {self.name}: {words}." for words in self.departures]
+            result.append(f"Not as {self.name}, since the run was told otherwise: {kept}.")
+        return result + [f"Not as {self.name}: {words}." for words in self.departures]
 
 
 def _words(value: Any, none: str) -> str:
@@ -138,10 +138,10 @@ class Preset:
         )
 
     def _check_needs(self, content: Mapping[str, Any], where: object) -> None:
-        mend = "add what is missing to the scene, or run it without --as"
+        hint = "add what is missing to the scene, or run it without --as"
         lacking = self.lacks(content)
         if lacking:
-            raise InputError(f"preset '{self.name}' needs {lacking}", where, mend)
+            raise InputError(f"preset '{self.name}' needs {lacking}", where, hint)
         missing = [key for key in self.needs if not _value_at(content, key)]
         if missing:
             key = missing[0]
@@ -149,7 +149,7 @@ class Preset:
             raise InputError(
                 f"preset '{self.name}' needs [{key}]: {self.needs[key]}{more}",
                 where,
-                mend,
+                hint,
             )
 
 

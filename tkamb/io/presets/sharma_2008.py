@@ -65,15 +65,15 @@ class Sharma2008(Preset):
 
     def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
         """Return in words what of a scene differs from the study and stays."""
-        found = []
+        result = []
         kind = content["tibia"].get("kind")
         if kind != "sagittal":
-            found.append(f"the shank moves as recorded ([tibia] kind = '{kind}'), in 3D")
+            result.append(f"the shank moves as recorded ([tibia] kind = '{kind}'), in 3D")
         laws = {one.get("law") for one in content.get("ligament", ())} - {"two-line"}
         if laws:
-            found.append(f"ligaments follow the law {', '.join(sorted(map(repr, laws)))}")
+            result.append(f"ligaments follow the law {', '.join(sorted(map(repr, laws)))}")
         if content.get("generic_ligaments"):
-            found.append("ligaments are a generic set scaled to the implant")
+            result.append("ligaments are a generic set scaled to the implant")
         if not content.get("ligament") and not content.get("generic_ligaments"):
-            found.append("no ligaments are modelled")
-        return tuple(found)
+            result.append("no ligaments are modelled")
+        return tuple(result)

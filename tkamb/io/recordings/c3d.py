@@ -19,14 +19,22 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import TABLE_LIMIT, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.geometry.frames import Array
 from tkamb.io.recordings.c3d_file import EXPORT, C3dFile, Parameters, parse_c3d
 from tkamb.io.recordings.force_plates import CHANNELS, ForcePlate, PlateRecord, force_plate
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 
-LARGEST_VALUE = 1e12
-"""In any unit: what is larger was not measured, and its square may overflow."""
+
+@dataclass(frozen=True)
+class C3dValueSettings:
+    """Which values of a C3D file are measurements."""
+
+    max_value: float = 1e12
+    """Largest value in any unit: a larger one was not measured, and its square may overflow."""
+
+
+C3D_VALUE = C3dValueSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +129,8 @@ class Recording:
         if name in self.equal_channels:
             raise InputError(f"has two channels '{name}'", self.path, "rename one")
         if name not in self.channels:
-            mend = names_near(name, self.channels, "its channels")
-            raise InputError(f"has no channel '{name}'", self.path, mend)
+            hint = names_near(name, self.channels, "its channels")
+            raise InputError(f"has no channel '{name}'", self.path, hint)
         return self.channels[name]
 
     def check_markers(self) -> None:
@@ -154,7 +162,7 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
     """Read the file as it was at `changed`; markers and plates of one trial are asked apart."""
     with np.errstate(all="ignore"):  # damaged numbers overflow; they are gaps below
-        file = parse_c3d(read_bytes(path, TABLE_LIMIT), path)
+        file = parse_c3d(read_bytes(path, FILE_LIMITS.table_bytes), path)
         return _Reader(path, file, units).recording()
 
 
@@ -177,7 +185,7 @@ class _Reader:
         labels, equal = self._labels()
         scale = self._metres_per_unit()
         points, residual = self.file.points, self.file.residual
-        wild = ~(np.abs(points) < LARGEST_VALUE).all(axis=2)
+        wild = ~(np.abs(points) < C3D_VALUE.max_value).all(axis=2)
         points[wild], residual[wild] = np.nan, np.nan
         analog_rate, names, signals, units = self._analog(rate)
         plates = self._plates(names, signals, units, scale)
@@ -265,7 +273,7 @@ class _Reader:
         offset = np.concatenate([offset, np.zeros(count - len(offset))])
         factor = scale * (1.0 if general is None else general)
         signals = ((self.file.raw_analog - offset) * factor).T
-        signals[~(np.abs(signals) < LARGEST_VALUE)] = np.nan
+        signals[~(np.abs(signals) < C3D_VALUE.max_value)] = np.nan
         names = [name or f"channel {k}" for k, name in enumerate(names[:count], 1)]
         names += [f"channel {k}" for k in range(len(names) + 1, count + 1)]
         return rate * samples, names, signals, [*units[:count], *[""] * (count - len(units))]

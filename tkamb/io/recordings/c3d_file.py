@@ -105,8 +105,8 @@ class Parameters:
     def integers(self, name: str) -> list[int]:
         """Return whole numbers without sign, as counts are; empty without any."""
         value = self.numbers(name)
-        found: list[float] = [] if value is None else value.ravel(order="F").tolist()
-        return [int(v) & 0xFFFF if -32768 <= v < 0 else int(v) for v in found if math.isfinite(v)]
+        result: list[float] = [] if value is None else value.ravel(order="F").tolist()
+        return [int(v) & 0xFFFF if -32768 <= v < 0 else int(v) for v in result if math.isfinite(v)]
 
     def series(self, name: str) -> Array:
         """Return NAME, NAME2, ... in one row: each holds at most 255 values."""
@@ -115,11 +115,11 @@ class Parameters:
 
     def texts(self, name: str) -> list[str]:
         """Return NAME, NAME2, ... in one list, stripped."""
-        found: list[str] = []
+        result: list[str] = []
         for key in self._numbered(name):
             value = self.get(key)
-            found += value if isinstance(value, list) else []
-        return found
+            result += value if isinstance(value, list) else []
+        return result
 
     def _numbered(self, name: str) -> list[str]:
         keys = [k for k in (*self.values, *self.damaged) if k.startswith(name)]

@@ -24,12 +24,20 @@ from tkamb.io.recordings.recordings import EmgRecording
 from tkamb.io.recordings.samples import check_overlap
 from tkamb.io.recordings.tables import read_table
 
-ORDER = 2
-"""Of either filter, in each direction."""
-FLAT = 1e-9
-"""Of the largest value: a signal that departs less from its mean is the mean's round-off."""
-UNEVEN = 0.01
-"""Of the median step: by how much steps between samples may differ from it."""
+
+@dataclass(frozen=True)
+class EmgSettings:
+    """How a recorded EMG becomes an envelope."""
+
+    filter_order: int = 2
+    """Order of either Butterworth filter in each direction; it runs forward and backward."""
+    flat_share: float = 1e-9
+    """Share of the largest value; a signal that departs less from its mean holds round-off only."""
+    step_tolerance: float = 0.01
+    """Share of the median time step by which steps between samples may differ from it."""
+
+
+EMG = EmgSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,23 +78,23 @@ def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
     """
     time, signals = _signals(source)
     step = np.diff(time)
-    if len(step) < 2 or np.abs(step - np.median(step)).max() > UNEVEN * np.median(step):
+    if len(step) < 2 or np.abs(step - np.median(step)).max() > EMG.step_tolerance * np.median(step):
         raise InputError("has EMG that is not sampled evenly", source.file, "resample it")
     check_overlap(source.file, time + source.offset, motion, "[muscles.emg]")
     rate = len(step) / (time[-1] - time[0])
     values, normalised_by = {}, {}
     for channel, signal in signals.items():
         try:
-            found = envelope(signal, rate, source.cutoff, source.high_pass)
+            result = envelope(signal, rate, source.cutoff, source.high_pass)
         except InputError as error:
             raise InputError(
-                error.what, f"{source.file}: channel '{channel}'", error.mend
+                error.what, f"{source.file}: channel '{channel}'", error.hint
             ) from None
-        by = found.max() if source.normalised_by == "recording" else source.normalised_by[channel]
+        by = result.max() if source.normalised_by == "recording" else source.normalised_by[channel]
         normalised_by[channel] = float(by)
-        if not found.max() > FLAT * np.abs(signal).max():
+        if not result.max() > EMG.flat_share * np.abs(signal).max():
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
-        values[channel] = found / normalised_by[channel]
+        values[channel] = result / normalised_by[channel]
     muscles = {muscle: channel for channel, own in source.channels.items() for muscle in own}
     return Envelopes(source.file, time + source.offset, values, muscles, normalised_by)
 
@@ -131,7 +139,7 @@ def _low_passed(signal: Array, cutoff: float) -> Array:
     """
     mirrored = np.concatenate([signal, signal[-2:0:-1]])
     ratio = np.tan(np.pi * np.fft.rfftfreq(len(mirrored))) / np.tan(np.pi * cutoff)
-    spectrum = np.fft.rfft(mirrored) / (1.0 + ratio ** (2 * ORDER))
+    spectrum = np.fft.rfft(mirrored) / (1.0 + ratio ** (2 * EMG.filter_order))
     return np.fft.irfft(spectrum, len(mirrored))[: len(signal)]
 
 

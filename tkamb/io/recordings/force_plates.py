@@ -202,11 +202,11 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
     if record.given.moment is not None:
         scales[3:] = _given_moment(record)
     wrench = matrix @ record.signals
-    found = _wrench(2, wrench * scales[:, None], record.origin)
+    result = _wrench(2, wrench * scales[:, None], record.origin)
     if stated is None or np.allclose(stated, scales, rtol=1e-9):
-        return (*found, ())
+        return (*result, ())
     other = _wrench(2, wrench * stated[:, None], record.origin)
-    inside = [_on_plate(record.corners, *one) for one in (found, other)]
+    inside = [_on_plate(record.corners, *one) for one in (result, other)]
     if inside[0] == inside[1]:
         raise InputError(
             f"is of type {record.kind}, and its channels state another unit of moment than "
@@ -214,7 +214,7 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
             record.where,
             "state the unit with --moment-unit or [ground_reaction] moment_unit",
         )
-    return (*(found if inside[0] else other), ())
+    return (*(result if inside[0] else other), ())
 
 
 def _on_plate(corners: Array, force: Array, moment: Array) -> bool:
@@ -264,8 +264,8 @@ def _axes(corners: Array, where: str) -> Array:
 def _stated_scales(record: PlateRecord) -> Array | None:
     """Return SI per unit of six channels that state force and moment; None if one does not."""
     readers = (newtons,) * 3 + (newton_metres,) * 3
-    found = [read(unit) for read, unit in zip(readers, record.units, strict=False)]
-    return None if None in found or len(found) < 6 else np.array(found, float)
+    result = [read(unit) for read, unit in zip(readers, record.units, strict=False)]
+    return None if None in result or len(result) < 6 else np.array(result, float)
 
 
 def _given_moment(record: PlateRecord) -> float:
@@ -285,19 +285,19 @@ def _scales(record: PlateRecord) -> Array:
     scales = []
     for quantity, unit in zip(kinds, record.units, strict=False):
         scale = readers[quantity](unit)
-        said = given[quantity]
-        told = None if said is None else readers[quantity](said)
-        if said is not None and told is None:
-            raise InputError(f"'{said}' is no unit of it", keys[quantity], examples[quantity])
-        if scale is not None and told is not None and quantity != "l" and told != scale:
+        text = given[quantity]
+        stated = None if text is None else readers[quantity](text)
+        if text is not None and stated is None:
+            raise InputError(f"'{text}' is no unit of it", keys[quantity], examples[quantity])
+        if scale is not None and stated is not None and quantity != "l" and stated != scale:
             raise InputError(
-                f"has a channel in '{unit}', but {keys[quantity]} says '{said}'",
+                f"has a channel in '{unit}', but {keys[quantity]} says '{text}'",
                 record.where,
                 f"correct {keys[quantity]}",
             )
-        if scale is None and told is None:
+        if scale is None and stated is None:
             raise _no_unit(record, unit, keys[quantity], examples[quantity])
-        scales.append(told if scale is None else scale)
+        scales.append(stated if scale is None else scale)
     return np.array(scales, float)
 
 

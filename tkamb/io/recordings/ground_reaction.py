@@ -32,21 +32,30 @@ from tkamb.units import MILLIMETRE
 
 DIRECTIONS = ("forward", "upward", "rightward")
 """The laboratory's axes, for the reader: a file's own may be others."""
-LEVEL_TOLERANCE = 0.01
-"""m; a centre of pressure that rises by more than this is not on a level plate."""
+
+
+@dataclass(frozen=True)
+class GroundReactionSettings:
+    """How a measured ground reaction is read and checked."""
+
+    level_tolerance: float = 0.01
+    """m; a centre of pressure that rises by more is not on a level plate."""
+    window: float = 0.5
+    """s; samples farther from the frames than this do not reach them through the filter."""
+    moment_tolerance: float = 1e-6
+    """N·m; horizontal moments above this belong to a point other than the centre of pressure."""
+    max_ankle_distance: float = 0.5
+    """m; a centre of pressure farther from the ankle lies under no foot of that leg."""
+
+
+GROUND_REACTION = GroundReactionSettings()
+
 LARGEST = {"force": (20000.0, "N"), "moment": (1000.0, "N·m")}
 """Twice what a triple jumper's foot bears; many times any free moment, and plates that give it
 about their own origin stay below it."""
 ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
 """Of a component's own peak, of the whole force's, and m: as near to its neighbours' curve as the
 larger of the forces, or as the last, no sample is odd."""
-WINDOW = 0.5
-"""s: samples farther from the frames than this do not reach them through the filter."""
-FREE_MOMENT = 1e-6
-"""N·m: horizontal moments above this show a moment about another point than the centre of
-pressure."""
-FARTHEST_FROM_ANKLE = 0.5
-"""m; a centre of pressure farther from the ankle than this is under no foot of that leg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +134,14 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     _check_upward(force, source)
     loaded = force[:, 1] >= source.unloaded
     held, point = _own_points(recorded, loaded, path)
-    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
+    near = (stamps >= time[0] - GROUND_REACTION.window) & (
+        stamps <= time[-1] + GROUND_REACTION.window
+    )
     # of plates the wrench was recorded: their point is a quotient, which small forces shake
     points = None if from_plates else point[near]
     odd = _odd_samples(path, stamps[near], force[near], points, loaded[near])
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
-    if loaded.any() and np.abs(point[loaded, 1] - level).max() > LEVEL_TOLERANCE:
+    if loaded.any() and np.abs(point[loaded, 1] - level).max() > GROUND_REACTION.level_tolerance:
         raise InputError(
             "the centre of pressure leaves the plate's level while it is loaded",
             path,
@@ -175,7 +186,7 @@ def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> t
     A row with a full moment states it about its own point, wherever that is.
     """
     held = _hold_point(recorded.time, recorded.point, loaded, path)
-    aside = np.abs(recorded.moment[:, [0, 2]]) > FREE_MOMENT
+    aside = np.abs(recorded.moment[:, [0, 2]]) > GROUND_REACTION.moment_tolerance
     own: NDArray[np.bool_] = np.asarray(np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1))
     return held, np.where(own[:, None], recorded.point, held)
 
@@ -281,7 +292,7 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
     """
     away = (ground.point - ankle)[ground.loaded][:, [0, 2]]
     farthest = float(np.linalg.norm(away, axis=1).max(initial=0.0))
-    if farthest > FARTHEST_FROM_ANKLE:
+    if farthest > GROUND_REACTION.max_ankle_distance:
         raise InputError(
             f"the centre of pressure lies up to {farthest:.3g} m from the ankle",
             path,
@@ -349,7 +360,7 @@ def _read_plates(source: ForceRecording) -> RecordedReaction:
     plates = [recording.plate(number) for number in dict.fromkeys(source.plates)]
     rotation = laboratory_rotation(source.laboratory_axes, source.file)
     levels = [float((rotation @ plate.centre)[1]) for plate in plates]
-    if np.ptp(levels) > LEVEL_TOLERANCE:
+    if np.ptp(levels) > GROUND_REACTION.level_tolerance:
         raise InputError("the plates lie at different levels", source.file, "give them one by one")
     wrenches, drift = [], {}
     for plate in plates:

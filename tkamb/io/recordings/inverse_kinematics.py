@@ -21,11 +21,22 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 
-SETTLED = 1e-6
-"""Step (m and rad) below which a frame is solved."""
-NEAR = 0.1
-"""Step (m and rad) after which the residuals' curvature is taken in: Newton's method."""
-MOST_STEPS = 60
+
+@dataclass(frozen=True)
+class InverseKinematicsSettings:
+    """The fit of the poses of a leg to its markers, frame by frame."""
+
+    step_tolerance: float = 1e-6
+    """m and rad; a frame has converged when its step is smaller."""
+    newton_below: float = 0.1
+    """m and rad; after a step smaller than this the curvature of the residuals is taken in
+    (Newton's method, otherwise Gauss-Newton)."""
+    max_iterations: int = 60
+    """Iterations after which a frame without convergence fails."""
+
+
+INVERSE_KINEMATICS = InverseKinematicsSettings()
+
 
 State = TypeVar("State")
 Index = NDArray[np.intp]
@@ -91,7 +102,7 @@ class ChainFit(Generic[State]):
         state: where it stands.
         rms: (f,) m, over the markers that were seen; NaN where none was.
         distance: (f, m) m, of each marker; NaN where missing.
-        solved: (f,) whether the last step was below `SETTLED`.
+        solved: (f,) whether the last step was below `INVERSE_KINEMATICS.step_tolerance`.
         steps: of the iteration.
     """
 
@@ -118,11 +129,11 @@ def fit_chain(
     damping, last = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
     left, steps = np.arange(len(measured)), 0
     state, here = start, chain.normal(start, target, each)
-    while steps < MOST_STEPS:
-        step = _step(here.of(left), damping[left], last[left] < NEAR)
+    while steps < INVERSE_KINEMATICS.max_iterations:
+        step = _step(here.of(left), damping[left], last[left] < INVERSE_KINEMATICS.newton_below)
         trial = chain.moved(chain.chosen(state, left), step)
         size = np.abs(step).max(axis=1)
-        done = size < SETTLED
+        done = size < INVERSE_KINEMATICS.step_tolerance
         state = chain.replaced(state, left[done], chain.chosen(trial, np.flatnonzero(done)))
         left, size, steps = left[~done], size[~done], steps + 1
         if not len(left):

@@ -28,7 +28,7 @@ from tkamb.io.recordings.filtering import Cutoff, differentiate_poses
 from tkamb.io.recordings.inverse_kinematics import ChainFit, fit_chain
 from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.leg_chain import FLEXION, LegChain, LegState, Segment
-from tkamb.io.recordings.markers import WRONG_MARKERS, fit_seen, marker_trajectories
+from tkamb.io.recordings.markers import MARKER_FIT, fit_seen, marker_trajectories
 from tkamb.io.recordings.recordings import MarkerSet, MotionRecording, Side
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.io.recordings.tibia import BodyMotion
@@ -36,8 +36,18 @@ from tkamb.units import MILLIMETRE
 
 Method = Literal["segments", "chain"]
 KNEE_SEGMENTS = ("shank", "thigh")
-JOINT_APART = 0.1
-"""m; skin moves by a third of this at the hip, the other foot is farther."""
+
+
+@dataclass(frozen=True)
+class MarkerMotionSettings:
+    """The motion of a leg from markers."""
+
+    max_joint_gap: float = 0.1
+    """m; largest distance of a joint from where the markers show it. Skin moves by a third of this
+    at the hip; the other foot is farther."""
+
+
+MARKER_MOTION = MarkerMotionSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +190,7 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
                 recorded.path,
                 "check the labels in [motion.markers], or use another trial",
             )
-        if len(known) and np.median(known) > WRONG_MARKERS:
+        if len(known) and np.median(known) > MARKER_FIT.max_median_residual:
             raise InputError(
                 f"markers of the {name} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
                 recorded.path,
@@ -195,7 +205,7 @@ def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Ta
             continue
         ends = transform(poses[own.joined_to], own.joint) - transform(poses[own.name], own.centre)
         apart = np.linalg.norm(ends, axis=1)
-        if np.isfinite(apart).any() and np.nanmedian(apart) > JOINT_APART:
+        if np.isfinite(apart).any() and np.nanmedian(apart) > MARKER_MOTION.max_joint_gap:
             raise InputError(
                 f"markers of the {own.name} put its joint with the {own.joined_to} "
                 f"{np.nanmedian(apart) / MILLIMETRE:.0f} mm from where the {own.joined_to}'s do",

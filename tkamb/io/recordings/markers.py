@@ -4,6 +4,7 @@ The same marker is `R.Thigh.Superior`, `RThighSuperior`, `JW:RThighSuperior`.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,16 @@ from tkamb.io.recordings.recordings import ShankRecording
 from tkamb.io.recordings.tables import Table
 from tkamb.units import MILLIMETRE
 
-WRONG_MARKERS = 0.05
-"""m; a median residual above this is a wrong marker, unit or set, not soft tissue."""
+
+@dataclass(frozen=True)
+class MarkerFitSettings:
+    """When fitted markers are refused."""
+
+    max_median_residual: float = 0.05
+    """m; a larger median residual shows a wrong marker, unit or set, not soft tissue."""
+
+
+MARKER_FIT = MarkerFitSettings()
 
 
 def plain_label(label: str) -> str:
@@ -34,12 +43,12 @@ def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str
     plain: dict[str, list[str]] = {}
     for label in labels:
         plain.setdefault(plain_label(label), []).append(label)
-    found = {}
+    result = {}
     for name in names:
         candidates = [name] if name in labels else plain.get(plain_label(name), [])
         if len(candidates) == 1:
-            found[name] = candidates[0]
-    return found
+            result[name] = candidates[0]
+    return result
 
 
 def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) -> Array:
@@ -86,7 +95,7 @@ def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]
 def check_fit(residual: Array, what: str, recorded: Table) -> None:
     """Raise InputError if a fit is so poor that markers or units must be wrong."""
     known = residual[np.isfinite(residual)]
-    if len(known) and np.median(known) > WRONG_MARKERS:
+    if len(known) and np.median(known) > MARKER_FIT.max_median_residual:
         raise InputError(
             f"{what} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
             recorded.path,

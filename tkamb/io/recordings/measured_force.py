@@ -13,8 +13,17 @@ from tkamb.io.recordings.tables import Table, read_table
 
 FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
 """Newton per unit of force; lbf: 0.45359237 kg x 9.80665 m/s²."""
-WIDEST_STEP = 2.5
-"""Times the median step: between samples further apart nothing is interpolated."""
+
+
+@dataclass(frozen=True)
+class ForceSampleSettings:
+    """Between which samples of a measured force is interpolated."""
+
+    max_gap: float = 2.5
+    """Times the median step; in a wider gap nothing is interpolated."""
+
+
+FORCE_SAMPLES = ForceSampleSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +51,7 @@ class MeasuredForce:
         step = np.diff(self.time)
         right = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
         known = (time >= self.time[0]) & (time <= self.time[-1])
-        known &= step[right - 1] <= WIDEST_STEP * np.median(step)
+        known &= step[right - 1] <= FORCE_SAMPLES.max_gap * np.median(step)
         return {
             name: np.where(known, np.interp(time, self.time, values), np.nan)
             for name, values in self.force.items()

@@ -13,16 +13,27 @@ from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import BoundaryLoop, boundary_loops, separate_bodies
 from tkamb.io.recordings.meshes import (
     BONE_SIZE,
-    SHEET_WIDTH,
+    MESH_FILE,
     Indices,
     plausible_units,
     read_triangles,
 )
 from tkamb.units import LENGTH
 
-_TYPICAL = 0.08
-_LEAST_SHARE = 0.12
-_MOST_LISTED = 10
+
+@dataclass(frozen=True)
+class MeshUnitSettings:
+    """How the unit of a mesh is recognized, and how many notices are listed."""
+
+    typical_size: float = 0.08
+    """m; largest extent of a typical component of a knee."""
+    min_size_share: float = 0.12
+    """Share of the largest mesh; a smaller one is in another unit."""
+    max_listed: int = 10
+    """Places of a fault that one message lists."""
+
+
+MESH_UNIT = MeshUnitSettings()
 
 
 @dataclass(frozen=True)
@@ -121,10 +132,13 @@ class MeshHealth:
     def _parts(self) -> list[str]:
         if len(self.bodies) < 2:
             return []
-        rest = len(self.bodies) - _MOST_LISTED
+        rest = len(self.bodies) - MESH_UNIT.max_listed
         return [
             f"  {len(self.bodies)} separate bodies; `tkamb mesh part FILE N --out F` writes one:",
-            *(f"    {n}: {b.line()}" for n, b in enumerate(self.bodies[:_MOST_LISTED], start=1)),
+            *(
+                f"    {n}: {b.line()}"
+                for n, b in enumerate(self.bodies[: MESH_UNIT.max_listed], start=1)
+            ),
             *([f"    and {rest} smaller"] if rest > 0 else []),
         ]
 
@@ -142,7 +156,9 @@ class MeshHealth:
         for hole in self.remaining_holes[:5]:
             where = ", ".join(f"{value:.4g}" for value in hole.centre)
             lines.append(f"  open: {hole.edges} edges, {hole.width:.3g} wide, at ({where})")
-        if self.remaining_holes and self.remaining_holes[0].width > SHEET_WIDTH * max(self.extents):
+        if self.remaining_holes and self.remaining_holes[0].width > MESH_FILE.sheet_opening * max(
+            self.extents
+        ):
             lines.append(
                 "  an open sheet, which no run takes as a part: give the whole closed part"
             )
@@ -224,7 +240,7 @@ def _measure(vertices: Array, faces: Indices) -> tuple[Array, list[str], float]:
     extents = np.ptp(vertices[faces.reshape(-1)], axis=0)
     longest = float(extents.max())
     units = plausible_units(longest) or plausible_units(longest, BONE_SIZE)
-    return extents, units, LENGTH[units[0]] if units else _TYPICAL / (longest or 1.0)
+    return extents, units, LENGTH[units[0]] if units else MESH_UNIT.typical_size / (longest or 1.0)
 
 
 def _bodies(mended: Repair, scale: float) -> tuple[Part, ...]:
@@ -258,7 +274,9 @@ def _flats(mended: Repair, name: str) -> tuple[FlatSide, ...]:
     for flat in find_flats(surface):
         tilt = np.degrees(np.arccos(min(np.abs(flat.normal).max(), 1.0)))
         sides.append(FlatSide(facing(flat.normal), flat.area / total, float(tilt)))
-    return tuple(side for side in sides if side.area_share > _LEAST_SHARE and side.tilt_deg < 30)
+    return tuple(
+        side for side in sides if side.area_share > MESH_UNIT.min_size_share and side.tilt_deg < 30
+    )
 
 
 def _count_noun(count: int, noun: str) -> str:

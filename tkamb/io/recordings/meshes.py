@@ -1,14 +1,14 @@
 """Mesh files into surfaces: SI units, anatomical axes, mended with a notice or refused."""
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.files import MESH_LIMIT, check_file
+from tkamb.files import FILE_LIMITS, check_file
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.inner_walls import InnerWall, find_inner_wall, touching_groups
@@ -28,17 +28,28 @@ IMPLANT_SIZE = (0.010, 0.250)
 BONE_SIZE = (0.010, 0.650)
 """m; least and greatest length of a bone at the knee, whole or in part."""
 
-SMALLEST_KNEE = 0.034
-"""m; no whole component of a person's knee is shorter (the smallest are 50 mm wide)."""
+
+@dataclass(frozen=True)
+class MeshFileSettings:
+    """Which meshes of components are used."""
+
+    min_size: float = 0.034
+    """m; no whole component of a knee is smaller. The smallest are 50 mm wide."""
+    rounding_notice: float = 1e-6
+    """m; a mesh whose coordinates are rounded more coarsely gets a notice: forces change by about
+    half a per cent."""
+    rounding_limit: float = 5e-6
+    """m; a mesh whose coordinates are rounded more coarsely is refused: 8 µm change forces by 4
+    %."""
+    sheet_opening: float = 1.0 / 3.0
+    """Share of a part's length; a wider opening makes the part an open sheet."""
+
+
+MESH_FILE = MeshFileSettings()
+
 USUAL_SIZE = (0.040, 0.120)
 """m; length of usual components, partial ones included."""
-ROUNDING_NOTICE = 1e-6
-"""m; a mesh rounded more coarsely gets a notice: forces change by about half a per cent."""
-ROUNDING_LIMIT = 5e-6
-"""m; a mesh rounded more coarsely is refused: 8 µm change forces by 4 %."""
 
-SHEET_WIDTH = 1.0 / 3.0
-"""An opening wider than this share of a part's length makes it a sheet."""
 
 _log = logging.getLogger("tkamb")
 
@@ -165,7 +176,7 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
 def _read_mesh(path: Path) -> tuple[Array, Indices]:
     """Return vertices and triangles of a mesh file; OBJ and PLY ones may hold polygons."""
     try:
-        check_file(path, MESH_LIMIT, what="mesh file")
+        check_file(path, FILE_LIMITS.mesh_bytes, what="mesh file")
         suffix = path.suffix.lower()
         if suffix == ".stl" and (corners := read_binary_stl(path)) is not None:
             return corners, np.arange(len(corners)).reshape(-1, 3)
@@ -203,7 +214,7 @@ def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> 
     if size != IMPLANT_SIZE:
         return fits
     usual = [unit for unit in fits if USUAL_SIZE[0] <= lengths[unit] <= USUAL_SIZE[1]]
-    return [unit for unit in fits if lengths[unit] >= SMALLEST_KNEE or not usual]
+    return [unit for unit in fits if lengths[unit] >= MESH_FILE.min_size or not usual]
 
 
 def body_size(body: Body, unit: float) -> str:
@@ -222,7 +233,7 @@ def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
     return text if more == 0 else f"{text}, and {more} more"
 
 
-_NO_TRIANGLES = "holds no triangles: is it cut short, or text?"
+_NO_TRIANGLES = "holds no triangles; it is cut short or no mesh: export it again"
 _FORMATS = "give an STL, OBJ, PLY or VTP file of triangles"
 _CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are closed for you"
 
@@ -255,7 +266,7 @@ def _check_part(
     Bodies that touch or overlap, on the two sides of a wall, are one.
     """
     extent = float(np.ptp(mended.vertices, axis=0).max())
-    if mended.holes and mended.holes[0].width > SHEET_WIDTH * extent:
+    if mended.holes and mended.holes[0].width > MESH_FILE.sheet_opening * extent:
         raise InputError(
             f"{name} is an open sheet, like a contact surface: its opening is "
             f"{mended.holes[0].width / MILLIMETRE:.3g} mm wide, so that nothing tells its inside "
@@ -321,7 +332,7 @@ def _check_size(
 def _check_knee_width(surface: Surface, path: str | Path) -> None:
     """Refuse a component with two condyles that no person's knee is small enough for."""
     extents = np.ptp(surface.bounds, axis=0)
-    if extents.max() < SMALLEST_KNEE and condyle_split(surface) is not None:
+    if extents.max() < MESH_FILE.min_size and condyle_split(surface) is not None:
         raise InputError(
             f"{surface.name} has two condyles and is {extents[2] / MILLIMETRE:.3g} mm wide, "
             "smaller than any person's knee",
@@ -340,14 +351,14 @@ def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> N
         name: of the part.
     """
     rounding = coordinate_rounding(corners) * LENGTH[unit]
-    if rounding <= ROUNDING_NOTICE:
+    if rounding <= MESH_FILE.rounding_notice:
         return
     far = float(np.abs(corners).max()) * LENGTH[unit] / MILLIMETRE
     words = (
         f"{name} lies {far:.3g} mm from the origin of its file, where coordinates are rounded to "
         f"{rounding / MILLIMETRE:.2g} mm"
     )
-    if rounding > ROUNDING_LIMIT:
+    if rounding > MESH_FILE.rounding_limit:
         raise InputError(
             words, path, "move it to the origin where it was made, and export it again"
         )

@@ -45,8 +45,18 @@ LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-
 FARTHEST_MM = (-200, 200)
 """The femoral origin lies within a hand's breadth of the insert; beyond, units are mistaken.
 So does the patella of the femoral origin."""
-LARGEST_TURN_DEG = 180
-"""Either way, of the patella on the femur."""
+
+
+@dataclass(frozen=True)
+class PatellaMotionSettings:
+    """Which recorded poses of the patella are plausible."""
+
+    max_rotation_deg: int = 180
+    """deg; largest rotation of the patella against the femur, either way."""
+
+
+PATELLA_MOTION = PatellaMotionSettings()
+
 FASTEST = {"turn": 100.0, "move": 10.0}
 """rad/s and m/s: five times the fastest kick, and more than noise makes of a recording."""
 ODD = {"turn": 0.5 * DEGREE, "move": 0.5 * MILLIMETRE}
@@ -162,13 +172,13 @@ def _from_markers(
             "[motion.markers]",
             "add it to coordinates, or let the knee find it: [contact] released",
         )
-    found = load_marker_motion(source, side, insert)
-    knee = found.coordinates.copy()
+    result = load_marker_motion(source, side, insert)
+    knee = result.coordinates.copy()
     for name in unrecorded:
         knee[:, KNEE_COORDINATES.index(name)] = 0.0
     _check_knee(knee, source.file)
-    motion = _differentiate(found.time, knee, None, source, source.file)
-    return replace(motion, unrecorded=unrecorded, markers=found)
+    motion = _differentiate(result.time, knee, None, source, source.file)
+    return replace(motion, unrecorded=unrecorded, markers=result)
 
 
 def _find_unrecorded(
@@ -268,7 +278,7 @@ def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
 
 def _check_patella(patella: Array, path: Path) -> None:
     """Raise where the patella's coordinates (n, 3) are nowhere near the femoral component."""
-    turn = (-LARGEST_TURN_DEG, LARGEST_TURN_DEG)
+    turn = (-PATELLA_MOTION.max_rotation_deg, PATELLA_MOTION.max_rotation_deg)
     for name, values, limits, unit, key in (
         ("patella_ap", patella[:, 0] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
         ("patella_si", patella[:, 1] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),

@@ -9,6 +9,7 @@ the femoral component. Any other link fixed to these may carry attachment points
 """
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,21 @@ from tkamb.io.recordings.urdf_check import (
     numbers_of,
 )
 
-PATELLA_MASS = 0.1
-"""kg, at the patella link's origin unless the URDF says otherwise."""
 
-PATELLA_RADIUS_OF_GYRATION = 0.015
-"""m: about that of a disc 40 mm across and 20 mm thick."""
+@dataclass(frozen=True)
+class PatellaLinkSettings:
+    """The patella of a patient whose URDF does not describe it, and the axes of its links."""
+
+    mass: float = 0.1
+    """kg; mass of the patella at its link's origin unless the URDF says otherwise."""
+    radius_of_gyration: float = 0.015
+    """m; about that of a disc 40 mm across and 20 mm thick."""
+    max_lateral_share: float = 0.5
+    """Share of a link's length by which its other end may lie beside the link's y axis, which
+    points up."""
+
+
+PATELLA_LINK = PatellaLinkSettings()
 
 
 THIGH = (0.2, 0.7)
@@ -43,9 +54,6 @@ SHANK = (0.15, 0.65)
 
 MOST_TURNED = np.radians(40.0)
 """rad, of the insert's axes from the tibia's: slope, torsion and varus of a deformed leg."""
-
-ASIDE = 0.5
-"""Of that distance: how far the other end may lie beside the link's y axis, which is upwards."""
 
 
 def load_urdf(patient: Patient, with_patella: bool) -> str:
@@ -120,18 +128,22 @@ def _mirror(robot: ElementTree.Element) -> None:
 def _check_places(robot: ElementTree.Element, path: Path) -> None:
     """Raise unless hip and insert lie where a leg has them, above femur and ankle."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
-    found = (
+    result = (
         ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),
         ("the origin of knee_ap", "tibia", _origin(joints["knee_ap"])[:3, 3], SHANK),
     )
-    for name, link, place, (low, high) in found:
+    for name, link, place, (low, high) in result:
         away = float(np.linalg.norm(place))
-        if not low <= away <= high or place[1] < 0 or np.hypot(*place[[0, 2]]) > ASIDE * away:
+        if (
+            not low <= away <= high
+            or place[1] < 0
+            or np.hypot(*place[[0, 2]]) > PATELLA_LINK.max_lateral_share * away
+        ):
             shown = ", ".join(f"{value:.4g}" for value in place)
             raise InputError(
                 f"{name} is at ({shown}) m in '{link}', {away:.4g} m from its origin",
                 path,
-                f"it must lie {low:g} to {high:g} m above it, along y: is it in metres?",
+                f"it must lie {low:g} to {high:g} m above it, along y, in metres",
             )
     turn = _origin(joints["knee_ap"])[:3, :3]
     if min(turn[0, 0], turn[1, 1]) < np.cos(MOST_TURNED):
@@ -156,8 +168,8 @@ def _complete_inertias(robot: ElementTree.Element, patient: Patient, with_patell
         assert patient.sex is not None
         _write_inertia(links[name], _segment(robot, name, patient.sex, patient))
     if with_patella and links["patella"].find("inertial") is None:
-        tensor = PATELLA_MASS * PATELLA_RADIUS_OF_GYRATION**2 * np.eye(3)
-        _write_inertia(links["patella"], RigidInertia(PATELLA_MASS, np.zeros(3), tensor))
+        tensor = PATELLA_LINK.mass * PATELLA_LINK.radius_of_gyration**2 * np.eye(3)
+        _write_inertia(links["patella"], RigidInertia(PATELLA_LINK.mass, np.zeros(3), tensor))
 
 
 def _segment(robot: ElementTree.Element, name: str, sex: Sex, patient: Patient) -> RigidInertia:

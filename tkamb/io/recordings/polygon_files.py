@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.files import MESH_LIMIT, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.geometry.frames import Array, Index
 
 Polygons = tuple[Array, Index, Index]
@@ -37,7 +37,7 @@ def read_obj(path: str | Path) -> Polygons:
         InputError: no such file.
         ValueError: a line cannot be understood; the words say which.
     """
-    text = read_bytes(path, MESH_LIMIT, what="mesh file").decode("latin-1")
+    text = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file").decode("latin-1")
     if "\\" in text:  # a line goes on in the next one
         text = text.replace("\\\r\n", " ").replace("\\\n", " ")
     vertices: list[tuple[float, ...]] = []
@@ -83,16 +83,16 @@ def read_ply(path: str | Path) -> Polygons:
         InputError: no such file.
         ValueError: it is no PLY file, or cut short, or holds triangle strips.
     """
-    content = read_bytes(path, MESH_LIMIT, what="mesh file")
+    content = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file")
     order, elements, start = _ply_header(content)
     if any(element.name == "tristrips" for element in elements):
         raise ValueError("it holds triangle strips")
     values = _ply_text if order == "" else _ply_binary
-    found = dict(values(content, start, elements, order))
-    if "vertex" not in found:
+    result = dict(values(content, start, elements, order))
+    if "vertex" not in result:
         raise ValueError("it has no vertices")
-    flat, _ = found["vertex"]
-    corners, ends = found.get("face", (np.zeros(0), np.zeros(0, np.int64)))
+    flat, _ = result["vertex"]
+    corners, ends = result.get("face", (np.zeros(0), np.zeros(0, np.int64)))
     return _checked(flat.reshape(-1, 3), corners, ends)
 
 

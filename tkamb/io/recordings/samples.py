@@ -14,14 +14,23 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
-AROUND = 12
-"""Samples on either side that show what is usual."""
-MANY_TIMES = 8.0
-"""Of the usual: normal noise reaches it once in 10 million samples."""
-SLOWEST = 5.0
-"""s: samples farther apart than this are no record of a movement."""
-AT_THE_ENDS = 4.0
-"""A cubic carried on by one sample errs by so much more than one between samples."""
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """How samples that were not measured are recognized."""
+
+    neighbours: int = 12
+    """Samples on either side that show what is usual."""
+    outlier_factor: float = 8.0
+    """Times the usual deviation: normal noise reaches it once in 10 million samples."""
+    max_step: float = 5.0
+    """s; samples farther apart are no record of a movement."""
+    end_factor: float = 4.0
+    """A cubic that is extrapolated by one sample has an error larger by this factor than one
+    between samples."""
+
+
+SAMPLE = SampleSettings()
 
 
 @dataclass(frozen=True)
@@ -61,8 +70,8 @@ def odd_samples(
         return ()
     away = np.abs(values - neighbours_curve(time, values))
     ends = np.ones(len(time))
-    ends[[0, 1, -2, -1]] = AT_THE_ENDS
-    limit = np.maximum(floor, MANY_TIMES * _usual(away / ends)) * ends
+    ends[[0, 1, -2, -1]] = SAMPLE.end_factor
+    limit = np.maximum(floor, SAMPLE.outlier_factor * _usual(away / ends)) * ends
     # An odd sample bends the curve of the four around it by two thirds and a sixth of itself.
     odd = [k for k in np.flatnonzero(away > limit) if away[k] >= away[max(k - 2, 0) : k + 3].max()]
     return tuple(OddSample(path, what, float(time[k]), float(away[k] / scale), unit) for k in odd)
@@ -85,7 +94,7 @@ def neighbours_curve(time: Array, values: Array) -> Array:
 
 def _usual(away: Array) -> Array:
     """Return the running median (n,) of the distances around each sample."""
-    width = min(2 * AROUND + 1, len(away))
+    width = min(2 * SAMPLE.neighbours + 1, len(away))
     windows = np.lib.stride_tricks.sliding_window_view(away, width)
     start = np.clip(np.arange(len(away)) - width // 2, 0, len(windows) - 1)
     return np.asarray(np.median(windows, axis=1)[start])
@@ -94,7 +103,7 @@ def _usual(away: Array) -> Array:
 def check_spacing(path: Path, time: Array) -> None:
     """Raise an InputError where the samples at (n,) s are too far apart to be a movement."""
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if spacing > SLOWEST:
+    if spacing > SAMPLE.max_step:
         raise InputError(
             f"samples are {spacing:g} s apart, too far to be a movement",
             path,

@@ -11,13 +11,25 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import TABLE_LIMIT, read_text
+from tkamb.files import FILE_LIMITS, read_text
 from tkamb.geometry.frames import Array
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 from tkamb.units import LENGTH
 
-TRC_ROUNDING_S = 1e-3
-"""Cameras write `.trc` times rounded to the millisecond; the header's rate is exact."""
+
+@dataclass(frozen=True)
+class TableValueSettings:
+    """Which numbers of a table are measurements."""
+
+    trc_time_rounding: float = 1e-3
+    """s; cameras write the times of a `.trc` rounded to the millisecond; the header's rate is
+    exact."""
+    max_value: float = 1e12
+    """Largest number in any unit: a larger one was not measured, and its square may overflow."""
+
+
+TABLE_VALUE = TableValueSettings()
+
 
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
@@ -25,8 +37,6 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 _OF_NUMBERS = "0123456789+-.eE "
 """What plain decimals are written with."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
-_LARGEST = 1e12
-"""Beyond any measurement and any clock: the square of a larger number may overflow."""
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
 
 
@@ -68,8 +78,8 @@ class Table:
         if name in self.equal:
             raise InputError(f"has two columns named '{name}'", self.path, "rename one")
         if name not in self.columns:
-            mend = names_near(name, self.columns, "its header")
-            raise InputError(f"has no column '{name}'", self.path, mend)
+            hint = names_near(name, self.columns, "its header")
+            raise InputError(f"has no column '{name}'", self.path, hint)
         return self.columns[name]
 
     def complete_column(self, name: str) -> Array:
@@ -120,8 +130,8 @@ class Table:
         unit = length_unit or self.length_unit
         if unit not in LENGTH:
             word = f"the unit '{self.unit_word}'" if self.unit_word else "no unit of length"
-            mend = f"give '{key}' in the scene, or --length-unit to an import: m, cm or mm"
-            raise InputError(f"states {word}", self.path, mend)
+            hint = f"give '{key}' in the scene, or --length-unit to an import: m, cm or mm"
+            raise InputError(f"states {word}", self.path, hint)
         if length_unit and self.length_unit and length_unit != self.length_unit:
             raise InputError(
                 f"is in {self.length_unit} by its own header, but the scene says {length_unit}",
@@ -168,7 +178,7 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text file that is no larger than a table may be."""
-    return read_text(path, TABLE_LIMIT, "utf-8-sig").splitlines()
+    return read_text(path, FILE_LIMITS.table_bytes, "utf-8-sig").splitlines()
 
 
 def read_csv(path: Path) -> Table:
@@ -187,8 +197,8 @@ def read_csv(path: Path) -> Table:
     names = [name.strip().strip('"') for name in rows[0][1]]
     for sign, word in ((";", "semicolons"), ("\t", "tabs")):
         if len(names) == 1 and sign in names[0]:
-            mend = "save it with commas between the cells and points in the numbers"
-            raise InputError(f"has {word} between its cells, not commas", path, mend)
+            hint = "save it with commas between the cells and points in the numbers"
+            raise InputError(f"has {word} between its cells, not commas", path, hint)
     body = [
         (number, cells if any(map(str.strip, cells[len(names) :])) else cells[: len(names)])
         for number, cells in rows[1:]
@@ -202,7 +212,9 @@ def read_storage(path: Path) -> Table:
     lines = read_lines(path)
     ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
     if not ends:
-        raise InputError("has no 'endheader' line", path, "is it an OpenSim storage file?")
+        raise InputError(
+            "has no 'endheader' line", path, "give an OpenSim storage file (.mot or .sto)"
+        )
     header = {}
     for line in lines[: ends[0]]:
         key, _, value = line.partition("=")
@@ -345,7 +357,7 @@ def _exact_time(time: Array, frame: Array, rate: str) -> Array:
         return time
     even = (frame - frame[0]) * period
     even = even + (time - even).mean()
-    return even if np.abs(even - time).max() <= TRC_ROUNDING_S else time
+    return even if np.abs(even - time).max() <= TABLE_VALUE.trc_time_rounding else time
 
 
 def _columns(
@@ -361,8 +373,8 @@ def _columns(
             wrong = f"line {number} has {len(cells)} cells, the header {len(names)}"
             raise InputError(wrong, path, _why_uneven(cells, names))
         values[k] = _row(cells, path, number)
-    found = {name: values[:, k].copy() for k, name in enumerate(names) if counts[name] == 1}
-    return found, tuple(sorted(name for name, count in counts.items() if count > 1))
+    result = {name: values[:, k].copy() for k, name in enumerate(names) if counts[name] == 1}
+    return result, tuple(sorted(name for name, count in counts.items() if count > 1))
 
 
 def _of_equal(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -374,7 +386,7 @@ def _row(cells: list[str], path: Path, line: int) -> list[float]:
         # The whole row at once is quicker; what is no number after all gets its message below.
         with contextlib.suppress(ValueError):
             numbers = [float(cell) for cell in cells]
-            if max(numbers) <= _LARGEST and min(numbers) >= -_LARGEST:
+            if max(numbers) <= TABLE_VALUE.max_value and min(numbers) >= -TABLE_VALUE.max_value:
                 return numbers
     return [_number(cell, path, line) for cell in cells]
 
@@ -389,11 +401,11 @@ def _number(cell: str, path: Path, line: int) -> float:
         raise InputError(f"line {line} holds '{text}', which is no number", path, plain)
     number = float(text)
     if math.isinf(number):
-        mend = "leave the cell empty where nothing was measured"
-        raise InputError(f"line {line} holds '{text}', which is not finite", path, mend)
-    if abs(number) > _LARGEST:
+        hint = "leave the cell empty where nothing was measured"
+        raise InputError(f"line {line} holds '{text}', which is not finite", path, hint)
+    if abs(number) > TABLE_VALUE.max_value:
         raise InputError(
-            f"line {line} holds '{text}', which nothing measures", path, "is it a typing mistake?"
+            f"line {line} holds '{text}', which is no measurement", path, "correct the cell"
         )
     return number
 
@@ -401,12 +413,12 @@ def _number(cell: str, path: Path, line: int) -> float:
 def _why_uneven(cells: list[str], names: list[str]) -> str:
     """Return what may make a row longer or shorter than the header."""
     if len(cells) < len(names):
-        return "is a cell missing, or a comma?"
+        return "add the missing cell or comma"
     # a decimal comma cuts every number in two: whole parts alone, and rows about twice as long
     whole = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
     if whole and 4 * len(cells) > 5 * len(names):
         return "are there decimal commas? write points"
-    return "has the header a name for every column?"
+    return "give every column a name in the header"
 
 
 READERS: dict[str, Callable[[Path], Table]] = {

@@ -29,18 +29,28 @@ from tkamb.io.recordings.samples import (
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.units import DEGREE, MILLIMETRE
 
-MOST_LEAN_DEG = 150.0
-"""Of a shank from the vertical, either way; a sprinter's swings back by 110."""
-FARTHEST = 100.0
-"""m from the laboratory's origin: what no camera covers."""
+
+@dataclass(frozen=True)
+class TibiaPoseSettings:
+    """Which recorded poses of the tibia are plausible."""
+
+    max_lean_deg: float = 150.0
+    """deg; lean of a shank from the vertical, either way. A sprinter's shank swings back by 110
+    deg."""
+    max_distance: float = 100.0
+    """m; distance from the laboratory's origin that no camera covers."""
+    shank_length: float = 0.4
+    """m; distance from the knee at which the far end of the shank is compared."""
+    window: float = 0.5
+    """s; samples farther from the frames than this do not reach them through the filter."""
+
+
+TIBIA_POSE = TibiaPoseSettings()
+
 FASTEST_TURN, FASTEST_MOVE = 100.0, 30.0
 """rad/s and m/s: twice the fastest sprinter's and kicker's shank."""
 ODD_TURN, ODD_MOVE = 0.5 * DEGREE, 3.0 * MILLIMETRE
 """As near to its neighbours' curve as skin markers are, no sample is odd."""
-SHANK_LENGTH = 0.4
-"""m: where the far end of the shank is looked at."""
-WINDOW = 0.5
-"""s: samples farther from the frames than this do not reach them through the filter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +115,20 @@ def load_tibia(source: ShankRecording, time: Array, side: Side, cutoff_Hz: Cutof
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
     """Return the odd samples of the shank's two ends, none of which is or moves impossibly."""
-    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
-    ends = {"ankle": np.zeros(3), "knee's end of the shank": np.array([0.0, SHANK_LENGTH, 0.0])}
+    near = (stamps >= time[0] - TIBIA_POSE.window) & (stamps <= time[-1] + TIBIA_POSE.window)
+    ends = {
+        "ankle": np.zeros(3),
+        "knee's end of the shank": np.array([0.0, TIBIA_POSE.shank_length, 0.0]),
+    }
     odd: list[OddSample] = []
     for end, point in ends.items():
         places = transform(poses[near], point)
         for axis, values in zip("xyz", places.T, strict=True):
             what = f"{axis} of the {end}"
-            limits, question = (-FARTHEST, FARTHEST), "check [tibia] columns and length_unit"
+            limits, question = (
+                (-TIBIA_POSE.max_distance, TIBIA_POSE.max_distance),
+                "check [tibia] columns and length_unit",
+            )
             check_range(recorded.path, f"shank: {what}", values, limits, "m", question)
             one = (recorded.path, what, stamps[near], values)
             check_steps(*one, FASTEST_MOVE, MILLIMETRE, "mm")
@@ -128,7 +144,7 @@ def _sagittal(
     stamps = recorded.time(source.columns.get("time", "time"))
     lean = recorded.complete_column(source.columns.get("angle", "angle"))
     lean = lean * angle_scale(recorded, source.angle_unit)
-    limits = (-MOST_LEAN_DEG, MOST_LEAN_DEG)
+    limits = (-TIBIA_POSE.max_lean_deg, TIBIA_POSE.max_lean_deg)
     question = "check [tibia] columns and angle_unit: it is the lean from the vertical"
     check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", question)
     check_spacing(recorded.path, stamps)

@@ -6,6 +6,7 @@ attribute becomes zero, a joint without limits another type. Here each is an err
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -61,8 +62,17 @@ _CHILDREN = {
 _MANY = {"visual", "collision"}
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _ANKLE_JOINT = "ankle"
-_MOST_TURNS = 8.0 * np.pi
-"""rad: angles are below one turn; a larger number is in degrees."""
+
+
+@dataclass(frozen=True)
+class UrdfAngleSettings:
+    """Which angles of a URDF are in radians."""
+
+    max_angle: float = 8.0 * np.pi
+    """rad; a larger number is in degrees: angles in a URDF are below one turn."""
+
+
+URDF_ANGLE = UrdfAngleSettings()
 
 
 def check_elements(robot: ElementTree.Element, path: Path) -> None:
@@ -107,14 +117,14 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
         place = element.tag == "origin" and key == "xyz"
         if place and np.abs(numbers_of(element, key)).max() > _FARTHEST:
-            mend = "xyz is in metres: is it in millimetres?"
-            raise InputError(f'<origin xyz="{text}"> is beyond {_FARTHEST:g} m', where, mend)
+            hint = "xyz is in metres: is it in millimetres?"
+            raise InputError(f'<origin xyz="{text}"> is beyond {_FARTHEST:g} m', where, hint)
         if key in ("value", *_INERTIA) and abs(float(text)) > _HEAVIEST:
-            mend = f"give at most {_HEAVIEST:g} (kg, kg·m²)"
-            raise InputError(f'<{element.tag} {key}="{text}"> is of no body', where, mend)
-        if key == "rpy" and np.abs(numbers_of(element, key)).max() > _MOST_TURNS:
-            mend = "rpy is in radians: is it in degrees?"
-            raise InputError(f'<origin rpy="{text}"> turns by several turns', where, mend)
+            hint = f"give at most {_HEAVIEST:g} (kg, kg·m²)"
+            raise InputError(f'<{element.tag} {key}="{text}"> is of no body', where, hint)
+        if key == "rpy" and np.abs(numbers_of(element, key)).max() > URDF_ANGLE.max_angle:
+            hint = "give rpy in radians, not in degrees"
+            raise InputError(f'<origin rpy="{text}"> turns by several turns', where, hint)
 
 
 def _finite(text: str, count: int) -> bool:
@@ -136,7 +146,9 @@ def check_links(robot: ElementTree.Element, path: Path, with_patella: bool) -> N
     links = [str(link.get("name")) for link in robot.findall("link")]
     for name in ("tibia", "femur", "hip") + (("patella",) if with_patella else ()):
         if name not in links:
-            raise InputError(f"has no link '{name}'", path, f"{names_near(name, links)} {_PAGE}")
+            raise InputError(
+                f"has no link '{name}'", path, f"add it, or rename one: {names_near(name, links)}"
+            )
 
 
 def check_tree(robot: ElementTree.Element, path: Path) -> None:
@@ -148,8 +160,8 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
         where = f"{path}: joint '{joint.get('name')}'"
         for end in (parent, child):
             if end not in links:
-                mend = f"add it, or {names_near(end, links)}"
-                raise InputError(f"names a link '{end}' that is not there", where, mend)
+                hint = f"add it, or {names_near(end, links)}"
+                raise InputError(f"names a link '{end}' that is not there", where, hint)
         if child in parents:
             raise InputError(f"link '{child}' hangs on a second joint", where, "keep one")
         parents[child] = parent
@@ -157,8 +169,12 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
         raise InputError(f"has two links '{repeated[0]}'", path, "rename one")
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
-        found = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
-        raise InputError(f"has {found}", path, "a leg is one tree: docs/patient.md")
+        result = f"{len(roots)} roots ({', '.join(roots)})" if roots else "a loop and no root"
+        raise InputError(
+            f"has {result}",
+            path,
+            "connect all links by joints to one tree with one root, without a loop",
+        )
     for name in links:
         place, steps = name, 0
         while place in parents and steps <= len(links):
@@ -196,7 +212,7 @@ def check_chain(
             continue
         for name in wanted:
             if name not in joints:
-                near = f"{names_near(name, joints)} {_PAGE}"
+                near = f"add it, or rename one: {names_near(name, joints)}"
                 raise InputError(f"has no joint '{name}'", path, near)
         _check_axes(joints, wanted, path, side)
         _check_order(robot, joints, list(wanted), (start, end), path)
@@ -210,9 +226,6 @@ def check_chain(
                 path,
                 f"only ankle and knee move: make it fixed, or {names_near(name, known)}",
             )
-
-
-_PAGE = "(docs/patient.md)"
 
 
 def _check_axes(
@@ -233,7 +246,7 @@ def _check_axes(
         raise InputError(
             f"its axes of knee_axial_rotation and knee_adduction are those of a {other} knee",
             path,
-            f"is [patient] side = '{side}' right?",
+            f"correct [patient] side, which is '{side}', or the axes",
         )
     for name, (kind, axis) in wanted.items():
         joint = joints[name]
@@ -253,8 +266,8 @@ def _check_limit(joint: ElementTree.Element, path: Path) -> None:
     """Raise unless a joint states all its limits, in order; they bound nothing here."""
     limit, name = joint.find("limit"), joint.get("name")
     if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
-        mend = "give lower, upper, effort and velocity"
-        raise InputError(f"joint '{name}' has no complete <limit>", path, mend)
+        hint = "give lower, upper, effort and velocity"
+        raise InputError(f"joint '{name}' has no complete <limit>", path, hint)
     low, high = (float(numbers_of(limit, key)[0]) for key in ("lower", "upper"))
     if low >= high:
         raise InputError(f"joint '{name}' has limits {low:g} to {high:g}", path, "exchange them")
@@ -280,12 +293,12 @@ def _check_order(
         moved = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
         if name != names[0] and moved.any():
             shown = " ".join(f"{value:g}" for value in moved)
-            mend = f"only '{names[0]}' is placed: give it the identity"
-            raise InputError(f"joint '{name}' has an origin {shown} in the chain", path, mend)
+            hint = f"only '{names[0]}' is placed: give it the identity"
+            raise InputError(f"joint '{name}' has an origin {shown} in the chain", path, hint)
         mass = masses.get(child)
         if name != names[-1] and mass is not None and numbers_of(mass, "value", "0").any():
-            mend = "links inside the chain have none: put it on tibia or femur"
-            raise InputError(f"link '{child}' has a mass", path, mend)
+            hint = "links inside the chain have none: put it on tibia or femur"
+            raise InputError(f"link '{child}' has a mass", path, hint)
     if place != between[1]:
         raise InputError(f"joint '{names[-1]}' leads to '{place}'", path, order)
 

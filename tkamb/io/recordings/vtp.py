@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.files import MESH_LIMIT, parse_xml, read_bytes
+from tkamb.files import FILE_LIMITS, parse_xml, read_bytes
 from tkamb.geometry.frames import Array
 from tkamb.geometry.polygons import triangulated
 
@@ -55,7 +55,7 @@ def read_vtp_values(path: str | Path, name: str) -> Array:
 
 
 def _read(path: str | Path, what: "Callable[[_PolyData], Read]") -> Read:
-    content = read_bytes(path, MESH_LIMIT, what="mesh file")
+    content = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file")
     try:
         return what(_PolyData(content, path))
     except (ValueError, KeyError, OverflowError, zlib.error) as error:  # base64's is a ValueError
@@ -107,11 +107,11 @@ class _PolyData:
 
     def values(self, name: str) -> Array:
         """Return one array of the points' data of all pieces."""
-        found = []
+        result = []
         for piece in self._root.iter("Piece"):
             named = {array.get("Name"): array for array in piece.iterfind("PointData/DataArray")}
-            found.append(self._array(named.get(name), name).astype(float))
-        return np.concatenate(found)
+            result.append(self._array(named.get(name), name).astype(float))
+        return np.concatenate(result)
 
     def _polygons(self, piece: Element, points: Array) -> Indices:
         """Return the polygons of a piece as triangles (k, 3)."""
@@ -158,7 +158,7 @@ class _PolyData:
         _, whole, last, *sizes = (int(n) for n in np.frombuffer(header, self._header))
         if count == 0:
             return b""
-        if whole * (count - 1) + (last or whole) > MESH_LIMIT:
+        if whole * (count - 1) + (last or whole) > FILE_LIMITS.mesh_bytes:
             raise ValueError("it unpacks to more than is read")
         packed, _ = self._taken(rest, sum(sizes), raw)
         blocks, start = [], 0

@@ -339,8 +339,11 @@ class _Parts:
             placement = insert_placement(surface, axes_rotation(table.axes))
         except InputError as error:
             if scene.implant.femoral and self._could_be_insert(scene.implant.femoral):
-                question = "are the meshes of [implant.femoral] and [implant.insert] exchanged?"
-                raise InputError(error.what, error.where, question) from None
+                hint = (
+                    "check whether the meshes of [implant.femoral] and [implant.insert] are "
+                    "exchanged"
+                )
+                raise InputError(error.what, error.where, hint) from None
             raise
         self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
         self.insert_placement = placement

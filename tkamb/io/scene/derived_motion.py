@@ -51,8 +51,8 @@ def seated_motion(
             "[motion]",
             "record ap and ml, or check the meshes' units, axes and origins",
         )
-    found = [KNEE_COORDINATES.index(name) for name in motion.unrecorded]
-    return _with_coordinates(motion, places, found, cutoff)
+    result = [KNEE_COORDINATES.index(name) for name in motion.unrecorded]
+    return _with_coordinates(motion, places, result, cutoff)
 
 
 def rolling_motion(
@@ -100,8 +100,8 @@ def _with_coordinates(
 ) -> KneeMotion:
     """Return the motion with some columns of other coordinates (f, 6), differentiated."""
     values = (motion.coordinates.copy(), motion.velocity.copy(), motion.acceleration.copy())
-    found = differentiate_coordinates(motion.time, places[:, columns], cutoff)
-    for value, new in zip(values, found, strict=True):
+    result = differentiate_coordinates(motion.time, places[:, columns], cutoff)
+    for value, new in zip(values, result, strict=True):
         value[:, columns] = new
     coordinates, velocity, acceleration = values
     return replace(motion, coordinates=coordinates, velocity=velocity, acceleration=acceleration)

@@ -43,7 +43,7 @@ def muscles(scene: Scene, chain: Chain) -> "tuple[Muscle, ...]":
     from tkamb.knee.muscles import Muscle, check_muscles
 
     left = scene.patient.side == "left"
-    found = tuple(
+    result = tuple(
         Muscle(
             table.name,
             tuple(_point(end, left) for end in table.path),
@@ -53,8 +53,8 @@ def muscles(scene: Scene, chain: Chain) -> "tuple[Muscle, ...]":
         )
         for table in muscle_tables(scene)
     )
-    check_muscles(found, chain)
-    return found
+    check_muscles(result, chain)
+    return result
 
 
 def patellar_ligament(scene: Scene) -> "PatellarLigament | None":

@@ -227,7 +227,7 @@ class TibiaTable(SceneTable):
     cutoff_Hz: Number | Literal["none"] | None = Field(
         None, description="low-pass cut-off; default: the motion's"
     )
-    ankle_mm: Annotated[Vector, within(-20000, 20000, "is it in millimetres?")] = Field(
+    ankle_mm: Annotated[Vector, within(-20000, 20000, "give it in millimetres")] = Field(
         (0.0, 0.0, 0.0), description="sagittal: the fixed ankle in the lab"
     )
     markers_mm: dict[str, Point] = Field(

@@ -39,8 +39,8 @@ def scaled_case(case: "Case") -> "Case":
         (case.scene.measured, "[measured]"),
     ):
         if there is not None:
-            what, mend = f"cannot scale a scene with {table}", "scale its models, or leave it out"
-            raise InputError(what, "[patient] scale", mend)
+            what, hint = f"cannot scale a scene with {table}", "scale its models, or leave it out"
+            raise InputError(what, "[patient] scale", hint)
     return replace(
         case,
         chain=case.chain.scaled(s),
@@ -58,9 +58,9 @@ def scaled_case(case: "Case") -> "Case":
 
 
 def _columns(values: Array, columns: list[int], s: float) -> Array:
-    found = values.copy()
-    found[:, columns] *= s
-    return found
+    result = values.copy()
+    result[:, columns] *= s
+    return result
 
 
 def _motion(motion: "KneeMotion", s: float) -> "KneeMotion":

@@ -226,11 +226,11 @@ def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
     for key, value in overrides.items():
         _override(content, key, value)
     try:
-        found = Scene.model_validate(content)
+        result = Scene.model_validate(content)
     except ValidationError as error:
         raise _complaint(error, Path("scene"), overrides) from None
-    found._overrides = overrides
-    return found
+    result._overrides = overrides
+    return result
 
 
 def _apply_preset(
@@ -290,13 +290,13 @@ def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
 
 def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) -> InputError:
     """Return what to mend first: an unknown key may be the missing one, misspelt."""
-    found = error.errors()
+    result = error.errors()
     rank = {"extra_forbidden": 0, "missing": 2}
-    first = min(found, key=lambda one: rank.get(one["type"], 1))
+    first = min(result, key=lambda one: rank.get(one["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
     option = next((o for o in overrides if f"{o}.".startswith(f"{key}.") or o == key), None)
     where = path if option is None else f"--set {option}"
-    more = f" ({len(found) - 1} more after this one)" if len(found) > 1 else ""
+    more = f" ({len(result) - 1} more after this one)" if len(result) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = list(_keys_of(first["loc"][:-1]))
         advice = names_near(str(first["loc"][-1]), known)

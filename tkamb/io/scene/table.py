@@ -29,38 +29,38 @@ def _axes(text: str) -> str:
 Axes = Annotated[str, AfterValidator(_axes)]
 
 
-def within(low: float, high: float, question: str) -> Any:
+def within(low: float, high: float, hint: str) -> Any:
     """Return the annotation of a number, or of each of a vector's, that must lie in a range."""
 
     def checked(value: Any) -> Any:
         for number in value if isinstance(value, tuple) else (value,):
             if number is not None and not low <= number <= high:
-                raise ValueError(f"{number:g} is not within {low:g} to {high:g}; {question}")
+                raise ValueError(f"{number:g} is not within {low:g} to {high:g}; {hint}")
         return value
 
     return AfterValidator(checked)
 
 
-def zero_or_within(low: float, high: float, question: str) -> Any:
+def zero_or_within(low: float, high: float, hint: str) -> Any:
     """Return the annotation of a number that is zero or must lie in a range."""
 
     def checked(value: float) -> float:
         if value != 0 and not low <= value <= high:
-            raise ValueError(f"{value:g} is neither 0 nor within {low:g} to {high:g}; {question}")
+            raise ValueError(f"{value:g} is neither 0 nor within {low:g} to {high:g}; {hint}")
         return value
 
     return AfterValidator(checked)
 
 
-HalfThickness = Annotated[Number, zero_or_within(0.2, 20, "is it in millimetres?")]
+HalfThickness = Annotated[Number, zero_or_within(0.2, 20, "give it in millimetres")]
 """Of a tendon, off the outline that it wraps; zero is a string."""
-Band = Annotated[Number, zero_or_within(0.1, 50, "is it in millimetres?")]
+Band = Annotated[Number, zero_or_within(0.1, 50, "give it in millimetres")]
 """Of the sections that a tendon wraps; zero is its own sagittal plane."""
-Point = Annotated[Vector, within(-1000, 1000, "is it in millimetres?")]
+Point = Annotated[Vector, within(-1000, 1000, "give it in millimetres")]
 """A bone's length (0.6 m at most) and a frame's origin beside it are less than a metre."""
-Offset = Annotated[Vector, within(-600, 600, "is it in millimetres?")]
+Offset = Annotated[Vector, within(-600, 600, "give it in millimetres")]
 """From a mesh's origin, at worst at the bone's other end, to the link's."""
-Turn = Annotated[Vector, within(-360, 360, "is it in degrees?")]
+Turn = Annotated[Vector, within(-360, 360, "give it in degrees")]
 
 
 def _known_format(name: str) -> str:

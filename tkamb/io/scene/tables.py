@@ -36,16 +36,16 @@ class PatientTable(SceneTable):
     urdf: Path
     side: Literal["right", "left"] = Field(description="the knee that is modelled")
     # From a child of six with a tumour prosthesis to the heaviest patients operated on.
-    mass_kg: Annotated[Number, within(20, 300, "is it in kilograms?")] = Field(
+    mass_kg: Annotated[Number, within(20, 300, "give it in kilograms")] = Field(
         description="body mass, 20 to 300; forces in BW are relative to it"
     )
     sex: Literal["male", "female"] | None = Field(
         None, description="only for segments without <inertial>: picks the de Leva table"
     )
     # The same child to the tallest adults but a few.
-    height_mm: Annotated[Number | None, within(1000, 2300, "is it in millimetres, standing?")] = (
-        Field(None, description="body height, 1000 to 2300")
-    )
+    height_mm: Annotated[
+        Number | None, within(1000, 2300, "give the standing height in millimetres")
+    ] = Field(None, description="body height, 1000 to 2300")
     scale: Annotated[Number, within(0.7, 1.4, "1 is the patient as recorded")] = Field(
         1.0,
         description=(
@@ -118,17 +118,19 @@ class LigamentTable(SceneTable):
     distal: Attachment
     law: Literal["two-line", "quadratic-toe"]
     # Ten times a whole cruciate ligament's (Race & Amis 1994: 347 N/mm), and as much a strain.
-    stiffness_N_per_mm: Annotated[Number | None, within(0, 5000, "is it in N/m?")] = Field(
-        None, gt=0
+    stiffness_N_per_mm: Annotated[Number | None, within(0, 5000, "give it in N/mm, not in N/m")] = (
+        Field(None, gt=0)
     )
     stiffness_N_per_strain: Annotated[
-        Number | None, within(0, 150000, "is it in N per unit strain?")
+        Number | None, within(0, 150000, "give it in N per unit strain")
     ] = Field(None, gt=0)
     # From a capsule's fibre to the superficial MCL's longest with its frame's length to spare.
-    slack_length_mm: Annotated[Number | None, within(3, 300, "is it in millimetres?")] = Field(None)
+    slack_length_mm: Annotated[Number | None, within(3, 300, "give it in millimetres")] = Field(
+        None
+    )
     # No ligament bears more than 0.3 (Butler et al. 1986).
-    reference_strain: Annotated[Number | None, within(-0.5, 0.3, "is it in per cent?")] = Field(
-        None, description="instead of slack_length_mm: strain at the reference pose"
+    reference_strain: Annotated[Number | None, within(-0.5, 0.3, "give a strain, not per cent")] = (
+        Field(None, description="instead of slack_length_mm: strain at the reference pose")
     )
     reference_flexion_deg: Number = Field(
         0.0,
@@ -201,7 +203,7 @@ class MuscleTable(SceneTable):
     )
     wrap: MuscleWrapTable | None = Field(None, description="default: straight between the points")
     # Twice the strongest of the lower limb (soleus and vastus lateralis, some 6 kN).
-    force_N: Annotated[Number | None, within(1, 15000, "is it in newtons?")] = Field(
+    force_N: Annotated[Number | None, within(1, 15000, "give it in newtons")] = Field(
         None, description="maximal isometric force; no bound where it is not given"
     )
 
@@ -265,7 +267,7 @@ class PatellarLigamentTable(SceneTable):
     proximal: Attachment
     distal: Attachment
     # Half of the shortest measured one to twice the longest (25 to 65 mm).
-    length_mm: Annotated[Number | None, within(12, 130, "is it in millimetres?")] = Field(
+    length_mm: Annotated[Number | None, within(12, 130, "give it in millimetres")] = Field(
         None, description="its constant length; needed where the patella is solved"
     )
     wrap: Switch = True
@@ -335,12 +337,12 @@ class MaterialTable(SceneTable):
     material and changes what is given; without it the material is given whole.
     """
 
-    base: str | None = Field(None, description="a built-in name, see docs/materials.md")
+    base: str | None = Field(None, description="name of a built-in material")
     name: str | None = Field(
         None, description="what to call it in results; default: 'own', or the base's with 'changed'"
     )
     # From a gel to ceramics; UHMWPE has 0.4 to 1.5 GPa.
-    young_modulus_MPa: Annotated[Number | None, within(0.1, 500000, "is it in megapascals?")] = (
+    young_modulus_MPa: Annotated[Number | None, within(0.1, 500000, "give it in megapascals")] = (
         Field(None, description="slope of the curve at the origin; a table's own by default")
     )
     poisson_ratio: Annotated[Number | None, Field(ge=0, lt=0.5)] = None

@@ -80,7 +80,7 @@ class Person:
             hint = f"give {limits.lightest:g} to {limits.heaviest:g} kg"
             raise InputError(f"a body of {self.mass:g} kg", "--mass-kg", hint)
         if not limits.shortest <= self.height <= limits.tallest:
-            hint = f"give {limits.shortest * 1e3:g} to {limits.tallest * 1e3:g}: is it in mm?"
+            hint = f"give {limits.shortest * 1e3:g} to {limits.tallest * 1e3:g}, in mm"
             raise InputError(f"a height of {self.height * 1e3:g} mm", "--height-mm", hint)
 
     @property

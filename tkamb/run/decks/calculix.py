@@ -19,8 +19,17 @@ from tkamb.geometry.frames import Index
 from tkamb.geometry.surface import Surface
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-PENALTY = 1e5
-"""N/mm³: contact gives way by 0.3 µm at 30 MPa."""
+
+@dataclass(frozen=True)
+class CalculixDeckSettings:
+    """What a deck for CalculiX states."""
+
+    penalty: float = 1e5
+    """N/mm³; contact stiffness. At 30 MPa surfaces overlap by 0.3 µm."""
+
+
+CALCULIX_DECK = CalculixDeckSettings()
+
 PATCH_THICKNESS = np.array([0.0, 1e-3, 0.0])
 """m: of the layer of wedges that stands for the rigid femoral component."""
 
@@ -97,7 +106,7 @@ class Deck:
             "*SOLID SECTION, ELSET=FEMUR, MATERIAL=STEEL",
             f"*RIGID BODY, NSET=NFEMUR, REF NODE={self._centre}, ROT NODE={self._centre + 1}",
             *("*SURFACE INTERACTION, NAME=SI", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"),
-            f"{PENALTY},0.001",
+            f"{CALCULIX_DECK.penalty},0.001",
             "*CONTACT PAIR, INTERACTION=SI, TYPE=NODE TO SURFACE",
             "SLAVE,MASTER",
         ]

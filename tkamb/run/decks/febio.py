@@ -10,6 +10,7 @@ Reference: FEBio User Manual 4.0, chapter 3, the input file format.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 import numpy as np
@@ -22,8 +23,17 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.run.decks.problem import PressProblem
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-STEPS = 10
-"""In which the travel grows."""
+
+@dataclass(frozen=True)
+class FebioDeckSettings:
+    """What a deck for FEBio states."""
+
+    load_steps: int = 10
+    """Steps in which the displacement is applied; FEBio halves them by itself where one fails."""
+
+
+FEBIO_DECK = FebioDeckSettings()
+
 FIXED = ("Rx", "Rz", "Ru", "Rv", "Rw")
 """Freedoms that the femoral component does not have: it moves along y alone."""
 
@@ -73,7 +83,13 @@ def contact_quads(lattice: Lattice) -> Index:
 
 
 def _control(root: Element) -> None:
-    control = _filled(root, "Control", analysis="STATIC", time_steps=STEPS, step_size=1 / STEPS)
+    control = _filled(
+        root,
+        "Control",
+        analysis="STATIC",
+        time_steps=FEBIO_DECK.load_steps,
+        step_size=1 / FEBIO_DECK.load_steps,
+    )
     solver = SubElement(control, "solver", type="solid")
     for name, value in (
         ("symmetric_stiffness", "non-symmetric"),
@@ -82,15 +98,19 @@ def _control(root: Element) -> None:
     ):
         SubElement(solver, name).text = str(value)
     stepper = SubElement(control, "time_stepper", type="default")
-    for name, value in (("max_retries", 10), ("dtmin", 0.001), ("dtmax", 1 / STEPS)):
+    for name, value in (
+        ("max_retries", 10),
+        ("dtmin", 0.001),
+        ("dtmax", 1 / FEBIO_DECK.load_steps),
+    ):
         SubElement(stepper, name).text = str(value)
 
 
 def _materials(root: Element, material: Material) -> None:
     if not isinstance(material.law, LinearElastic):
         what = "has no law that FEBio's deck knows"
-        mend = "run the frame with material = 'polyethylene-linear'"
-        raise InputError(what, f"material '{material.name}'", mend)
+        hint = "run the frame with material = 'polyethylene-linear'"
+        raise InputError(what, f"material '{material.name}'", hint)
     block = SubElement(root, "Material")
     insert = SubElement(block, "material", id="1", name="insert", type="isotropic elastic")
     SubElement(insert, "density").text = "1"

@@ -60,12 +60,12 @@ class FramePress:
         Raises:
             InputError: a material or bearing that the program's deck does not hold.
         """
-        problem, said = self.problem, self.comments()
+        problem, text = self.problem, self.comments()
         if kind == "feb":
             return febio_text(
                 problem,
                 self.approach,
-                (*said, "Compare the size of Fy of femur.csv with the load."),
+                (*text, "Compare the size of Fy of femur.csv with the load."),
             )
         start = problem.depth / MILLIMETRE
         more = (
@@ -75,7 +75,7 @@ class FramePress:
         pair = problem.pair
         deck = Deck(
             problem.lattice, problem.patch, pair.material, pair.bearing, problem.load,
-            comments=(*said, *more),
+            comments=(*text, *more),
         )  # fmt: skip
         return deck.text
 

@@ -1,6 +1,7 @@
 """Which coordinates and muscles of a model belong to a leg, and what loads its foot."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -23,8 +24,17 @@ GROUPS = {
     frozenset(["foot"]): "within the foot",
 }
 """Where a muscle's ends lie -> its group's name."""
-SAME = 1e-6
-"""Relative or m: strengths, lengths and points that differ by less are the same."""
+
+
+@dataclass(frozen=True)
+class ModelMatchSettings:
+    """When two muscle lines are the same."""
+
+    tolerance: float = 1e-6
+    """Relative, or m; strengths, lengths and points that differ by less are the same."""
+
+
+MODEL_MATCH = ModelMatchSettings()
 
 
 def leg_bones(leg: Leg) -> dict[str, tuple[str, ...]]:
@@ -48,8 +58,8 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
 
     def own(joint: Joint) -> list[str]:
         there = leg.model.coordinates.values()
-        found = [c for c in there if c.joint == joint.name]
-        return [c.name for c in found if not c.locked and c.name not in followers]
+        result = [c for c in there if c.joint == joint.name]
+        return [c.name for c in result if not c.locked and c.name not in followers]
 
     below = [joint for joint in leg.model.joints if joint.inboard == leg.ankle.outboard]
     return (*own(leg.hip), leg.flexion, *own(leg.ankle), *(c for j in below for c in own(j)))
@@ -153,9 +163,9 @@ def _same_muscle(one: Muscle, other: Muscle) -> bool:
     )
     first, second = one.path.points[0], other.path.points[0]
     return (
-        bool((np.abs(strong - weak) <= SAME * strong).all())
+        bool((np.abs(strong - weak) <= MODEL_MATCH.tolerance * strong).all())
         and isinstance(first, PathPoint)
         and isinstance(second, PathPoint)
         and first.body == second.body
-        and float(np.abs(first.location - second.location).max()) < SAME
+        and float(np.abs(first.location - second.location).max()) < MODEL_MATCH.tolerance
     )

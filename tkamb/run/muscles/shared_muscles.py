@@ -5,7 +5,7 @@ frames. The flexion row is the knee's own (`tkamb.knee.extensor_response`), so t
 the extensor group which the optimisation finds is the one that the knee's equations give back.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,9 +23,19 @@ from tkamb.run.muscles.recording import LegRecording, group_names, load_knee_tri
 from tkamb.run.muscles.sharing import Sharing
 from tkamb.units import MILLIMETRE
 
-SAME_PLACE = 0.5 * MILLIMETRE
-"""How far the URDF's insert and hip may lie from the model's."""
-MOST_SHARINGS = 8
+
+@dataclass(frozen=True)
+class SharedMuscleSettings:
+    """Muscles shared between the joints of a leg."""
+
+    max_offset: float = 0.5 * MILLIMETRE
+    """m; how far the insert and the hip of the URDF may lie from those of the muscle model."""
+    max_iterations: int = 8
+    """Iterations between muscle forces and the lines that they turn; what is open afterwards is
+    reported."""
+
+
+SHARED_MUSCLES = SharedMuscleSettings()
 
 
 class SharedMuscles:
@@ -139,7 +149,7 @@ class SharedMuscles:
         turns out to carry nothing.
         """
         lifted = geometry.lifted
-        for _ in range(MOST_SHARINGS):
+        for _ in range(SHARED_MUSCLES.max_iterations):
             share = self.share(k, geometry, friction, lifted)
             geometry = replace(geometry, share=share)
             if share.status != "ok":
@@ -234,8 +244,8 @@ def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
     assert table is not None and table.emg is not None and envelopes is not None
     for name in envelopes.channel_of:
         if name not in trial.muscles:
-            mend = names_near(name, trial.muscles, "the leg's muscles")
-            raise InputError(f"no muscle '{name}'", "[muscles.emg] channels", mend)
+            hint = names_near(name, trial.muscles, "the leg's muscles")
+            raise InputError(f"no muscle '{name}'", "[muscles.emg] channels", hint)
     if table.emg.use == "report":
         return trial
     values = np.full((len(time), len(trial.muscles)), np.nan)
@@ -265,7 +275,7 @@ def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
         ("hip", centre, case.chain.link_in("hip", "femur")[:3, 3]),
     ):
         apart = float(np.linalg.norm(here - there))
-        if apart > SAME_PLACE:
+        if apart > SHARED_MUSCLES.max_offset:
             raise InputError(
                 f"has its {name} {apart / MILLIMETRE:.1f} mm from where the URDF has it",
                 table.model,

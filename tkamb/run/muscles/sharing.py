@@ -13,8 +13,17 @@ from tkamb.run.muscles.emg import EmgGuide
 from tkamb.run.muscles.hill import HILL
 from tkamb.run.muscles.static_optimisation import LoadSharing, share_load
 
-KKT_LIMIT = 1e-8
-"""Largest violation of the optimality conditions (relative) with which a frame is kept."""
+
+@dataclass(frozen=True)
+class SharingSettings:
+    """When a solution of the static optimisation is accepted."""
+
+    kkt_tolerance: float = 1e-8
+    """Relative; largest violation of the optimality conditions (Karush, Kuhn and Tucker) with which
+    a frame is kept."""
+
+
+SHARING = SharingSettings()
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ class FrameProblems:
             except ComputationError as error:
                 reason = error.what
             else:
-                if shared.kkt_residual < KKT_LIMIT:
+                if shared.kkt_residual < SHARING.kkt_tolerance:
                     return shared.activation, shared.others, shared.kkt_residual, "ok"
                 reason = f"the optimum is met to {shared.kkt_residual:.1g} only"
         nothing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)

@@ -185,7 +185,7 @@ def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
     terms = np.concatenate([own, hessian @ a, pull])
     size = max(float(np.abs(terms).max(initial=0.0)), 1e-12)
     scale = _row_scale(problem)
-    found = [float(np.abs(still).max(initial=0.0)) / size]
+    result = [float(np.abs(still).max(initial=0.0)) / size]
     for value, low, high, multiplier, unit in (
         (a, problem.lowest, problem.highest, shared.own_multiplier, np.ones_like(a)),
         (y, problem.lower, problem.upper, shared.other_multiplier, scale),
@@ -194,8 +194,8 @@ def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
         bound = np.where(multiplier > 0, high, low)
         active = multiplier != 0
         slack = np.abs(value - bound)[active] * np.abs(multiplier)[active] / size
-        found += [float(beyond.max(initial=0.0)), float(slack.max(initial=0.0))]
-    return max(found)
+        result += [float(beyond.max(initial=0.0)), float(slack.max(initial=0.0))]
+    return max(result)
 
 
 def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[Array, Array, Array]:
@@ -210,7 +210,7 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
     upper = (problem.upper - problem.offset)[bounded] / scale[bounded]
     lower = (problem.lower - problem.offset)[bounded] / scale[bounded]
     equal = np.concatenate([problem.lowest == problem.highest, lower == upper])
-    a, _, flag, told = daqp.solve(
+    a, _, flag, text = daqp.solve(
         np.ascontiguousarray(hessian),
         np.ascontiguousarray(gradient),
         np.ascontiguousarray(rows),
@@ -222,7 +222,7 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
     )
     if flag != OPTIMAL:
         raise ComputationError("no muscle forces within their limits carry this frame", "muscles")
-    multiplier = np.asarray(told["lam"], float)
+    multiplier = np.asarray(text["lam"], float)
     other = np.zeros(len(problem.offset))
     count = len(problem.lowest)
     other[bounded] = multiplier[count:] / scale[bounded]

@@ -1,6 +1,7 @@
 """Questions about the ground reaction: its size, and whether it acts under the foot."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,31 +15,44 @@ PEAK_LOAD = (0.4, 4.0)
 
 FOOT_FORWARD = (-0.065, 0.23)
 """m, of the centre of pressure from the ankle centre: from heel to toe of a foot 0.3 m long."""
-FOOT_ASIDE = 0.075
-"""m, either way: half the breadth of a shoe, and as much for an oblique foot."""
+
+
+@dataclass(frozen=True)
+class GroundReactionLimitSettings:
+    """Which ground reactions are plausible."""
+
+    max_lateral_distance: float = 0.075
+    """m, to either side; half the breadth of a shoe, and as much again for an oblique foot."""
+    loaded_share: float = 0.2
+    """Share of the peak force; at less the centre of pressure is a quotient of small numbers."""
+    min_lean: float = 0.03
+    """Forward over upward force; at less the force hardly leans and the sign of its lean says
+    nothing."""
+    max_outward_lean: float = 0.02
+    """Sideways over upward force, outwards. In standing, walking and squatting it is inwards, by
+    0.04 to 0.07 in six recordings; on the stairs of subject JW it is 0.007 outwards."""
+    max_hip_distance: float = 0.6
+    """Share of shank and thigh together. Sitting with an upright shank has 0.55; walking, stairs
+    and squats of the models stay within 0.41."""
+    ankle_distance: float = 0.015
+    """m; a standing person has the centre of pressure 0.04 ahead of the ankle. A path as near as
+    this is in another unit."""
+    max_unloaded_stance: float = 0.15
+    """s; in four recorded walks no foot stands unloaded for longer than 0.02, and for 0.4 where a
+    plate is left out."""
+    unloaded_force: float = 0.05
+    """BW; a foot with less force is unloaded."""
+    max_peak_ratio: float = 1.6
+    """Ratio of one foot's largest to its smallest peak in a walk; 1.1 in three recordings."""
+
+
+GROUND_REACTION_LIMITS = GroundReactionLimitSettings()
+
 ANKLE_ABOVE = (0.03, 0.32)
 """m, of the ankle above the plate: barefoot and flat, to tiptoe in high heels."""
-WELL_LOADED = 0.2
-"""Of the peak force: below, the centre of pressure is a quotient of small numbers."""
-SWING = 0.03
-"""Of forward over upward: below, a force hardly leans and the sign of its lean says nothing."""
-AWAY = 0.02
-"""Of sideways over upward force, outwards: in standing, walking and squatting it is inwards, by
-0.04 to 0.07 in six recordings; on stairs of subject JW it is 0.007 outwards."""
-HIP_AWAY = 0.6
-"""Of shank and thigh together: sitting with an upright shank has 0.55; the models' walking, stairs
-and squats stay within 0.41."""
-AT_ANKLE = 0.015
-"""m: who stands has it 0.04 ahead; a path as near as this to the ankle is in another unit."""
 WALKS, STANDS = 1.0, 0.3
 """m/s, of the ankle: it swings faster than the first (a walk's 4, a slow one's 1.5) and in stance
 is slower than the second, from the foot's landing to the heel's rising."""
-STANCE = 0.15
-"""s: in four walks no foot stands unloaded for longer than 0.02; on a plate left out, for 0.4."""
-UNLOADED = 0.05
-"""BW: less, and the foot bears nothing."""
-STEPS_APART = 1.6
-"""Times: between one foot's peaks in a walk, 1.1 in three recordings."""
 
 
 def load_questions(case: Case) -> Iterator[Question]:
@@ -71,11 +85,11 @@ def step_questions(case: Case) -> Iterator[Question]:
     if speed.max() < WALKS:
         return
     upward = ground.force[:, 1]
-    bears = upward > UNLOADED * case.body_weight
+    bears = upward > GROUND_REACTION_LIMITS.unloaded_force * case.body_weight
     still = [
         (first, last)
         for first, last in _runs(~bears & (speed < STANDS))
-        if time[last] - time[first] > STANCE
+        if time[last] - time[first] > GROUND_REACTION_LIMITS.max_unloaded_stance
     ]
     if still:
         frames = np.zeros(len(time), bool)
@@ -93,7 +107,7 @@ def step_questions(case: Case) -> Iterator[Question]:
     peaks = [k for k in peaks if k not in ends]  # not cut off on its way up or down
     if len(peaks) > 1:
         low, high = min(peaks, key=upward.__getitem__), max(peaks, key=upward.__getitem__)
-        if upward[high] > STEPS_APART * upward[low]:
+        if upward[high] > GROUND_REACTION_LIMITS.max_peak_ratio * upward[low]:
             yield Question(
                 f"one step loads the foot with {upward[low]:.0f} N at {time[low]:.4g} s, another "
                 f"with {upward[high]:.0f} N at {time[high]:.4g} s: does one plate have another "
@@ -122,7 +136,10 @@ def direction_questions(case: Case) -> Iterator[Question]:
     leg = _to_hip(case)[loaded]
     force, forward = ground.force[loaded], _forward(case)[loaded]
     slopes = [np.einsum("fi,fi->f", line, forward) / line[:, 1] for line in (force, leg)]
-    if min(np.std(slope) for slope in slopes) > SWING and np.corrcoef(slopes)[0, 1] < -0.5:
+    if (
+        min(np.std(slope) for slope in slopes) > GROUND_REACTION_LIMITS.min_lean
+        and np.corrcoef(slopes)[0, 1] < -0.5
+    ):
         yield Question(
             "the ground reaction leans forward where the leg leans back: is the sign of its "
             "forward column turned, or are the columns left-handed?",
@@ -136,12 +153,12 @@ def _sideways_question(case: Case) -> Iterator[Question]:
     if ground is None or case.tibia is None:
         return
     upward = ground.force[:, 1]
-    loaded = ground.loaded & (upward > WELL_LOADED * upward.max())
+    loaded = ground.loaded & (upward > GROUND_REACTION_LIMITS.loaded_share * upward.max())
     if loaded.sum() < 5:
         return
     force, forward = ground.force[loaded], _forward(case)[loaded]
     aside = float((force[:, 2] * forward[:, 0] - force[:, 0] * forward[:, 2]).sum())
-    if aside > AWAY * force[:, 1].sum():
+    if aside > GROUND_REACTION_LIMITS.max_outward_lean * force[:, 1].sum():
         yield Question(
             f"the ground pushes the leg outwards with {100 * aside / force[:, 1].sum():.0f} % of "
             "its upward force: is the sign of its sideways column turned, or are the columns "
@@ -161,7 +178,7 @@ def posture_questions(case: Case) -> Iterator[Question]:
         + np.linalg.norm(chain.link_in("hip", "femur")[:3, 3])
     )
     ahead = np.einsum("fi,fi->f", _to_hip(case), _forward(case))
-    off = loaded & (np.abs(ahead) > HIP_AWAY * length)
+    off = loaded & (np.abs(ahead) > GROUND_REACTION_LIMITS.max_hip_distance * length)
     if off.any():
         k = int(np.argmax(np.where(off, np.abs(ahead), 0.0)))
         side = "ahead of" if ahead[k] > 0 else "behind"
@@ -179,7 +196,7 @@ def _well_loaded(case: Case) -> Mask:
     if ground is None or case.tibia is None or table is None or table.applied != "cop":
         return np.zeros(len(case.motion.time), bool)
     upward = ground.force[:, 1]
-    return np.asarray(ground.loaded & (upward > WELL_LOADED * upward.max()))
+    return np.asarray(ground.loaded & (upward > GROUND_REACTION_LIMITS.loaded_share * upward.max()))
 
 
 def _to_hip(case: Case) -> Array:
@@ -204,7 +221,7 @@ def foot_questions(case: Case) -> Iterator[Question]:
         return
     away, forward = ground.point - tibia.pose[:, :3, 3], _forward(case)
     nearest = float(np.linalg.norm(away[loaded][:, [0, 2]], axis=1).max())
-    if nearest < AT_ANKLE:
+    if nearest < GROUND_REACTION_LIMITS.ankle_distance:
         yield Question(
             f"the centre of pressure stays within {nearest / MILLIMETRE:.2g} mm of the ankle, "
             "seen from above: is it in centimetres or metres?",
@@ -217,7 +234,14 @@ def foot_questions(case: Case) -> Iterator[Question]:
         sides = sides[::-1]
     places = (
         ("ahead of", "behind", ahead, FOOT_FORWARD),
-        (*sides, aside, (-FOOT_ASIDE, FOOT_ASIDE)),
+        (
+            *sides,
+            aside,
+            (
+                -GROUND_REACTION_LIMITS.max_lateral_distance,
+                GROUND_REACTION_LIMITS.max_lateral_distance,
+            ),
+        ),
         ("below", "above", -away[:, 1], ANKLE_ABOVE),
     )
     for word, opposite, place, (low, high) in places:

@@ -1,6 +1,7 @@
 """Questions about lines of action: where they end, how stiff and how far stretched they are."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,34 +15,46 @@ if TYPE_CHECKING:
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.load import LinkPoint
 
-STRAIN = 0.15
-"""Ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al. 1986)."""
-SLACK = -0.4
-"""A bundle that is never nearer to being taut has no task in this movement."""
+
+@dataclass(frozen=True)
+class LineLimitSettings:
+    """Which ligaments and muscle lines are plausible."""
+
+    max_strain: float = 0.15
+    """Strain; ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al.
+    1986)."""
+    min_strain: float = -0.4
+    """Strain; a bundle that is never nearer to being taut has no effect in this movement."""
+    max_attachment_distance: float = 0.16
+    """m, from the insert's centre; the superficial MCL, the farthest, ends 0.06 to 0.12 below
+    it."""
+    max_overlap: float = 0.03
+    """m; of a tibial end above the insert's bottom, or of a femoral end below the flexion axis."""
+    min_anterior_offset: float = 0.01
+    """m; of the quadriceps origin ahead of the line from hip to knee, 0.029 to 0.044 in three
+    models. Vasti begin on the front of a shaft that is bowed forward, the rectus femoris ahead of
+    the hip."""
+    max_patella_distance: float = 0.06
+    """m; of the ends of both lines from the patella's origin. A patella is 0.045 long."""
+    max_tendon_change: float = 0.15
+    """Share of its mean length by which the patellar ligament may change between recorded ends; it
+    strains by a few per cent."""
+
+
+LINE_LIMITS = LineLimitSettings()
+
 STIFFNESS_PER_MM, STIFFNESS_PER_STRAIN = (2.0, 500.0), (20.0, 30000.0)
 """N/mm and N: from a tenth of a capsule's bundle to more than a whole cruciate ligament
 (347 N/mm: Race & Amis 1994; 18 kN for both PCL bundles: Blankevoort & Huiskes 1996)."""
-FARTHEST_ATTACHMENT = 0.16
-"""m from the insert's centre: the superficial MCL, the farthest, ends 0.06 to 0.12 below it."""
-BEYOND = 0.03
-"""m, of a tibial end above the insert's bottom, or of a femoral one below the flexion axis."""
 TENDON = (0.025, 0.085)
 """m, of the patellar ligament's length."""
 ORIGIN = (0.08, 0.55)
 """m, of an extensor's origin above the flexion axis: within the thigh."""
-AHEAD = 0.01
-"""m, of that origin from the line from hip to knee at least: 0.029 to 0.044 in three models. Vasti
-begin on the front of a shaft that is bowed forward, the rectus femoris ahead of the hip."""
 TUBEROSITY = (0.01, 0.11)
 """m, of the patellar ligament's distal end from the insert's centre; it lies below and ahead."""
-ON_PATELLA = 0.06
-"""m, of both lines' ends from the patella's origin: the patella is 0.045 long."""
 PATELLA_HEIGHT, PATELLA_ASIDE = 0.025, 0.025
 """m: the lines end at least so far apart along it (0.039 to 0.045 in three models), and within
 half its breadth."""
-TENDON_CHANGE = 0.15
-"""Of its mean, the change of the patellar ligament's length between recorded ends: it strains by
-a few per cent."""
 
 
 def attachment_questions(case: Case) -> Iterator[Question]:
@@ -54,8 +67,8 @@ def attachment_questions(case: Case) -> Iterator[Question]:
     far = [name for name, end in ends if not _belongs(*_on_carrier(case, end))]
     if far:
         yield Question(
-            f"{some(far)} ends more than {FARTHEST_ATTACHMENT / MILLIMETRE:.0f} mm from the knee, "
-            "or beyond the joint: is its point_mm, sign or link another one?",
+            f"{some(far)} ends more than {LINE_LIMITS.max_attachment_distance / MILLIMETRE:.0f} mm "
+            "from the knee, or beyond the joint: is its point_mm, sign or link another one?",
             "attachment far from its place",
         )
     for muscle in case.muscles:
@@ -91,7 +104,10 @@ def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
 def _belongs(carrier: str, place: Array) -> bool:
     """Say whether a ligament may end at a place (3,) m, as `_on_carrier` gives it."""
     beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
-    return float(np.linalg.norm(place)) <= FARTHEST_ATTACHMENT and beyond <= BEYOND
+    return (
+        float(np.linalg.norm(place)) <= LINE_LIMITS.max_attachment_distance
+        and beyond <= LINE_LIMITS.max_overlap
+    )
 
 
 def stiffness_questions(case: Case) -> Iterator[Question]:
@@ -115,7 +131,7 @@ def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float])
         bundle.name
         for bundle in ligaments
         if tensions.get(bundle.name, 0.0)
-        > float(bundle.force((1.0 + STRAIN) * bundle.slack_length))
+        > float(bundle.force((1.0 + LINE_LIMITS.max_strain) * bundle.slack_length))
     ]
 
 
@@ -133,20 +149,28 @@ def strain_questions(
         return
     table = np.array([strains[bundle.name] for bundle in ligaments])
     most = table.max(axis=1)
-    torn = [bundle.name for bundle, strain in zip(ligaments, most, strict=True) if strain > STRAIN]
+    torn = [
+        bundle.name
+        for bundle, strain in zip(ligaments, most, strict=True)
+        if strain > LINE_LIMITS.max_strain
+    ]
     if torn:
         i, k = divmod(int(np.argmax(table)), table.shape[1])
         yield Question(
-            f"{some(torn)} would strain beyond {100 * STRAIN:.0f} %, {ligaments[i].name} by "
-            f"{100 * table[i, k]:.0f} % at {time[k]:.4g} s: is an attachment, a slack length or "
-            "the recorded pose wrong?",
+            f"{some(torn)} would strain beyond {100 * LINE_LIMITS.max_strain:.0f} %, "
+            f"{ligaments[i].name} by {100 * table[i, k]:.0f} % at {time[k]:.4g} s: "
+            "is an attachment, a slack length or the recorded pose wrong?",
             "",
         )
-    loose = [bundle.name for bundle, strain in zip(ligaments, most, strict=True) if strain < SLACK]
+    loose = [
+        bundle.name
+        for bundle, strain in zip(ligaments, most, strict=True)
+        if strain < LINE_LIMITS.min_strain
+    ]
     if loose:
         yield Question(
-            f"{some(loose)} is never within {-100 * SLACK:.0f} % of being taut: is an attachment "
-            "or slack_length_mm in another unit?",
+            f"{some(loose)} is never within {-100 * LINE_LIMITS.min_strain:.0f} % of "
+            "being taut: is an attachment or slack_length_mm in another unit?",
             "ligament far from taut throughout",
         )
 
@@ -168,7 +192,11 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
         _, origin = _on_carrier(case, muscle.points[0])
         ahead = origin[0] - hip[0] * origin[1] / hip[1]
         aside = np.hypot(origin[0], origin[2]) > 0.12
-        if not ORIGIN[0] <= origin[1] <= ORIGIN[1] or ahead < AHEAD or aside:
+        if (
+            not ORIGIN[0] <= origin[1] <= ORIGIN[1]
+            or ahead < LINE_LIMITS.min_anterior_offset
+            or aside
+        ):
             off.append(f"[{muscle.name}] origin")
         _, base = _on_carrier(case, muscle.points[-1])
         on_patella.insert(-1, (f"[{muscle.name}] insertion", base, 1.0))
@@ -180,7 +208,10 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
     if not TUBEROSITY[0] <= away <= TUBEROSITY[1] or distal[0] < 0 or distal[1] > 0.01:
         off.append("[patellar_ligament] distal")
     for name, place, sign in on_patella:
-        beyond = np.linalg.norm(place) > ON_PATELLA or abs(place[2]) > PATELLA_ASIDE
+        beyond = (
+            np.linalg.norm(place) > LINE_LIMITS.max_patella_distance
+            or abs(place[2]) > PATELLA_ASIDE
+        )
         if beyond or sign * place[1] < 0.0:
             off.append(name)
     if off:
@@ -199,13 +230,15 @@ def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
         return
     low, high = float(lengths.min()), float(lengths.max())
     mean = float(lengths.mean())
-    if not TENDON[0] <= mean <= TENDON[1] or high - low > TENDON_CHANGE * mean:
+    if not TENDON[0] <= mean <= TENDON[1] or high - low > LINE_LIMITS.max_tendon_change * mean:
         yield Question(
             f"the patellar ligament is {low / MILLIMETRE:.0f} to {high / MILLIMETRE:.0f} mm long: "
             "is one of its ends, or the patella's motion, wrong in sign or unit?",
             "patellar ligament of odd length",
         )
-    elif abs(declared / mean - 1) > TENDON_CHANGE:  # not where none is declared: NaN
+    elif (
+        abs(declared / mean - 1) > LINE_LIMITS.max_tendon_change
+    ):  # not where none is declared: NaN
         yield Question(
             f"the patellar ligament is {mean / MILLIMETRE:.0f} mm between its ends, but length_mm "
             f"is {declared / MILLIMETRE:g}: which is right?",

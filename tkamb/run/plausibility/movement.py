@@ -1,6 +1,7 @@
 """Questions about the recorded movement: ranges, rates, samples off their neighbours' curve."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,8 +12,23 @@ from tkamb.io.scene.recording_tables import GroundReactionTable
 from tkamb.run.plausibility.question import Question
 from tkamb.units import DEGREE, MILLIMETRE
 
-FLEXION_RADIANS = 3.3
-"""deg: a bend of more than 10 deg, in radians and called degrees, stays below this."""
+
+@dataclass(frozen=True)
+class MovementLimitSettings:
+    """Which movements are plausible."""
+
+    max_flexion_as_radians: float = 3.3
+    """deg; a bend of more than 10 deg that is stored in radians but read as degrees stays below
+    this."""
+    max_marker_residual: float = 12.0 * MILLIMETRE
+    """m; root mean square in the median frame. Skin moves by up to 10 mm in a cluster, 5 mm on the
+    stairs of subject JW."""
+    min_duration: float = 0.15
+    """s; no movement of a leg is shorter."""
+
+
+MOVEMENT_LIMITS = MovementLimitSettings()
+
 LEAN_RADIANS, DEEP = 2.6, 60.0
 """deg: a shank that leans by up to 150 deg, in radians and called degrees, stays below the first;
 whoever bends the knee by the second leans by ten times as much."""
@@ -22,10 +38,6 @@ USUAL_RATE = {"flexion": 20.0, "adduction": 6.0, "axial_rotation": 10.0}
 """rad/s: a kick's flexion; the others in a pivoting jump."""
 PATELLA_AWAY = (15.0 * MILLIMETRE, 80.0 * MILLIMETRE)
 """Of a recorded patella's origin from the flexion axis: 26 to 57 mm in eight designs' bends."""
-MARKERS_OFF = 12.0 * MILLIMETRE
-"""rms, in the median frame: skin moves by up to 10 mm in a cluster, 5 mm on subject JW's stairs."""
-BRIEFEST = 0.15
-"""s: no movement of a leg is over sooner."""
 
 
 def motion_questions(case: Case) -> Iterator[Question]:
@@ -34,7 +46,7 @@ def motion_questions(case: Case) -> Iterator[Question]:
     angles = dict(zip(KNEE_COORDINATES, motion.coordinates.T, strict=True))
     rates = dict(zip(KNEE_COORDINATES, motion.velocity.T, strict=True))
     flexion = angles["flexion"] / DEGREE
-    if np.ptp(flexion) > 0.2 and np.abs(flexion).max() < FLEXION_RADIANS:
+    if np.ptp(flexion) > 0.2 and np.abs(flexion).max() < MOVEMENT_LIMITS.max_flexion_as_radians:
         yield Question(
             f"flexion runs from {flexion.min():.2g} to {flexion.max():.2g} deg: is it in radians?",
             "flexion hardly changes",
@@ -82,7 +94,7 @@ def motion_questions(case: Case) -> Iterator[Question]:
                 far,
             )
     lasting = float(motion.time[-1] - motion.time[0])
-    if lasting < BRIEFEST:
+    if lasting < MOVEMENT_LIMITS.min_duration:
         yield Question(
             f"the motion lasts {lasting:.3g} s: is its time in seconds?", "motion too brief"
         )
@@ -97,7 +109,7 @@ def marker_questions(case: Case) -> Iterator[Question]:
     else:
         return
     known = rms[np.isfinite(rms)]
-    if len(known) and (middle := float(np.median(known))) > MARKERS_OFF:
+    if len(known) and (middle := float(np.median(known))) > MOVEMENT_LIMITS.max_marker_residual:
         yield Question(
             f"{whose} lie {middle / MILLIMETRE:.0f} mm (rms) from their places: is markers_mm "
             "another subject's or trial's, or are two of them exchanged?",

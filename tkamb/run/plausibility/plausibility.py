@@ -1,6 +1,7 @@
 """All questions of a case, and what they say about a frame."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,8 +29,17 @@ if TYPE_CHECKING:
     from tkamb.run.mechanics import FrameLoads, Mechanics
 
 ANSWERS = "[output] answers"
-FORCE_BW = 8.0
-"""BW: instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
+
+
+@dataclass(frozen=True)
+class ForceLimitSettings:
+    """Which contact forces are plausible."""
+
+    max_force_BW: float = 8.0
+    """BW; instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
+
+
+FORCE_LIMITS = ForceLimitSettings()
 
 
 class Plausibility:
@@ -49,7 +59,7 @@ class Plausibility:
     def __init__(self, mechanics: "Mechanics") -> None:
         self._mechanics = mechanics
         case = mechanics.case
-        found = [
+        result = [
             *segment_questions(case),
             *motion_questions(case),
             *marker_questions(case),
@@ -64,8 +74,8 @@ class Plausibility:
             *sign_questions(case),
         ]
         if case.ligaments or case.muscles:
-            found += _line_questions(mechanics)
-        self.questions, self.answered = _answered(found, case.scene.output.answers)
+            result += _line_questions(mechanics)
+        self.questions, self.answered = _answered(result, case.scene.output.answers)
 
     def flags(self, k: int, body: "FrameLoads") -> list[str]:
         """Return the words for the status of frame k."""
@@ -73,12 +83,14 @@ class Plausibility:
             question.flag for question in self.questions if question.flag and question.concerns(k)
         ]
         if self._mechanics.ligaments:
-            from tkamb.run.plausibility.lines import STRAIN, torn_bundles
+            from tkamb.run.plausibility.lines import LINE_LIMITS, torn_bundles
 
             if torn := torn_bundles(self._mechanics.ligaments, body.geometry.tensions):
-                words.append(f"ligament strain above {100 * STRAIN:.0f} %: {some(torn)}")
+                words.append(
+                    f"ligament strain above {100 * LINE_LIMITS.max_strain:.0f} %: {some(torn)}"
+                )
         force = float(np.linalg.norm(body.loads.contact_force)) / self._mechanics.case.body_weight
-        if force > FORCE_BW:
+        if force > FORCE_LIMITS.max_force_BW:
             words.append(
                 f"contact force of {force:.1f} BW, more than any knee was measured to bear"
             )
@@ -94,28 +106,28 @@ def _answered(
         asked: all of them.
         answers: words of a question's text -> its answer.
     """
-    left, told = list(asked), []
+    left, text = list(asked), []
     for words, answer in answers.items():
         own = [question for question in left if words and words.lower() in question.text.lower()]
         if not own:
             texts = "; ".join(question.text for question in left) or "there is none"
-            mend = f"leave it out, or take words of one that is asked: {texts}"
-            raise InputError(f"no question holds '{words}'", ANSWERS, mend)
+            hint = f"leave it out, or take words of one that is asked: {texts}"
+            raise InputError(f"no question holds '{words}'", ANSWERS, hint)
         if not answer.strip():
             raise InputError(f"'{words}' has no answer", ANSWERS, "say why the input is right")
-        told += [f"Answered: {question.text} {answer}" for question in own]
+        text += [f"Answered: {question.text} {answer}" for question in own]
         left = [question for question in left if question not in own]
-    return tuple(left), tuple(told)
+    return tuple(left), tuple(text)
 
 
 def _line_questions(mechanics: "Mechanics") -> list[Question]:
     from tkamb.run.plausibility import lines
 
     case = mechanics.case
-    found = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
+    result = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
     poses = mechanics.recorded_poses
-    found += lines.extensor_questions(case, poses)
+    result += lines.extensor_questions(case, poses)
     if not (case.scene.contact and case.scene.contact.released):
         strains = {b.name: b.strain(b.length(poses)) for b in mechanics.ligaments}
-        found += lines.strain_questions(mechanics.ligaments, strains, case.motion.time)
-    return found
+        result += lines.strain_questions(mechanics.ligaments, strains, case.motion.time)
+    return result

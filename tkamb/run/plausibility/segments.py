@@ -1,6 +1,7 @@
 """Questions about shank and thigh: masses, centres, radii of gyration, lengths."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,27 +11,39 @@ from tkamb.io.scene.case import Case
 from tkamb.run.plausibility.question import Question
 from tkamb.units import DEGREE, MILLIMETRE
 
-SEGMENT_MASS = 1.6
-"""Times or one over: a segment's mass against de Leva's share of the body's, which differs by
-1.35 at most between cadaver studies and by 1.3 with obesity. Pounds for kilograms are 2.2."""
+
+@dataclass(frozen=True)
+class SegmentLimitSettings:
+    """Which masses and positions of the segments of a leg are plausible."""
+
+    max_mass_ratio: float = 1.6
+    """Ratio, or its inverse, of a segment's mass to de Leva's share of the body's. It differs by
+    1.35 at most between cadaver studies and by 1.3 with obesity; pounds read as kilograms give
+    2.2."""
+    max_patella_offset: float = 0.05
+    """m; of the patella's centre of mass from its origin."""
+    max_insert_rotation: float = 20.0 * DEGREE
+    """rad; from the tibia's axes. The slope is up to 10 deg, and the axis of a shank may be laid
+    through other points."""
+    max_centre_offset: float = 0.12
+    """Share of a segment's length by which its centre of mass may lie beside its axis; with the
+    foot, which points forward, twice as much."""
+
+
+SEGMENT_LIMITS = SegmentLimitSettings()
+
 PATELLA_MASS = (0.02, 0.6)
 """kg, from the bone alone to all that moves with it."""
-PATELLA_SIZE = 0.05
-"""m: a patella's centre of mass is not farther than this from its origin."""
 PATELLA_RADII = (0.005, 0.04)
 """m, of gyration: a bone 45 mm wide and 20 mm thick has 9 to 13 mm."""
 
 SHANK_SHARE, THIGH_SHARE = (0.19, 0.30), (0.19, 0.31)
 """Of body height: 0.246 and 0.245 (Drillis & Contini 1966) and a fourth more or less."""
-INSERT_TURN = 20.0 * DEGREE
-"""From the tibia's axes: slope up to 10 deg, and a shank's axis laid through other points."""
 RADII = ((0.15, 0.45), (0.05, 0.30))
 """Of gyration over segment length, across and along it: de Leva's are 0.24 to 0.37 and 0.09 to
 0.16; a foot makes the shank's larger."""
 CENTRE = (0.15, 0.8)
 """Of a segment's mass, as a share of its length from the distal joint: 0.37 to 0.64 (de Leva)."""
-CENTRE_ASIDE = 0.12
-"""Of that length, beside it; with the foot, which points forward, twice as much."""
 
 
 def segment_questions(case: Case) -> Iterator[Question]:
@@ -45,7 +58,11 @@ def segment_questions(case: Case) -> Iterator[Question]:
     }
     masses = {link: chain.segment(link)[0] for link in shares}
     ratios = {link: masses[link] / (share * case.body_mass) for link, share in shares.items()}
-    if wrong := [s for s, r in ratios.items() if not 1 / SEGMENT_MASS <= r <= SEGMENT_MASS]:
+    if wrong := [
+        s
+        for s, r in ratios.items()
+        if not 1 / SEGMENT_LIMITS.max_mass_ratio <= r <= SEGMENT_LIMITS.max_mass_ratio
+    ]:
         link = wrong[0]
         yield Question(
             f"'{link}' of the URDF weighs {masses[link]:.3g} kg, {ratios[link]:.2g} times what it "
@@ -70,7 +87,7 @@ def segment_questions(case: Case) -> Iterator[Question]:
                 )
     turn = chain.insert_in_tibia[:3, :3]
     leans = np.degrees(np.arccos(np.clip(np.diag(turn), -1, 1)))
-    if leans.max() > INSERT_TURN / DEGREE:
+    if leans.max() > SEGMENT_LIMITS.max_insert_rotation / DEGREE:
         yield Question(
             f"the insert's axes are turned by {leans.max():.0f} deg from the tibia's: is the rpy "
             "of knee_ap right?",
@@ -88,7 +105,10 @@ def _of_patella(case: Case) -> Iterator[Question]:
             f"the radii of gyration of 'patella' are {shown} mm: is its <inertia> in kg·m²?",
             "inertia of patella unlike a patella's",
         )
-    if not PATELLA_MASS[0] <= mass <= PATELLA_MASS[1] or np.linalg.norm(centre) > PATELLA_SIZE:
+    if (
+        not PATELLA_MASS[0] <= mass <= PATELLA_MASS[1]
+        or np.linalg.norm(centre) > SEGMENT_LIMITS.max_patella_offset
+    ):
         shown = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
         yield Question(
             f"'patella' of the URDF weighs {mass:.3g} kg, its centre of mass at ({shown}) mm: is "
@@ -104,7 +124,9 @@ def _of_inertia(case: Case, link: str, end: Array) -> Iterator[Question]:
     along = end / length
     share = float(centre @ along) / length
     aside = float(np.linalg.norm(centre - share * end)) / length
-    if not CENTRE[0] <= share <= CENTRE[1] or aside > CENTRE_ASIDE * (2 if link == "tibia" else 1):
+    if not CENTRE[0] <= share <= CENTRE[1] or aside > SEGMENT_LIMITS.max_centre_offset * (
+        2 if link == "tibia" else 1
+    ):
         shown = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
         yield Question(
             f"the centre of mass of '{link}' is at ({shown}) mm, off its segment: is the origin "

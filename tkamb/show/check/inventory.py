@@ -23,8 +23,17 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.measured_force import MeasuredForce
 
 ANGLES = ("flexion", "adduction", "axial_rotation")
-TORN = 0.1
-"""Strain at which a bundle is named: docs/results.md."""
+
+
+@dataclass(frozen=True)
+class InventorySettings:
+    """What `tkamb check` lists."""
+
+    high_strain: float = 0.1
+    """Strain from which a bundle is named; ligaments of the knee tear at 12 to 20 %."""
+
+
+INVENTORY = InventorySettings()
 
 
 @dataclass(frozen=True)
@@ -50,27 +59,27 @@ class Entry:
 def inventory(mechanics: Mechanics) -> tuple[Entry, ...]:
     """Return what every file and table of a case gave."""
     case = mechanics.case
-    found = [_patient(case), _motion(case)]
+    result = [_patient(case), _motion(case)]
     if case.scene.tibia or case.motion.markers:
-        found.append(_shank(case))
+        result.append(_shank(case))
     if case.ground is not None:
-        found.append(_ground(case))
-    found += _surfaces(case)
+        result.append(_ground(case))
+    result += _surfaces(case)
     if mechanics.ligaments:
-        found.append(_ligaments(mechanics))
+        result.append(_ligaments(mechanics))
     if case.muscles:
-        found.append(_extensor(case))
+        result.append(_extensor(case))
     if case.scene.muscles:
         file = case.scene.muscles.model
-        found.append(Entry("muscles", file, "all of the leg, by static optimisation"))
+        result.append(Entry("muscles", file, "all of the leg, by static optimisation"))
     if case.emg is not None:
         text = f"channels {', '.join(case.emg.values)}, {_span(case.emg.time)}"
-        found.append(Entry("EMG", case.emg.path, text))
+        result.append(Entry("EMG", case.emg.path, text))
     if case.scene.contact:
-        found.append(_contact(case))
+        result.append(_contact(case))
     if case.measured is not None:
-        found.append(_measured(case.measured, case.body_weight))
-    return tuple(found)
+        result.append(_measured(case.measured, case.body_weight))
+    return tuple(result)
 
 
 def _patient(case: Case) -> Entry:
@@ -154,7 +163,7 @@ def _ligaments(mechanics: Mechanics) -> Entry:
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
         for name, values in strains.items()
         for flexion, value in zip(STRAIN_FLEXIONS, values, strict=True)
-        if value > TORN
+        if value > INVENTORY.high_strain
     ]
     text = f"{len(mechanics.ligaments)} bundles: {_listed([b.name for b in mechanics.ligaments])}"
     known = np.array([v for values in strains.values() for v in values if np.isfinite(v)])
@@ -165,13 +174,13 @@ def _ligaments(mechanics: Mechanics) -> Entry:
 
 def _listed(names: Sequence[str]) -> str:
     """Return names by commas; three or more that count up one by one as first–last."""
-    said: list[str] = []
+    text: list[str] = []
     for stem, group in groupby(names, lambda name: name.rstrip("0123456789")):
         own = list(group)
         first, last = own[0][len(stem) :], own[-1][len(stem) :]
         counted = [f"{stem}{k}" for k in range(int(first), int(last) + 1)] if first and last else []
-        said += [f"{own[0]}–{last}"] if len(own) > 2 and own == counted else own
-    return ", ".join(said)
+        text += [f"{own[0]}–{last}"] if len(own) > 2 and own == counted else own
+    return ", ".join(text)
 
 
 def _extensor(case: Case) -> Entry:

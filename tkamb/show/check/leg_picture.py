@@ -91,11 +91,11 @@ def shown_frames(mechanics: Mechanics) -> list[int]:
     wanted = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
     if case.ground is not None:
         wanted.insert(1, int(np.argmax(np.linalg.norm(case.ground.force, axis=1))))
-    found: list[int] = []
+    result: list[int] = []
     for k in wanted:
-        if len(found) < 3 and all(abs(k - other) >= max(count // 5, 1) for other in found):
-            found.append(k)
-    return sorted(found)
+        if len(result) < 3 and all(abs(k - other) >= max(count // 5, 1) for other in result):
+            result.append(k)
+    return sorted(result)
 
 
 def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:

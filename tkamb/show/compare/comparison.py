@@ -30,8 +30,17 @@ SETTINGS = {
 }
 """Keys of summary.json that are said where they differ."""
 VERSIONS = "identity"
-LARGEST_COUNT = 8
-"""Runs that one picture can hold apart by colour."""
+
+
+@dataclass(frozen=True)
+class CompareSettings:
+    """How many runs are compared."""
+
+    max_runs: int = 8
+    """Number of runs that a picture can tell apart by colour."""
+
+
+COMPARE = CompareSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +141,9 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
         InputError: fewer than two or too many folders, one that holds no results, or runs that
             ask for different axes.
     """
-    if not 2 <= len(folders) <= LARGEST_COUNT:
+    if not 2 <= len(folders) <= COMPARE.max_runs:
         what = f"{len(folders)} folders of results"
-        raise InputError(what, "compare", f"give two to {LARGEST_COUNT}")
+        raise InputError(what, "compare", f"give two to {COMPARE.max_runs}")
     paths = [Path(folder) for folder in folders]
     read = [read_results(path) for path in paths]
     for path, results in zip(paths, read, strict=True):
@@ -146,8 +155,8 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
         Run(label, path, results, own, pair_frames(read[0], axes[0], results, own))
         for label, path, results, own in zip(_labels(paths), paths, read, axes, strict=True)
     )
-    found = [one for run in runs[1:] for one in differences(runs[0], run)]
-    return Comparison(runs, kind, tuple(_notes(runs)), tuple(found))
+    result = [one for run in runs[1:] for one in differences(runs[0], run)]
+    return Comparison(runs, kind, tuple(_notes(runs)), tuple(result))
 
 
 def _common_axis(paths: Sequence[Path], read: Sequence[Results]) -> str:
@@ -176,7 +185,7 @@ def differences(first: Run, run: Run) -> list[Difference]:
     """
     if run.pairing is None:
         return []
-    found = []
+    result = []
     for column, values in first.results.columns.items():
         if KINDS.get(column, "number") != "number" or column in NOT_COMPARED:
             continue
@@ -187,7 +196,7 @@ def differences(first: Run, run: Run) -> list[Difference]:
             continue
         worst = int(np.nanargmax(np.abs(off)))
         largest = float(np.nanmax(np.abs(values)))
-        found.append(
+        result.append(
             Difference(
                 run.label,
                 column,
@@ -200,7 +209,7 @@ def differences(first: Run, run: Run) -> list[Difference]:
                 int(np.isfinite(off).sum()),
             )
         )
-    return found
+    return result
 
 
 def _notes(runs: Sequence[Run]) -> list[str]:

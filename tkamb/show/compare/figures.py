@@ -22,9 +22,18 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 5.4, 2.7
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
 """So that runs that lie on each other, and readers who see no colour, tell them apart."""
-FAILED_ROW = 0.03
-"""Height of the first run's crosses above the bottom, in heights of the picture; the next are
-as much higher each."""
+
+
+@dataclass(frozen=True)
+class CompareFigureSettings:
+    """Pictures of compared runs."""
+
+    failed_row_height: float = 0.03
+    """Share of a picture's height; of the crosses of failed frames above the bottom, and from one
+    run to the next."""
+
+
+COMPARE_FIGURE = CompareFigureSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +112,7 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
     marker = "o" if len(values) == 1 else ""  # a line of one point would not be seen
     axes.plot(x, y, color=colour, linestyle=dashes, gid=f"run-{number}", marker=marker)
     lost = failed(run.results)
-    height = np.full(int(lost.sum()), FAILED_ROW * (1 + number))
+    height = np.full(int(lost.sum()), COMPARE_FIGURE.failed_row_height * (1 + number))
     axes.plot(
         run.axis.values[lost], height, "x", color=colour, markersize=5,
         transform=axes.get_xaxis_transform(), gid=f"failed-{number}",

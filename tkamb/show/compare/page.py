@@ -93,13 +93,13 @@ def _run(comparison: Comparison, number: int) -> dict[str, Any]:
 
 
 def _plots(comparison: Comparison) -> list[dict[str, str]]:
-    found = []
+    result = []
     for number, quantity in enumerate(QUANTITIES):
         figure = draw_quantity(comparison, quantity)
         if figure is not None:
             svg = svg_text(figure, f"plot{number}")
-            found.append({"title": quantity.title, "unit": quantity.unit, "svg": svg})
-    return found
+            result.append({"title": quantity.title, "unit": quantity.unit, "svg": svg})
+    return result
 
 
 def _rows(comparison: Comparison, found: Sequence[Difference]) -> list[list[str]]:

@@ -11,8 +11,16 @@ from tkamb.show.axis import HorizontalAxis
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-SAME_PLACE = 1e-6
-"""deg, per cent or s: as near on the axis as two runs of one recording are."""
+
+@dataclass(frozen=True)
+class PairingSettings:
+    """When frames of two runs are the same instant."""
+
+    tolerance: float = 1e-6
+    """deg, per cent or s; frames nearer on the axis are the same instant of one recording."""
+
+
+PAIRING = PairingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +85,9 @@ def _same_frames(
 ) -> Index | None:
     """Return the other's frame of each frame (f,), -1 without one; None: not one recording."""
     at = {float(time): k for k, time in enumerate(other_time)}
-    found = np.array([at.get(float(time), -1) for time in first_time], np.int64)
-    paired = found >= 0
+    result = np.array([at.get(float(time), -1) for time in first_time], np.int64)
+    paired = result >= 0
     if paired.sum() < min(len(first_time), len(other_time)):
         return None
-    near = np.abs(first_place[paired] - other_place[found[paired]]) <= SAME_PLACE
-    return found if near.all() else None
+    near = np.abs(first_place[paired] - other_place[result[paired]]) <= PAIRING.tolerance
+    return result if near.all() else None

@@ -1,6 +1,7 @@
 """The forces of a drawing: magnitudes from results.csv, lines of action from the geometry."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +17,17 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 NOTHING = np.full(3, np.nan)
-CONTACT_POINT = 0.6 * MILLIMETRE
-"""m, radius."""
+
+
+@dataclass(frozen=True)
+class ArrowSettings:
+    """Arrows of the viewer."""
+
+    contact_point_radius: float = 0.6 * MILLIMETRE
+    """m; radius of the sphere at a centre of pressure."""
+
+
+ARROW = ArrowSettings()
 
 
 def force_arrows(
@@ -37,7 +47,7 @@ def force_arrows(
         "ground reaction": _vector(results, "ground_reaction_{}_N"),
         "hip": _vector(results, "hip_force_{}_N"),
     }
-    found = [
+    result = [
         _arrow(
             "ground reaction",
             geometries,
@@ -49,26 +59,28 @@ def force_arrows(
         *_extensor(results, geometries),
         *_condyles(results, geometries, friction),
     ]
-    return tuple(arrow for arrow in found if np.isfinite(arrow.forces).any())
+    return tuple(arrow for arrow in result if np.isfinite(arrow.forces).any())
 
 
 def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
     """Return a ball at each condyle's contact point and at the patella's."""
-    found = {
+    result = {
         f"{side} contact point": [_condyle_point(one, side) for one in geometries]
         for side in ("medial", "lateral")
     }
     patella = "patellofemoral contact point"
-    found[patella] = [one.extensor.contact_point if one.extensor else NOTHING for one in geometries]
+    result[patella] = [
+        one.extensor.contact_point if one.extensor else NOTHING for one in geometries
+    ]
     return tuple(
         Marker(
             name,
             "patella" if name == patella else "contact points",
             BLACK,
             np.stack(points),
-            CONTACT_POINT,
+            ARROW.contact_point_radius,
         )
-        for name, points in found.items()
+        for name, points in result.items()
         if np.isfinite(points).any()
     )
 

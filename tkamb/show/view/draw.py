@@ -44,8 +44,8 @@ def draw(
     case, mechanics, results = run.case, run.mechanics, run.results
     geometries = run.geometries(progress)
     states = [one.state for one in geometries]
-    maps, found = results.maps, map_rows(results)
-    rows = [found.get(k, -1) for k in range(len(results))]
+    maps, result = results.maps, map_rows(results)
+    rows = [result.get(k, -1) for k in range(len(results))]
     contact = case.scene.contact
     floor, centre = floor_and_foot(case, geometries, run.frames)
     others = floor + worn_insert(results, case.scene.patient.side)
@@ -53,7 +53,7 @@ def draw(
     muscles, most_active = muscle_strands(geometries)
     strands = [*bundles, *extensor_strands(mechanics, states, results), *muscles]
     markers = [*contact_markers(geometries), *centre]
-    if maps is not None and found:
+    if maps is not None and result:
         assert case.insert is not None
         centres = centres_of_pressure(results, case.insert)
         strands += path_strands(centres)

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,18 @@ if TYPE_CHECKING:
 
 SIZE = (1280, 720)
 """Pixels; MP4 wants even numbers."""
-MOST_PER_SECOND = 50.0
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """The film of the viewer."""
+
+    max_frame_rate: float = 50.0
+    """Frames per second; screens show 60."""
+
+
+FILM = FilmSettings()
+
 READY = (
     "new Promise((done, fail) => { setTimeout(() => fail('not drawn in 60 s'), 60000); "
     "setInterval(() => document.body.dataset.ready && done(), 20); })"
@@ -65,7 +77,7 @@ def write_film(show: "Show", path: Path, progress: Progress = lambda frames: fra
     """
     times = max((one.times for one in show.drawings), key=len)
     rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 1.0
-    rate = float(np.clip(rate, 1.0, MOST_PER_SECOND))
+    rate = float(np.clip(rate, 1.0, FILM.max_frame_rate))
     pictures = film_frames(show.html(), len(times), progress)
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with replaced_file(path) as temporary:
@@ -126,9 +138,9 @@ def _playwright() -> Any:
 
 def _encoder() -> str:
     """Return the path of an ffmpeg: the machine's, or that of the extra."""
-    found = shutil.which("ffmpeg")
-    if found is not None:
-        return found
+    result = shutil.which("ffmpeg")
+    if result is not None:
+        return result
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:

@@ -10,14 +10,14 @@ import numpy as np
 
 from tkamb.contact.registry import contact_names
 from tkamb.errors import InputError, TkambError
-from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_pose
+from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, Index, knee_pose
 from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.si import in_si
 from tkamb.knee.chain import Chain
 from tkamb.knee.equilibrium.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
-from tkamb.run.known import Known
+from tkamb.run.known import SharedState
 from tkamb.run.known_errors import as_json, known_error
 from tkamb.run.mechanics import FrameLoads, Mechanics
 from tkamb.show.view.bench import ROWS, Bench, BenchRequest, write_bench
@@ -45,7 +45,7 @@ class LiveAnswer:
     status: str
     pose: Array
     points: Array
-    triangles: Array
+    triangles: Index
     pressure: Array
     gap: Array
     ligaments: dict[str, Array]
@@ -74,7 +74,7 @@ class LiveKnee:
         self.case = _without_muscles(case)
         self.bench = Bench(self.case, Mechanics(self.case, near=True).ligaments)
         self._sides: dict[tuple[str, float], ContactSide] = {}
-        self._known: Known | None = None
+        self._known: SharedState | None = None
         self._threads: dict[tuple[str, float], Thread] = {}
         self._refused: dict[tuple[str, float], TkambError] = {}
         self._before: dict[tuple[str, float], FrameContact] = {}
@@ -192,7 +192,7 @@ class LiveKnee:
             case = self.bench.case_of(request)
             mechanics = Mechanics(case, self._known, near=True)
             self._sides[key] = ContactSide(case, mechanics)
-            self._known = Known(mechanics.query, None, None, range(ROWS))
+            self._known = SharedState(mechanics.query, None, None, range(ROWS))
         return self._sides[key]
 
     def _compute(self, request: BenchRequest) -> LiveAnswer:

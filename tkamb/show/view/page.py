@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,17 @@ BROWSERS = (
     "microsoft-edge",
 )
 SOFTWARE_GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-LONGEST_PICTURE = 120.0
-"""s."""
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """Pictures that a browser takes of the viewer page."""
+
+    timeout: float = 120.0
+    """s; a browser that takes longer has failed."""
+
+
+PAGE = PageSettings()
 
 
 def page_html(
@@ -83,12 +93,12 @@ def find_browser() -> str:
     Raises:
         ComputationError: there is none.
     """
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
+    result = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if result is None:
         raise ComputationError(
-            "no browser found", mend="install chromium (Debian: apt install chromium)"
+            "no browser found", hint="install chromium (Debian: apt install chromium)"
         )
-    return found
+    return result
 
 
 def screenshot(html: str, size: tuple[int, int]) -> bytes:
@@ -123,9 +133,9 @@ def screenshot(html: str, size: tuple[int, int]) -> bytes:
             f"{page.as_uri()}#figure=1",
         ]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=LONGEST_PICTURE)
+            done = subprocess.run(command, capture_output=True, timeout=PAGE.timeout)
         except subprocess.TimeoutExpired:
-            raise ComputationError(f"no picture of the page in {LONGEST_PICTURE:g} s") from None
+            raise ComputationError(f"no picture of the page in {PAGE.timeout:g} s") from None
         if b'data-ready="yes"' not in done.stdout or not picture.exists():
             raise ComputationError("the page could not be drawn", str(browser))
         return picture.read_bytes()

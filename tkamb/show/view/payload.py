@@ -41,7 +41,7 @@ from tkamb.show.view.drawing import (
     Solid,
     Strand,
 )
-from tkamb.show.view.shading import MOST_TRIANGLES, Shaded, shade
+from tkamb.show.view.shading import SHADING, Shaded, shade
 from tkamb.units import MILLIMETRE
 
 
@@ -150,7 +150,7 @@ def _view(
     for solid in drawing.solids:
         shape = shade(
             solid.surface,
-            MOST_TRIANGLES if solid.wear is None else VIEW_PAYLOAD.most_coloured_triangles,
+            SHADING.max_triangles if solid.wear is None else VIEW_PAYLOAD.most_coloured_triangles,
         )
         if shape.error:
             notes.append(

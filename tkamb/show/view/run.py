@@ -55,13 +55,13 @@ class CaseResults:
         from tkamb.knee.equilibrium.frame_contact import FrameContact
         from tkamb.run.contact_side import ContactSide
 
-        side, found = ContactSide(self.case, self.mechanics), list[KneeGeometry]()
+        side, result = ContactSide(self.case, self.mechanics), list[KneeGeometry]()
         touched: list[FrameContact] = []
         for k in progress(self.frames):
             body, contact_of_frame = side.frame(k, touched)
-            found.append(body.geometry)
+            result.append(body.geometry)
             touched.append(contact_of_frame)
-        return found
+        return result
 
     def _geometry(self, k: int, row: int | None) -> KneeGeometry:
         """Return what the equations of a frame of the motion worked on.

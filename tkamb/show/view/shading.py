@@ -10,9 +10,18 @@ from numpy.typing import NDArray
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-MOST_TRIANGLES = 6_000
-"""Per surface; a finer one is decimated before it is drawn. With two of that size and the smaller
-parts a frame takes less than 100 ms where no graphics card helps."""
+
+@dataclass(frozen=True)
+class ShadingSettings:
+    """How surfaces of the viewer are simplified."""
+
+    max_triangles: int = 6_000
+    """Triangles per surface; a finer one is decimated before it is drawn. With two of that size and
+    the smaller parts a frame takes less than 100 ms without a graphics card."""
+
+
+SHADING = ShadingSettings()
+
 AGGRESSIVENESS = range(5, 11)
 """How soon far vertices may be merged: tried until few enough triangles are left."""
 
@@ -35,7 +44,7 @@ class Shaded:
 
 
 @lru_cache(maxsize=16)
-def shade(surface: Surface, most_triangles: int = MOST_TRIANGLES) -> Shaded:
+def shade(surface: Surface, most_triangles: int = SHADING.max_triangles) -> Shaded:
     """Return a surface for drawing; vertices on sharp edges are doubled."""
     surface, error = decimate(surface, most_triangles)
     normals = surface.corner_normals
@@ -66,8 +75,8 @@ def decimate(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
         fewer, kept = simplify(points, faces, target_count=most_triangles, agg=aggressiveness)
         if len(kept) <= most_triangles:
             break
-    found = Surface(fewer.astype(float) * MILLIMETRE, kept.astype(np.int64), surface.name)
-    return found, _distance(found, surface)
+    result = Surface(fewer.astype(float) * MILLIMETRE, kept.astype(np.int64), surface.name)
+    return result, _distance(result, surface)
 
 
 def _distance(one: Surface, other: Surface) -> float:

@@ -96,17 +96,17 @@ def solids(
     """
     solved = np.stack([state.pose("femur") for state in states])
     still = np.eye(4)[None]
-    found = []
+    result = []
     if case.insert is not None:
-        found.append(Solid("insert", "insert", case.insert, INSERT, 1.0, still))
+        result.append(Solid("insert", "insert", case.insert, INSERT, 1.0, still))
     if case.post is not None:
-        found.append(Solid("post", "insert", case.post, INSERT, 1.0, still))
+        result.append(Solid("post", "insert", case.post, INSERT, 1.0, still))
     if case.femoral is not None:
         poses = _contact_poses(solved, maps, rows)
-        found.append(
+        result.append(
             Solid("femoral component", "femoral component", case.femoral, METAL, 0.5, poses)
         )
-        found.append(
+        result.append(
             Solid(
                 "recorded femoral component",
                 "recorded pose",
@@ -116,13 +116,13 @@ def solids(
                 recorded,
             )
         )
-    found += [_femur(case, states, solved), _tibia(states)]
+    result += [_femur(case, states, solved), _tibia(states)]
     if case.scene.patella is not None and case.patella is not None:
         poses = np.stack([state.pose("patella") for state in states])
-        found.append(Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses))
+        result.append(Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses))
         bone = _patella(case)
-        found.append(Solid("patella", "patella", bone, BONE, 0.55, poses))
-    return tuple(found)
+        result.append(Solid("patella", "patella", bone, BONE, 0.55, poses))
+    return tuple(result)
 
 
 def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
@@ -261,14 +261,14 @@ def _hull(balls: Sequence[tuple[float, ...]]) -> Surface:
 
 def hull(points: Array, name: str) -> Surface:
     """Return the convex hull of points (n, 3), m, its triangles wound outwards."""
-    found = ConvexHull(points)
-    faces = found.simplices
+    result = ConvexHull(points)
+    faces = result.simplices
     a, b, c = np.moveaxis(points[faces], 1, 0)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.equations[:, :3]) < 0
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), result.equations[:, :3]) < 0
     faces = np.where(inward[:, None], faces[:, ::-1], faces)
     place = np.full(len(points), -1)
-    place[found.vertices] = np.arange(len(found.vertices))
-    return Surface(points[found.vertices], place[faces], name)
+    place[result.vertices] = np.arange(len(result.vertices))
+    return Surface(points[result.vertices], place[faces], name)
 
 
 def sphere_points(count: int = 640) -> Array:

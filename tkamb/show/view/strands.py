@@ -91,7 +91,7 @@ def extensor_strands(
             paths.append(extensor.paths(state))
         except ComputationError:
             paths.append((None, None))
-    muscle, ligament = (list(found) for found in zip(*paths, strict=True))
+    muscle, ligament = (list(result) for result in zip(*paths, strict=True))
     name = extensor.muscle.name.replace("_", " ")
     slack = [
         results[f"{one}_N"] < VIEW_STRAND.slack_force for one in ("quadriceps", "patellar_ligament")
@@ -165,7 +165,7 @@ def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
 def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
     """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
     rays, top = insert.rays, float(insert.bounds[1, 1]) + MILLIMETRE
-    found = {}
+    result = {}
     for side in SIDE_COLOURS:
         x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))
         points = np.column_stack([x, np.full(len(x), top), z])
@@ -173,8 +173,8 @@ def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]
         points[~known] = np.nan
         down, _ = rays.first(points[known], np.array([0.0, -1.0, 0.0]))
         points[known, 1] -= np.where(np.isfinite(down), down, np.nan)
-        found[side] = points
-    return found
+        result[side] = points
+    return result
 
 
 def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:

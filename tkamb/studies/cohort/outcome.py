@@ -143,8 +143,8 @@ class CohortWorker:
             and not name.endswith(TIMES)
             and name not in results.not_modelled
         }
-        found = Outcome("", columns, results.status, chosen_map(results, self._map_flexion))
-        return found if self._wear is None else self._worn(run, results, found, self._wear)
+        result = Outcome("", columns, results.status, chosen_map(results, self._map_flexion))
+        return result if self._wear is None else self._worn(run, results, result, self._wear)
 
     def _worn(
         self, run: CohortRun, results: Results, found: Outcome, wear: CohortWearTable

@@ -241,7 +241,7 @@ def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
     count = math.prod(map(len, axes))
     if count > MOST_RUNS:
         raise InputError(f"makes {count} runs, more than {MOST_RUNS}", path, "split it")
-    found: list[CohortRun] = []
+    result: list[CohortRun] = []
     each = tqdm(itertools.product(*axes), "reading scenes", count, unit="scene", disable=None)
     for subject, trial, design, contact in each:
         if trial.subjects and (subject is None or subject.name not in trial.subjects):
@@ -259,10 +259,12 @@ def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
         own = design.scenes.get(trial.name) if design else None
         scene_path = path.parent / (own or trial.scene)
         scene = _scene(scene_path, overrides, labels, path)
-        found.append(CohortRun(len(found), labels, scene_path, overrides, scene))
-    if not found:
-        raise InputError("makes no run", path, "does any subject do any trial?")
-    return found
+        result.append(CohortRun(len(result), labels, scene_path, overrides, scene))
+    if not result:
+        raise InputError(
+            "makes no run", path, "give every subject at least one trial in [[trial]] subjects"
+        )
+    return result
 
 
 def _scene(
@@ -279,22 +281,22 @@ def _overrides(entry: Any, folder: Path) -> dict[str, Any]:
     """Return what an entry of an axis changes, paths made absolute."""
     if entry is None:
         return {}
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     if isinstance(entry, SubjectTable) and entry.scale != 1.0:
-        found["patient.scale"] = entry.scale
+        result["patient.scale"] = entry.scale
     if isinstance(entry, DesignTable):
         meshes = {"femoral": entry.femoral, "insert": entry.insert}
-        found |= {
+        result |= {
             f"implant.{part}.mesh": str((folder / mesh).absolute())
             for part, mesh in meshes.items()
             if mesh is not None
         }
-        found |= {} if entry.bearing is None else {"implant.insert.bearing": entry.bearing}
+        result |= {} if entry.bearing is None else {"implant.insert.bearing": entry.bearing}
     if isinstance(entry, ContactModelTable):
-        found["contact.model"] = entry.model or entry.name
+        result["contact.model"] = entry.model or entry.name
         if entry.resolution_mm is not None:
-            found["contact.resolution_mm"] = entry.resolution_mm
-    return found | entry.set
+            result["contact.resolution_mm"] = entry.resolution_mm
+    return result | entry.set
 
 
 def _slice(text: str, path: Path) -> slice:
@@ -310,8 +312,22 @@ def _complaint(error: ValidationError, path: Path) -> InputError:
     first = min(error.errors(), key=lambda one: rank.get(one["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        return InputError(f"unknown key '{key}'", path, "docs/cohort.md lists the keys")
+        near = names_near(str(first["loc"][-1]), _keys_beside(first["loc"]))
+        return InputError(f"unknown key '{key}'", path, f"remove it, or rename it: {near}")
     if first["type"] == "missing":
-        return InputError(f"missing key '{key}'", path, "docs/cohort.md lists the keys")
+        return InputError(f"missing key '{key}'", path, "add it")
     message = first["msg"].removeprefix("Value error, ")
     return InputError(f"'{key}': {message}" if key else message, path)
+
+
+def _keys_beside(location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table that a key of a cohort file stands in."""
+    tables: dict[int | str, type[SceneTable]] = {
+        "subject": SubjectTable,
+        "trial": TrialTable,
+        "design": DesignTable,
+        "contact": ContactModelTable,
+        "wear": CohortWearTable,
+    }
+    table = tables.get(location[0], CohortTable) if len(location) > 1 else CohortTable
+    return list(table.model_fields)

@@ -14,7 +14,7 @@ from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.shards import Shards, remove_shards
-from tkamb.run.workers import Crew, Progress, Task
+from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.cohort.folder import write_cohort
 from tkamb.studies.cohort.outcome import CohortWorker, Outcome
 from tkamb.studies.cohort.plan import Cohort, load_cohort
@@ -60,7 +60,7 @@ def run_cohort(
     cohort: Cohort | str | Path,
     directory: str | Path,
     *,
-    crew: Crew | None = None,
+    crew: PoolOptions | None = None,
     part: Part | None = None,
     resume: bool = False,
     force: bool = False,
@@ -90,7 +90,7 @@ def run_cohort(
         KeyboardInterrupt: what is finished is kept in the folder.
     """
     cohort = cohort if isinstance(cohort, Cohort) else load_cohort(cohort)
-    crew = crew or Crew()
+    crew = crew or PoolOptions()
     crew.check()
     identity = _identity(cohort)
     directory = Path(directory)
@@ -123,7 +123,7 @@ def run_cohort(
 def _identity(cohort: Cohort) -> dict[str, Any]:
     code: dict[str, Any] = {"version of tkamb": __version__, "code of tkamb": code_identity()}
     models = sorted({run.scene.contact.model for run in cohort.runs if run.scene.contact})
-    foreign = {name: found for name in models if (found := contact_code(name)) is not None}
+    foreign = {name: result for name in models if (result := contact_code(name)) is not None}
     return cohort.identity() | code | ({CONTACT_CODE: foreign} if foreign else {})
 
 
@@ -131,12 +131,12 @@ def _identity(cohort: Cohort) -> dict[str, Any]:
 def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Path]]:
     """Hold the folders of all parts, whose runs are gathered; none while one computes."""
     with ExitStack() as stack:
-        found = []
+        result = []
         if part is None and resume:
-            found = sorted(directory.glob(SHARD_NAME.format("*", "*")))
-        for one in found:
+            result = sorted(directory.glob(SHARD_NAME.format("*", "*")))
+        for one in result:
             stack.enter_context(claimed_directory(one, command="cohort"))
-        yield found
+        yield result
 
 
 def _holds_parts_alone(directory: Path) -> bool:
@@ -148,10 +148,10 @@ def _holds_parts_alone(directory: Path) -> bool:
 
 def _kept(places: list[Shards], wanted: list[int]) -> dict[int, Outcome]:
     """Return the runs that are finished already."""
-    found: dict[int, Outcome] = {}
+    result: dict[int, Outcome] = {}
     for shards in places:
         for number in wanted if shards.resumed else ():
             shard = shards.get(number)
             if shard is not None:
-                found[number] = Outcome.of(shard)
-    return found
+                result[number] = Outcome.of(shard)
+    return result

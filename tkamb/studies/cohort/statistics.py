@@ -23,8 +23,17 @@ UNITS = ("_N", "_BW", "_MPa", "_mm2", "_mm", "_deg", "_Nm", "_equilibrium", "_yi
 CYCLE = "cycle_percent"
 CYCLE_BIN, WHOLE_CYCLE = 10.0, 100.0
 AXES = ("flexion_deg", CYCLE)
-ROUNDING = 1e-9
-"""Of a bin: 60 deg, which radians make 59.99999999999999, begins the bin from 60 on."""
+
+
+@dataclass(frozen=True)
+class CohortStatisticsSettings:
+    """Statistics over the runs of a cohort."""
+
+    bin_tolerance: float = 1e-9
+    """Share of a bin; 60 deg, which radians make 59.99999999999999, begins the bin from 60 on."""
+
+
+COHORT_STATISTICS = CohortStatisticsSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +155,11 @@ def _computed(outcome: Outcome) -> dict[str, Array]:
 
 def _places(values: Array, axis: str, width: float) -> NDArray[np.int64]:
     """Return the bin of each frame; a cycle's last moment, 100 %, is in its last bin."""
-    found = np.floor(values / width + ROUNDING).astype(int)
-    end = axis == CYCLE and np.isclose(values, WHOLE_CYCLE, rtol=0, atol=ROUNDING * width)
-    return np.where(end, found - 1, found)
+    result = np.floor(values / width + COHORT_STATISTICS.bin_tolerance).astype(int)
+    end = axis == CYCLE and np.isclose(
+        values, WHOLE_CYCLE, rtol=0, atol=COHORT_STATISTICS.bin_tolerance * width
+    )
+    return np.where(end, result - 1, result)
 
 
 def _means(values: Array, place: Array, count: int) -> Array:

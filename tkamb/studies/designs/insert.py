@@ -13,8 +13,16 @@ from tkamb.geometry.frames import Array
 from tkamb.studies.designs import solids
 from tkamb.studies.designs.femoral import rounded_edge
 
-BLEND_HALF = 8.0
-"""mm; unequal dishes blend within this distance of the middle."""
+
+@dataclass(frozen=True)
+class InsertBlendSettings:
+    """Inserts with dishes of unequal radii."""
+
+    blend_half_width: float = 8.0
+    """mm; unequal dishes blend within this distance of the middle."""
+
+
+INSERT_BLEND = InsertBlendSettings()
 
 
 @dataclass(frozen=True)
@@ -131,7 +139,7 @@ class Insert:
         medial = self._arc(x, self.medial_dish_radii)
         if self.medial_dish_radii == self.lateral_dish_radii:
             return medial
-        s = np.clip(0.5 + 0.5 * z / BLEND_HALF, 0.0, 1.0)
+        s = np.clip(0.5 + 0.5 * z / INSERT_BLEND.blend_half_width, 0.0, 1.0)
         lateral = s * s * (3.0 - 2.0 * s)
         return (1.0 - lateral) * medial + lateral * self._arc(x, self.lateral_dish_radii)
 

@@ -64,14 +64,14 @@ def measured_radii(design: Design) -> list[Radius]:
     """Return every radius of a design that meets the other part, measured on its own meshes."""
     femoral, insert = design.femoral, design.insert
     body, dish = _mesh(*femoral.mesh()), _mesh(*insert.mesh())
-    found = []
+    result = []
     for side, sign in (("medial", -1.0), ("lateral", 1.0)):
         profile = femoral.profile if sign < 0 else femoral.lateral_profile
-        found += _femoral(body, femoral, profile, sign, side)
-        found += _dish(dish, insert, sign, side)
+        result += _femoral(body, femoral, profile, sign, side)
+        result += _dish(dish, insert, sign, side)
     if femoral.cam is not None:
-        found.append(_cam(femoral, femoral.cam))
-    return found
+        result.append(_cam(femoral, femoral.cam))
+    return result
 
 
 def _cam(femoral: FemoralComponent, cam: Cam) -> Radius:
@@ -94,7 +94,7 @@ def _femoral(
     z = sign * femoral.ridge_half
     cut = section(body, [0.0, 0.0, 1.0], [0.0, 0.0, z])[:, :2]
     ends = np.degrees([profile.range[0], *profile.joints, profile.range[1]])
-    found = []
+    result = []
     for i, radius in enumerate(profile.radii):
         start, end = max(ends[i], CONTACT_PHI[0]), min(ends[i + 1], CONTACT_PHI[1])
         if end - start < 4.0 * RADIUS.arc_margin_deg:
@@ -104,9 +104,9 @@ def _femoral(
         on_arc = (phi > start + RADIUS.arc_margin_deg) & (phi < end - RADIUS.arc_margin_deg)
         on_arc &= np.linalg.norm(arm, axis=1) > radius - 2.0
         name = f"{side} sagittal {start:g} to {end:g} deg"
-        found.append(Radius(name, float(radius), circle_radius(cut[on_arc])))
-        found.append(_coronal(body, femoral, profile, np.radians((start + end) / 2.0), z, side))
-    return found
+        result.append(Radius(name, float(radius), circle_radius(cut[on_arc])))
+        result.append(_coronal(body, femoral, profile, np.radians((start + end) / 2.0), z, side))
+    return result
 
 
 def _coronal(
@@ -133,12 +133,12 @@ def _dish(dish: trimesh.Trimesh, insert: Insert, sign: float, side: str) -> list
     radii = insert.medial_dish_radii if sign < 0 else insert.lateral_dish_radii
     cut = section(dish, [0.0, 0.0, 1.0], [0.0, 0.0, z])
     cut = cut[cut[:, 1] > 0.5 * insert.thickness]
-    found = []
+    result = []
     for radius, way, words in ((radii[0], 1.0, "anterior"), (radii[1], -1.0, "posterior")):
         ahead = way * (cut[:, 0] - low)
         part = cut[(ahead > 0.7) & (ahead < RADIUS.dish_reach_mm)]
-        found.append(Radius(f"{side} dish, {words}", radius, circle_radius(part[:, :2])))
+        result.append(Radius(f"{side} dish, {words}", radius, circle_radius(part[:, :2])))
     cut = section(dish, [1.0, 0.0, 0.0], [low, 0.0, 0.0])
     near = (np.abs(cut[:, 2] - z) < RADIUS.coronal_reach_mm) & (cut[:, 1] > 0.5 * insert.thickness)
     measured = circle_radius(cut[near][:, 1:])
-    return [*found, Radius(f"{side} dish, coronal", insert.coronal_radius, measured)]
+    return [*result, Radius(f"{side} dish, coronal", insert.coronal_radius, measured)]

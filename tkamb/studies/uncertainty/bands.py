@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.run.results import FEWEST, MOST_FAILED, PERCENTILES
+from tkamb.run.results import PERCENTILES, STATISTICS_LIMITS
 
 ENDS = ("p05", "p95")
 ROUND_OFF = 1e-9
@@ -30,7 +30,8 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
     """Return p05, p50 and p95 over samples, each of the shape of one sample.
 
     Of the samples that have a number (linear between order statistics); NaN where fewer than
-    `FEWEST` have one, or where more than `MOST_FAILED` of all failed.
+    `STATISTICS_LIMITS.min_samples` have one, or where more than
+    `STATISTICS_LIMITS.max_failed_share` of all failed.
 
     Args:
         values: (n, ...) NaN where a sample has no number.
@@ -39,9 +40,9 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN, hidden below
         found = np.nanpercentile(values, list(PERCENTILES.values()), axis=0)
-    hidden = np.isfinite(values).sum(axis=0) < FEWEST
+    hidden = np.isfinite(values).sum(axis=0) < STATISTICS_LIMITS.min_samples
     if failed is not None:
-        hidden = hidden | (failed.mean(axis=0) > MOST_FAILED)
+        hidden = hidden | (failed.mean(axis=0) > STATISTICS_LIMITS.max_failed_share)
     found[:, hidden] = np.nan
     return dict(zip(PERCENTILES, found, strict=True))
 
@@ -215,7 +216,7 @@ def influences(
 def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
     """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
     there, count = np.isfinite(y), errors.shape[1]
-    if there.sum() < max(FEWEST, SAMPLES_PER_INPUT * count):
+    if there.sum() < max(STATISTICS_LIMITS.min_samples, SAMPLES_PER_INPUT * count):
         return None
     y, x = y[there], errors[there]
     variance = float(y.var())

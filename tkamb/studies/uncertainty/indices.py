@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.run.results import FEWEST
+from tkamb.run.results import STATISTICS_LIMITS
 from tkamb.studies.uncertainty.bands import varies
 
 RESAMPLED = 200
@@ -50,8 +50,8 @@ def sobol_indices(
     sum y² the mean over A and B. Of a result with many frames, numerators and denominators are
     summed over the frames (Gamboa et al. 2014): a frame counts with its variance. Rows where a
     needed sample failed are left out; the indices are then those among possible poses. Standard
-    errors by bootstrap over the rows. A result without variance, or of fewer than `FEWEST` rows,
-    has none.
+    errors by bootstrap over the rows. A result without variance, or of fewer than
+    `STATISTICS_LIMITS.min_samples` rows, has none.
 
     Args:
         results: (m,) names.
@@ -86,7 +86,7 @@ def _index(
 ) -> SobolIndex | None:
     """Return one input's indices from (n, f) values; None where nothing can be said."""
     there = np.isfinite(a) & np.isfinite(b) & np.isfinite(crossed)
-    kept = there.sum(axis=0) >= FEWEST
+    kept = there.sum(axis=0) >= STATISTICS_LIMITS.min_samples
     if not kept.any():
         return None
     there = there[:, kept]

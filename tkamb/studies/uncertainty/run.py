@@ -15,10 +15,10 @@ from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
-from tkamb.run.results import FEWEST, Results
+from tkamb.run.results import STATISTICS_LIMITS, Results
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import chosen_frames, simulate
-from tkamb.run.workers import Crew, Progress, Task, Team
+from tkamb.run.workers import PoolOptions, Progress, Task, WorkerPool
 from tkamb.studies.uncertainty.bands import (
     Influence,
     band_columns,
@@ -119,9 +119,12 @@ def estimate_uncertainty(
     """
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
-    crew = Crew(workers, dask)
-    if not FEWEST <= samples <= MOST_SAMPLES:
-        raise InputError(f"{samples} is not within {FEWEST} to {MOST_SAMPLES}", "--samples")
+    crew = PoolOptions(workers, dask)
+    if not STATISTICS_LIMITS.min_samples <= samples <= MOST_SAMPLES:
+        raise InputError(
+            f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
+            "--samples",
+        )
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
     crew.check()
@@ -178,7 +181,7 @@ class _Job:
     points: list[Point]
     crossed: int
     method: str
-    team: Team
+    team: WorkerPool
     progress: Progress
 
     @property

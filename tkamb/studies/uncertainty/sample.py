@@ -17,7 +17,7 @@ from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.equilibrium.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
-from tkamb.run.known import Known
+from tkamb.run.known import SharedState
 from tkamb.run.mechanics import Mechanics
 from tkamb.run.status import failures_of, frame_status
 from tkamb.run.tabulate import frame_row
@@ -124,10 +124,10 @@ class Sampler:
                 values[:, column] = [row.get(name, np.nan) for name in self.names]
         return Sample(values, np.array(problems), errors)
 
-    def _known(self, draw: Draw) -> Known:
+    def _known(self, draw: Draw) -> SharedState:
         nominal = self._mechanics
         muscles = varied_muscles(nominal.muscles, draw)
-        return Known(nominal.query, muscles, nominal.extensor, self._frames)
+        return SharedState(nominal.query, muscles, nominal.extensor, self._frames)
 
     def _varied(self, draw: Draw) -> Case:
         case = varied_case(self.case, draw)

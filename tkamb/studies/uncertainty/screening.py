@@ -9,7 +9,7 @@ from tkamb.geometry.frames import Array
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import load_case
 from tkamb.run.simulation import chosen_frames
-from tkamb.run.workers import Crew, Progress, Task
+from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.uncertainty.inputs import VariedInput, varied_inputs
 from tkamb.studies.uncertainty.sample import Sample, Sampler
 from tkamb.studies.uncertainty.sampling import one_at_a_time
@@ -50,7 +50,7 @@ def screen(
     scene: Scene,
     *,
     frames: slice | None = None,
-    crew: Crew | None = None,
+    crew: PoolOptions | None = None,
     progress: Progress = lambda samples, count: samples,
 ) -> list[Screened]:
     """Move one input at a time by one standard deviation and return what that changes.
@@ -72,7 +72,7 @@ def screen(
         InputError: bad input.
         ComputationError: a worker ended before its sample.
     """
-    crew = crew or Crew()
+    crew = crew or PoolOptions()
     crew.check()
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))

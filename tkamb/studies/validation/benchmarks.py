@@ -5,7 +5,7 @@ Every function returns {id of `published.toml`: our value in the unit named ther
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,19 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 Values = dict[str, float]
 UPRIGHT = knee_pose([0.0] * 6)
-SENSEL = 1.27 * MILLIMETRE
-COARSE_MM = 2.0
-"""Of every press on an implant, so that the whole page takes minutes."""
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """Presses on implants that are compared with publications."""
+
+    sensel: float = 1.27 * MILLIMETRE
+    """m; edge of a sensel of the pressure film in the publications."""
+    resolution_mm: float = 2.0
+    """mm; resolution of every press on an implant, so that the whole page takes minutes."""
+
+
+BENCHMARK = BenchmarkSettings()
 
 
 def _model(name: str, resolution_mm: float, **options: Any) -> Any:
@@ -88,7 +98,7 @@ def _plate_on_box() -> ContactPair:
 
 def patch() -> Values:
     """Return pressures under a rigid plate on a box, 1000 N, 1 mm."""
-    pair, found = _plate_on_box(), {}
+    pair, result = _plate_on_box(), {}
     for name, key, options in (
         ("fe", "fe", {}),
         ("lattice-source", "source", {"pressure_rule": "source"}),
@@ -96,9 +106,9 @@ def patch() -> Values:
         model = _model(name, 1.0, **options)
         pressure = model.press(model.prepare(pair), 1000.0, UPRIGHT).pressure
         loaded = pressure[pressure > 0.0]
-        found[f"patch_{key}_max"] = loaded.max() / MEGAPASCAL
-        found[f"patch_{key}_min"] = loaded.min() / MEGAPASCAL
-    return found
+        result[f"patch_{key}_max"] = loaded.max() / MEGAPASCAL
+        result[f"patch_{key}_min"] = loaded.min() / MEGAPASCAL
+    return result
 
 
 def refinement() -> Values:
@@ -137,8 +147,8 @@ def against_fe(
     designs: Path,
     name: str = "nkii_cp",
     flexions: Sequence[float] = (15.0, 60.0, 105.0),
-    size_mm: float = COARSE_MM,
-    fe_size_mm: float = COARSE_MM,
+    size_mm: float = BENCHMARK.resolution_mm,
+    fe_size_mm: float = BENCHMARK.resolution_mm,
 ) -> Values:
     """Return the source's lattice and ours against finite elements on an implant.
 
@@ -148,7 +158,7 @@ def against_fe(
     """
     design = load_design(designs / name)
     fe = _pressed(design, "fe", flexions, size_mm=fe_size_mm)
-    found = {}
+    result = {}
     kinds: tuple[tuple[str, str, dict[str, Any]], ...] = (
         ("lattice-source", "source", {"pressure_rule": "source"}),
         ("lattice", "lattice", {}),
@@ -156,15 +166,15 @@ def against_fe(
     for model, key, options in kinds:
         ours = _pressed(design, model, flexions, size_mm=size_mm, **options)
         pairs = list(zip(ours, fe, strict=True))
-        found[f"{key}_approach"] = max(abs(a[0] - b[0]) for a, b in pairs) / MILLIMETRE
+        result[f"{key}_approach"] = max(abs(a[0] - b[0]) for a, b in pairs) / MILLIMETRE
         area = max(abs(a[1].area - b[1].area) for a, b in pairs)
-        found[f"{key}_area"] = area / MILLIMETRE**2
+        result[f"{key}_area"] = area / MILLIMETRE**2
         for what in ("peak", "mean"):
             pressure, exact = (
                 np.array([getattr(p[i][1], f"{what}_pressure") for p in pairs]) for i in (0, 1)
             )
-            found[f"{key}_{what}"] = 100.0 * float(np.abs(pressure / exact - 1.0).max())
-    return found
+            result[f"{key}_{what}"] = 100.0 * float(np.abs(pressure / exact - 1.0).max())
+    return result
 
 
 def _pressed(
@@ -172,7 +182,7 @@ def _pressed(
     name: str,
     flexions: Iterable[float],
     load: float = 1200.0,
-    size_mm: float = COARSE_MM,
+    size_mm: float = BENCHMARK.resolution_mm,
     **options: Any,
 ) -> list[tuple[float, CondyleContact]]:
     """Return approach (m) and medial condyle of one contact model at flexions (deg)."""
@@ -202,8 +212,8 @@ def foundation(designs: Path) -> Values:
 
 def _both(design: Design, name: str) -> Array:
     """Peak pressures (2,) Pa of the medial condyle at 15 and 60 deg, whole component."""
-    pressed = PressedDesign(design, COARSE_MM)
-    pressed.model = _model(name, COARSE_MM)
+    pressed = PressedDesign(design, BENCHMARK.resolution_mm)
+    pressed.model = _model(name, BENCHMARK.resolution_mm)
     results = [pressed.press_both(flexion * DEGREE, 2400.0) for flexion in (15.0, 60.0)]
     return np.array([_only(result).peak_pressure for result in results])
 
@@ -228,18 +238,18 @@ def film() -> Values:
 
     Hertz ellipses of 100, 150 and 200 mm² and of aspect 1 to 3: what tables D-3 and D-4 hold.
     """
-    found = []
+    result = []
     for area in (100.0, 150.0, 200.0):
         for aspect in (1.0, 2.0, 3.0):
             a = np.sqrt(area / np.pi * aspect) * MILLIMETRE
-            found.append(worst_errors((a, a / aspect), SENSEL))
-    return {f"film_{k}": 100.0 * float(np.median([row[k] for row in found])) for k in found[0]}
+            result.append(worst_errors((a, a / aspect), BENCHMARK.sensel))
+    return {f"film_{k}": 100.0 * float(np.median([row[k] for row in result])) for k in result[0]}
 
 
 def measured_stress(designs: Path) -> Values:
     """Return the average contact stress (MPa) of the six designs at 2000 N a knee, medians."""
     flexions = (0.0, 15.0, 60.0)
-    found = np.array(
+    result = np.array(
         [
             [
                 c.mean_pressure
@@ -248,7 +258,7 @@ def measured_stress(designs: Path) -> Values:
             for f in FOLDERS.values()
         ]
     )
-    middle = np.median(found, axis=0) / MEGAPASCAL
+    middle = np.median(result, axis=0) / MEGAPASCAL
     return {f"stress_{int(f)}": float(p) for f, p in zip(flexions, middle, strict=True)}
 
 
@@ -264,7 +274,8 @@ def _variant(designs: Path, dish: float, coronal: float, thickness: float = 9.0)
         post=None,
     )
     return PressedDesign(
-        replace(design, articulation=replace(design.articulation, insert=insert)), COARSE_MM
+        replace(design, articulation=replace(design.articulation, insert=insert)),
+        BENCHMARK.resolution_mm,
     )
 
 
@@ -282,12 +293,12 @@ def conformity(designs: Path) -> Values:
     conforming: 80 and 23.5 mm.
     """
     high, low = _variant(designs, 50.0, 20.6), _variant(designs, 80.0, 23.5)
-    found = {
+    result = {
         f"conformity_{f}": 100.0 * (1.0 - _peak(high, f, 1500.0) / _peak(low, f, 1500.0))
         for f in (0, 60, 90)
     }
     rises = [_peak(p, 0, 1500.0, 10.0) / _peak(p, 0, 1500.0) - 1.0 for p in (high, low)]
-    return {**found, "malrotation": 100.0 * (rises[0] - rises[1])}
+    return {**result, "malrotation": 100.0 * (rises[0] - rises[1])}
 
 
 def thickness_and_plane(designs: Path) -> Values:

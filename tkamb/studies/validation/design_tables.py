@@ -1,6 +1,7 @@
 """Tables D-3 to D-6 beside parametric designs that are pressed at the tables' own forces."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,25 @@ FOLDERS = {
 CONDYLES: tuple[Condyle, Condyle] = ("medial", "lateral")
 QUANTITIES = ("area_mm2", "overlap_mm2", "mean_pressure_MPa", "overlap_pressure_MPa")
 """Contact area, the source's area, and force over each."""
-SAMPLES = 6
-"""Besides the nominal case."""
+
+
+@dataclass(frozen=True)
+class DesignTableSettings:
+    """Tables of designs."""
+
+    samples: int = 6
+    """Samples besides the nominal case."""
+
+
+DESIGN_TABLE = DesignTableSettings()
 
 
 def pressed_row(
-    pressed: PressedDesign, name: str, condyle: Condyle, row: int, samples: int = SAMPLES
+    pressed: PressedDesign,
+    name: str,
+    condyle: Condyle,
+    row: int,
+    samples: int = DESIGN_TABLE.samples,
 ) -> dict[str, Any]:
     """Press one condyle at one percentage of the bend over all assumptions.
 
@@ -48,9 +62,9 @@ def pressed_row(
     percent = float(dissertation.table(1).percent[row])
     cases = assumptions(samples, pressed.design.bearing == "mobile")
     cells = [pressed.cell(condyle, percent, force, case) for case in cases]
-    found = in_public_units(cell for cell in cells if cell is not None)
+    result = in_public_units(cell for cell in cells if cell is not None)
     spread = np.stack(
-        [found[0], found.min(axis=0), np.median(found, axis=0), found.max(axis=0)], axis=1
+        [result[0], result.min(axis=0), np.median(result, axis=0), result.max(axis=0)], axis=1
     )
     values = {q: np.round(spread[i], 3).tolist() for i, q in enumerate(QUANTITIES)}
     return {
@@ -58,7 +72,7 @@ def pressed_row(
         "condyle": condyle,
         "percent": percent,
         "force_N": round(force, 1),
-        "carried": [len(found), len(cases)],
+        "carried": [len(result), len(cases)],
         **values,
     }
 
@@ -77,20 +91,20 @@ def press_tables(
         resolution_mm: of the lattice.
         said: is told each design when it is done.
     """
-    found = []
+    result = []
     for name in dissertation.designs():
         pressed = PressedDesign(load_design(folder / FOLDERS[name]), resolution_mm)
-        found += [pressed_row(pressed, name, c, row) for c in CONDYLES for row in rows]
+        result += [pressed_row(pressed, name, c, row) for c in CONDYLES for row in rows]
         said(name)
-    return found
+    return result
 
 
 def compared(row: dict[str, Any]) -> dict[str, bool]:
     """Return per quantity whether the table's mean lies within the range over the assumptions."""
     index = int(np.flatnonzero(dissertation.table(1).percent == row["percent"])[0])
     area, pressure = table_cell(row["design"], row["condyle"], index)
-    told = dict(zip(QUANTITIES, (area, area, pressure, pressure), strict=True))
-    return {q: row[q][1] <= value <= row[q][3] for q, value in told.items()}
+    text = dict(zip(QUANTITIES, (area, area, pressure, pressure), strict=True))
+    return {q: row[q][1] <= value <= row[q][3] for q, value in text.items()}
 
 
 def overlapping(row: dict[str, Any]) -> dict[str, bool]:
@@ -98,14 +112,14 @@ def overlapping(row: dict[str, Any]) -> dict[str, bool]:
     index = int(np.flatnonzero(dissertation.table(1).percent == row["percent"])[0])
     column = dissertation.designs().index(row["design"])
     shift = 0 if row["condyle"] == "medial" else 1
-    told = {}
+    text = {}
     for quantity in QUANTITIES:
         base = dissertation.MEDIAL_PRESSURE if "pressure" in quantity else dissertation.MEDIAL_AREA
         table = dissertation.table(base + shift)
         mean, deviation = table.mean[index, column], table.deviation[index, column]
         _, low, _, high = row[quantity]
-        told[quantity] = bool(low <= mean + deviation and high >= mean - deviation)
-    return told
+        text[quantity] = bool(low <= mean + deviation and high >= mean - deviation)
+    return text
 
 
 def by_design(rows: Sequence[dict[str, Any]], quantity: str, condyle: Condyle) -> Array:

@@ -91,12 +91,12 @@ def page(stored: dict[str, Any]) -> str:
 def _head(stored: dict[str, Any]) -> list[str]:
     within = Counter(q for row in stored["tables"] for q, yes in compared(row).items() if yes)
     cells = len(stored["tables"])
-    found = ", ".join(f"{WORDS[q]} {within[q]}" for q in QUANTITIES)
+    result = ", ".join(f"{WORDS[q]} {within[q]}" for q in QUANTITIES)
     return [
         "# Published numbers beside ours",
         "",
         badge(stored["values"]),
-        f"Of {cells} cells of tables D-3 to D-6, within our range over the assumptions: {found}.",
+        f"Of {cells} cells of tables D-3 to D-6, within our range over the assumptions: {result}.",
         "",
         MADE.format(**stored),
     ]
@@ -112,13 +112,13 @@ def _values(values: dict[str, float]) -> list[str]:
     ]
     for row in published()["value"]:
         unit = f" {row['unit']}" if row["unit"] else ""
-        told = f"{_band(row['low'], row['high'])}{unit} ({row['band']})"
+        text = f"{_band(row['low'], row['high'])}{unit} ({row['band']})"
         ours, verdict = "", "not computed yet"
         if row["id"] in values:
             ours = f"{_number(values[row['id']])}{unit}"
             verdict = "hit" if hit(row, values[row["id"]]) else "**missed**"
         name = sources[row["source"]]["cited"].split(",")[0].split(" (")[0]
-        lines.append(f"| {name} | {row['says']} | {told} | {ours} | {verdict} |")
+        lines.append(f"| {name} | {row['says']} | {text} | {ours} | {verdict} |")
     lines += ["", "Read where:", ""]
     for source in sources.values():
         doi = f", doi:{source['doi']}" if source["doi"] else ""
@@ -222,15 +222,15 @@ def _cells(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         at = percent.index(row["percent"]), dissertation.designs().index(row["design"])
         shift = CONDYLES.index(row["condyle"])
-        told = []
+        text = []
         for number in (dissertation.MEDIAL_AREA, dissertation.MEDIAL_PRESSURE):
             table = dissertation.table(number + shift)
-            told.append(f"{table.mean[at]:g} ± {table.deviation[at]:g}")
+            text.append(f"{table.mean[at]:g} ± {table.deviation[at]:g}")
         spread = {q: f"{row[q][0]:.3g} ({row[q][1]:.3g} to {row[q][3]:.3g})" for q in QUANTITIES}
         lines.append(
             f"| {row['design']} | {row['condyle']} | {row['percent']:g} | {row['force_N']:.0f} | "
-            f"{spread['area_mm2']} | {spread['overlap_mm2']} | {told[0]} | "
-            f"{spread['mean_pressure_MPa']} | {spread['overlap_pressure_MPa']} | {told[1]} |"
+            f"{spread['area_mm2']} | {spread['overlap_mm2']} | {text[0]} | "
+            f"{spread['mean_pressure_MPa']} | {spread['overlap_pressure_MPa']} | {text[1]} |"
         )
     return lines
 

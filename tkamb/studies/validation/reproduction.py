@@ -5,6 +5,7 @@ that scripts/data/validation.json has already are taken from there by the page.
 """
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,18 @@ TILTED = (0.3, (30.5, 30.7, 31.2), -6.9)
 """deg coronal, mm of recorded heights, mm AP: where the adjustment is shown."""
 LIFTED = (0.45, (15.0, 30.0))
 """deg coronal error put in, deg of flexion: the positions of section 5.2.2."""
-EVERY = 10
-"""Of the 101 frames of the shipped bend: 0, 10, ... 100 % as in appendix D."""
+
+
+@dataclass(frozen=True)
+class ReproductionSettings:
+    """The reproduction of the dissertation."""
+
+    stride: int = 10
+    """Every so many of the 101 frames of the shipped bend: 0, 10, ... 100 % as in appendix D."""
+
+
+REPRODUCTION = ReproductionSettings()
+
 
 Values = dict[str, float]
 
@@ -49,11 +60,11 @@ def lattice(model: Path) -> Values:
     prepared = time.process_time()
     contact.press(state, LOAD / 10, pose)  # compiles what is not on disk yet
     pressed = time.process_time()
-    found = contact.press(state, LOAD, pose)
+    result = contact.press(state, LOAD, pose)
     ended = time.process_time()
     solid, operator = state.problem.solid, state.problem.operator
     linear = SourceLattice(CELLS, loops="source", law="linear", pressure_rule="source", cache=False)
-    loaded = found.pressure > 0
+    loaded = result.pressure > 0
     return {
         "nodes": state.node_count,
         "cells": len(state.lattice.cells),
@@ -64,9 +75,9 @@ def lattice(model: Path) -> Values:
         "springs": len(state.lattice.springs.ends),
         "unknowns": solid.nodes.size,
         "held": int(state.problem.held.sum()),
-        "loops": found.iterations,
-        "load_error": -float(found.wrench_on_insert[1]) / LOAD - 1.0,
-        "pressure_sum": float((found.pressure * found.area).sum()) / LOAD,
+        "loops": result.iterations,
+        "load_error": -float(result.wrench_on_insert[1]) / LOAD - 1.0,
+        "pressure_sum": float((result.pressure * result.area).sum()) / LOAD,
         "linear_loops": linear.press(linear.prepare(pair), LOAD, pose).iterations,
         "prepare_seconds": prepared - begun,
         "press_seconds": ended - pressed,
@@ -126,7 +137,7 @@ def lift_off(scene: Path) -> Values:
     error, flexions = LIFTED
     recorded = load_case(load_scene(scene)).motion.coordinates[:, 5] / DEGREE
     frames = [int(np.abs(recorded - flexion).argmin()) for flexion in flexions]
-    found = {}
+    result = {}
     for name, adjust in (("adjusted", True), ("unadjusted", False)):
         wrong = {"implant.femoral.rotation_deg": [error, 0.0, 0.0], "contact.adjust": adjust}
         tilted, shares, changes = load_scene(scene, wrong, PRESET), [], []
@@ -136,10 +147,10 @@ def lift_off(scene: Path) -> Values:
             shares.append(min(forces) / sum(forces))
             changes.append(abs(float(row["adjust_force_change_BW"][0])))
         if adjust:
-            found["adjust_change_BW"] = max(changes)
-        found[f"share_{name}"] = min(shares)
-        found[f"lost_{name}"] = sum(share == 0.0 for share in shares)
-    return found
+            result["adjust_change_BW"] = max(changes)
+        result[f"share_{name}"] = min(shares)
+        result[f"lost_{name}"] = sum(share == 0.0 for share in shares)
+    return result
 
 
 def bend(scene: Path) -> tuple[Values, list[dict[str, float]]]:
@@ -148,40 +159,43 @@ def bend(scene: Path) -> tuple[Values, list[dict[str, float]]]:
     Returns:
         Values of sections 4.4, 5.2.1 to 5.2.3, and a row for each 10 % of the bend.
     """
-    found = simulate(load_scene(scene, preset=PRESET), frames=slice(0, 101, EVERY))
-    weight = float(found["force_total_N"][0] / found["force_total_BW"][0])
+    result = simulate(load_scene(scene, preset=PRESET), frames=slice(0, 101, REPRODUCTION.stride))
+    weight = float(result["force_total_N"][0] / result["force_total_BW"][0])
     columns = {
-        1: found["medial_force_N"] / weight,
-        2: found["lateral_force_N"] / weight,
-        3: found["medial_area_mm2"],
-        4: found["lateral_area_mm2"],
-        5: found["medial_mean_pressure_MPa"],
-        6: found["lateral_mean_pressure_MPa"],
-        7: found["quadriceps_N"] / weight,
-        8: found["patellar_ligament_N"] / weight,
-        9: found["patellofemoral_N"] / weight,
-        10: found["force_ap_N"] / weight,
-        11: found["force_ml_N"] / weight,
-        12: found["force_si_N"] / weight,
+        1: result["medial_force_N"] / weight,
+        2: result["lateral_force_N"] / weight,
+        3: result["medial_area_mm2"],
+        4: result["lateral_area_mm2"],
+        5: result["medial_mean_pressure_MPa"],
+        6: result["lateral_mean_pressure_MPa"],
+        7: result["quadriceps_N"] / weight,
+        8: result["patellar_ligament_N"] / weight,
+        9: result["patellofemoral_N"] / weight,
+        10: result["force_ap_N"] / weight,
+        11: result["force_ml_N"] / weight,
+        12: result["force_si_N"] / weight,
     }
     rows: list[dict[str, Any]] = []
-    for k in range(len(found)):
-        row: dict[str, Any] = {"percent": EVERY * k, "flexion_deg": float(found["flexion_deg"][k])}
+    for k in range(len(result)):
+        row: dict[str, Any] = {
+            "percent": REPRODUCTION.stride * k,
+            "flexion_deg": float(result["flexion_deg"][k]),
+        }
         row |= {f"D-{number}": round(float(values[k]), 4) for number, values in columns.items()}
-        rows.append(row | {"status": found.status[k]})
-    total, ratio = found["force_total_BW"], found["lateral_force_N"] / found["medial_force_N"]
-    residual = np.hypot(found["residual_ap_N"], found["residual_ml_N"]) / found["force_total_N"]
+        rows.append(row | {"status": result.status[k]})
+    total, ratio = result["force_total_BW"], result["lateral_force_N"] / result["medial_force_N"]
+    residual = np.hypot(result["residual_ap_N"], result["residual_ml_N"]) / result["force_total_N"]
     values = {
         "peak_BW": float(np.nanmax(total)),
-        "peak_deg": float(found["flexion_deg"][int(np.nanargmax(total))]),
+        "peak_deg": float(result["flexion_deg"][int(np.nanargmax(total))]),
         "start_BW": float(total[0]),
-        "start_deg": float(found["flexion_deg"][0]),
+        "start_deg": float(result["flexion_deg"][0]),
         "ratio_low": float(np.nanmin(ratio)),
         "ratio_high": float(np.nanmax(ratio)),
         "residual_percent": 100.0 * float(np.nanmax(residual)),
         "quadriceps_as_source": float(columns[7][-1]),
-        "slip_medial_mm": float(found["medial_slip_mm"][-1]),
-        "slip_lateral_mm": float(found["lateral_slip_mm"][-1]),
+        "slip_medial_mm": float(result["medial_slip_mm"][-1]),
+        "slip_lateral_mm": float(result["lateral_slip_mm"][-1]),
     }
     return values, rows
 

@@ -96,10 +96,10 @@ def _settings(preset: Mapping[str, Any]) -> list[str]:
     lines = ["## What the preset sets", "", "| key | value |", "| --- | --- |"]
     for key, value in preset.items():
         if isinstance(value, Mapping):
-            told = ", ".join(f"{name} = {item}" for name, item in value.items())
+            text = ", ".join(f"{name} = {item}" for name, item in value.items())
         else:
-            told = "left out" if value is None else (str(value).lower() if value != [] else "none")
-        lines.append(f"| `{key}` | {told} |")
+            text = "left out" if value is None else (str(value).lower() if value != [] else "none")
+        lines.append(f"| `{key}` | {text} |")
     return [*lines, "", SET, ""]
 
 

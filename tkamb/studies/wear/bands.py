@@ -14,9 +14,10 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.results import STATISTICS_LIMITS
 from tkamb.run.shards import Shard, Shards
-from tkamb.run.workers import Crew, Numbered, Task
-from tkamb.studies.uncertainty.bands import FEWEST, percentiles
+from tkamb.run.workers import Numbered, PoolOptions, Task
+from tkamb.studies.uncertainty.bands import percentiles
 from tkamb.studies.uncertainty.correlation import correlation_root
 from tkamb.studies.uncertainty.inputs import VariedInput
 from tkamb.studies.uncertainty.sampling import normal_samples
@@ -24,8 +25,19 @@ from tkamb.studies.wear.sample import BANDED, Rows, WearSampler, varied_wear_inp
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase
 
-SAMPLES = 32
-MOST_SAMPLES = 10_000
+
+@dataclass(frozen=True)
+class WearBandSettings:
+    """Bands of wear from samples."""
+
+    samples: int = 32
+    """Samples unless the user asks for another number."""
+    max_samples: int = 10_000
+    """Largest number of samples that is accepted."""
+
+
+WEAR_BAND = WearBandSettings()
+
 SAID = (
     ("volume_mm3", "volume", "mm3"),
     ("max_depth_mm", "depth", "mm"),
@@ -71,14 +83,14 @@ class WearBands:
 
     def lines(self) -> list[str]:
         """Return the bands after the last cycle as lines of text."""
-        last, found = self.rows[-1], []
+        last, result = self.rows[-1], []
         for name, what, unit in SAID:
             low, high = last.get(f"{name}_p05", math.nan), last.get(f"{name}_p95", math.nan)
             if math.isfinite(low):
-                found.append(f"{what} {low:.4g} to {high:.4g} {unit}")
+                result.append(f"{what} {low:.4g} to {high:.4g} {unit}")
         varied = ", ".join(f"{v.name} ± {v.deviation:g} {v.unit}" for v in self.varied)
-        said = ", ".join(found) or "too few samples for a band"
-        return [f"5 to 95 % of {self.samples} samples: {said}; varied: {varied}"]
+        text = ", ".join(result) or "too few samples for a band"
+        return [f"5 to 95 % of {self.samples} samples: {text}; varied: {varied}"]
 
     def questions(self) -> list[str]:
         """Return what a reader must know before using the bands."""
@@ -130,7 +142,7 @@ class Sampling:
         self,
         simulation: tuple[WearCase, int, int],
         rows: Sequence[Mapping[str, float]],
-        crew: Crew | None = None,
+        crew: PoolOptions | None = None,
         shards: Shards | None = None,
         progress: Progress = lambda samples, count: samples,
     ) -> WearBands:
@@ -154,7 +166,9 @@ class Sampling:
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
         try:
             with interrupt_as_such():
-                for number, sample in progress((crew or Crew()).answers(task, left), len(left)):
+                for number, sample in progress(
+                    (crew or PoolOptions()).answers(task, left), len(left)
+                ):
                     done[number] = sample
                     if shards is not None:
                         shards.put(number, Shard({}, dict(sample)))
@@ -176,16 +190,16 @@ def _bands(
     names = [name for name in BANDED if np.isfinite(rows[-1][name])]
     at = np.array([row["cycles"] for row in rows])
     values = np.full((len(samples), len(names), len(at)), np.nan)
-    for sample, found in zip(samples, values, strict=True):
-        for column, name in zip(found, names, strict=True):
+    for sample, result in zip(samples, values, strict=True):
+        for column, name in zip(result, names, strict=True):
             if sample:
                 column[:] = np.interp(at, sample["cycles"], sample[name], right=np.nan)
     bands = percentiles(values, np.isnan(values[:, 0]))
     made = [
         {
-            f"{name}_{end}": float(found[m, r])
+            f"{name}_{end}": float(result[m, r])
             for m, name in enumerate(names)
-            for end, found in bands.items()
+            for end, result in bands.items()
         }
         for r in range(len(at))
     ]
@@ -196,6 +210,10 @@ def _bands(
 
 def check_samples(samples: int) -> None:
     """Raise an InputError for a number of samples that gives no band; 0: none is wanted."""
-    if samples and not FEWEST <= samples <= MOST_SAMPLES:
-        mend = "or 0, for no bands"
-        raise InputError(f"{samples} is not within {FEWEST} to {MOST_SAMPLES}", "--samples", mend)
+    if samples and not STATISTICS_LIMITS.min_samples <= samples <= WEAR_BAND.max_samples:
+        hint = "or 0, for no bands"
+        raise InputError(
+            f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {WEAR_BAND.max_samples}",
+            "--samples",
+            hint,
+        )

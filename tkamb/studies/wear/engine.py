@@ -21,8 +21,18 @@ from tkamb.studies.wear.motion import CycleMotion
 
 GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
 """m along x where the search for the dwell position begins."""
-GRID_ACROSS = 0.002
-"""m along z, likewise."""
+
+
+@dataclass(frozen=True)
+class WearGridSettings:
+    """Grid on which wear is summed."""
+
+    spacing_z: float = 0.002
+    """m; spacing along z (medial to lateral)."""
+
+
+WEAR_GRID = WearGridSettings()
+
 SEARCH = {"xatol": 1e-5, "fatol": 1e-9, "maxfev": 120}
 """The search ends within 10 µm."""
 
@@ -104,8 +114,8 @@ class ContactEngine:
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
 
         def height(place: Array) -> float:
-            found = pair.first_touch_height(pose_of(rotation, [place[0], 0.0, place[1]]))
-            return found if np.isfinite(found) else 1.0
+            result = pair.first_touch_height(pose_of(rotation, [place[0], 0.0, place[1]]))
+            return result if np.isfinite(result) else 1.0
 
         middle = self.femoral.moved(pose_of(rotation, [0.0] * 3)).bounds.mean(axis=0)
         # the grid is centred where the bounding boxes' middles meet, and where the origins do
@@ -113,14 +123,14 @@ class ContactEngine:
             np.array([x, z]) - start
             for start in (np.zeros(2), middle[[0, 2]])
             for x in GRID
-            for z in (-GRID_ACROSS, 0.0, GRID_ACROSS)
+            for z in (-WEAR_GRID.spacing_z, 0.0, WEAR_GRID.spacing_z)
         ]
         heights = [height(start) for start in starts]
         best = starts[int(np.argmin(heights))]
         if min(heights) >= 1.0:
             raise InputError("lies over the insert nowhere", self.femoral.name, "check the axes")
-        found = minimize(height, best, method="Nelder-Mead", options=SEARCH)
-        return float(found.x[0]), float(found.x[1])
+        result = minimize(height, best, method="Nelder-Mead", options=SEARCH)
+        return float(result.x[0]), float(result.x[1])
 
 
 def interpolation(map_points: Array, points: Array) -> csr_array:

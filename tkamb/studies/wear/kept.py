@@ -14,7 +14,7 @@ import numpy as np
 from tkamb.atomic import replaced_file
 from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
-from tkamb.files import MESH_LIMIT, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.run.plug_ins import foreign_code
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase, WearState
@@ -74,7 +74,7 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
     if not path.is_file():
         return None
     try:
-        with np.load(BytesIO(read_bytes(path, MESH_LIMIT)), allow_pickle=False) as file:
+        with np.load(BytesIO(read_bytes(path, FILE_LIMITS.mesh_bytes)), allow_pickle=False) as file:
             content = dict(file)
     except UNREADABLE as error:
         raise _damaged(path, str(error) or type(error).__name__) from None

@@ -25,8 +25,17 @@ from tkamb.units import MEGAPASCAL
 
 PER_NEWTON_METRE = 1e-9
 """m³/(N m) per mm³/(N m)."""
-LARGEST_WEAR_FACTOR = 1e-3
-"""mm³/(N m), a hundred times what any polyethylene in a joint was measured at."""
+
+
+@dataclass(frozen=True)
+class WearLawSettings:
+    """Which wear factors are accepted."""
+
+    max_wear_factor: float = 1e-3
+    """mm³/(N m); a hundred times the largest that was measured for polyethylene in a joint."""
+
+
+WEAR_LAW = WearLawSettings()
 
 
 class WearLaw(ABC):
@@ -202,9 +211,9 @@ def check_factor(value: Any, where: str) -> float:
         InputError: it is negative, not finite, or beyond all that was measured.
     """
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and math.isfinite(value) and 0 <= value <= LARGEST_WEAR_FACTOR):
-        mend = f"give a number from 0 to {LARGEST_WEAR_FACTOR:g}; is the unit mm³/(N m)?"
-        raise InputError(f"cannot be {value}", where, mend)
+    if not (number and math.isfinite(value) and 0 <= value <= WEAR_LAW.max_wear_factor):
+        hint = f"give a number from 0 to {WEAR_LAW.max_wear_factor:g} in mm³/(N m)"
+        raise InputError(f"cannot be {value}", where, hint)
     return float(value)
 
 
@@ -280,8 +289,8 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
     Raises:
         InputError: no such law, a parameter that is missing or unknown, or a bad value.
     """
-    found = law_class(name)
-    own = [field.name for field in fields(found)]  # type: ignore[arg-type]
+    result = law_class(name)
+    own = [field.name for field in fields(result)]  # type: ignore[arg-type]
     table = f"[laws.{name}]" if where is None else f"{where}: [laws.{name}]"
     for key in parameters:
         if key not in own:
@@ -290,6 +299,6 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
         if key not in parameters:
             raise InputError(f"does not give '{key}'", table, f"it needs: {', '.join(own)}")
     try:
-        return found(**parameters)
+        return result(**parameters)
     except InputError as error:
-        raise InputError(error.what, f"{table}: {error.where}", error.mend) from None
+        raise InputError(error.what, f"{table}: {error.where}", error.hint) from None

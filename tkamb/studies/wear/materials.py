@@ -82,7 +82,7 @@ class WearMaterial:
             law_class(name)  # a name that there is not is another mistake
             raise InputError(
                 f"material '{self.name}' has no parameters for the law '{name}'",
-                mend=f"it has: {', '.join(self.laws)}; others in a material file (docs/wear.md)",
+                hint=f"it has: {', '.join(self.laws)}; give the others in a material file",
             )
         return wear_law(name, parameters, self.name)
 
@@ -102,8 +102,8 @@ def wear_material(name: str | Path) -> WearMaterial:
     if str(name) in known:
         return _material(str(name), known[str(name)], f"wear material '{name}'")
     if Path(name).suffix != ".toml":
-        mend = f"{names_near(str(name), known)}; or give a material file (.toml)"
-        raise InputError(f"no wear material '{name}'", mend=mend)
+        hint = f"{names_near(str(name), known)}; or give a material file (.toml)"
+        raise InputError(f"no wear material '{name}'", hint=hint)
     content = read_toml(name, what="wear material")
     return _material(str(content.pop("name", Path(name).stem)), content, name)
 
@@ -120,7 +120,9 @@ def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial
             raise InputError(f"unknown key '{key}'", where, names_near(key, own))
     for key in ("density_kg_per_m3", "law", "laws", "sources"):
         if key not in content:
-            raise InputError(f"'{key}' is missing", where, "see docs/wear.md")
+            raise InputError(
+                f"'{key}' is missing", where, f"add it; a material has the keys {', '.join(own)}"
+            )
     density, laws = content["density_kg_per_m3"], content["laws"]
     low, high = DENSITY_RANGE
     if not (isinstance(density, int | float) and low <= density <= high):
@@ -158,8 +160,8 @@ def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]
         and 0 < given[0] <= 1 <= given[1]
     )
     if not sound:
-        mend = "give two factors, at most 1 and at least 1, e.g. [0.5, 2.0]"
-        raise InputError(f"cannot be {given}", f"{where}: factor_range", mend)
+        hint = "give two factors, at most 1 and at least 1, e.g. [0.5, 2.0]"
+        raise InputError(f"cannot be {given}", f"{where}: factor_range", hint)
     if "range_source" not in content:
         raise InputError("'range_source' is missing", where, "say where the range comes from")
     return float(given[0]), float(given[1])

@@ -16,10 +16,21 @@ from tkamb.studies.wear.force_control import ForceDrive
 from tkamb.units import MILLIMETRE
 
 CLOSINGS: tuple[Closing, ...] = get_args(Closing)
-LEVER = 0.025
-"""m; what a turn moves at a condyle, to compare turns with translations."""
-WIDE_GAP = 0.1
-"""Share of the motion's extent. Ends further apart are asked about; the cycle stays the same."""
+
+
+@dataclass(frozen=True)
+class CycleMotionSettings:
+    """How the motion of a wear cycle is read."""
+
+    lever_arm: float = 0.025
+    """m; displacement of a condyle per rotation, to compare rotations with translations. Half the
+    distance of the condyles."""
+    notable_gap: float = 0.1
+    """Share of the motion's extent; where the ends of a cycle lie farther apart the user is asked.
+    The cycle stays as it is."""
+
+
+CYCLE_MOTION = CycleMotionSettings()
 
 
 class Path(NamedTuple):
@@ -139,7 +150,7 @@ class CycleMotion:
             return cls(
                 poses, load, span, 1, tuple(notes), seconds=steps, path=path, closing=closing
             )
-        if gap > WIDE_GAP * extent:
+        if gap > CYCLE_MOTION.notable_gap * extent:
             questions.append(
                 f"{apart}, {gap / extent:.0%} of its extent; the cycle closes by one screw motion "
                 "from the last frame to the first: is that meant? (--close there-and-back, or "
@@ -265,7 +276,7 @@ def _with_middles(values: Array) -> Array:
 
 
 def distance(one: Array, other: Array) -> float:
-    """Return how far apart two poses (4, 4) are, m, a turn counted at `LEVER`."""
+    """Return how far apart two poses (4, 4) are, m, a turn counted at `CYCLE_MOTION.lever_arm`."""
     move = inverse(one) @ other
     turn = np.linalg.norm(Rotation.from_matrix(move[:3, :3]).as_rotvec())
-    return float(np.linalg.norm(move[:3, 3]) + LEVER * turn)
+    return float(np.linalg.norm(move[:3, 3]) + CYCLE_MOTION.lever_arm * turn)

@@ -40,12 +40,21 @@ LIMITS = {
 }
 """Largest size of a column's values."""
 FLEXION_LIMITS = (-30.0, 170.0)
-LARGEST_FORCE = 1e4
-"""N, fifteen body weights."""
-ROUND_OFF = 1e-9
-"""Share of a step by which it may exceed the longest one."""
-CLOSES_WITHIN = 0.01
-"""Share of a column's range by which its last row may differ from its first."""
+
+
+@dataclass(frozen=True)
+class WearProfileSettings:
+    """Which load profiles of a simulator are accepted."""
+
+    max_force: float = 1e4
+    """N; fifteen body weights."""
+    step_tolerance: float = 1e-9
+    """Share of a step by which it may exceed the longest one."""
+    closure_tolerance: float = 0.01
+    """Share of a column's range by which its last row may differ from its first."""
+
+
+WEAR_PROFILE = WearProfileSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +170,9 @@ def read_profile(path: str | Path, frames: int) -> Profile:
 
 def _divided(rows: Array, longest: float) -> Array:
     """Return rising numbers with others evenly between them, so that no step exceeds `longest`."""
-    pieces = np.maximum(1, np.ceil(np.diff(rows) / longest - ROUND_OFF)).astype(int)
+    pieces = np.maximum(1, np.ceil(np.diff(rows) / longest - WEAR_PROFILE.step_tolerance)).astype(
+        int
+    )
     parts = [
         np.linspace(begin, end, count, endpoint=False)
         for begin, end, count in zip(rows[:-1], rows[1:], pieces, strict=True)
@@ -190,17 +201,17 @@ def _percent(table: Table) -> Array:
 def _check_range(name: str, values: Array, path: str | Path) -> None:
     low, high = -LIMITS.get(name, 0.0), LIMITS.get(name, 0.0)
     if name == LOAD:
-        low, high = 0.0, LARGEST_FORCE
+        low, high = 0.0, WEAR_PROFILE.max_force
     elif name == "flexion_deg":
         low, high = FLEXION_LIMITS
     wrong = np.flatnonzero((values < low) | (values > high))
     if wrong.size:
         row = int(wrong[0])
         what = f"'{name}' is {values[row]:g} in data row {row + 1}"
-        raise InputError(what, path, f"it lies within {low:g} to {high:g}; unit and sign?")
+        raise InputError(what, path, f"give {low:g} to {high:g}; check unit and sign")
 
 
 def _check_closed(name: str, values: Array, path: str | Path) -> None:
-    if abs(values[-1] - values[0]) > CLOSES_WITHIN * np.ptp(values):
+    if abs(values[-1] - values[0]) > WEAR_PROFILE.closure_tolerance * np.ptp(values):
         what = f"does not close: '{name}' is {values[0]:g} at 0 % and {values[-1]:g} at 100 %"
         raise InputError(what, path, "the last row repeats the first")

@@ -34,15 +34,26 @@ FIRST = (
 """What is said before any number."""
 PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
 """Columns that follow the wear factor in proportion, but for what the worn shape changes."""
-LARGEST_FRAMES_CHANGE = 0.02
-"""Of a cycle's volume by half as many frames, beyond which they are too few."""
-DEAREST_CORRECTION = 0.05
-"""Correction of a map's force beyond which the map is too coarse."""
+
+
+@dataclass(frozen=True)
+class WearReportSettings:
+    """What a wear report asks about."""
+
+    max_frame_change: float = 0.02
+    """Share of a cycle's volume by which it may change with half as many frames; beyond that the
+    frames are too few."""
+    max_map_correction: float = 0.05
+    """Share of a map's force; where its correction is larger the map is too coarse."""
+    max_published_ratio: float = 3.0
+    """Times the published rates; a higher rate is asked about."""
+
+
+WEAR_REPORT = WearReportSettings()
+
 PUBLISHED_RATES = (1.6, 4.4)
 """mm³ per million cycles of one whole knee in two tests: Dreyer et al. (2023),
 doi:10.1101/2023.05.09.23289712."""
-FAR_FROM_PUBLISHED = 3.0
-"""Times the published rates beyond which a rate is asked about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +166,12 @@ class WearReport:
 
     def side_by_side(self) -> list[dict[str, Any]]:
         """Return what each law of the material takes off the unworn insert, with its range."""
-        found = []
+        result = []
         for name, law in self.material.all_laws().items():
             if name not in self.first.volumes:
                 continue
             rate = self.first.volumes[name] * MILLION / MILLIMETRE**3
-            found.append(
+            result.append(
                 {
                     "law": name,
                     "first_volume_mm3_per_Mc": rate,
@@ -169,18 +180,18 @@ class WearReport:
                     "geometry": law.geometry,
                 }
             )
-        return found
+        return result
 
     def questions(self) -> list[str]:
         """Return what a reader must know before using the numbers."""
         asked = [] if not self.material.caution else [self.material.caution]
         asked += self.case.motion.questions
-        if self.first.frames_change > LARGEST_FRAMES_CHANGE:
+        if self.first.frames_change > WEAR_REPORT.max_frame_change:
             asked.append(
                 f"half as many frames per cycle move its volume by {self.first.frames_change:.1%}: "
                 "take more with --frames-per-cycle"
             )
-        if self.state.map_error > DEAREST_CORRECTION:
+        if self.state.map_error > WEAR_REPORT.max_map_correction:
             asked.append(
                 f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
                 "take a finer resolution"
@@ -191,7 +202,11 @@ class WearReport:
                 "however short they were: take more --updates"
             )
         low, high = PUBLISHED_RATES
-        if not low / FAR_FROM_PUBLISHED <= self.rate <= high * FAR_FROM_PUBLISHED:
+        if (
+            not low / WEAR_REPORT.max_published_ratio
+            <= self.rate
+            <= high * WEAR_REPORT.max_published_ratio
+        ):
             asked.append(
                 f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
                 f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"
@@ -213,24 +228,24 @@ class WearReport:
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        found = self.as_dict()
-        creep = found["creep_depth_mm"]
-        said = "not modelled" if creep is None else f"{creep:.4g} mm deep"
-        low, high = found["volume_mm3_range"]
-        slow, fast = found["volume_mm3_per_Mc_range"]
+        result = self.as_dict()
+        creep = result["creep_depth_mm"]
+        text = "not modelled" if creep is None else f"{creep:.4g} mm deep"
+        low, high = result["volume_mm3_range"]
+        slow, fast = result["volume_mm3_per_Mc_range"]
         others = [
             f"{one['law']} {one['first_volume_mm3_per_Mc']:.3g} "
             f"({one['first_volume_mm3_per_Mc_range'][0]:.3g} to "
             f"{one['first_volume_mm3_per_Mc_range'][1]:.3g})"
-            for one in found["laws_side_by_side"]
+            for one in result["laws_side_by_side"]
         ]
         return [
             FIRST,
-            f"{found['cycles']:.6g} cycles in {found['blocks']} blocks, {found['law']}, "
-            f"{found['material']}: {found['status']}",
-            f"worn off {found['volume_mm3']:.4g} mm3, {found['mass_mg']:.4g} mg, "
-            f"{found['max_depth_mm']:.4g} mm deep at most, over {found['worn_area_mm2']:.4g} mm2",
-            f"rate {self.rate:.4g} mm3 per million cycles; creep {said}",
+            f"{result['cycles']:.6g} cycles in {result['blocks']} blocks, {result['law']}, "
+            f"{result['material']}: {result['status']}",
+            f"worn off {result['volume_mm3']:.4g} mm3, {result['mass_mg']:.4g} mg, "
+            f"{result['max_depth_mm']:.4g} mm deep at most, over {result['worn_area_mm2']:.4g} mm2",
+            f"rate {self.rate:.4g} mm3 per million cycles; creep {text}",
             f"range by the wear factor alone: {low:.3g} to {high:.3g} mm3, {slow:.3g} to "
             f"{fast:.3g} mm3 per million cycles ({self.material.range_source})",
             f"geometry: {self.case.law.geometry}",
@@ -241,7 +256,7 @@ class WearReport:
             ),
             *([] if self.bands is None else self.bands.lines()),
             *self._found_lines(),
-            *(f"note: {note}" for note in found["notes"]),
+            *(f"note: {note}" for note in result["notes"]),
         ]
 
     def _found_lines(self) -> list[str]:
@@ -249,9 +264,10 @@ class WearReport:
         drive = self.case.motion.drive
         if drive is None:
             return []
-        found = drive.ranges(self.last.poses, self.last.failed)
+        result = drive.ranges(self.last.poses, self.last.failed)
         places = (
-            f"{name} {found[f'{name}_low_{unit}']:.3g} to {found[f'{name}_high_{unit}']:.3g} {unit}"
+            f"{name} {result[f'{name}_low_{unit}']:.3g} to "
+            f"{result[f'{name}_high_{unit}']:.3g} {unit}"
             for name, unit in ((name, UNITS[name][0]) for name in drive.names)
         )
         return [f"force control: {', '.join(places)}; {len(self.last.failed)} rows failed"]

@@ -13,8 +13,8 @@ from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.results import Results
 from tkamb.run.shards import Shards
-from tkamb.run.workers import Crew
-from tkamb.studies.wear.bands import SAMPLES, Progress, Sampling, check_samples
+from tkamb.run.workers import PoolOptions
+from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
 from tkamb.studies.wear.kept import keep_state, kept_state, wear_identity
 from tkamb.studies.wear.laws import WearLaw
 from tkamb.studies.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
@@ -56,7 +56,7 @@ class WearRun:
         *,
         resume: bool = False,
         progress: Callable[[float], None] = lambda cycles: None,
-        crew: Crew | None = None,
+        crew: PoolOptions | None = None,
         sample_progress: Progress = lambda samples, count: samples,
     ) -> WearReport:
         """Simulate and return the report.
@@ -201,7 +201,7 @@ def prepare_wear(
     made_of, chosen = asked.material_and_law
     case = _case(ready, made_of, chosen)
     if samples is None:
-        samples = SAMPLES if ready.uncertainty else 0
+        samples = WEAR_BAND.samples if ready.uncertainty else 0
     sampling = Sampling.of(ready, case, samples) if samples else None
     return WearRun(ready, case, made_of, cycles, updates, sampling)
 

@@ -66,11 +66,11 @@ def varied_wear_inputs(
     Raises:
         InputError: none varies.
     """
-    found = () if motion.drive is None else motion.drive.names
+    result = () if motion.drive is None else motion.drive.names
     inputs = [
         VariedInput(name, getattr(table, f"{name}_{unit}"), unit)
         for name, unit in POSES.items()
-        if name not in found and (not profile or f"{name}_{unit}" in table.model_fields_set)
+        if name not in result and (not profile or f"{name}_{unit}" in table.model_fields_set)
     ]
     inputs.append(VariedInput("young_modulus", table.young_modulus, "relative"))
     inputs.append(VariedInput("wear_factor", table.wear_factor, "relative"))

@@ -191,8 +191,8 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
 
 def _refuse_post(case: Case) -> None:
     if case.post is not None:
-        mend = "leave the key out: the dishes' wear alone is modelled"
-        raise InputError("the post does not wear", "[contact] post", mend)
+        hint = "leave the key out: the dishes' wear alone is modelled"
+        raise InputError("the post does not wear", "[contact] post", hint)
 
 
 def _cycle_of_maps(maps: ContactMaps, scene: Scene, most: int) -> CycleMotion:
@@ -222,8 +222,8 @@ def _of_profile(
     drive = profile.drive(dwell, springs)
     notes = ["a simulator's cycle in displacement control; AP and ML from the dwell position"]
     if drive is not None:
-        found = ", ".join(drive.names)
-        notes = [f"a simulator's cycle in force control: {found} in equilibrium, without friction"]
+        result = ", ".join(drive.names)
+        notes = [f"a simulator's cycle in force control: {result} in equilibrium, without friction"]
         if friction := case.scene.contact.friction:
             notes.append(f"the scene's friction of {friction:g} is left out of force control")
     seconds = np.diff(profile.percent) / 100.0 * period

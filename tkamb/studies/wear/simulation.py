@@ -18,22 +18,35 @@ from tkamb.studies.wear.sliding import SlidingHistory
 from tkamb.studies.wear.worn_surface import ArticularSurface, volume
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-MOST_CYCLES = 10**9
-MOST_UPDATES = 10_000
-THINNEST = 1e-4
-"""m; where less of the insert is left it counts as worn through."""
-WORN = 1e-9
-"""m; less depth than this is no wear."""
+
+@dataclass(frozen=True)
+class WearSimulationSettings:
+    """The simulation of wear over many cycles."""
+
+    max_cycles: float = 10**9
+    """Largest number of cycles that is accepted: a thousand years of walking."""
+    max_updates: int = 10_000
+    """Largest number of updates of the surface that is accepted."""
+    min_thickness: float = 1e-4
+    """m; an insert that is thinner counts as worn through."""
+    min_depth: float = 1e-9
+    """m; less depth is no wear."""
+    max_pattern_change: float = 0.2
+    """Share of the worn volume that may lie elsewhere after a block of cycles; a block with more is
+    halved."""
+    max_block_division: int = 256
+    """Ratio of the longest block to the shortest one that is tried."""
+    min_row_share: float = 0.5
+    """Share of the rows of a force-controlled profile that must be computed for a cycle to
+    count."""
+    min_improvement: float = 1.1
+    """Factor by which halving a block has to lessen the change for another halving."""
+
+
+WEAR_SIMULATION = WearSimulationSettings()
+
 MILLIGRAM = 1e-6
 """kg."""
-MOST_CHANGE = 0.2
-"""Share of the worn volume that may lie elsewhere after a block."""
-MOST_HALVINGS = 256
-"""A block is not made shorter than this part of the longest."""
-FEWEST_ROWS = 0.5
-"""Share of a force-controlled profile's rows without which there is no cycle."""
-HELPS = 1.1
-"""Halving a block has to lessen the change by at least this factor to be done again."""
 MEND = "check load and poses, or another contact model"
 
 
@@ -137,10 +150,12 @@ class CycleWear:
 
 def check_blocks(cycles: int, updates: int) -> None:
     """Raise an InputError for numbers of cycles or updates that make no simulation."""
-    if not 1 <= cycles <= MOST_CYCLES:
-        raise InputError(f"{cycles} cycles", "--cycles", f"give 1 to {MOST_CYCLES:.0e}")
-    if not 1 <= updates <= min(MOST_UPDATES, cycles):
-        most = min(MOST_UPDATES, cycles)
+    if not 1 <= cycles <= WEAR_SIMULATION.max_cycles:
+        raise InputError(
+            f"{cycles} cycles", "--cycles", f"give 1 to {WEAR_SIMULATION.max_cycles:.0e}"
+        )
+    if not 1 <= updates <= min(WEAR_SIMULATION.max_updates, cycles):
+        most = min(WEAR_SIMULATION.max_updates, cycles)
         raise InputError(f"{updates} updates", "--updates", f"give 1 to {most}")
 
 
@@ -151,7 +166,7 @@ def simulate_wear(
     *,
     state: WearState | None = None,
     keep: Callable[[WearState], None] = lambda state: None,
-    most_change: float = MOST_CHANGE,
+    most_change: float = WEAR_SIMULATION.max_pattern_change,
 ) -> tuple[WearState, CycleWear]:
     """Return the insert after `cycles`, and what the next cycle would do to it.
 
@@ -188,8 +203,11 @@ def simulate_wear(
         after = _cycle(case, tried)
         lost = isinstance(after, str)
         change = math.inf if isinstance(after, str) else now.change_to(after)
-        shorter = step / 2 >= cycles / updates / MOST_HALVINGS
-        if shorter and (lost or (change > most_change and not before <= change * HELPS)):
+        shorter = step / 2 >= cycles / updates / WEAR_SIMULATION.max_block_division
+        if shorter and (
+            lost
+            or (change > most_change and not before <= change * WEAR_SIMULATION.min_improvement)
+        ):
             state, before = replace(state, step=step / 2), change
             continue
         if isinstance(after, str):
@@ -286,7 +304,7 @@ def _rows(maps: CycleMaps, motion: CycleMotion) -> list[int] | str:
     known = [k for k in every if k not in maps.failed]
     if not maps.failed:
         return known
-    if motion.drive is None or len(known) < FEWEST_ROWS * len(motion):
+    if motion.drive is None or len(known) < WEAR_SIMULATION.min_row_share * len(motion):
         frame, why = next(iter(maps.failed.items()))
         lost = f"no contact in {len(maps.failed)} of {len(motion)} frames"
         return f"{lost}, the first of them {frame}: {why}"
@@ -318,17 +336,18 @@ def _worn(case: WearCase, state: WearState, now: CycleWear, step: float) -> Wear
 
 
 def _until_worn_through(left: Array, fall: Array) -> float:
-    """Return the share of a block after which somewhere only `THINNEST` is left; 1: nowhere."""
+    """Return the share of a block after which somewhere only `WEAR_SIMULATION.min_thickness` is
+    left; 1: nowhere."""
     falls = fall > 0
     if not falls.any():
         return 1.0
-    share = (left[falls] - THINNEST) / fall[falls]
+    share = (left[falls] - WEAR_SIMULATION.min_thickness) / fall[falls]
     return float(np.clip(share.min(), 0.0, 1.0))
 
 
 def _row(case: WearCase, state: WearState, now: CycleWear) -> dict[str, float]:
     """Return one row of the table: the insert after the state's cycles."""
-    articular, worn = case.articular, state.wear > WORN
+    articular, worn = case.articular, state.wear > WEAR_SIMULATION.min_depth
     area = float(now.area[worn].sum())
     medial = articular.surface.vertices[articular.vertices, 2] < 0
     each = state.wear * now.area

@@ -12,10 +12,18 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
 
-DEEPEST = 5e-3
-"""m; the farthest that a load may press the femoral component into the bed in one step."""
-LOAD_TOLERANCE = 1e-9
-"""m; how well the approach of a load is found."""
+
+@dataclass(frozen=True)
+class ViscoelasticBedSettings:
+    """The press into a viscoelastic bed."""
+
+    max_approach: float = 5e-3
+    """m; farthest that a load may press the femoral component into the bed in one step."""
+    approach_tolerance: float = 1e-9
+    """m; tolerance of the approach that carries a load."""
+
+
+VISCOELASTIC_BED = ViscoelasticBedSettings()
 
 
 @dataclass(frozen=True)
@@ -79,12 +87,12 @@ class PronySeries:
         """
         strain = np.asarray(strain, float)
         memory = np.multiply.outer(np.array(self.fractions), strain[0])
-        found = [self.equilibrium * strain[0] + memory.sum(axis=0)]
+        result = [self.equilibrium * strain[0] + memory.sum(axis=0)]
         for step, before, after in zip(np.diff(time), strain[:-1], strain[1:], strict=True):
             _, decay, kept = self.response(float(step))
             memory = (memory.T * decay).T + np.multiply.outer(kept, after - before)
-            found.append(self.equilibrium * after + memory.sum(axis=0))
-        return np.array(found)
+            result.append(self.equilibrium * after + memory.sum(axis=0))
+        return np.array(result)
 
 
 class ViscoelasticBed:
@@ -114,16 +122,25 @@ class ViscoelasticBed:
         """Go on by `step` s to a load (N) at a pose whose y is free; return the pressure (n,) Pa.
 
         Raises:
-            InputError: the load cannot be carried within `DEEPEST` of the pose's y.
+            InputError: the load cannot be carried within
+                `VISCOELASTIC_BED.max_approach` of the pose's y.
         """
 
         def missing(fall: float) -> float:
-            found = self._pressed(pose, fall, step)[1]
-            return float((found * self._bed.area) @ self._bed.normals[:, 1]) - load
+            result = self._pressed(pose, fall, step)[1]
+            return float((result * self._bed.area) @ self._bed.normals[:, 1]) - load
 
-        if missing(-DEEPEST) > 0 or missing(DEEPEST) < 0:
+        if (
+            missing(-VISCOELASTIC_BED.max_approach) > 0
+            or missing(VISCOELASTIC_BED.max_approach) < 0
+        ):
             raise InputError(f"a load of {load:g} N cannot be reached", "viscoelastic")
-        fall = brentq(missing, -DEEPEST, DEEPEST, xtol=LOAD_TOLERANCE)
+        fall = brentq(
+            missing,
+            -VISCOELASTIC_BED.max_approach,
+            VISCOELASTIC_BED.max_approach,
+            xtol=VISCOELASTIC_BED.approach_tolerance,
+        )
         strain, pressure = self._pressed(pose, fall, step)
         _, decay, kept = self._series.response(step)
         self._memory = decay[:, None] * self._memory + kept[:, None] * (strain - self._strain)

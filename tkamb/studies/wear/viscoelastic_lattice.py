@@ -119,9 +119,9 @@ class ViscoelasticLattice:
         if load is not None:
             pose[1, 3] -= lowest
             gaps, planes = gaps - lowest, planes.raised(-lowest)
-        found = self._solved(load, pose, (gaps, planes), slope, offset)
-        pose[1, 3] -= found.forces.approach if load is not None else 0.0
-        force[found.candidates] = found.forces.force[:, None] * found.planes.normals
+        result = self._solved(load, pose, (gaps, planes), slope, offset)
+        pose[1, 3] -= result.forces.approach if load is not None else 0.0
+        force[result.candidates] = result.forces.force[:, None] * result.planes.normals
         return pose, force
 
     def _solved(
@@ -140,13 +140,13 @@ class ViscoelasticLattice:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load / slope) + sunk
         for _ in range(self._settings.max_expansions):
             guess = initial_guess(state.compliance, gaps, planes, depth, load is None, None, None)
-            found = solve(state.problem, pose, load, _softer(guess, slope, offset), self._settings)
-            if not found.converged:
+            result = solve(state.problem, pose, load, _softer(guess, slope, offset), self._settings)
+            if not result.converged:
                 break
             covered = load is None or len(guess.candidates) == np.isfinite(gaps).sum()
-            if covered or found.forces.approach * REACH <= guess.reach:
-                return found
-            depth = 1.1 * found.forces.approach
+            if covered or result.forces.approach * REACH <= guess.reach:
+                return result
+            depth = 1.1 * result.forces.approach
         raise ComputationError("the contact does not come to rest", "viscoelastic")
 
 

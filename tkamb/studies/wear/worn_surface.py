@@ -15,12 +15,22 @@ from tkamb.geometry.topology import edge_use
 Chosen = Callable[[Surface], NDArray[np.bool_]]
 
 DOWN = np.array([0.0, -1.0, 0.0])
-STEEPEST = 0.1
-"""Smallest n_y of a face that can be worn from above: 84 deg from the horizontal."""
-SKIN = 1e-6
-"""m; rays through the insert start so far below its surface."""
-MOST_ROUNDS = 12
-"""Halvings; an edge of a metre ends at a quarter of a millimetre."""
+
+
+@dataclass(frozen=True)
+class WornSurfaceSettings:
+    """The surface from which wear is removed."""
+
+    min_normal_y: float = 0.1
+    """Smallest y component of the normal of a face that can be worn from above: 84 deg from the
+    horizontal."""
+    ray_offset: float = 1e-6
+    """m; rays through the insert start so far below its surface."""
+    max_halvings: int = 12
+    """Halvings of an edge; one of a metre ends at a quarter of a millimetre."""
+
+
+WORN_SURFACE = WornSurfaceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,18 +69,20 @@ class ArticularSurface:
         surface = refined(
             Surface(np.asarray(merged.vertices), np.asarray(merged.faces), insert.name),
             spacing,
-            lambda s: s.face_normals[:, 1] > STEEPEST,
+            lambda s: s.face_normals[:, 1] > WORN_SURFACE.min_normal_y,
         )
         upward, whole = area_vectors(surface)
         length = np.linalg.norm(upward, axis=1)
-        up = np.flatnonzero((upward[:, 1] > STEEPEST * length) & (whole[:, 1] > 0))
+        up = np.flatnonzero((upward[:, 1] > WORN_SURFACE.min_normal_y * length) & (whole[:, 1] > 0))
         points = surface.vertices[up]
         caster = RayCaster(surface)
         above = points.copy()
         above[:, 1] = surface.bounds[1, 1] + 1e-3
         first = caster.first(above, DOWN)[0]
-        top = np.abs(above[:, 1] - first - points[:, 1]) < 10 * SKIN
-        thickness = SKIN + caster.first(points + SKIN * DOWN, DOWN)[0]
+        top = np.abs(above[:, 1] - first - points[:, 1]) < 10 * WORN_SURFACE.ray_offset
+        thickness = (
+            WORN_SURFACE.ray_offset + caster.first(points + WORN_SURFACE.ray_offset * DOWN, DOWN)[0]
+        )
         seen = top & np.isfinite(thickness)
         if not seen.any():
             raise InputError("no part of it faces upwards", insert.name, "check the mesh's axes")
@@ -102,7 +114,7 @@ def area_vectors(surface: Surface) -> tuple[Array, Array]:
     def summed(each: Array) -> Array:
         return np.stack([np.bincount(corners, np.tile(v, 3), count) for v in each.T], axis=1)
 
-    up = surface.face_normals[:, 1] > STEEPEST
+    up = surface.face_normals[:, 1] > WORN_SURFACE.min_normal_y
     return summed(np.where(up[:, None], vector, 0.0)), summed(vector)
 
 
@@ -123,7 +135,7 @@ def refined(surface: Surface, longest: float, chosen: Chosen) -> Surface:
         longest: m.
         chosen: says of a surface's faces (k,) which are to be refined.
     """
-    for _ in range(MOST_ROUNDS):
+    for _ in range(WORN_SURFACE.max_halvings):
         halved = _halved(surface, longest, chosen(surface))
         if halved is None:
             break

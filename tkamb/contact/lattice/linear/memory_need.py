@@ -57,7 +57,7 @@ class TooLittleMemoryError(ComputationError):
         )
         super().__init__(what, "lattice", "take a coarser resolution")
 
-    def hint(self, size: float) -> str:
+    def advice(self, size: float) -> str:
         """Return what to do about it: the cells that fit, for those of a size (m) that do not."""
         fits = size * (self.likely / max(self.left, 1.0)) ** (1.0 / MEMORY_NEED.memory_exponent)
         if fits > MEMORY_NEED.largest_cell_size:

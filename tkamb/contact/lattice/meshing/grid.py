@@ -188,7 +188,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
     """
     if target_size <= 0.0:
         raise InputError(
-            f"a cell size of {target_size / MILLIMETRE:g} mm", mend="give a positive size"
+            f"a cell size of {target_size / MILLIMETRE:g} mm", hint="give a positive size"
         )
     # Sizes are tried outwards from the target until all three spacings fit near-cubic cells.
     for percent in range(400):
