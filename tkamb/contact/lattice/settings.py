@@ -8,10 +8,10 @@ class LatticeSolverSettings:
     """When the contact iteration stops, and what it may leave out."""
 
     force_tolerance: float = 2e-3
-    """Largest residual force of the displaced solid, relative to the contact forces (Euclidean norms
-    over the free unknowns). Smaller: more passes. The factor in 16-bit integers leaves up to 1e-3
-    spread over the whole solid, which moves an approach by 1e-7 of itself; so it is no smaller
-    than twice that."""
+    """Largest residual force of the displaced solid, relative to the contact forces (Euclidean
+    norms over the free unknowns). Smaller: more passes. The factor in 16-bit integers leaves up
+    to 1e-3 spread over the whole solid, which moves an approach by 1e-7 of itself; so it is no
+    smaller than twice that."""
     work_tolerance: float = 3e-4
     """Largest work of the residual force on the displacement, relative to the work of the contact
     forces, times the softening: an estimate of the relative error of the approach (the energy
