@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from tkamb.contact.given_material import material_in_words
 from tkamb.errors import InputError
 
 WIDTH = 92
@@ -333,7 +334,7 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
 
 def _material_words(contact: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if material:
-        return f"The insert was {material['words']}."
+        return f"The insert was {material_in_words(material)}."
     if contact["material"] == "polyethylene":
         return (
             "The insert was polyethylene: E = 561.5 MPa, nu = 0.45, Ramberg–Osgood with "
