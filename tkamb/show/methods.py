@@ -334,7 +334,8 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
 
 def _material_words(contact: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if material:
-        return f"The insert was {material_in_words(material)}."
+        words = material_in_words(material).replace(": E ", ": E = ", 1)
+        return f"The insert was {words}."
     if contact["material"] == "polyethylene":
         return (
             "The insert was polyethylene: E = 561.5 MPa, nu = 0.45, Ramberg–Osgood with "
