@@ -16,9 +16,15 @@ from tkamb.units import DEGREE, MILLIMETRE
 class CondyleSettings:
     """How the two condyles of a femoral component are told apart."""
 
-    notch_depth: float = 3e-3
-    """m; a shallower notch makes no two condyles. A single condyle of a real component has up to
-2.4 mm along some direction (DM, JW and the shipped knee cut in halves), two condyles 6 to 14 mm."""
+    notch_depth: float = 2e-3
+    """m; a shallower notch along z makes no two condyles; real components have 6 to 14 mm."""
+    yawed_notch_depth: float = 3e-3
+    """m; a shallower notch along another direction is no line through two condyles. A single
+    condyle of a real component has up to 2.4 mm along some direction (DM, JW and the shipped knee
+    cut in halves)."""
+    extended_notch_depth: float = 0.5e-3
+    """m; least notch at 0 deg of flexion along the line through two condyles: a single long body
+    has none there, whatever its ends make of it when it is flexed."""
     facet_depth: float = 3e-5
     """m; what facets of 1–2 mm cut off a condyle: heights that differ by less are the same."""
     strip_width: float = 1e-3
@@ -68,7 +74,7 @@ def condyle_split(femoral: Surface) -> float | None:
     The lower outline of the component in the frontal plane is taken at flexions from 0 to
     120 deg (rotation about +z, as in `tkamb.geometry.frames`), in strips of 1 mm along z,
     as height above its lowest point, and averaged over flexion. Two condyles show as two
-    valleys with a ridge, the notch, between them. It must rise at least 3 mm above both;
+    valleys with a ridge, the notch, between them. It must rise at least 2 mm above both;
     the split is the middle of the notch at half its height. A sphere, a cylinder along z
     or a unicondylar part has one valley.
 
@@ -118,7 +124,11 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
     for n, yaw in enumerate(yaws):
         cosine, sine = np.cos(yaw), np.sin(yaw)
         turn = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
-        outline, _ = _mean_outline(samples @ turn.T, search.strip, np.array(search.flexions))
+        turned_samples = samples @ turn.T
+        extended, _ = _mean_outline(turned_samples, search.strip, np.zeros(1))
+        if _rise(extended).max() < CONDYLE.extended_notch_depth:
+            continue
+        outline, _ = _mean_outline(turned_samples, search.strip, np.array(search.flexions))
         depth[n] = _rise(outline).max()
     deepest = float(depth.max())
     weight = np.where(depth > deepest / 2, depth, 0.0)
@@ -129,7 +139,7 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
 def _check_yaw(femoral: Surface) -> None:
     """Raise an InputError where two condyles lie along another direction than z."""
     yaw, notch = condyle_yaw(femoral)
-    if notch < CONDYLE.notch_depth or abs(yaw) <= YAW_SEARCH.largest_yaw:
+    if notch < CONDYLE.yawed_notch_depth or abs(yaw) <= YAW_SEARCH.largest_yaw:
         return
     raise InputError(
         f"its two condyles lie along a line turned by {abs(yaw) / DEGREE:.0f} deg from the "

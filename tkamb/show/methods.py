@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.io.given_material import material_in_words
 
 
 @dataclass(frozen=True)
@@ -351,6 +350,8 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
 
 def _material_words(contact: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if material:
+        from tkamb.io.given_material import material_in_words  # brings scipy
+
         return f"The insert was of {material_in_words(material)}."
     if contact["material"] == "polyethylene":
         return (
