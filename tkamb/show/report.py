@@ -184,6 +184,11 @@ def _legend(results: "Results") -> list[str]:
             "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
             "full lines: the scene as it stands."
         )
+    if results.band_with_discrepancy("force_total_N") is not None:
+        sentences.append(
+            "Paler and wider: 5 to 95 % by the varied inputs and by what the model leaves out, as "
+            "far as comparisons with measured knees say."
+        )
     if flagged(results).any():
         sentences.append("Orange ticks at the bottom: frames to be read with care.")
     if failed(results).any():
