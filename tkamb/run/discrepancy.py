@@ -3,11 +3,14 @@
 A measured force is the predicted one, with whatever its inputs err by, plus the discrepancy d of
 what the model leaves out (Kennedy & O'Hagan 2001). Over the frames t of a trial of an activity
 
-    d(t) = m + b + w(t),   m ~ N(0, S²/2),   b ~ N(0, S²/2),   w ~ AR(1) of variance V,
+    d(t) = m + b + w(t),   m ~ (0, S²/2),   b ~ (0, S²/2),   w ~ AR(1) of variance V,
 
 m is common to all trials of an activity, b to all frames of a trial, and w is correlated over a
 time of some 0.1 s. S² is the mean square of the trials' biases, V the mean of their scatter's
-squares. With n trials of the activity and their mean bias B, m has the mean n B/(n + 1) and the
+squares. The trials are of one subject; what others add is not in them, so that published blind
+predictions of other subjects count as one more trial in S². Variances from few trials are not
+well known themselves: d is Student's t, with as many degrees of freedom as trials are in S².
+With n trials of the activity and their mean bias B, m has the mean n B/(n + 1) and the
 variance S²/2/(n + 1); with n = 0 the activity is like any other. Biases and scatters hold what
 the inputs err by as well, so that the square of the inputs' deviation is taken off the variance.
 
@@ -24,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import stdtrit
 
 from tkamb.geometry.frames import Array
 
@@ -47,8 +50,16 @@ class DiscrepancySettings:
     """How the discrepancy is fitted and added to the samples."""
 
     quantiles: int = 41
-    """Values of the normal distribution that are added to each sample; more changes the ends of a
-    band by less than 1 %."""
+    """Values of Student's t that are added to each sample; more changes the ends of a band by less
+    than 1 %."""
+    published_total_BW: float = 0.43  # noqa: N815
+    """BW: error of a published blind prediction of the total force in walking, 281 N (parametric
+    model, third Grand Challenge, PMC3627216), over JW's weight."""
+    published_medial_BW: float = 0.41  # noqa: N815
+    """BW: likewise of the medial force: the middle of 229 to 312 N by the four winners of the
+    Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255)."""
+    published_lateral_BW: float = 0.43  # noqa: N815
+    """BW: likewise of the lateral force: the middle of 238 to 326 N."""
     fewest_frames: int = 5
     """Frames of a trial below which its bias and scatter say too little."""
 
@@ -94,12 +105,14 @@ class Discrepancy:
     Args:
         mean: of the discrepancy, body weights.
         deviation: its standard deviation without that of the inputs, body weights.
+        freedom: degrees of freedom of Student's t.
         own_trials: of the activity.
         trials: of all activities.
     """
 
     mean: float
     deviation: float
+    freedom: int
     own_trials: int
     trials: int
 
@@ -161,12 +174,14 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     if not known:
         return None
     own = [one.bias_BW for one in known if one.activity == activity]
-    offset = float(np.mean([one.bias_BW**2 for one in known]))
+    published = float(getattr(DISCREPANCY, f"published_{force}_BW"))
+    offset = float(np.mean([published**2, *(one.bias_BW**2 for one in known)]))
     scatter = float(np.mean([one.scatter_BW**2 for one in known]))
     inputs = float(np.mean([one.inputs_BW**2 for one in known]))
     mean = sum(own) / (len(own) + 1)
     variance = offset / 2 * (1 + 1 / (len(own) + 1)) + scatter - inputs
-    return Discrepancy(mean, float(np.sqrt(max(0.0, variance))), len(own), len(known))
+    deviation = float(np.sqrt(max(0.0, variance)))
+    return Discrepancy(mean, deviation, len(known) + 1, len(own), len(known))
 
 
 def band_with_discrepancy(
@@ -174,7 +189,7 @@ def band_with_discrepancy(
 ) -> Array:
     """Return the band of inputs and discrepancy together, (percents, f), of the samples' unit.
 
-    Each sample stands for a normal distribution about itself. A force is never below zero.
+    Each sample stands for a distribution about itself. A force is never below zero.
 
     Args:
         samples: (n, f) NaN where a sample has no number.
@@ -183,9 +198,7 @@ def band_with_discrepancy(
         percents: of the distribution below the ends of the band.
     """
     steps = (np.arange(DISCREPANCY.quantiles) + 0.5) / DISCREPANCY.quantiles
-    normal = ndtri(steps)
-    normal /= np.sqrt((normal**2).mean())
-    added = (found.mean + found.deviation * normal) * body_weight
+    added = (found.mean + found.deviation * stdtrit(found.freedom, steps)) * body_weight
     spread = samples[:, None, :] + added[:, None]
     every = np.maximum(spread.reshape(-1, samples.shape[1]), 0.0)
     every[np.isnan(spread.reshape(-1, samples.shape[1]))] = np.nan
