@@ -52,13 +52,13 @@ class DiscrepancySettings:
     quantiles: int = 41
     """Values of Student's t that are added to each sample; more changes the ends of a band by less
     than 1 %."""
-    published_total_BW: float = 0.43  # noqa: N815
+    published_total_BW: float = 0.43
     """BW: error of a published blind prediction of the total force in walking, 281 N (parametric
     model, third Grand Challenge, PMC3627216), over JW's weight."""
-    published_medial_BW: float = 0.41  # noqa: N815
+    published_medial_BW: float = 0.41
     """BW: likewise of the medial force: the middle of 229 to 312 N by the four winners of the
     Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255)."""
-    published_lateral_BW: float = 0.43  # noqa: N815
+    published_lateral_BW: float = 0.43
     """BW: likewise of the lateral force: the middle of 238 to 326 N."""
     fewest_frames: int = 5
     """Frames of a trial below which its bias and scatter say too little."""

@@ -17,7 +17,9 @@ Share = Annotated[Number, Field(ge=0, le=1)]
 
 _OF_POSE = "of the recorded pose; default: that of the recording, fluoroscopy or skin markers"
 _GIVE = "; no default: give what your laboratory knows"
-_SMITH = "; default: as Smith et al. (2016, doi:10.1055/s-0035-1558858) vary it"
+_TISSUE = (
+    "; default: an assumption, for a Monte Carlo study of the kind of Smith et al. (PMC4755512)"
+)
 _ASSUMED = "; default: an assumption, without a source"
 
 
@@ -159,11 +161,11 @@ class UncertaintyTable(SceneTable):
         "wide the lamina is whose sections the line wraps. An assumption, without a source: bands "
         "of 5 to 15 mm are all defensible, and move the quadriceps by up to 9 % in deep flexion",
     )
-    ligament_stiffness: Share = Field(0.3, description="relative, each bundle by itself" + _SMITH)
+    ligament_stiffness: Share = Field(0.3, description="relative, each bundle by itself" + _TISSUE)
     ligament_strain: Annotated[Number, Field(ge=0, le=0.1)] = Field(
         0.02,
         description="of each bundle by itself: added to its reference strain, or by which its "
-        "slack length is divided: L0/(1 + e)" + _SMITH,
+        "slack length is divided: L0/(1 + e)" + _TISSUE,
     )
     friction: Annotated[Number, Field(ge=0, le=0.5)] = Field(
         0.017,
