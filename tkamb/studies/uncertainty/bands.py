@@ -130,7 +130,8 @@ def discrepancy_columns(
         summary: of the run.
         body_weight: N.
     """
-    known, columns = discrepancy_of(summary), {}
+    known = discrepancy_of(summary)
+    columns: dict[str, Array] = {}
     for index, name in enumerate(names):
         found = known.get(COLUMNS.get(name, ""))
         if found is None:
