@@ -247,21 +247,32 @@ def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "forces": {force: asdict(one) for force, one in found.items()},
         "trials": [one.trial for one in known_errors() if one.force == FORCES[0]],
+        "rmse_BW": rms_error(known_errors(), FORCES[0], summary.get("activity")),
         "subjects": len({one.subject for one in known_errors()}),
         "words": discrepancy_words(summary),
     }
 
 
+def _of_activity(known: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
+    """Return the trials of an activity; of one that was not compared, all."""
+    return [one for one in known if one.activity == activity] or known
+
+
+def rms_error(known: Sequence[TrialError], force: str, activity: str | None) -> float:
+    """Return the root mean square over trials of the nominal runs' errors (body weights)."""
+    rms = [one.nominal_rmse_BW for one in _of_activity(known, activity) if one.force == force]
+    return float(np.sqrt(np.mean(np.square(rms))))
+
+
 def discrepancy_words(summary: Mapping[str, Any]) -> str:
     """Return in a sentence how far the method was off when it was compared with measured knees."""
     known, activity = known_errors(), summary.get("activity")
-    own = [one for one in known if one.activity == activity] or known
+    own = _of_activity(known, activity)
     of_what = f"in {activity}" if any(one.activity == activity for one in known) else "in all"
     parts = []
     for force in FORCES:
-        rms = [one.nominal_rmse_BW for one in own if one.force == force]
-        if rms:
-            parts.append(f"{np.sqrt(np.mean(np.square(rms))):.2f} BW ({force})")
+        if any(one.force == force for one in own):
+            parts.append(f"{rms_error(known, force, activity):.2f} BW ({force})")
     trials = len({one.trial for one in own})
     subjects = len({one.subject for one in own})
     words = (

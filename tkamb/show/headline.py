@@ -162,8 +162,7 @@ def _discrepancy(results: "Results") -> Card | None:
     words = (results.summary.get("discrepancy") or {}).get("words")
     if not words or results.summary.get("measured"):
         return None
-    known = results.summary["discrepancy"]
-    value = f"{len(known['trials'])} trials, {known['subjects']} subject"
+    value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW off in total"
     return Card("Compared with measured knees", value, words)
 
 
