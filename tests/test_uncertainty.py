@@ -147,6 +147,8 @@ def sampled(sampler, monkeypatch, **normal):
 def test_a_sample_is_the_run_of_the_scene_with_its_inputs_moved(monkeypatch):
     names = ["force_total_N", "medial_force_N", "ligament_LCL_N", "quadriceps_N"]
     table = {"uncertainty__ligament_strain": 0.02, "uncertainty__tuberosity_mm": 2.0}
+    factors = ("ligament_stiffness", "segment_mass", "ground_reaction")  # of mean 1, not median
+    table |= {f"uncertainty__{name}": 0.0 for name in factors}
     scene, frames = knee(**table), slice(60, 61)
     sampler = Sampler(scene, range(60, 61), names)
     nominal = simulate(scene, frames=frames)
@@ -234,6 +236,10 @@ def test_a_scene_in_which_nothing_varies_is_refused():
     none = [f"uncertainty__{key}" for key in ("ap_mm", "si_mm", "ml_mm", "friction")]
     none += [f"uncertainty__{key}_deg" for key in ("axial_rotation", "adduction", "flexion")]
     none += [f"uncertainty__centre_of_pressure_{axis}_mm" for axis in ("ap", "ml")]
+    none += [f"uncertainty__{key}" for key in ("segment_mass", "ground_reaction")]
+    none += [f"uncertainty__ligament_{key}" for key in ("stiffness", "strain")]
+    none += [f"uncertainty__{key}_mm" for key in ("knee_centre", "femoral_placement")]
+    none += [f"uncertainty__insert_placement_{unit}" for unit in ("mm", "deg")]
     with pytest.raises(Exception, match="no input varies"):
         estimate_uncertainty(bodies_alone(**dict.fromkeys(none, 0.0)), samples=20)
 

@@ -103,6 +103,10 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         crew=PoolOptions(options.workers, options.dask),
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
+    from tkamb.studies.uncertainty.inputs import held_inputs
+
+    if held := held_inputs(load_case(scene)):
+        text.append(f"not varied: {', '.join(held)}")
     text.append("one input at a time by one standard deviation: minus, plus; no interactions")
     text.append(
         "an offset either way may raise a force: it climbs one flank of the insert or other"
@@ -114,6 +118,8 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 def headline(found: "Uncertainty") -> list[str]:
     """Return the peak's band and what moves it most, in lines of text."""
     from numpy import isfinite, nanargmax
+
+    from tkamb.show.headline import peak_legend, peak_words, peaks_of
 
     total = found.results["force_total_BW"]
     if not isfinite(total).any():
@@ -130,7 +136,10 @@ def headline(found: "Uncertainty") -> list[str]:
             f"median {of_samples['median']:.2f} BW, 5 to 95 %: {of_samples['p05']:.2f} to "
             f"{of_samples['p95']:.2f}"
         )
-    lines = [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
+    peaks = peaks_of(found.results.summary)
+    lines = [f"peak {name} force: {peak_words(one)} BW" for name, one in peaks.items()]
+    lines += [f"({peak_legend(peaks)})"] if peaks else []
+    lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
     of_chance = TERMS / found.results.summary["uncertainty"]["samples"]
     chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):
@@ -139,10 +148,14 @@ def headline(found: "Uncertainty") -> list[str]:
         if parts:
             lines.append(f"{result} varies by {parts} (shares of variance, by regression{chance})")
     for name, one in found.results.summary["uncertainty"].get("measured_inside", {}).items():
+        more = one.get("share_with_discrepancy")
         lines.append(
             f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
             f"{one['frames']} frames"
+            + ("" if more is None else f", with the discrepancy in {more:.0%}")
         )
+    if words := (found.results.summary.get("discrepancy") or {}).get("words"):
+        lines.append(words)
     for result in ("force_total_N", "medial_force_N"):
         parts = ", ".join(
             f"{one.name} {_with_error(one.first, one.first_error)} alone, "

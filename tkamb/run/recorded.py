@@ -1,7 +1,4 @@
-"""What was recorded beside a run held against what it predicts: measured force, EMG.
-
-Nothing of this is imported unless the scene has [measured] or [muscles.emg].
-"""
+"""What was recorded beside a run held against what it predicts: measured force, EMG."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -77,6 +74,15 @@ def measured_column(name: str) -> str:
     return f"measured_{name}_N"
 
 
+def predicted_columns(columns: Mapping[str, Any]) -> dict[str, str]:
+    """Return force -> the column that predicts it: the first that holds a number."""
+    found = {}
+    for name, candidates in PREDICTED.items():
+        known = [one for one in candidates if one in columns and np.isfinite(columns[one]).any()]
+        found[name] = next(iter(known or candidates))
+    return found
+
+
 def compare_measured(
     columns: Mapping[str, Any], names: Iterable[str], body_weight: float
 ) -> dict[str, dict[str, Any]]:
@@ -96,14 +102,12 @@ def compare_measured(
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
     missing = np.full(len(failed), np.nan)
-    result = {}
+    result, predicting = {}, predicted_columns(columns)
     for name in names:
-        predicted = {column: columns.get(column, missing) for column in PREDICTED[name]}
-        known = [column for column, values in predicted.items() if np.isfinite(values).any()]
-        column = next(iter(known or predicted))
-        measured = columns[measured_column(name)]
-        counted = _frame_counts(predicted[column], measured, failed)
-        error = _force_errors(columns["time_s"], predicted[column], measured, body_weight)
+        column, measured = predicting[name], columns[measured_column(name)]
+        predicted = columns.get(column, missing)
+        counted = _frame_counts(predicted, measured, failed)
+        error = _force_errors(columns["time_s"], predicted, measured, body_weight)
         result[name] = {"predicted": column} | counted | error
     return result
 

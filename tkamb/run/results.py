@@ -115,6 +115,12 @@ class Results:
         result = [end for end in ends if end is not None]
         return np.array(result) if len(result) == len(ends) else None
 
+    def band_with_discrepancy(self, name: str) -> Array | None:
+        """Return p05 and p95 (2, f) of a column by inputs and discrepancy; None: it has none."""
+        ends = [self.bands.get(f"{name}_discrepancy_{end}") for end in ("p05", "p95")]
+        found = [end for end in ends if end is not None]
+        return np.array(found) if len(found) == len(ends) else None
+
     def why_no_band(self, frame: int) -> str:
         """Return why a frame's results have no band, in words."""
         if self.bands["failed_share"][frame] > STATISTICS_LIMITS.max_failed_share:

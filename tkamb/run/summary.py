@@ -19,10 +19,12 @@ from tkamb.io.recordings.gait import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene, scene_files
 from tkamb.io.scene.tables import ContactTable, MusclesTable
-from tkamb.run.columns import JOINT_MOMENT, RESERVE, belongs, family_column, name_in
+from tkamb.run.columns import ACTIVATION, JOINT_MOMENT, RESERVE, belongs, family_column, name_in
+from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.known_errors import as_json, known_error, left_out
 from tkamb.run.mechanics import STRAIN_FLEXIONS
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
+from tkamb.run.recorded import predicted_columns
 from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
 from tkamb.units import DEGREE, MILLIMETRE
@@ -54,6 +56,9 @@ class SummarySettings:
 
 SUMMARY = SummarySettings()
 
+
+SATURATED = 0.99
+"""Activation above which a muscle is said to pull as hard as it can."""
 
 LIBRARIES = ("pin", "numpy", "scipy", "trimesh", "python-fcl")
 
@@ -88,6 +93,10 @@ def summary_of(
         summary["first_wrapping_flexion_deg"] = _first_wrapping(columns)
     if scene.muscles:
         summary["reserves"] = reserves(columns)
+        summary["saturated_muscles"] = saturated_muscles(columns)
+    summary["peaks_BW"] = peaks(columns, case.body_weight)
+    if scene.contact or scene.muscles:
+        summary["discrepancy"] = discrepancy_summary(summary)
     if case.measured is not None or case.emg is not None:
         from tkamb.run.recorded import compare_recorded
 
@@ -386,6 +395,38 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
             "frames_above_5_percent": int((reserve > SUMMARY.notable_reserve * largest).sum()),
         }
     return result
+
+
+def saturated_muscles(columns: Mapping[str, Any]) -> dict[str, int]:
+    """Return muscle -> in how many frames it pulls as hard as it can, of those that do."""
+    found = {}
+    for column, values in columns.items():
+        if belongs(column, ACTIVATION):
+            frames = int((np.asarray(values) > SATURATED).sum())
+            if frames:
+                found[name_in(column, ACTIVATION)] = frames
+    return found
+
+
+def peaks(columns: Mapping[str, Any], body_weight: float) -> dict[str, dict[str, float]]:
+    """Return force -> its largest value in body weights, with its frame, time and flexion.
+
+    Args:
+        columns: of results.csv.
+        body_weight: N.
+    """
+    found = {}
+    for force, name in predicted_columns(columns).items():
+        values = columns.get(name)
+        if values is not None and np.isfinite(values).any():
+            frame = int(np.nanargmax(values))
+            found[force] = {
+                "nominal": float(values[frame]) / body_weight,
+                "frame": frame,
+                "time_s": float(columns["time_s"][frame]),
+                "flexion_deg": float(columns["flexion_deg"][frame]),
+            }
+    return found
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:

@@ -28,6 +28,8 @@ class HeadlineSettings:
 
     most_inputs: int = 2
     """How many inputs a sentence names."""
+    most_muscles: int = 4
+    """How many saturated muscles are named."""
     notable_failed_share: float = 0.05
     """Share of samples: where more fail, the bands leave out a whole tail."""
     residual_percent: float = 0.05
@@ -86,9 +88,12 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     """Return the headline numbers that the run has."""
     result = (
         _questions(results),
+        _peaks(results),
         _peak_force(results, axis),
         _band(results, axis),
         _measured(results),
+        _discrepancy(results),
+        _muscle_limits(results),
         _shares(results),
         _peak_pressure(results, axis),
         _post(results, axis),
@@ -114,6 +119,72 @@ def _questions(results: "Results") -> Card | None:
     many = len(questions) > 1
     detail = " ".join(f"({k}) {q}" if many else str(q) for k, q in enumerate(questions, 1))
     return Card("Questions to answer", str(len(questions)), detail, True)
+
+
+def peak_words(peak: Mapping[str, Any]) -> str:
+    """Return a peak force with its bands in words, body weights.
+
+    Args:
+        peak: of the summary's `peaks_BW` or of its uncertainty's, which has bands.
+    """
+    if peak.get("p05") is None:
+        return f"{peak['nominal']:.2f}"
+    words = f"{peak['median']:.2f} ({peak['p05']:.2f}–{peak['p95']:.2f}"
+    if peak.get("discrepancy_p05") is not None:
+        words += f"; {peak['discrepancy_p05']:.2f}–{peak['discrepancy_p95']:.2f}"
+    return words + ")"
+
+
+def peaks_of(summary: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return force -> its peak, with bands where inputs were varied."""
+    varied = (summary.get("uncertainty") or {}).get("peaks_BW")
+    return varied or summary.get("peaks_BW") or {}
+
+
+def peak_legend(found: Mapping[str, Any]) -> str:
+    """Return in words what stands in the brackets of `peak_words`."""
+    if not any(one.get("p05") is not None for one in found.values()):
+        return "as the inputs stand; tkamb uncertainty says how sure that is"
+    words = "median of the samples (5 to 95 % by the inputs"
+    if any(one.get("discrepancy_p05") is not None for one in found.values()):
+        words += "; 5 to 95 % by the inputs and by what the model leaves out"
+    return words + ")"
+
+
+def _peaks(results: "Results") -> Card | None:
+    """Return the peak total, medial and lateral force with their bands."""
+    found = peaks_of(results.summary)
+    if not found:
+        return None
+    value = ", ".join(f"{name} {peak_words(one)}" for name, one in found.items()) + " BW"
+    detail = peak_legend(found) + "; each at the frame where it is largest as the inputs stand"
+    return Card("Peak total, medial and lateral force", value, detail)
+
+
+def _discrepancy(results: "Results") -> Card | None:
+    """Return how far the method was off in measured knees, where this one was not measured."""
+    words = (results.summary.get("discrepancy") or {}).get("words")
+    if not words or results.summary.get("measured"):
+        return None
+    value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW off in total"
+    return Card("Compared with measured knees", value, words)
+
+
+def _muscle_limits(results: "Results") -> Card | None:
+    """Return what the hip's reserves carry, and which muscles pull as hard as they can."""
+    reserves = results.summary.get("reserves") or {}
+    saturated = results.summary.get("saturated_muscles") or {}
+    if not reserves:
+        return None
+    hip = {name: one for name, one in reserves.items() if name.startswith("hip")}
+    largest = max((one["percent_of_largest_moment"] for one in hip.values()), default=0.0)
+    named = sorted(saturated, key=lambda name: -saturated[name])[: HEADLINE.most_muscles]
+    listed = ", ".join(f"{name} ({saturated[name]} frames)" for name in named)
+    detail = f"muscles that pull as hard as they can: {listed or 'none'}"
+    if len(saturated) > len(named):
+        detail += f" and {len(saturated) - len(named)} more"
+    value = f"hip {largest:.0f} % of its largest moment" if hip else "no hip"
+    return Card("Reserves, and saturated muscles", value, detail, bool(saturated))
 
 
 def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
@@ -156,9 +227,11 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
     ]
     for name, inside in table.get("measured_inside", {}).items():
         if inside["frames"]:
+            more = inside.get("share_with_discrepancy")
+            both = "" if more is None else f", within that of inputs and discrepancy in {more:.0%}"
             parts.append(
                 f"the measured {name} force lies within its band in {inside['share']:.0%} of "
-                f"{inside['frames']} frames"
+                f"{inside['frames']} frames{both}"
             )
     sampled = table.get("peak_force_total_BW")
     if sampled and sampled["median"] is None:

@@ -61,6 +61,7 @@ class Line:
         dashed: drawn dashed.
         band: (3, f) p05, p50 and p95 over samples with varied inputs, in the panel's unit; None:
             there are none.
+        wide_band: (2, f) p05 and p95 by the inputs and by what the model leaves out; None: unknown.
         behind: drawn broad and pale behind the others: what they are held against.
     """
 
@@ -70,6 +71,7 @@ class Line:
     colour: str
     dashed: bool = False
     band: Array | None = None
+    wide_band: Array | None = None
     behind: bool = False
 
 
@@ -151,10 +153,9 @@ def _line(
     scale: float = 1.0,
 ) -> Line:
     values = results.columns.get(column, np.full(len(results), np.nan))
-    band = results.band(column)
-    return Line(
-        column, label, values * scale, colour, dashed, None if band is None else band * scale
-    )
+    bands = (results.band(column), results.band_with_discrepancy(column))
+    scaled = (None if band is None else band * scale for band in bands)
+    return Line(column, label, values * scale, colour, dashed, *scaled)
 
 
 def _components(results: "Results", stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:

@@ -53,6 +53,8 @@ class PlotSettings:
     """Of the width, between the axes and what is written beside them."""
     band_opacity: float = 0.16
     """Opacity of the band around a line, 0 to 1."""
+    wide_band_opacity: float = 0.07
+    """Opacity of the band that what the model leaves out adds, 0 to 1."""
 
 
 PLOT = PlotSettings()
@@ -248,6 +250,10 @@ def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
     (x, low), (_, middle), (_, high) = (axis.broken(one) for one in line.band)
     opacity, name = PLOT.band_opacity, f"band-{line.name}"
     axes.fill_between(x, low, high, color=line.colour, alpha=opacity, linewidth=0, gid=name)
+    if line.wide_band is not None:
+        (x_wide, least), (_, most) = (axis.broken(one) for one in line.wide_band)
+        pale, name = PLOT.wide_band_opacity, f"wide-band-{line.name}"
+        axes.fill_between(x_wide, least, most, color=line.colour, alpha=pale, linewidth=0, gid=name)
     axes.plot(x, middle, color=line.colour, linestyle=":", linewidth=1, gid=f"median-{line.name}")
 
 

@@ -189,6 +189,11 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
         offs = results.summary["gait"]["toe_off_percent"] if axis.kind == "cycle" else ()
         words += "".join(f"; toe-off at {off:.0f} % of the cycle" for off in offs)
         sentences.append(f"{words}.")
+    if results.band_with_discrepancy("force_total_N") is not None:
+        sentences.append(
+            "Paler and wider: 5 to 95 % by the varied inputs and by what the model leaves out, as "
+            "far as comparisons with measured knees say."
+        )
     if flagged(results).any():
         sentences.append("Orange ticks at the bottom: frames to be read with care.")
     if failed(results).any():

@@ -4,6 +4,7 @@ Every key is one standard deviation of a normal distribution in the key's unit; 
 relative are of a positive factor of mean 1 (lognormal). Zero: that input does not vary.
 """
 
+from dataclasses import asdict, dataclass
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -14,8 +15,72 @@ Length = Annotated[Number, Field(ge=0, le=50)]
 Angle = Annotated[Number, Field(ge=0, le=20)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 
-_FLUOROSCOPY = "of the recorded pose; default: single-plane fluoroscopy, Mahfouz et al. 2003"
+_OF_POSE = "of the recorded pose; default: that of the recording, fluoroscopy or skin markers"
 _GIVE = "; no default: give what your laboratory knows"
+_TISSUE = (
+    "; default: an assumption, for a Monte Carlo study of the kind of Smith et al. (PMC4755512)"
+)
+_ASSUMED = "; default: an assumption, without a source"
+
+
+@dataclass(frozen=True)
+class FluoroscopyErrorSettings:
+    """Standard deviations of a pose from single-plane fluoroscopy.
+
+    Reference: Mahfouz, Hoff, Komistek, Dennis, IEEE Trans Med Imaging 22:1561 (2003),
+    doi:10.1109/TMI.2003.820027: implants in a cadaver, against an optical tracker.
+    """
+
+    ap_mm: float = 0.473
+    """mm, in the image plane; Mahfouz et al. 2003."""
+    si_mm: float = 0.449
+    """mm, in the image plane; Mahfouz et al. 2003."""
+    ml_mm: float = 3.031
+    """mm, out of the image plane; Mahfouz et al. 2003."""
+    axial_rotation_deg: float = 0.771
+    """deg; Mahfouz et al. 2003."""
+    adduction_deg: float = 0.942
+    """deg; Mahfouz et al. 2003."""
+    flexion_deg: float = 0.841
+    """deg; Mahfouz et al. 2003."""
+
+
+@dataclass(frozen=True)
+class SkinMarkerErrorSettings:
+    """Standard deviations of a pose from skin markers, and of the markers themselves.
+
+    Coordinates that the scene takes from the markers vary with the markers. The pose's own
+    values hold for the others, which nobody recorded.
+
+    References: doi:10.1016/j.gaitpost.2005.04.012 (Benoit et al. 2006, eight men with pins in
+    femur and tibia: knee rotations off by up to 4.4 deg and translations by up to 13 mm in
+    walking); PMC8631460 (six patients with a total knee, markers beside fluoroscopy: the thigh's
+    cluster off by up to 10 deg and 18 mm, the shank's by up to 7 deg and 17 mm, single markers by
+    4 to 16 mm more).
+    """
+
+    ap_mm: float = 5.0
+    """mm; an assumption: the largest error of Benoit et al. is 2.6 of it."""
+    si_mm: float = 1.0
+    """mm; an assumption: contact keeps the condyles on the insert."""
+    ml_mm: float = 3.0
+    """mm; an assumption: the insert's flanks allow no more."""
+    axial_rotation_deg: float = 2.2
+    """deg; an assumption: half the largest error of Benoit et al."""
+    adduction_deg: float = 2.2
+    """deg; likewise."""
+    flexion_deg: float = 2.2
+    """deg; likewise. A run of bands has it from the markers, if the scene takes it from them."""
+    thigh_mm: float = 10.0
+    """mm, of each thigh marker in each direction; an assumption: a rigid fit of three markers
+    240 mm apart is then off by 3 deg and 6 mm, a third of the largest errors in PMC8631460."""
+    shank_mm: float = 6.0
+    """mm, of each shank marker in each direction; an assumption: likewise 2 deg and 3.5 mm, a third
+    to a fifth of the largest errors in PMC8631460, which stand in swing."""
+
+
+FLUOROSCOPY_ERROR = FluoroscopyErrorSettings()
+SKIN_MARKER_ERROR = SkinMarkerErrorSettings()
 
 
 class CorrelationTable(SceneTable):
@@ -46,12 +111,12 @@ class UncertaintyTable(SceneTable):
     """
 
     seed: Count = Field(1, ge=0, description="of all draws; the same seed gives the same samples")
-    ap_mm: Length = Field(0.473, description=_FLUOROSCOPY)
-    si_mm: Length = Field(0.449, description="likewise")
-    ml_mm: Length = Field(3.031, description="likewise: out of the image plane")
-    axial_rotation_deg: Angle = Field(0.771, description="likewise")
-    adduction_deg: Angle = Field(0.942, description="likewise")
-    flexion_deg: Angle = Field(0.841, description="likewise")
+    ap_mm: Length | None = Field(None, description=_OF_POSE)
+    si_mm: Length | None = Field(None, description=_OF_POSE)
+    ml_mm: Length | None = Field(None, description=_OF_POSE)
+    axial_rotation_deg: Angle | None = Field(None, description=_OF_POSE)
+    adduction_deg: Angle | None = Field(None, description=_OF_POSE)
+    flexion_deg: Angle | None = Field(None, description=_OF_POSE)
     constant_share: Annotated[Number, Field(ge=0, le=1)] = Field(
         0.5,
         description="share of a pose error's variance that is the same in all frames; the rest "
@@ -62,32 +127,33 @@ class UncertaintyTable(SceneTable):
         description="correlation time of that noise: AR(1) with exp(-dt/correlation_s); 0 is "
         "white. An assumption, without a source",
     )
-    markers_mm: Length = Field(
-        0.0,
+    markers_mm: Length | None = Field(
+        None,
         description="of each marker of [motion.markers] on shank and thigh, each direction by "
-        "itself, the same in all frames" + _GIVE,
+        "itself, the same in all frames; default: 10 mm on the thigh, 6 mm on the shank, an "
+        "assumption after PMC8631460",
     )
     knee_centre_mm: Length = Field(
-        0.0,
+        3.0,
         description="AP, SI and ML each: the shank, and the knee with it, against the ground "
-        "reaction, in the tibia's axes" + _GIVE,
+        "reaction, in the tibia's axes" + _ASSUMED,
     )
-    ground_reaction: Share = Field(0.0, description="relative, force and free moment" + _GIVE)
+    ground_reaction: Share = Field(0.02, description="relative, force and free moment" + _ASSUMED)
     centre_of_pressure_ap_mm: Length = Field(
         3.0, description="laboratory x; default: Exell et al. 2012, 3 ± 2 mm"
     )
     centre_of_pressure_ml_mm: Length = Field(3.0, description="laboratory z; likewise")
-    segment_mass: Share = Field(0.0, description="relative, all segments together" + _GIVE)
+    segment_mass: Share = Field(0.1, description="relative, all segments together" + _ASSUMED)
     muscle_strength: Share = Field(
-        0.0,
+        0.2,
         description="relative, of the muscles of [muscles]: each group of muscles by itself"
-        + _GIVE,
+        + _ASSUMED,
     )
     muscle_attachment_mm: Length = Field(
-        0.0,
+        3.0,
         description="AP, SI and ML each: either end of the lines that pull the patella, and of "
         "the muscles of [muscles] that cross the knee where they leave shank and thigh, each "
-        "group by itself" + _GIVE,
+        "group by itself" + _ASSUMED,
     )
     tendon_band_mm: Length = Field(
         3.0,
@@ -95,11 +161,11 @@ class UncertaintyTable(SceneTable):
         "wide the lamina is whose sections the line wraps. An assumption, without a source: bands "
         "of 5 to 15 mm are all defensible, and move the quadriceps by up to 9 % in deep flexion",
     )
-    ligament_stiffness: Share = Field(0.0, description="relative, each bundle by itself" + _GIVE)
+    ligament_stiffness: Share = Field(0.3, description="relative, each bundle by itself" + _TISSUE)
     ligament_strain: Annotated[Number, Field(ge=0, le=0.1)] = Field(
-        0.0,
+        0.02,
         description="of each bundle by itself: added to its reference strain, or by which its "
-        "slack length is divided: L0/(1 + e)" + _GIVE,
+        "slack length is divided: L0/(1 + e)" + _TISSUE,
     )
     friction: Annotated[Number, Field(ge=0, le=0.5)] = Field(
         0.017,
@@ -108,11 +174,13 @@ class UncertaintyTable(SceneTable):
     )
     young_modulus: Share = Field(
         0.0,
-        description="relative, of the insert; each sample then prepares its contact anew" + _GIVE,
+        description="relative, of the insert; each sample then prepares its contact anew, so that "
+        "it does not vary by default; of the forces it moves next to nothing",
     )
     yield_stress: Share = Field(
         0.0,
-        description="relative, of [output] yield_stress_MPa, which tells overloaded area" + _GIVE,
+        description="relative, of [output] yield_stress_MPa, which tells overloaded area; 0: the "
+        "limit stands as it is stated",
     )
     wear_factor: Share = Field(
         0.44,
@@ -123,24 +191,40 @@ class UncertaintyTable(SceneTable):
         0.0, description="relative, of both constants of creep, for `tkamb wear` alone" + _GIVE
     )
     femoral_placement_mm: Length = Field(
-        0.0,
+        1.0,
         description="AP, SI and ML each: the femur's ligament and muscle attachments against the "
-        "femoral component" + _GIVE,
+        "femoral component" + _ASSUMED,
     )
     insert_placement_mm: Length = Field(
-        0.0, description="AP, SI and ML each: the insert on the tibia" + _GIVE
+        1.0, description="AP, SI and ML each: the insert on the tibia" + _ASSUMED
     )
     insert_placement_deg: Angle = Field(
-        0.0, description="about AP, SI and ML each: the insert on the tibia" + _GIVE
+        1.0, description="about AP, SI and ML each: the insert on the tibia" + _ASSUMED
     )
     tuberosity_mm: Length = Field(
-        0.0, description="AP, SI and ML each: the patellar ligament's distal end" + _GIVE
+        2.0, description="AP, SI and ML each: the patellar ligament's distal end" + _ASSUMED
     )
     dome_mm: Length = Field(
-        0.0,
+        1.0,
         description="AP and SI each: where a recorded patella, the dome of its button, is on the "
-        "femur" + _GIVE,
+        "femur" + _ASSUMED,
     )
     correlation: tuple[CorrelationTable, ...] = Field(
         (), description="inputs that err together; needs a positive semi-definite matrix"
     )
+
+    def completed(self, from_markers: bool) -> Self:
+        """Return the table with the pose's deviations of its kind of recording.
+
+        What the table gives stays.
+
+        Args:
+            from_markers: whether the knee's motion is taken from skin markers; else fluoroscopy.
+        """
+        defaults = asdict(SKIN_MARKER_ERROR if from_markers else FLUOROSCOPY_ERROR)
+        own = {
+            name: value
+            for name, value in defaults.items()
+            if name in type(self).model_fields and getattr(self, name) is None
+        }
+        return self.model_copy(update=own)

@@ -15,6 +15,7 @@ from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
 from tkamb.show.compare.pairing import Pairing, pair_frames
+from tkamb.show.headline import peaks_of
 
 NOT_COMPARED = ("time_s", "body_seconds", "query_seconds", "contact_seconds")
 SETTINGS = {
@@ -118,6 +119,7 @@ class Comparison:
                     "contact": run.results.summary.get("contact"),
                     "frames": len(run.results),
                     "failed_frames": int(failed(run.results).sum()),
+                    "peaks_BW": peaks_of(run.results.summary),
                     "paired": _pairing_word(run.pairing),
                 }
                 for run in self.runs

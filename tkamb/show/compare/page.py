@@ -15,6 +15,7 @@ from tkamb.show.compare.figures import (
     run_colour,
     shown_frame,
 )
+from tkamb.show.headline import peak_legend, peak_words, peaks_of
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import svg_text
 
@@ -69,7 +70,7 @@ def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
         title=" and ".join(run.label for run in comparison.runs),
         kind=comparison.kind,
         runs=[_run(comparison, number) for number in range(len(comparison.runs))],
-        notes=comparison.notes,
+        notes=[*peak_lines(comparison), *comparison.notes],
         plots=_plots(comparison),
         maps=None if maps is None else svg_text(maps, "maps"),
         first=_rows(comparison, first),
@@ -119,12 +120,24 @@ def _rows(comparison: Comparison, found: Sequence[Difference]) -> list[list[str]
     ]
 
 
+def peak_lines(comparison: Comparison) -> list[str]:
+    """Return each run's peak total, medial and lateral force with its bands, a line per run."""
+    lines = []
+    for run in comparison.runs:
+        found = peaks_of(run.results.summary)
+        if found:
+            words = ", ".join(f"{name} {peak_words(one)}" for name, one in found.items())
+            lines.append(f"{run.label}: peak {words} BW, {peak_legend(found)}")
+    return lines
+
+
 def table_lines(comparison: Comparison) -> list[str]:
-    """Return notes and the first differences as lines of text."""
+    """Return each run's peak forces, notes and the first differences as lines of text."""
     heads = ["run", "column", "max", "% of peak", "at frame", "rms", "mean", "frames"]
     rows = [heads, *_rows(comparison, headline(comparison))]
     widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
     table = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
     if len(rows) == 1:
         table = ["no differences could be computed"]
-    return [*(f"note: {note}" for note in comparison.notes), *(line.rstrip() for line in table)]
+    notes = [f"note: {note}" for note in comparison.notes]
+    return [*peak_lines(comparison), *notes, *(line.rstrip() for line in table)]

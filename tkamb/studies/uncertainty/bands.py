@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
+from tkamb.run.discrepancy import COLUMNS, band_with_discrepancy, coverage, discrepancy_of
 from tkamb.run.results import PERCENTILES, STATISTICS_LIMITS
 
 ENDS = ("p05", "p95")
@@ -117,6 +118,66 @@ def band_columns(
     return columns
 
 
+def discrepancy_columns(
+    names: Sequence[str], values: Array, summary: Mapping[str, Any], body_weight: float
+) -> dict[str, Array]:
+    """Return the columns `<name>_discrepancy_p05`, `_p95`: band of inputs and discrepancy.
+
+    Empty where nothing is known of the run's discrepancy; NaN where a force has no band.
+
+    Args:
+        names: (m,) columns of results.csv.
+        values: (n, m, f) of each sample.
+        summary: of the run.
+        body_weight: N.
+    """
+    known = discrepancy_of(summary)
+    columns: dict[str, Array] = {}
+    for index, name in enumerate(names):
+        found = known.get(COLUMNS.get(name, ""))
+        if found is None:
+            continue
+        unit = 1.0 if name.endswith("_BW") else body_weight
+        ends = band_with_discrepancy(values[:, index], found, unit)
+        ends[:, np.isnan(percentiles(values[:, index])["p50"])] = np.nan
+        columns |= {f"{name}_discrepancy_{end}": one for end, one in zip(ENDS, ends, strict=True)}
+    return columns
+
+
+def peak_bands(
+    columns: Mapping[str, Any],
+    bands: Mapping[str, Array],
+    compared: Mapping[str, str],
+    body_weight: float,
+) -> dict[str, dict[str, Any]]:
+    """Return force -> its nominal peak with its bands at that frame, in body weights.
+
+    Args:
+        columns: of results.csv.
+        bands: of bands.csv.
+        compared: force -> column of results.csv, in N.
+        body_weight: N.
+
+    Returns:
+        Force -> frame, nominal, median, p05, p95, discrepancy_p05, discrepancy_p95, of which
+        those are None that have no band.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for force, name in compared.items():
+        if not np.isfinite(columns[name]).any():
+            continue
+        frame = int(np.nanargmax(columns[name]))
+        row: dict[str, Any] = {"frame": frame, "nominal": float(columns[name][frame]) / body_weight}
+        ends = {"median": "p50"} | {end: end for end in ENDS}
+        ends |= {f"discrepancy_{end}": f"discrepancy_{end}" for end in ENDS}
+        for key, ending in ends.items():
+            band = bands.get(f"{name}_{ending}")
+            known = band is not None and np.isfinite(band[frame])
+            row[key] = float(band[frame]) / body_weight if known and band is not None else None
+        found[force] = row
+    return found
+
+
 def causes(problems: np.ndarray) -> dict[str, float]:
     """Return why frames failed: cause -> its share of those that did, the most frequent first.
 
@@ -140,16 +201,20 @@ def measured_inside(
         compared: force -> what it is held against, as in the summary's `measured`.
 
     Returns:
-        Force -> frames that have both, and the share of them inside; NaN of none.
+        Force -> frames that have both, and the share of them inside, NaN of none: in the band of
+        inputs, and, where there is one, in that of inputs and discrepancy.
     """
     found: dict[str, dict[str, Any]] = {}
     for name, one in compared.items():
         measured, column = columns[f"measured_{name}_N"], one["predicted"]
-        low, high = (bands.get(f"{column}_{end}", np.full(len(measured), np.nan)) for end in ENDS)
-        both = np.isfinite(measured) & np.isfinite(low)
-        inside = (low <= measured) & (measured <= high)
-        share = float(inside[both].mean()) if both.any() else float("nan")
-        found[name] = {"frames": int(both.sum()), "share": share}
+        missing = np.full(len(measured), np.nan)
+        low, high = (bands.get(f"{column}_{end}", missing) for end in ENDS)
+        frames, share = coverage(low, high, measured)
+        found[name] = {"frames": frames, "share": share}
+        low, high = (bands.get(f"{column}_discrepancy_{end}", missing) for end in ENDS)
+        frames, share = coverage(low, high, measured)
+        if frames:
+            found[name]["share_with_discrepancy"] = share
     return found
 
 
@@ -182,8 +247,9 @@ def influences(
     b_i² var(x_i) + c_i² var(x_i²); that of an input which errs with others has what it does with
     them in it, and may be negative (Li et al. 2010). Parts and variances are summed
     over the frames. What is left is the rest: kinks, interactions and chance. A result that does
-    not vary beyond round-off has no rows. Empty with fewer than `SAMPLES_PER_INPUT` samples per
-    input.
+    not vary beyond round-off has no rows. With fewer than `SAMPLES_PER_INPUT` samples per input
+    each input is regressed on alone, and of its part is taken off what chance explains of n
+    samples, 2/(n - 1) of the variance.
 
     Args:
         results: (m,) names.
@@ -216,12 +282,27 @@ def influences(
 def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
     """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
     there, count = np.isfinite(y), errors.shape[1]
-    if there.sum() < max(STATISTICS_LIMITS.min_samples, SAMPLES_PER_INPUT * count):
+    if there.sum() < STATISTICS_LIMITS.min_samples:
         return None
     y, x = y[there], errors[there]
     variance = float(y.var())
+    if len(y) < SAMPLES_PER_INPUT * count:
+        return _one_by_one(y, x)
     terms: Any = np.hstack([x, x**2])
     terms = terms - terms.mean(axis=0)
     slopes, *_ = np.linalg.lstsq(terms, y - y.mean(), rcond=None)
     parts = slopes * (terms.T @ (y - y.mean())) / len(y)
     return slopes[:count], parts[:count] + parts[count:], variance
+
+
+def _one_by_one(y: Array, x: Array) -> tuple[Array, Array, float]:
+    """Return the same of each input by itself: too few samples to regress on all of them."""
+    variance, slopes, parts = float(y.var()), np.zeros(x.shape[1]), np.zeros(x.shape[1])
+    for i, column in enumerate(x.T):
+        terms: Any = np.column_stack([column, column**2])
+        terms = terms - terms.mean(axis=0)
+        slope, *_ = np.linalg.lstsq(terms, y - y.mean(), rcond=None)
+        explained = float(slope @ (terms.T @ (y - y.mean()))) / len(y)
+        by_chance = (variance - explained) * 2 / max(len(y) - 3, 1)
+        slopes[i], parts[i] = float(slope[0]), explained - by_chance
+    return slopes, parts, variance

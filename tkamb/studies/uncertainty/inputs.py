@@ -7,7 +7,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.io.scene.case import Case
-from tkamb.io.scene.uncertainty import UncertaintyTable
+from tkamb.io.scene.uncertainty import SKIN_MARKER_ERROR, UncertaintyTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 AXES = ("ap", "si", "ml")
@@ -75,8 +75,9 @@ def _all_inputs(case: Case) -> list[VariedInput]:
 
 
 def uncertainty_of(case: Case) -> UncertaintyTable:
-    """Return the scene's table, or its defaults."""
-    return case.scene.uncertainty or UncertaintyTable()
+    """Return the scene's table, or its defaults, with those of its kind of recording."""
+    table = case.scene.uncertainty or UncertaintyTable()
+    return table.completed(from_markers=case.scene.motion.markers is not None)
 
 
 def pose_names(inputs: tuple[VariedInput, ...]) -> list[str]:
@@ -85,26 +86,32 @@ def pose_names(inputs: tuple[VariedInput, ...]) -> list[str]:
 
 
 def _pose_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
-    contact = case.scene.contact
+    contact, markers = case.scene.contact, case.scene.motion.markers
     free = (*contact.released, "si") if contact and contact.released else ()  # found with them
+    given = (case.scene.uncertainty or UncertaintyTable()).model_fields_set
     found = []
     for name in KNEE_COORDINATES:
         unit = "mm" if name in AXES else "deg"
-        if name not in free:
-            found.append(VariedInput(name, getattr(table, f"{name}_{unit}"), unit))
+        key = f"{name}_{unit}"
+        # a coordinate that is taken from the markers varies with them
+        with_markers = markers is not None and name in markers.coordinates and key not in given
+        if name not in free and not with_markers:
+            found.append(VariedInput(name, getattr(table, key), unit))
     return found
 
 
 def _marker_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
     """Return those of each marker on shank and thigh."""
     markers = case.scene.motion.markers
-    labels = [
-        label
-        for segment in (markers.segment if markers else ())
-        if segment.name in MARKED
-        for label in segment.markers_mm
-    ]
-    return [one for label in labels for one in _places(f"marker.{label}", AXES, table.markers_mm)]
+    by_segment = {"shank": SKIN_MARKER_ERROR.shank_mm, "thigh": SKIN_MARKER_ERROR.thigh_mm}
+    inputs: list[VariedInput] = []
+    for segment in markers.segment if markers else ():
+        if segment.name in MARKED:
+            given = table.markers_mm
+            deviation = by_segment[segment.name] if given is None else given
+            for label in segment.markers_mm:
+                inputs += _places(f"marker.{label}", AXES, deviation)
+    return inputs
 
 
 def _load_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:

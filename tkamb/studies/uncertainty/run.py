@@ -15,6 +15,7 @@ from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.recorded import predicted_columns
 from tkamb.run.results import STATISTICS_LIMITS, Results
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import chosen_frames, simulate
@@ -23,9 +24,11 @@ from tkamb.studies.uncertainty.bands import (
     Influence,
     band_columns,
     causes,
+    discrepancy_columns,
     influences,
     measured_inside,
     peak_band,
+    peak_bands,
 )
 from tkamb.studies.uncertainty.correlation import correlation_root
 from tkamb.studies.uncertainty.folder import write_uncertainty
@@ -227,11 +230,15 @@ class _Job:
         errors = np.array([one.errors for one in plain])
         bands = band_columns(self.nominal["time_s"], names, values, failed)
         tornado = influences(wanted, input_names, values[:, rows], errors)
-        summary = self.nominal.summary
+        summary, weight = self.nominal.summary, self.case.body_weight
+        bands |= discrepancy_columns(names, values, summary, weight)
         summary["uncertainty"] = self._summary(problems, tornado)
         if PEAK in names:
             peak = peak_band(self.nominal[PEAK], values[:, names.index(PEAK)], failed)
             summary["uncertainty"]["peak_force_total_BW"] = peak
+        summary["uncertainty"]["peaks_BW"] = peak_bands(
+            self.nominal.columns, bands, predicted_columns(self.nominal.columns), weight
+        )
         if summary.get("measured"):
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside

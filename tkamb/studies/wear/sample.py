@@ -67,10 +67,12 @@ def varied_wear_inputs(
         InputError: none varies.
     """
     result = () if motion.drive is None else motion.drive.names
+    if not profile:
+        table = table.completed(from_markers=False)
     inputs = [
         VariedInput(name, getattr(table, f"{name}_{unit}"), unit)
         for name, unit in POSES.items()
-        if name not in result and (not profile or f"{name}_{unit}" in table.model_fields_set)
+        if name not in result and getattr(table, f"{name}_{unit}") is not None
     ]
     inputs.append(VariedInput("young_modulus", table.young_modulus, "relative"))
     inputs.append(VariedInput("wear_factor", table.wear_factor, "relative"))

@@ -23,6 +23,7 @@ from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
 from tkamb.run.summary import files_hash, scene_hash
+from tkamb.studies.uncertainty.inputs import uncertainty_of
 from tkamb.studies.wear.engine import ContactEngine
 from tkamb.studies.wear.motion import CycleMotion, check_closing, chosen_frames
 from tkamb.studies.wear.profile import Profile, read_profile
@@ -153,7 +154,7 @@ def wear_setup(
         scene_sha256=hashes,
         files_sha256=files_hash(case),
         run_frames=run_frames,
-        uncertainty=case.scene.uncertainty,
+        uncertainty=uncertainty_of(case) if simulator is None else case.scene.uncertainty,
         simulated=simulator is not None,
     )
 
@@ -185,7 +186,7 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
         source=str(path),
         scene_sha256=_hashes(case, scene),
         files_sha256=files_hash(case),
-        uncertainty=scene.uncertainty,
+        uncertainty=uncertainty_of(case),
     )
 
 

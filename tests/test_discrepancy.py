@@ -1,0 +1,151 @@
+"""What the model leaves out: fitted on trials, added to samples, told in words."""
+
+import numpy as np
+import pytest
+
+from tkamb.io.scene.uncertainty import FLUOROSCOPY_ERROR, SKIN_MARKER_ERROR, UncertaintyTable
+from tkamb.run.discrepancy import (
+    COLUMNS,
+    FORCES,
+    Discrepancy,
+    band_with_discrepancy,
+    coverage,
+    discrepancy_of,
+    discrepancy_words,
+    fitted,
+    known_errors,
+    trial_error,
+)
+from tkamb.run.summary import peaks, saturated_muscles
+from tkamb.studies.uncertainty.bands import discrepancy_columns, influences, peak_bands
+
+
+def one_trial(
+    rng, name="a", activity="walking", bias=0.0, scatter=0.2, inputs=0.1, frames=40, count=50
+):
+    """A trial whose truth is off by a bias and white noise, with samples about the nominal."""
+    nominal = 700.0 * (1.5 + np.sin(np.linspace(0, 6, frames)))
+    truth = nominal + 700.0 * (bias + scatter * rng.standard_normal(frames))
+    samples = nominal + 700.0 * inputs * rng.standard_normal((count, frames))
+    time = np.arange(frames) / 30
+    names = (name, "S", activity, "total")
+    return trial_error(names, time, samples, truth, nominal, 700.0), samples, truth
+
+
+def test_a_known_bias_scatter_and_input_deviation_are_found_again():
+    error, _, _ = one_trial(np.random.default_rng(0), bias=0.3, frames=2000, count=200)
+    assert error.bias_BW == pytest.approx(0.3, abs=0.02)
+    assert error.scatter_BW == pytest.approx(0.2, abs=0.01)
+    assert error.inputs_BW == pytest.approx(0.1, abs=0.005)
+    assert error.nominal_bias_BW == pytest.approx(-0.3, abs=0.02)  # predicted minus measured
+
+
+def test_the_correlation_time_of_an_ar1_is_found_again():
+    rng, step, tau = np.random.default_rng(1), 1 / 30, 0.2
+    rho, noise = np.exp(-step / tau), [0.0]
+    for _ in range(6000):
+        noise.append(rho * noise[-1] + np.sqrt(1 - rho**2) * rng.standard_normal())
+    truth = 700.0 * (2.0 + 0.1 * np.array(noise))
+    nominal = np.full(len(truth), 1400.0)
+    names = ("a", "S", "walking", "total")
+    time = np.arange(len(truth)) * step
+    error = trial_error(names, time, np.tile(nominal, (30, 1)), truth, nominal, 700.0)
+    assert error.correlation_s == pytest.approx(tau, rel=0.1)
+
+
+def test_the_band_of_inputs_and_discrepancy_covers_a_trial_that_it_was_not_fitted_on():
+    rng, shares = np.random.default_rng(2), []
+    for _ in range(150):
+        of_activity = rng.standard_normal()  # m and b of the module's docstring, S = 0.4
+        biases = 0.4 * (of_activity + rng.standard_normal(9)) / np.sqrt(2)
+        trials = [one_trial(rng, str(k), bias=bias, frames=10) for k, bias in enumerate(biases)]
+        found = fitted([error for error, _, _ in trials[1:]], "total", "walking")
+        _, samples, truth = trials[0]
+        shares.append(coverage(*band_with_discrepancy(samples, found, 700.0), truth)[1])
+    assert 0.85 <= np.mean(shares) <= 0.95
+
+
+def test_an_activity_s_own_bias_moves_its_band_and_another_s_does_not():
+    rng = np.random.default_rng(3)
+    trials = [one_trial(rng, str(k), "squat", -0.5)[0] for k in range(3)]
+    squat, other = (fitted(trials, "total", one) for one in ("squat", "stairs up"))
+    assert squat.mean == pytest.approx(-0.375, abs=0.05)  # 3/4 of the mean bias
+    assert other.mean == 0.0 and other.deviation > squat.deviation
+    assert fitted(trials, "medial", "squat") is None
+
+
+def test_a_band_with_discrepancy_is_never_below_zero_and_empty_without_samples():
+    samples = np.full((30, 2), 100.0)
+    samples[:, 1] = np.nan
+    found = Discrepancy(0.0, 1.0, 4, 1, 3)
+    low, high = band_with_discrepancy(samples, found, 700.0)
+    assert low[0] == 0.0 and high[0] > 100.0 + 1.64 * 700.0  # Student's t is wider
+    assert np.isnan([low[1], high[1]]).all()
+
+
+SUMMARY = {"scene_tables": {"muscles": {}}, "activity": "squat"}
+
+
+def test_the_package_knows_three_trials_of_one_subject():
+    known = known_errors()
+    assert {one.force for one in known} == set(FORCES)
+    assert {one.trial for one in known} == {"ngait_og3", "ngait_og1", "squat"}
+    assert {one.subject for one in known} == {"JW"}
+    assert set(discrepancy_of(SUMMARY)) == set(FORCES)
+    assert discrepancy_of({"activity": "squat"}) == {}
+
+
+def test_the_sentence_names_trials_and_subjects():
+    words = discrepancy_words(SUMMARY)
+    assert words.startswith("when this method was compared with measured knees, it was off by ")
+    assert words.endswith("in squat: 1 trial, 1 subject")
+    assert "3 trials, 1 subject" in discrepancy_words(SUMMARY | {"activity": "lunge"})
+    assert "without [muscles]" in discrepancy_words({"activity": "squat"})
+
+
+def test_columns_and_peaks_carry_the_wider_band():
+    rng = np.random.default_rng(4)
+    values = 1400.0 + 70.0 * rng.standard_normal((60, 2, 3))
+    columns = discrepancy_columns(["force_si_N", "quadriceps_N"], values, SUMMARY, 700.0)
+    assert set(columns) == {f"force_si_N_discrepancy_{end}" for end in ("p05", "p95")}
+    bands = columns | {f"force_si_N_{end}": np.full(3, 1.0) for end in ("p05", "p50", "p95")}
+    nominal = {"force_si_N": np.array([1.0, 1400.0, 2.0])}
+    peak = peak_bands(nominal, bands, {"total": "force_si_N"}, 700.0)["total"]
+    assert (peak["frame"], peak["nominal"]) == (1, 2.0)
+    assert peak["discrepancy_p95"] - peak["discrepancy_p05"] > 0.3
+    assert set(COLUMNS.values()) == set(FORCES)
+
+
+def test_peaks_and_saturated_muscles_of_a_run():
+    nan = np.nan
+    columns = {
+        "time_s": np.arange(3.0),
+        "flexion_deg": np.array([1.0, 2.0, 3.0]),
+        "force_si_N": np.array([nan, 1400.0, 700.0]),
+        "medial_force_N": np.full(3, nan),
+        "medial_force_equilibrium_N": np.array([nan, 350.0, 700.0]),
+        "activation_vaslat": np.array([nan, 1.0, 0.3]),
+        "activation_soleus": np.array([nan, 0.2, 0.3]),
+    }
+    found = peaks(columns, 700.0)
+    assert found["total"] == {"nominal": 2.0, "frame": 1, "time_s": 1.0, "flexion_deg": 2.0}
+    assert found["medial"]["nominal"] == 1.0 and "lateral" not in found
+    assert saturated_muscles(columns) == {"vaslat": 1}
+
+
+def test_defaults_follow_the_kind_of_recording_and_given_numbers_stay():
+    marked, seen = (UncertaintyTable().completed(one) for one in (True, False))
+    assert seen.flexion_deg == FLUOROSCOPY_ERROR.flexion_deg
+    assert marked.flexion_deg == SKIN_MARKER_ERROR.flexion_deg
+    given = UncertaintyTable.model_validate({"flexion_deg": 0.1, "ap_mm": 0.0})
+    assert given.completed(True).flexion_deg == 0.1 and given.completed(True).ap_mm == 0.0
+
+
+def test_few_samples_still_say_which_input_moves_a_result():
+    rng, count = np.random.default_rng(5), 60
+    x = rng.standard_normal((100, 1, count))
+    y = (3.0 * x[:, :, 7] + 0.3 * rng.standard_normal((100, 1)))[:, None, :]
+    rows = influences(["y"], [str(k) for k in range(count)], y, x)
+    assert rows[0].name == "7" and rows[0].share > 0.9
+    assert rows[0].change == pytest.approx(3.0, abs=0.2)
+    assert abs(sum(row.share for row in rows[1:-1])) < 0.5  # chance is taken off
