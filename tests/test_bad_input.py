@@ -48,7 +48,7 @@ def rewrite(path, change):
         ({"contact__resolution_mm": -1.0}, "resolution_mm"),
         ({"contact__resolution_mm": 500.0}, "resolution"),
         ({"contact__options": {"law": "cheese"}}, "nonlinear, linear"),
-        ({"contact__options": {"resolution": 1.0}}, "no option 'resolution'"),
+        ({"contact__options": {"resolution": 1.0}}, "give one of them"),
         ({"motion__length_unit": "cm"}, "length_unit"),
         ({"ground_reaction__laboratory_axes": "+x,+z,-y"}, "laboratory_axes"),
         ({"ground_reaction__laboratory_axes": "-x,-y,+z"}, "laboratory_axes"),

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def test_answers_of_a_cluster_are_those_of_this_process_and_preparation_is_done_
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
 def test_a_scheduler_that_is_not_there_is_one_line(address, tmp_path, monkeypatch, capsys):
     distributed()
-    monkeypatch.setattr(cluster, "PATIENCE", 0.5)
+    monkeypatch.setattr(cluster, "CLUSTER", replace(cluster.CLUSTER, answer_seconds=0.5))
     folder = tmp_path / "out"
     assert main(["uncertainty", str(SCENE), "--dask", address, "--out", str(folder)]) == 2
     said = capsys.readouterr().err.strip()

@@ -2,6 +2,7 @@
 
 import hashlib
 import http.server
+import inspect
 import json
 import socket
 import sys
@@ -221,6 +222,6 @@ def test_the_registry_names_what_the_scenes_use():
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real data are not here")
 def test_the_real_files_are_the_registered_ones(tmp_path, capsys):
     said = get(capsys, "--from", SHARED, "--to", tmp_path / "dm")
-    names = json.loads((Path(command.__file__).parent / "dm.json").read_text())["files"]
+    names = json.loads((Path(inspect.getfile(Dataset)).parent / "dm.json").read_text())["files"]
     assert f"{len(names)} files written" in said
     assert files_in(tmp_path / "dm") == set(names)

@@ -45,7 +45,7 @@ def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_pa
     assert "muscle_quadriceps" not in frame.loads.values
     case, chain = mechanics.case, mechanics.case.chain
     line = muscle_line(case.muscles[0], chain, case.femoral)
-    motion, step = mechanics._chain_motion(2, case.motion.coordinates[2]), 1e-6
+    motion, step = mechanics.chain_motion(2, case.motion.coordinates[2]), 1e-6
 
     def length(joint, change):
         joints = motion.joints.copy()

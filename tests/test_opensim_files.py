@@ -160,8 +160,8 @@ def test_a_byte_order_mark_is_no_fault(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("</gravity>", "</gravitas>", ("mismatched tag: line 9, column", "mend that line")),
-        ("<gravity>", "<gravity", ("not well-formed (invalid token): line 9, column", "mend")),
+        ("</gravity>", "</gravitas>", ("mismatched tag: line 9, column", "correct that line")),
+        ("<gravity>", "<gravity", ("not well-formed (invalid token): line 9, column", "correct")),
     ],
 )
 def test_xml_that_nobody_reads_names_line_column_and_remedy(tmp_path, old, new, words):
@@ -507,9 +507,9 @@ def test_a_speed_alone_is_no_coordinate(tmp_path):
 @pytest.mark.parametrize(
     ("scale", "in_degrees", "words"),
     [
-        (57.3, False, "reaches 63 rad with inDegrees=no"),
-        (1.0, None, "does not say inDegrees; "),
-        (57.3, None, "add inDegrees=yes or inDegrees=no to its header"),
+        (57.3, False, "reaches 63.03, which no joint does in radians"),
+        (1.0, None, "add the line inDegrees=no (radians) or inDegrees=yes"),
+        (57.3, None, "add the line inDegrees=yes above its endheader"),
     ],
 )
 def test_an_impossible_or_unknown_angle_unit_is_refused(tmp_path, capsys, scale, in_degrees, words):
@@ -522,4 +522,4 @@ def test_an_impossible_or_unknown_angle_unit_is_refused(tmp_path, capsys, scale,
 def test_radians_said_to_be_degrees_are_noticed(tmp_path, capsys):
     path = states(tmp_path, {"knee_r_0": BEND}, True)
     main(changed(recorded_leg(tmp_path), trc=None, motion=str(path)))
-    assert "are the angles in radians" in capsys.readouterr().out
+    assert "is it in radians" in capsys.readouterr().out

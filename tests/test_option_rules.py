@@ -249,7 +249,7 @@ def test_motion_and_forces_are_joined_where_both_are(tmp_path, capsys):
     assert "0.5000 to 2.5000 s are used" in capsys.readouterr().out
     write_storage(tmp_path / "grf.mot", {"time": clock + 9.0} | columns, False)
     assert main(changed(arguments, out=str(tmp_path / "other"))) == 2
-    assert "give recordings of one trial" in capsys.readouterr().err
+    assert "give files of one trial" in capsys.readouterr().err
 
 
 def test_the_rules_name_options_that_are_there():

@@ -161,7 +161,7 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
         "tkamb.io.opensim",
         "tkamb.io.recordings.emg",
         "tkamb.io.recordings.measured",
-        "tkamb.run.",
+        "tkamb.run.recorded",
     )
     code = (
         "import sys; from tkamb.io.scene import load_scene; "

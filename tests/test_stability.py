@@ -16,6 +16,7 @@ from tkamb.cli import main
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.show.stability_picture import picture
+from tkamb.studies import stability
 from tkamb.studies.extremes import Extreme, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
@@ -121,7 +122,8 @@ def test_a_hang_is_stopped_and_the_next_case_judged(monkeypatch):
 
 
 def test_a_reference_that_takes_too_long_leaves_a_case_unverified(monkeypatch):
-    monkeypatch.setattr("tkamb.studies.stability.STABILITY.longest_reference_seconds", 0.5)
+    quick = replace(stability.STABILITY, longest_reference_seconds=0.5)
+    monkeypatch.setattr(stability, "STABILITY", quick)
     slow = Extreme(load_N=20000.0, conformity=0.99)
     (verdict,) = run_stability([slow])
     assert verdict.kind == "unverified" and "no reference in 0.5 s" in verdict.reason

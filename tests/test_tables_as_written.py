@@ -96,9 +96,9 @@ def test_unit_words_of_a_trc(tmp_path, word):
     ("name", "text", "words"),
     [
         ("a.csv", "time,x,y\n0,0,1,5,2,5\n0,1,1,5,2,5\n", "decimal commas"),
-        ("a.csv", "time,x,y\n0.0,1.5,2.5,7.5,8.5\n", "a name for every column"),
+        ("a.csv", "time,x,y\n0.0,1.5,2.5,7.5,8.5\n", "give every column a name"),
         ("a.sto", "endheader\ntime\tx\n0,01\t2\n", "is the comma a decimal point"),
-        ("a.mot", "endheader\ntime\tx\n0.01\t2\t3\n", "a name for every column"),
+        ("a.mot", "endheader\ntime\tx\n0.01\t2\t3\n", "give every column a name"),
     ],
 )
 def test_decimal_commas_are_guessed_only_where_they_may_be(tmp_path, name, text, words):
@@ -249,7 +249,7 @@ def test_clocks_without_a_common_part_are_refused_with_both(tmp_path, capsys):
     path = two_forces(tmp_path, span=(5.0, 6.0))
     given = changed(recorded_leg(tmp_path), grf=path, grf_force="ground_force_2")
     assert main(given) == 2
-    assert "do they belong to one trial" in capsys.readouterr().err
+    assert "give files of one trial" in capsys.readouterr().err
 
 
 # Labels under several prefixes

@@ -8,6 +8,7 @@ from typing import Any
 from tkamb.commands.scene_options import add_force
 from tkamb.errors import InputError
 from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.units import LENGTH
 
 UNIT_OPTIONS = ("--units", "--mesh-unit")
 AXES_OPTIONS = ("--axes", "--mesh-axes")
@@ -196,7 +197,7 @@ def _add_units(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument(
         *UNIT_OPTIONS,
         dest="units",
-        choices=("mm", "cm", "m"),
+        choices=tuple(LENGTH),
         default="mm",
         help=f"{what}; default: mm",
     )

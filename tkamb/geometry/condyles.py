@@ -74,9 +74,9 @@ def condyle_split(femoral: Surface) -> float | None:
     The lower outline of the component in the frontal plane is taken at flexions from 0 to
     120 deg (rotation about +z, as in `tkamb.geometry.frames`), in strips of 1 mm along z,
     as height above its lowest point, and averaged over flexion. Two condyles show as two
-    valleys with a ridge, the notch, between them. It must rise at least 2 mm above both;
-    the split is the middle of the notch at half its height. A sphere, a cylinder along z
-    or a unicondylar part has one valley.
+    valleys with a ridge, the notch, between them. It must rise at least 3 mm above both, or 2 mm
+    where it is there in extension too; the split is the middle of the notch at half its height. A
+    sphere, a cylinder along z or a unicondylar part has one valley.
 
     In a right knee z above the split is lateral, below it medial.
 
@@ -92,7 +92,10 @@ def condyle_split(femoral: Surface) -> float | None:
     rise = _rise(outline)
     top = int(np.argmax(rise))
     _check_yaw(femoral)
-    if rise[top] < CONDYLE.notch_depth:
+    # A shallow notch counts if it is there in extension too: one condyle that lies askew has none.
+    extended, _ = _mean_outline(samples, CONDYLE.strip_width, np.zeros(1))
+    in_extension = _rise(extended).max() >= CONDYLE.notch_depth
+    if rise[top] < (CONDYLE.notch_depth if in_extension else CONDYLE.yawed_notch_depth):
         return None
     high = outline > outline[top] - rise[top] / 2
     first = last = top

@@ -63,6 +63,8 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
     result = find_ground(request, leg.side, seen.axes, feet_there)
     time = recorded.time()
+    if request.interval is not None:
+        _check_within(time, *request.interval)
     interval, joined = common_interval(time, result.interval, result.span)
     interval, frames, thinned = _thinned(time, interval, request.cutoff_Hz)
     markers = MarkerFile(
@@ -120,6 +122,8 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     text += result.said
     if result.ground is not None:
         text.append("laboratory: the model's ground, x forward, y up")
+    if request.interval is not None:
+        _check_within(motion.time, *request.interval)
     interval, joined = common_interval(motion.time, result.interval, result.span)
     if interval is not None:
         motion = motion.part(*interval)
@@ -181,3 +185,15 @@ def _thinned(
     last = float(inside[(count - 1) * every])
     line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
     return (float(inside[0]), last), count, line
+
+
+def _check_within(time: Array, start: float, end: float) -> None:
+    """Raise unless an interval lies within a recording, but for a frame at either end."""
+    frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if start < time[0] - frame or end > time[-1] + frame:
+        raise InputError(
+            f"{start:g} to {end:g} s is not within the recording, "
+            f"{time[0]:.4f} to {time[-1]:.4f} s",
+            "--interval",
+            "give it on the recording's own clock",
+        )
