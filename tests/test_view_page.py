@@ -288,5 +288,5 @@ def test_the_lattice_is_drawn_when_its_layer_is_switched_on(live, show):
 
 
 def test_results_can_be_viewed_in_a_notebook(folder):
-    text = tkamb.show(read_results(folder), frame=1)._repr_html_()
+    text = tkamb.view(read_results(folder), frame=1)._repr_html_()
     assert text.startswith("<iframe srcdoc=") and "&lt;script" in text

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tkamb.run.results_folder import read_results
     from tkamb.run.simulation import simulate
     from tkamb.show.view.live_window import live
-    from tkamb.show.view.show import show
+    from tkamb.show.view.show import show as view
 
 __all__ = [
     "Extensor",
@@ -45,8 +45,8 @@ __all__ = [
     "load_scene",
     "read_results",
     "read_scene",
-    "show",
     "simulate",
+    "view",
 ]
 
 _HOMES = {
@@ -66,7 +66,7 @@ _HOMES = {
     "load_scene": "tkamb.io.scene",
     "read_results": "tkamb.run.results_folder",
     "read_scene": "tkamb.run.read_scene",
-    "show": "tkamb.show.view.show",
+    "view": "tkamb.show.view.show:show",
     "simulate": "tkamb.run.simulation",
 }
 
@@ -74,9 +74,12 @@ __version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:
+    if name == "show":  # the package; called, it is the former name of `view`
+        return import_module("tkamb.show")
     if name not in _HOMES:
         raise AttributeError(f"module 'tkamb' has no attribute '{name}'")
-    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    module, _, attribute = _HOMES[name].partition(":")
+    value = globals()[name] = getattr(import_module(module), attribute or name)
     return value
 
 

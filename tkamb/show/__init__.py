@@ -1,1 +1,24 @@
-"""What a reader gets: report, comparison, check of a scene, viewer."""
+"""What a reader gets: report, comparison, check of a scene, viewer.
+
+`tkamb.show(results)` was a function before release 0.2 and works until 0.3; `tkamb.view(results)` is
+its name now.
+"""
+
+import sys
+import warnings
+from types import ModuleType
+from typing import Any
+
+
+class _CallableModule(ModuleType):
+    """This package, which may still be called as the function of its name was."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """Return what `tkamb.view` returns, with a warning."""
+        from tkamb.show.view.show import show
+
+        warnings.warn("tkamb.show is now tkamb.view", DeprecationWarning, stacklevel=2)
+        return show(*arguments, **options)
+
+
+sys.modules[__name__].__class__ = _CallableModule

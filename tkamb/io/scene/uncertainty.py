@@ -28,7 +28,7 @@ class FluoroscopyErrorSettings:
     """Standard deviations of a pose from single-plane fluoroscopy.
 
     Reference: Mahfouz, Hoff, Komistek, Dennis, IEEE Trans Med Imaging 22:1561 (2003),
-    doi:10.1109/TMI.2003.820027: implants in a cadaver, against an optical tracker.
+    doi:10.1109/TMI.2003.820027, implants in a cadaver, against an optical tracker.
     """
 
     ap_mm: float = 0.473
