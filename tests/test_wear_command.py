@@ -145,7 +145,7 @@ def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, s
         ("--updates", "0"): "0 updates",
         ("--wear-factor=-1e-7",): "-1e-07",
         ("--wear-factor", "nan"): "nan",
-        ("--wear-factor", "3.5"): "is the unit",
+        ("--wear-factor", "3.5"): "in mm³/(N m)",
         ("--law", "archerd"): "did you mean archard",
         ("--law", "pressure-cross-shear"): "has no parameters",
         ("--material", "conventionnal"): "did you mean conventional",

@@ -186,6 +186,9 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
         height = samples[:, 0] * np.sin(flexion) + samples[:, 1] * np.cos(flexion)
         outline = np.full(count, np.inf)
         np.minimum.at(outline, strip, height)
+        # Long thin triangles leave strips without a sample: they are between their neighbours.
+        sampled_strips = np.flatnonzero(np.isfinite(outline))
+        outline = np.interp(np.arange(count), sampled_strips, outline[sampled_strips])
         total += np.minimum(outline - outline.min(), CONDYLE.deepest_notch)
     middles = low + (np.arange(count) + 0.5) * (high - low) / count
     return total / len(flexions), middles

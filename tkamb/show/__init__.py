@@ -1,7 +1,7 @@
 """What a reader gets: report, comparison, check of a scene, viewer.
 
-`tkamb.show(results)` was a function before release 0.2 and works until 0.3; `tkamb.view(results)` is
-its name now.
+`tkamb.show(results)` was a function before release 0.2 and works until 0.3; `tkamb.view(results)`
+is its name now.
 """
 
 import sys
