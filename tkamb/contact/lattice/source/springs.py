@@ -158,8 +158,7 @@ class SourceNetwork(Solid):
 
     def _assembled(self, stiffness: Array, direction: Array) -> sparse.csr_matrix:
         block = stiffness[:, None, None] * direction[:, :, None] * direction[:, None, :]
-        # Stiffness of a spring along its direction; transversal terms are left out, as in a tangent
-        # of small turns.
+        # Stiffness along the spring only: how the force turns with it is left out.
         matrices = np.block([[block, -block], [-block, block]])
         return self._spring_pattern.assemble([matrices])
 
