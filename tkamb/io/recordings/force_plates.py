@@ -42,23 +42,21 @@ _log = logging.getLogger("tkamb")
 
 @dataclass(frozen=True)
 class PlateSettings:
-    """What decides how a plate's channels are read.
-
-    Args:
-        steady_N: largest standard deviation of the vertical force over the frames of ZERO; a
-            foot that comes or goes makes more.
-        baseline_N: a vertical force over these frames up to this is drift of the amplifier.
-        baseline_share: so is a larger one that is at most this share of the largest change that
-            the plate shows; who stands on it in these frames makes more.
-        loaded_N: force on a plate that shows where its centre of pressure lies.
-        beside: share of the plate's half width by which that may lie outside the corners.
-    """
+    """How the channels of a force plate are read."""
 
     steady_N: float = 10.0
+    """N; largest standard deviation of the vertical force over the frames of ZERO. A foot that
+    comes or goes makes more."""
     baseline_N: float = 20.0
+    """N; a vertical force over the frames of ZERO up to this is drift of the amplifier."""
     baseline_share: float = 0.2
+    """Share of the largest change that the plate shows. A larger force over the frames of ZERO
+    is drift too where it is at most this; a person who stands on the plate makes more."""
     loaded_N: float = 100.0
+    """N; force from which the centre of pressure of a plate is checked."""
     beside: float = 0.2
+    """Share of the plate's half width by which the centre of pressure may lie outside the
+    corners."""
 
 
 SETTINGS = PlateSettings()

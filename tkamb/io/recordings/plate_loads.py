@@ -15,29 +15,26 @@ from tkamb.geometry.frames import Array
 
 @dataclass(frozen=True)
 class PlateLoadSettings:
-    """When a force plate counts as loaded, and what of it is drift.
-
-    Args:
-        load_N: force beyond the unloaded level that is a load; filters of ground reactions mostly
-            use 20 N.
-        margin_s: the wrench counts from this much before a load to this much after it. A foot
-            comes down and leaves within 0.02 s.
-        quiet_share: share of the samples, those of the smallest force, that show the unloaded
-            level.
-        quiet_spread_N: they show it if they lie within this of each other; no foot is so steady.
-        most_drift_N: and below this; a larger force is a foot's.
-        drift_N: an unloaded level beyond this is told. Noise has no median, and 2 N change the
-            knee's force by less than 0.5 % of a body's weight.
-        unloaded_s: a plate that is free for less shows no drift.
-    """
+    """When a force plate counts as loaded, and what of its force is drift."""
 
     load_N: float = 20.0
+    """N; force beyond the unloaded level that is a load. Filters of ground reactions mostly use
+    20 N."""
     margin_s: float = 0.05
+    """s; the wrench counts from this much before a load to this much after it. A foot comes
+    down and leaves within 0.02 s."""
     quiet_share: float = 0.1
+    """Share of the samples, those of the smallest force, that show the unloaded level."""
     quiet_spread_N: float = 2.0
+    """N; these samples show the level if they lie within this of each other. No foot is so
+    steady."""
     most_drift_N: float = 60.0
+    """N; largest unloaded level that is drift; a larger force is that of a foot."""
     drift_N: float = 2.0
+    """N; a larger unloaded level gets a note. The median of noise is zero, and 2 N change the
+    force of the knee by less than 0.5 % of a body weight."""
     unloaded_s: float = 0.1
+    """s; a plate that is unloaded for less shows no drift."""
 
 
 PLATE_LOAD = PlateLoadSettings()
