@@ -30,7 +30,7 @@ def test_the_paragraph_needs_only_the_folder(run, capsys):
         "MCL_anterior k = 91.25 N/mm, L0 = 82.73 mm",
         "elastic foundation of independent columns",
         "points lay 1 mm apart",
-        "E 561.5 MPa",
+        "E = 561.5 MPa",
         "coefficient of 0.05",
         "doi:10.1016/0021-9290(91)90019-J",
     ):
