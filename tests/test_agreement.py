@@ -9,6 +9,7 @@ import pytest
 from joints import HALF, flat_joint
 from scenes import write_scene
 from tkamb import simulate
+from tkamb.contact.narrow import TOO_NARROW
 from tkamb.contact.probe import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
@@ -141,7 +142,9 @@ def test_sensitivity_is_the_slope_of_presses_farther_apart(tmp_path):
 
 
 def test_the_shipped_knee_agrees_with_itself_and_says_what_half_a_degree_does(shipped):
-    assert shipped.status == ["ok"] * len(shipped)
+    # At this coarse spacing the contact is too narrow for its columns; nothing else is flagged.
+    parts = {part for status in shipped.status for part in status.split("; ")}
+    assert all(part == "ok" or TOO_NARROW in part or "take finer" in part for part in parts)
     moved = 0.5 * shipped["medial_force_per_adduction_N_per_deg"]
     assert (moved > 0.25 * shipped["force_si_N"]).all()
     assert (shipped["split_determined"] == 0).all()

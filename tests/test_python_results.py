@@ -116,7 +116,7 @@ def touches(one, other):
 def test_what_one_meets_first_says_itself_in_a_line():
     from tkamb.run.press import press_meshes
 
-    files = Path(tkamb.__file__).parent / "starter" / "files"
+    files = Path(tkamb.__file__).parent / "io" / "starter" / "files"
     report = press_meshes(
         files / "femoral_component.stl",
         files / "insert.stl",

@@ -138,7 +138,7 @@ def test_maps_are_read_only_when_asked(tmp_path):
     maps = ContactMaps(tmp_path / "contact.h5")
     assert "pressure_Pa" not in vars(maps)
     assert maps.pressure_Pa.shape == (5, len(maps.points_m))
-    with pytest.raises(InputError, match="no such contact.h5"):
+    with pytest.raises(InputError, match=r"no such contact\.h5"):
         read_maps(tmp_path / "nothing.h5")
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(InputError, match="HDF5"):

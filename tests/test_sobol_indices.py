@@ -107,6 +107,11 @@ def stiff_knee():
     still = {f"uncertainty__{key}": 0.0 for key in ("ap_mm", "si_mm", "ml_mm", "friction")}
     still |= {f"uncertainty__{key}_deg": 0.0 for key in ("axial_rotation", "adduction", "flexion")}
     still |= {f"uncertainty__centre_of_pressure_{axis}_mm": 0.0 for axis in ("ap", "ml")}
+    lengths = ("knee_centre", "muscle_attachment", "tendon_band", "femoral_placement")
+    lengths += ("insert_placement", "tuberosity", "dome")
+    still |= {f"uncertainty__{key}_mm": 0.0 for key in lengths}
+    still |= {"uncertainty__insert_placement_deg": 0.0, "uncertainty__muscle_strength": 0.0}
+    still |= {f"uncertainty__ligament_{key}": 0.0 for key in ("stiffness", "strain")}
     return bodies_alone(**still, uncertainty__segment_mass=0.1, uncertainty__ground_reaction=0.1)
 
 

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
 
 from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.surface import Surface
@@ -62,6 +61,8 @@ class ArticularEdge:
             insert: in the insert frame.
             settings: when contact is at the edge.
         """
+        from scipy.ndimage import distance_transform_edt  # a report needs the words alone
+
         low, high = insert.bounds[:, [0, 2]]
         # Two rows of margin on each side, so that the outside is one connected region.
         count = np.ceil((high - low) / settings.spacing).astype(int) + 4
@@ -91,6 +92,8 @@ class ArticularEdge:
 
 def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
     """Return the connected parts of a mask (a, b) that hold a cell outside the insert."""
+    from scipy.ndimage import label  # a report needs the words alone
+
     part, _ = label(flat, structure=np.ones((3, 3)))
     touching = np.unique(part[outside])
     return np.asarray(flat & np.isin(part, touching), bool)

@@ -18,7 +18,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from tkamb.geometry.frames import Array
 from tkamb.run.maps import ContactMaps
@@ -93,6 +92,8 @@ class TopView:
         The map's triangles end in steps of their own size. The outline is where the signed
         distance from their rim, averaged over such a step, is zero.
         """
+        from scipy.ndimage import distance_transform_edt, gaussian_filter  # takes 0.1 s to load
+
         grey = np.pad(self.grey, PRESSURE_PICTURE.outline_margin, constant_values=-1.0)
         over = grey >= 0
         far, nearest = distance_transform_edt(~over, return_indices=True)
