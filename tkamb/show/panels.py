@@ -153,9 +153,16 @@ def _line(
     scale: float = 1.0,
 ) -> Line:
     values = results.columns.get(column, np.full(len(results), np.nan))
-    bands = (results.band(column), results.band_with_discrepancy(column))
-    scaled = (None if band is None else band * scale for band in bands)
-    return Line(column, label, values * scale, colour, dashed, *scaled)
+    band, wide = results.band(column), results.band_with_discrepancy(column)
+    return Line(
+        column,
+        label,
+        values * scale,
+        colour,
+        dashed,
+        None if band is None else band * scale,
+        None if wide is None else wide * scale,
+    )
 
 
 def _components(results: "Results", stem: str, unit: str, scale: float = 1.0) -> tuple[Line, ...]:
