@@ -11,6 +11,8 @@ Each name is imported when it is first used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from tkamb.moved import accept_old_names
+
 if TYPE_CHECKING:
     from tkamb.contact.registry import contact_model
     from tkamb.io.scene import Scene, load_scene
@@ -71,6 +73,8 @@ _HOMES = {
 }
 
 __version__ = "0.2.0"
+
+accept_old_names()
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,38 @@
+"""Import paths of release 0.1 lead to the same objects, with a warning."""
+
+import subprocess
+import sys
+from importlib import import_module
+
+import pytest
+
+from tkamb.moved import FOLDERS, MODULES, new_name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "name"),
+    [
+        ("tkamb.inputs.c3d", "tkamb.io.recordings.c3d", "read_c3d"),
+        ("tkamb.scene", "tkamb.io.scene", "load_scene"),
+        ("tkamb.simulation", "tkamb.run.simulation", "simulate"),
+    ],
+)
+def test_an_old_path_gives_the_same_object_and_warns(old, new, name):
+    code = f"from {old} import {name} as a; from {new} import {name} as b; assert a is b"
+    done = subprocess.run(
+        [sys.executable, "-W", "always", "-c", code], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"{old} is now {new}" in done.stderr
+
+
+def test_every_new_place_exists():
+    for new in (*FOLDERS.values(), *MODULES.values()):
+        import_module(new)
+
+
+def test_what_has_not_moved_is_left_alone():
+    assert new_name("tkamb.contact.hertz") is None
+    assert new_name("tkamb.bodyguard") is None
+    with pytest.raises(ModuleNotFoundError):
+        import_module("tkamb.nowhere")

@@ -1,0 +1,81 @@
+"""Import paths of release 0.1: they lead to the modules' new places until release 0.3.
+
+`from tkamb.inputs.c3d import read_c3d` imports `tkamb.io.recordings.c3d`, with a
+DeprecationWarning.
+"""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+FOLDERS = {
+    "tkamb.body": "tkamb.knee",
+    "tkamb.equilibrium": "tkamb.knee.equilibrium",
+    "tkamb.scene": "tkamb.io.scene",
+    "tkamb.inputs": "tkamb.io.recordings",
+    "tkamb.importing": "tkamb.io.importing",
+    "tkamb.opensim": "tkamb.io.opensim",
+    "tkamb.output": "tkamb.show",
+    "tkamb.uncertainty": "tkamb.studies.uncertainty",
+    "tkamb.cohort": "tkamb.studies.cohort",
+    "tkamb.wear": "tkamb.studies.wear",
+    "tkamb.designs": "tkamb.studies.designs",
+}
+"""Folder of release 0.1 -> where its modules are."""
+MODULES = {
+    "tkamb.simulation": "tkamb.run.simulation",
+    "tkamb.results": "tkamb.run.results",
+    "tkamb.results_folder": "tkamb.run.results_folder",
+    "tkamb.columns": "tkamb.run.columns",
+    "tkamb.press": "tkamb.run.press",
+}
+"""Module of release 0.1 -> its new name."""
+
+
+def new_name(name: str) -> str | None:
+    """Return where a module of release 0.1 is now; None for one that has not moved."""
+    if name in MODULES:
+        return MODULES[name]
+    for old, new in FOLDERS.items():
+        if name == old or name.startswith(f"{old}."):
+            return new + name[len(old) :]
+    return None
+
+
+class _Alias(Loader):
+    """Loads a module by its new name."""
+
+    def __init__(self, target: str) -> None:
+        self.target = target
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Return the module at its new place; the old name is one more name of it."""
+        return import_module(self.target)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Do nothing: the module has been executed at its new place."""
+
+
+class _MovedFinder(MetaPathFinder):
+    """Finds modules by their former names."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return a spec that leads to the new place; None for what has not moved."""
+        new = new_name(fullname)
+        if new is None:
+            return None
+        words = f"{fullname} is now {new}; the old name works until release 0.3"
+        warnings.warn(words, DeprecationWarning, stacklevel=2)
+        return ModuleSpec(fullname, _Alias(new), is_package=fullname in FOLDERS)
+
+
+def accept_old_names() -> None:
+    """Let former import paths lead to the new places; once for a process."""
+    if not any(isinstance(finder, _MovedFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _MovedFinder())  # before the path of a moved folder is searched
