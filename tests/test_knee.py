@@ -382,7 +382,7 @@ def knee_of(read, **changes):
 def test_what_does_not_fit_is_refused_in_one_line(read):
     plain, motion, _ = read
     q, v = motion.q[60], motion.v[60]
-    knee = knee_of(read)
+    knee, bare = knee_of(read), tkamb.Knee(plain.model)
     mesh = plain.femoral.mesh.copy()
     mesh.apply_scale(1000.0)
     bundle = replace(plain.ligaments[0], slack_length=float("nan"))
@@ -404,7 +404,8 @@ def test_what_does_not_fit_is_refused_in_one_line(read):
         (lambda: knee.external_forces(q, v, 3.0), "no quadriceps"),
         (lambda: plain.external_forces(q, v, -3.0), "only pulls"),
         (lambda: knee.press(q, -1.0), "load"),
-        (lambda: tkamb.Knee(plain.model).press(q, 1.0), "no contact"),
+        (lambda: bare.press(q, 1.0), "no contact"),
+        (lambda: bare.inverse_dynamics(q, v, 0 * v, contact=knee.press(q, 500.0)), "no contact"),
         (lambda: knee.equilibrium(q, v, v, None, ("flexion",)), "no coordinate"),
         (lambda: tkamb.contact_model("lattice", resolution=1.0), "resolution"),
         (lambda: tkamb.contact_model("lattice", 1.0, resolution=1e-3), "both"),

@@ -26,6 +26,17 @@ def test_an_old_path_gives_the_same_object_and_warns(old, new, name):
     assert f"{old} is now {new}" in done.stderr
 
 
+def test_a_module_stays_what_it_is_when_an_old_path_has_led_to_it():
+    code = (
+        "import tkamb.output, tkamb.show; from importlib import reload, resources; "
+        "assert tkamb.show.__spec__.name == tkamb.show.__name__ == 'tkamb.show'; "
+        "assert resources.files('tkamb.show').joinpath('view').is_dir(); "
+        "assert reload(tkamb.show) is tkamb.output"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_every_new_place_exists():
     for new in (*FOLDERS.values(), *MODULES.values()):
         import_module(new)

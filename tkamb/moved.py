@@ -51,13 +51,20 @@ class _Alias(Loader):
 
     def __init__(self, target: str) -> None:
         self.target = target
+        self.own_spec: ModuleSpec | None = None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         """Return the module at its new place; the old name is one more name of it."""
-        return import_module(self.target)
+        module = import_module(self.target)
+        self.own_spec = module.__spec__
+        return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Do nothing: the module has been executed at its new place."""
+        """Give the module its own spec back, by which its files are found.
+
+        It has been executed at its new place; the import has put the spec of the old name there.
+        """
+        module.__spec__ = self.own_spec
 
 
 class _MovedFinder(MetaPathFinder):

@@ -63,6 +63,8 @@ class KneeSettings:
     """m and rad: an insert frame this near to that of its flat bottom is the same frame."""
     pose_tolerance: float = 1e-12
     """m and rad: residual of the joint coordinates that make a given pose of the knee."""
+    accepted_pose_error: float = 1e-8
+    """m and rad: at most what is left after the last Newton step of a pose that is reached."""
     max_pose_steps: int = 30
     """Newton steps at most to find these coordinates."""
 
@@ -371,7 +373,8 @@ class Knee:
             The loads; a state without a solution holds NaN and says why in `problems`.
 
         Raises:
-            InputError: an argument of the wrong size, or an unknown muscle.
+            InputError: an argument of the wrong size, an unknown muscle, or a contact given to a
+                knee without a contact model.
         """
         data = self.create_data_for_kinematics() if data is None else data
         instant = self._instant(q, v, a, external, tensions, data)
@@ -380,8 +383,7 @@ class Knee:
         if contact is not None:
             from tkamb.contact.probe import condyle_wrenches
 
-            assert self.contact is not None
-            wrenches = condyle_wrenches(contact, self.contact.pair.split)
+            wrenches = condyle_wrenches(contact, self._need_contact().pair.split)
             condyles = instant.resultants(0, instant.coordinates, wrenches)
             off = frozenset(instant.sides - set(condyles))
             points = replace(NO_CONTACT, condyles=condyles, lifted=off)
@@ -871,7 +873,6 @@ class Knee:
         chain_motion = bridge.motion(pin_data, self.extensor is not None)
         patella = None
         if self.extensor is not None:
-            assert self.extensor is not None
             joints = None if self._finds_patella else chain_motion.joints[0, 6:]
             place = knee_pose(chain_motion.joints[0, :6])
             patella = PatellaAt(self._extensor_lines, place, joints, self.extensor.solved)
@@ -961,7 +962,7 @@ class Knee:
             step = np.zeros(model.nv)
             step[columns] = np.linalg.lstsq(jacobian, error, rcond=None)[0]
             q = pin.integrate(model, q, step)
-        if np.abs(error).max() < 1e-8:
+        if np.abs(error).max() < KNEE.accepted_pose_error:
             return q
         raise InputError(
             f"the {knee_size(self.anatomy)} degrees of freedom between tibia and femur do not "
