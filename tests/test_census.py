@@ -36,6 +36,14 @@ def test_a_census_tells_read_from_part_and_refused(tmp_path):
         "good.c3d": "read",
     }
     assert "type 7" in rows["deeper/plate.c3d"]["why"][0]
+    compared = {name: row["compared"] for name, row in rows.items()}
+    assert compared == {
+        "a.csv": [],  # no second reader reads tables of text
+        "cut.c3d": [],
+        "deeper/plate.c3d": ["time", "markers"],
+        "good.c3d": ["time", "markers"],  # ezc3d wants FORCE_PLATFORM:USED a whole number
+    }
+    assert "compared with a second reader: 2" in said
     assert "1 part, 2 read, 1 refused" in said and "cut short" in said
 
 
@@ -48,7 +56,7 @@ def test_a_census_finds_what_a_second_reader_reads_otherwise(tmp_path):
     loader.exec_module(census)
     path = write_c3d(tmp_path / "a.c3d", standing_markers())
     mine = census.c3d_values(census.read_c3d(path))
-    assert census.differing(path, mine, census.other_c3d) == []
+    assert census.differing(path, mine, census.other_c3d) == (["time", "markers"], [])
     mine["markers"] = mine["markers"] * 1.001
-    (line,) = census.differing(path, mine, census.other_c3d)
+    _, (line,) = census.differing(path, mine, census.other_c3d)
     assert "markers: up to" in line
