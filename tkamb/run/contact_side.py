@@ -126,15 +126,15 @@ class ContactSide:
             return body, contact
         if not self._sensitivity:
             return body, contact
-        start, turned = clock.perf_counter(), None
+        start, adjusted = clock.perf_counter(), None
         if self._probe.exact:
             sensitivity = split_tangent(self._probe, contact.result)
         else:
             last = before[-1] if before else None
             like = (last.result, last.turned) if last and last.result and last.turned else None
-            sensitivity, turned = split_sensitivity(self._probe, contact.result, like)
+            sensitivity, adjusted = split_sensitivity(self._probe, contact.result, like)
         seconds = contact.seconds + clock.perf_counter() - start
-        return body, replace(contact, sensitivity=sensitivity, turned=turned, seconds=seconds)
+        return body, replace(contact, sensitivity=sensitivity, turned=adjusted, seconds=seconds)
 
     def _press_recorded(
         self, k: int, before: Sequence[FrameContact]
