@@ -60,9 +60,9 @@ class Hertz(ContactModel):
     quadrics fitted there give normal and relative curvatures (`curvature.osculate`), the
     elliptic solution gives the law F = c delta^1.5 with E* = E/(1 - nu²) of the insert at
     zero strain (`ellipse.contact_ellipse`). Both condyles move down together, so each has
-    delta = travel beyond its own touch times n_y: the tilt decides how they share. Contact
-    point and curvatures stay those of first touch; E is the slope at the origin whatever
-    the material's curve.
+    delta = travel beyond its own touch times n_y: the tilt decides how they share the load.
+    Contact point and curvatures stay those of first touch. E is the slope of the material's
+    curve at the origin.
 
     The map holds the semi-ellipsoid, averaged over each grid cell and scaled so that its
     vertical force is the law's exactly; the wrench is the sum over the map. Area and peak

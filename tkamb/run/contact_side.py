@@ -127,7 +127,7 @@ class ContactSide:
             return body, contact
         if not self._sensitivity:
             return body, contact
-        start, turned = clock.perf_counter(), None
+        start, adjusted = clock.perf_counter(), None
         if self._probe.exact:
             sensitivity = split_tangent(self._probe, contact.result)
         else:
@@ -136,9 +136,9 @@ class ContactSide:
             sensitivity, rotated = split_sensitivity(
                 self._probe, contact.result, contact.start, like
             )
-            turned = None if rotated is None else rotated[1]
+            adjusted = None if rotated is None else rotated[1]
         seconds = contact.seconds + clock.perf_counter() - start
-        return body, replace(contact, sensitivity=sensitivity, turned=turned, seconds=seconds)
+        return body, replace(contact, sensitivity=sensitivity, turned=adjusted, seconds=seconds)
 
     def _press_recorded(
         self, k: int, before: Sequence[FrameContact]

@@ -192,9 +192,9 @@ def _warm(model: ContactModel, state: Any, case: StudyCase, start: WarmStart) ->
     return median(seconds)
 
 
-def _timed(call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+def _timed(call: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
     start = clock.perf_counter()
-    result = call(*given)
+    result = call(*arguments)
     return clock.perf_counter() - start, result
 
 

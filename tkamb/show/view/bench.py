@@ -108,7 +108,6 @@ class BenchRequest:
         slack_percent: change of all ligaments' slack lengths.
         released: coordinates that find their equilibrium.
         contact: name of the contact model; resolution_mm its spacing.
-        frame: of the recorded motion, whose height is where a search begins.
     """
 
     flexion_deg: float = 0.0

@@ -78,12 +78,12 @@ class ForceDrive:
             failed: row -> why it has none; they are counted.
         """
         counted = self._counted(poses)
-        known = [k for k in range(len(poses)) if k not in failed]
+        good = [k for k in range(len(poses)) if k not in failed]
         ranges: dict[str, float] = {"failed_rows": len(failed)}
         for name in self.names:
             unit = UNITS[name][0]
-            ranges[f"{name}_low_{unit}"] = float(counted[f"{name}_{unit}"][known].min())
-            ranges[f"{name}_high_{unit}"] = float(counted[f"{name}_{unit}"][known].max())
+            ranges[f"{name}_low_{unit}"] = float(counted[f"{name}_{unit}"][good].min())
+            ranges[f"{name}_high_{unit}"] = float(counted[f"{name}_{unit}"][good].max())
         return ranges
 
     def rows(self, poses: Array, failed: Mapping[int, str]) -> list[dict[str, Any]]:
