@@ -7,7 +7,6 @@ the same numbers by `tkamb run`.
 """
 
 import csv
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -174,8 +173,8 @@ def _range(key: str) -> tuple[float, float]:
 
 def _number(key: str, value: Any, low: float, high: float) -> float:
     good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or not low <= value <= high:
-        raise InputError(f"{key} = {value!r}", "bench", f"give {low:g} to {high:g}")
+    if not good or not low <= value <= high:  # not a number is in no range
+        raise InputError(f"{key} = {value!r:.60}", "bench", f"give {low:g} to {high:g}")
     return float(value)
 
 
@@ -202,7 +201,7 @@ def _placement(name: str, values: Any) -> Placement:
 
 def _released(values: Any) -> tuple[str, ...]:
     known = [name for name in KNEE_COORDINATES if name != "flexion"]
-    if not isinstance(values, list | tuple) or not set(values) <= set(known):
+    if not isinstance(values, list | tuple) or any(name not in known for name in values):
         raise InputError("released names no coordinates", "bench", f"of {', '.join(known)}")
     chosen = set(values) | ({"si"} if values else set())
     return tuple(name for name in known if name in chosen)

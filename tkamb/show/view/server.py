@@ -241,6 +241,21 @@ class _Handler(BaseHTTPRequestHandler):
 
     timeout = VIEW_SERVER.idle_seconds
 
+    def parse_request(self) -> bool:
+        """Refuse requests of HTTP/0.9, whose answers have no headers."""
+        good = super().parse_request()
+        if good and self.request_version == "HTTP/0.9":
+            self.send_error(HTTPStatus.HTTP_VERSION_NOT_SUPPORTED)
+            return False
+        return good
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer what the library refuses as everything else: one line, with all headers."""
+        self.request_version = "HTTP/1.0"
+        self.close_connection = True
+        status = HTTPStatus(code)
+        self._send_line(status, status.phrase)
+
     def do_GET(self) -> None:
         if not self._is_allowed():
             self._refuse()
@@ -306,7 +321,7 @@ class _Handler(BaseHTTPRequestHandler):
         given = self.path[: len(self.root)].encode(errors="replace")
         return (
             self.headers.get("Host") in self.names
-            and (origin is None or origin.removeprefix("http://") in self.names)
+            and (origin is None or origin in {f"http://{name}" for name in self.names})
             and secrets.compare_digest(given, self.root.encode())
         )
 
