@@ -160,8 +160,7 @@ def test_what_nobody_foresaw_of_a_preparation_is_said_to_the_page(knee, monkeypa
     monkeypatch.setattr(knee, "_side", lambda request: 1 / 0)
     request = replace(states(knee)["pressed"], resolution_mm=7.0)
     with pytest.raises(TkambError, match="not foreseen: ZeroDivisionError"):
-        while knee.preparing(request):
-            pass
+        list(iter(lambda: knee.preparing(request), ""))
 
 
 def test_a_scene_without_contact_is_refused(tmp_path, capfd):
