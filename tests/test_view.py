@@ -283,6 +283,7 @@ def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
         (b'{"frame": 1' + b"0" * 5000 + b', "model": "hertz"}', "limit"),
         (b'{"frame": 999, "model": "hertz"}', "999"),
         (b'{"frame": 0, "model": "none such"}', "none such"),
+        (b'{"frame": 0, "model": "\\ud800"}', "ud800"),
     ],
 )
 def test_a_bad_question_gets_one_line(server, body, word):

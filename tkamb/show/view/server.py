@@ -40,6 +40,8 @@ class ViewServerSettings:
     """Bytes of a request; a longer one is refused."""
     idle_seconds: float = 15.0
     """s: without a byte from a client that is connected, before it is cut off."""
+    longest_line: int = 2000
+    """Characters of an answer in words; a longer one is cut."""
     token_bytes: int = 18
     """Random bytes of the token in the address."""
 
@@ -332,7 +334,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_line(self, status: HTTPStatus, words: str) -> None:
         """Send one line of text."""
-        self._send(status, "text/plain; charset=utf-8", " ".join(words.split()).encode())
+        line = " ".join(words.split())[: VIEW_SERVER.longest_line]
+        # a name from the question may hold what UTF-8 does not have
+        self._send(status, "text/plain; charset=utf-8", line.encode(errors="backslashreplace"))
 
     def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
         self.send_response(status)
