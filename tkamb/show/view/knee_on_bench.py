@@ -8,6 +8,7 @@ the insert's: on the bench nothing depends on it. The load so acts along the ins
 
 import logging
 import re
+import shutil
 import tempfile
 from dataclasses import asdict, fields, replace
 from importlib import resources
@@ -70,7 +71,11 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     poses = np.array([knee.at(one, data).pose for one in np.atleast_2d(np.asarray(q, float))])
     coordinates = knee_coordinates(placement @ poses)
     own = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
-    case = load_case(load_scene(_write_scene(knee, placement, coordinates, own)))
+    try:
+        case = load_case(load_scene(_write_scene(knee, placement, coordinates, own)))
+    except InputError:
+        shutil.rmtree(own, ignore_errors=True)
+        raise
     return LiveKnee(replace(case, motion=still_motion(coordinates)), own)
 
 

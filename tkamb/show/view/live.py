@@ -172,12 +172,18 @@ class LiveKnee:
         finally:
             del self._threads[key]
 
-    def answer(self, request: BenchRequest, number: int | None = None) -> LiveAnswer:
+    def answer(
+        self, request: BenchRequest, number: int | None = None, from_rest: bool = False
+    ) -> LiveAnswer:
         """Return what the bench shows.
+
+        The state before is the initial guess: a lattice's answer differs by it within the solver's
+        tolerance.
 
         Args:
             request: the state of the bench.
             number: from `overtake`; None: whatever comes after, this is wanted.
+            from_rest: without that guess, as `tkamb run` computes its first frame.
 
         Raises:
             TkambError: a newer request came.
@@ -186,6 +192,8 @@ class LiveKnee:
         with self._computing:
             if number is not None and number != self._latest:
                 raise TkambError("overtaken")
+            if from_rest:
+                self._before.pop(setting(request), None)
             return self._compute(request)
 
     def save(self, request: BenchRequest, folder: Path) -> Path:
@@ -282,7 +290,7 @@ class LiveKnee:
         flags = [*contact.flags]
         return LiveAnswer(
             request,
-            _numbers(body, contact, mechanics),
+            _numbers(body, contact, mechanics, ends),
             "; ".join(flags) or "ok",
             result.pose,
             state.points,
@@ -309,8 +317,10 @@ class LiveKnee:
         return as_json(known_error(request.contact, request.resolution_mm, material, options))
 
 
-def _numbers(body: FrameLoads, contact: FrameContact, mechanics: Mechanics) -> dict[str, float]:
-    """Return the numbers of results.csv that the bench shows, under the same names."""
+def _numbers(
+    body: FrameLoads, contact: FrameContact, mechanics: Mechanics, ends: dict[str, Array]
+) -> dict[str, float]:
+    """Return the numbers that the bench shows; those of results.csv under the same names."""
     result = contact.result
     assert result is not None
     numbers = {
@@ -331,6 +341,10 @@ def _numbers(body: FrameLoads, contact: FrameContact, mechanics: Mechanics) -> d
         }
     for name, tension in body.geometry.tensions.items():
         numbers[f"ligament_{name}_N"] = tension
+    for bundle in mechanics.ligaments:
+        proximal, distal = ends[bundle.name]
+        strain = bundle.strain(np.linalg.norm(distal - proximal))
+        numbers[f"ligament_{bundle.name}_strain_percent"] = 100.0 * float(strain)
     if contact.equilibrium is not None:
         places = contact.equilibrium.coordinates
         for name, value in zip(KNEE_COORDINATES, places, strict=True):

@@ -216,6 +216,10 @@ class ViewServer:
         """Address of the page, token included."""
         return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
 
+    def _repr_html_(self) -> str:
+        """Return a link, which a notebook shows."""
+        return f'<a href="{self.url}" target="_blank" rel="noopener">{self.url}</a>'
+
     def serve(self) -> None:
         """Answer until `close`, or until the user interrupts."""
         self._server.serve_forever(poll_interval=0.2)
