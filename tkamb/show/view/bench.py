@@ -302,8 +302,8 @@ class Bench:
         about = cross(transform(moved, chain.insert_in_tibia[:3, 3]), axial) + cross(centre, weight)
         point = np.array([about[2], 0.0, -about[0]]) / force[1]
         moment = about - cross(point, force)
-        rows = (np.tile(values, (ROWS, 1)) for values in (force, point, moment))
-        return GroundReaction(*rows, np.ones(ROWS, bool))
+        forces, points, moments = (np.tile(values, (ROWS, 1)) for values in (force, point, moment))
+        return GroundReaction(forces, points, moments, np.ones(ROWS, bool))
 
     def _bone(self, request: BenchRequest) -> Array:
         """Return the pose (4, 4) of the tibia as recorded in the tibia of the moved insert.
