@@ -1,4 +1,4 @@
-"""How the split between the condyles answers to the adduction, at a constant load."""
+"""Change of the medial-lateral split with adduction, at a constant load."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -36,16 +36,16 @@ def split_sensitivity(
 ) -> tuple[float, ContactResult | None]:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
-    Zero where one condyle carries everything: it then holds only until the other touches. NaN
-    where the turned press does not succeed.
+    Zero where one condyle carries everything: the value then holds until the other condyle touches.
+    NaN where the press with more adduction fails.
 
     Args:
         probe: of the contact model.
-        result: a contact; the load is what it carries along -y.
+        result: a contact; its load is the force along -y.
         like: another contact and what this returned of it, which may save time.
 
-    Returns:
-        The change, and the contact with the adduction turned; None where that does not succeed.
+        Returns:
+        The change, and the contact with more adduction; None where that press fails.
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
