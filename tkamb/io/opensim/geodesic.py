@@ -38,7 +38,7 @@ class GeodesicSettings:
     tolerance: float = 1e-11
     """rad; error of the direction in which the string arrives."""
     overshoot_below: float = 0.05
-    """rad; at a smaller error, a string that arrives backwards has gone too far."""
+    """rad: if the error is smaller than this, a string that arrives backwards has overshot."""
 
 
 GEODESIC = GeodesicSettings()
@@ -126,7 +126,8 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
         if is_converged.all():
             break
         step = -np.linalg.solve(jacobian[~is_converged], residual[~is_converged][..., None])[..., 0]
-        # a string that would turn back has gone past where it leaves, by as far as it must return
+        # A string that would turn back has overshot the point where it leaves the surface, by the
+        # distance that it has to return.
         past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~is_converged]
         step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~is_converged][past]])
         waiting = waiting[~is_converged]

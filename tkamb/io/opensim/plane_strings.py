@@ -1,4 +1,4 @@
-"""Strings over an ellipsoid that stay in one plane: where the search for the taut one starts.
+"""Strings over an ellipsoid that stay in one plane: initial guesses of the taut string.
 
 Scaled to the unit sphere, each half plane through both ends cuts out a circle, and the taut
 string in it is known in closed form; its length is that of the arc on the ellipsoid.
@@ -139,7 +139,7 @@ class _Planes:
         return cosine[..., None] * outward + sine[..., None] * along + self.centre[:, :, None]
 
     def speeds(self, places: Array, axes: Array) -> Array:
-        """Return by how many metres (f, k, n) a point at places (n,) moves per unit of place.
+        """Return the speed (f, k, n), m per unit of place, of a point along the arcs.
 
         Args:
             places: in -1…1 of the arcs.

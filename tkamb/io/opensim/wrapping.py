@@ -58,7 +58,7 @@ class Touch:
         entry: (f, 3) m, where they meet it, in its frame.
         exit: (f, 3) m, where they leave it.
         arc_m: (f,) length on it.
-        push: (f, 2, 3) what an object that yields does to start and end, per unit tension.
+        push: (f, 2, 3) force of a shrinking object on start and end, per unit tension.
     """
 
     touches: Mask

@@ -111,7 +111,7 @@ def envelope(
         signal: (n,) evenly sampled.
         rate_Hz: of the samples.
         cutoff_Hz: of the low-pass after rectifying.
-        high_pass_Hz: of the high-pass before; "none" takes the mean away alone.
+        high_pass_Hz: of the high-pass before; "none" only subtracts the mean.
 
     Raises:
         InputError: a gap, a cut-off at or above half the rate, or a signal shorter than a

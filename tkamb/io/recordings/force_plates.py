@@ -17,7 +17,7 @@ POINT:UNITS. Where the channels of a type 4 plate themselves state units of forc
 these count; if both readings differ, the one that puts the centre of pressure on the plate does.
 
 With o = ORIGIN from the transducers' origin to the surface's centre the moment there is
-M - o × F. A centre of pressure is a quotient and is left to who knows the threshold.
+M - o × F. The centre of pressure is not computed here: it needs a force threshold.
 
 FORCE_PLATFORM:ZERO names frames in which nobody stands on the plates. The mean of each channel
 over them is subtracted, unless the plate is loaded in them.
@@ -166,7 +166,7 @@ def force_plate(record: PlateRecord) -> ForcePlate:
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
-    """Return why the frames of ZERO are no baseline; empty if they are."""
+    """Return why the frames of ZERO cannot be a baseline; empty if they can."""
     assert record.zero is not None
     vertical = force[:, 2]
     window = vertical[record.zero]
@@ -176,8 +176,8 @@ def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
     if drift and spread <= SETTINGS.steady_N:
         return ""
     return (
-        f"force plate {record.number} bears {abs(level):.0f} N in the frames that "
-        "FORCE_PLATFORM:ZERO calls unloaded: no baseline is subtracted"
+        f"force plate {record.number} shows {abs(level):.0f} N in the frames that "
+        "FORCE_PLATFORM:ZERO states as unloaded: no baseline is subtracted"
     )
 
 

@@ -1,8 +1,8 @@
-"""When a force plate is loaded, and what it reads while nobody stands on it.
+"""When a force plate is loaded, and its reading while nobody stands on it.
 
-Amplifiers drift. A plate that nobody stands on then adds a moment about the knee that no foot
-exerts, with the plate's whole distance as its lever. So a plate counts while it is loaded, and
-its unloaded level is told.
+Amplifiers drift. A plate that nobody stands on then adds a false moment about the knee, with its
+distance from the knee as lever arm. Therefore a plate counts only while it is loaded, and its
+unloaded level is reported.
 """
 
 import math
@@ -15,7 +15,7 @@ from tkamb.geometry.frames import Array
 
 @dataclass(frozen=True)
 class PlateLoadSettings:
-    """When a force plate counts as loaded, and what of its force is drift."""
+    """When a force plate counts as loaded, and which force is drift."""
 
     load_N: float = 20.0
     """N; force beyond the unloaded level that is a load. Filters of ground reactions mostly use
