@@ -1,8 +1,8 @@
 """One row of the trade-off: a model on a case, timed, in a process of its own.
 
 `python -m tkamb.studies.measures` reads a `Job` as JSON from standard input and prints the
-measure as JSON, so that its peak memory is its own and a crash or a hang is a row too. The
-process computes with one thread: timings repeat, and are those of a worker among others.
+measure as JSON. So the peak memory is that of the job alone, and a crash or a hang gives a row,
+too. The process computes with one thread, so that timings are repeatable.
 """
 
 import json
@@ -35,11 +35,11 @@ class MeasureSettings:
     longest_seconds: float = 300.0
     """A job that takes longer is stopped and says so."""
     repeats: int = 3
-    """Of preparing and pressing for the first time; of warm presses at least."""
+    """Repeats of the preparation and the first press; smallest number of warm presses."""
     warm_presses: int = 7
     """Presses from a neighbouring pose that are timed."""
     enough_seconds: float = 3.0
-    """No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
+    """s: no more repeats after this time of measurement, except `repeats` warm presses."""
 
 
 MEASURE = MeasureSettings()
@@ -164,7 +164,7 @@ def _first(
 ) -> tuple[tuple[float, float], tuple[StudyCase, Any, ContactResult]]:
     """Return the median seconds of prepare and first press, and the last of both.
 
-    The bodies are made anew each time: nothing that is remembered of them makes it faster.
+    The bodies are made again each time, so that no cached property of them saves time.
     """
     prepares: list[float] = []
     colds: list[float] = []

@@ -24,7 +24,7 @@ class DesignTouchSettings:
     halvings: int = 18
     """Halvings of the bracket around the adduction; 18 leave 3e-7 rad."""
     largest_adduction: float = 0.04
-    """rad, about a guess."""
+    """rad: largest distance of the adduction from the initial guess."""
 
 
 DESIGN_TOUCH = DesignTouchSettings()

@@ -302,7 +302,7 @@ def conformity(designs: Path) -> Values:
 
 
 def thickness_and_plane(designs: Path) -> Values:
-    """Return how peak pressure answers to thickness and to the plane of conformity, 60 deg.
+    """Return how peak pressure depends on thickness and on the plane of conformity, 60 deg.
 
     Conformity r/R is raised by a tenth, across from 0.85 and along from 0.5.
     """

@@ -35,13 +35,13 @@ WORN_SURFACE = WornSurfaceSettings()
 
 @dataclass(frozen=True, eq=False)
 class ArticularSurface:
-    """The vertices of the insert that face upwards, and what of the surface each stands for.
+    """The vertices of the insert that face upwards, with their tributary areas.
 
     A vertex owns a third of each of its triangles. Its normal n is the direction of the summed
-    area vectors of those that face upwards, its area the sum of the y components of all over
+    area vectors of those that face upwards. Its area is the sum of the y components of all, over
     n_y: a rim has the normal of the surface, not of the wall. A depth h along the normal is
-    taken off by moving the vertex down by h/n_y. x and z of no vertex change, and the volume of
-    a closed surface is linear in y then, so that
+    removed by moving the vertex down by h/n_y. x and z do not change, and the volume of a closed
+    surface is then linear in y, so that
 
         volume removed = sum over vertices of h times area
 
