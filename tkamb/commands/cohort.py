@@ -12,7 +12,7 @@ from tkamb.run.guard import say
 
 @dataclass(frozen=True)
 class CohortOutputSettings:
-    """What `tkamb cohort` prints."""
+    """Output of `tkamb cohort`."""
 
     max_failed_runs: int = 10
     """Failed runs that are printed; the folder has them all."""

@@ -81,7 +81,7 @@ class TrialError:
         scatter_BW: standard deviation about it.
         inputs_BW: root mean square of the band of inputs' standard deviation.
         correlation_s: time over which the scatter's correlation falls to 1/e.
-        nominal_rmse_BW: root mean square error of the run as the inputs stand.
+        nominal_rmse_BW: root mean square error of the run with the inputs as given.
         nominal_bias_BW: its mean error, predicted minus measured.
     """
 
@@ -132,7 +132,7 @@ def trial_error(
         time: (f,) s.
         samples: (n, f) N; NaN where a sample has none.
         measured: (f,) N; NaN where nothing was measured.
-        nominal: (f,) N, of the run as the inputs stand.
+        nominal: (f,) N, of the run with the inputs as given.
         body_weight: N.
     """
     enough = np.isfinite(samples).sum(axis=0) > samples.shape[0] / 2

@@ -33,9 +33,10 @@ class FrameMapSettings:
     rim_byte: int = 64
     """Byte of the page's picture where the contact ends; above it there is pressure."""
     most_frames: int = 250
-    """A longer run shows, at each place of the slider, the nearest of so many maps."""
+    """Largest number of maps in the page; a longer run shows the nearest one at each place of the
+    slider."""
     coarsening: int = 2
-    """The page's grid has every so-manieth point of the picture's."""
+    """The page's grid has every second point of the picture's."""
 
 
 FRAME_MAP = FrameMapSettings()

@@ -218,7 +218,7 @@ def draw_map(
 def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list[Axes], Axes]:
     """Return axes for maps, row by row, and for their colour bar, `gap` points beside them.
 
-    What stands around maps is known, so that no layout need look for it.
+    The sizes of the labels around maps are known, so that no layout engine is needed.
     """
     figure.set_layout_engine("none")
     width, height = 72 * figure.get_size_inches()
@@ -374,7 +374,7 @@ def _label_stops(
 
 
 def _spread(heights: Array, step: float) -> Array:
-    """Return rising heights moved apart to at least a step, about where they were."""
+    """Return rising heights moved apart to at least a step, near their original places."""
     count = np.arange(len(heights))
     pressed = np.maximum.accumulate(heights - step * count) + step * count
     return pressed - 0.5 * float(np.mean(pressed - heights))

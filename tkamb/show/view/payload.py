@@ -47,7 +47,7 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class ViewPayloadSettings:
-    """What the viewer's page is given."""
+    """Settings of the data for the viewer's page."""
 
     arrow_metres_per_body_weight: float = 0.03
     """Length of an arrow of one body weight."""
@@ -64,7 +64,7 @@ WHITE = "#ffffff"
 """Of a material whose vertices have colours of their own."""
 
 FRONT = 0
-"""three.js: triangles are seen from outside only, which spares half of them."""
+"""three.js: only the outer side of triangles is drawn, which saves half of them."""
 
 TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": np.uint32}
 
@@ -245,7 +245,7 @@ def _insert_transform(root: str, side: str) -> SetTransform:
 
 
 def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[Any]:
-    """Return what hangs a solid into the scene; wear colours it on a scale up to `deepest` mm."""
+    """Return the commands that add a solid; wear colours it on a scale up to `deepest` mm."""
     colours, colour = None, solid.colour
     if solid.wear is not None:
         nearest = cKDTree(solid.surface.vertices).query(shape.vertices)[1]

@@ -1,4 +1,4 @@
-"""Surfaces as the graphics card wants them: few enough triangles, smooth but with sharp edges."""
+"""Surfaces for the graphics card: few triangles, smooth shading, sharp edges."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,7 +23,7 @@ class ShadingSettings:
 SHADING = ShadingSettings()
 
 AGGRESSIVENESS = range(5, 11)
-"""How soon far vertices may be merged: tried until few enough triangles are left."""
+"""Values of the simplifier's aggressiveness, tried in turn until few enough triangles remain."""
 
 
 @dataclass(frozen=True, eq=False)
