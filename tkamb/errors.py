@@ -12,7 +12,7 @@ class MessageSettings:
     """How messages are written."""
 
     max_names: int = 8
-    """Number of names that a message lists."""
+    """Number of names that a message lists. Chosen: a message stays short."""
 
 
 MESSAGE = MessageSettings()

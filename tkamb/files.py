@@ -25,11 +25,12 @@ class FileLimitSettings:
     """Sizes of the largest files that are read; a larger file is not of the stated kind."""
 
     text_bytes: float = 16 * MEGABYTE
-    """Bytes of a scene, a URDF or a summary: a thousand times the size of the shipped ones."""
+    """Bytes of a scene, a URDF or a summary. Chosen: a thousand times the size of the shipped
+    ones."""
     table_bytes: float = 512 * MEGABYTE
-    """Bytes of a recording: an hour of fifty channels at 200 Hz has 500 MB."""
+    """Bytes of a recording. Chosen: an hour of fifty channels at 200 Hz has 500 MB."""
     mesh_bytes: float = 1000 * MEGABYTE
-    """Bytes of a mesh: twenty million triangles in a binary STL."""
+    """Bytes of a mesh. Chosen: twenty million triangles in a binary STL."""
     xml_depth: int = 100
     """Nested elements of an XML file; a URDF has 5, an OpenSim model 20."""
 

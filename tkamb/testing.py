@@ -27,8 +27,8 @@ class ModelCheckSettings:
     """Checks of a contact model of a plug-in."""
 
     stiffness_tolerance: float = 0.1
-    """Relative, between finite differences over 10 and 5 % of the approach; contact nodes that come
-    in one by one make small steps."""
+    """Relative, between finite differences over 10 and 5 % of the approach. Chosen: contact nodes
+    that come in one by one make small steps."""
 
 
 MODEL_CHECK = ModelCheckSettings()

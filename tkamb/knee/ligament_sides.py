@@ -17,8 +17,9 @@ class LigamentSideSettings:
     """Whether a collateral ligament is on its side of the knee."""
 
     wrong_side_distance: float = 8.0 * MILLIMETRE
-    """m: an end farther than this beyond the middle of the knee is on the wrong side. Collateral
-    ligaments end 20 to 45 mm from the middle, and no frame is displaced by as much as this."""
+    """m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen:
+    collateral ligaments end 20 to 45 mm from the middle, and no frame is displaced by as much as
+    this."""
 
 
 LIGAMENT_SIDE = LigamentSideSettings()

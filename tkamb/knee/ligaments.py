@@ -34,8 +34,8 @@ class LigamentSettings:
     """1: eps1 of Blankevoort's curve; the toe region ends at twice this strain, the same for
     every ligament."""
     max_reference_distance: float = 15.0 * DEGREE
-    """rad: a recorded frame whose flexion is farther from the reference flexion is no
-    reference pose."""
+    """rad: a recorded frame whose flexion is farther from the reference flexion is no reference
+    pose. Chosen: 15 deg: farther away a ligament has another strain."""
 
 
 LIGAMENT = LigamentSettings()

@@ -28,7 +28,8 @@ class MuscleBandSettings:
     """A muscle as a band around the femur."""
 
     sections: int = 7
-    """Sagittal planes across the band whose sections are wrapped."""
+    """Sagittal planes across the band whose sections are wrapped. Chosen: more sections change the
+    lines by little."""
 
 
 MUSCLE_BAND = MuscleBandSettings()

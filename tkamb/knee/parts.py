@@ -33,7 +33,7 @@ class PartSettings:
     """Checks of the implant meshes."""
 
     max_length: float = 0.5
-    """m: no part of an implant is longer. A longer mesh is probably in millimetres and is
+    """m: no part of an implant is longer. Chosen: a longer mesh is probably in millimetres and is
     refused."""
 
 

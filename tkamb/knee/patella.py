@@ -21,8 +21,8 @@ class PatellaSettings:
     """Equilibrium of the patella."""
 
     least_determinant: float = 1e-6
-    """1: determinant of contact normal and ligament direction (unit vectors) below which the
-    two are one line."""
+    """1: determinant of contact normal and ligament direction (unit vectors) below which the two
+    are one line. Chosen: above rounding."""
 
 
 PATELLA = PatellaSettings()

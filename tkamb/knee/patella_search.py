@@ -37,17 +37,23 @@ class PatellaSearchSettings:
     """The search for the patella's place."""
 
     length_tolerance: float = 1e-8
-    """m: residual of gap and ligament length below which the search has converged."""
+    """m: residual of gap and ligament length below which the search has converged. Chosen: far
+    below what changes a force."""
     rotation_tolerance: float = 1e-7
-    """rad: tolerance of the rotation at which the moment vanishes."""
+    """rad: tolerance of the rotation at which the moment vanishes. Chosen: far below what changes a
+    force."""
     max_chord_lengths: float = 8.0
-    """Chord lengths: largest extrapolation along a chord."""
+    """Chord lengths: largest extrapolation along a chord. Chosen: farther away the chord does not
+    predict."""
     max_evaluations: int = 14
-    """Largest number of evaluations from one initial guess near by."""
+    """Largest number of evaluations from one initial guess near by. Chosen: searches that converge
+    need fewer."""
     lever_arm: float = 0.02
-    """m: arm that makes a rotation comparable to a length when slopes are updated from a step."""
+    """m: arm that makes a rotation comparable to a length when slopes are updated from a step.
+    Chosen: half the width of a patella."""
     max_distance: float = 5e-3
-    """m: a place farther than this from the button's first touch lies behind the femur."""
+    """m: largest distance of a place from the button's first touch. Chosen: a place farther away
+    lies behind the femur."""
 
 
 PATELLA_SEARCH = PatellaSearchSettings()

@@ -43,22 +43,25 @@ class PatellofemoralSettings:
     """Patellofemoral contact with smoothed gaps."""
 
     patch_depth: float = 5e-5
-    """m: tau of the module's equations. A contact of relative radius R is averaged over about
-    sqrt(R tau)."""
+    """m: tau of the module's equations. Chosen: a contact of relative radius R is averaged over
+    about sqrt(R tau)."""
     sample_spacing: float = 1e-3
-    """m: spacing of the button's samples in the patella's coronal plane."""
+    """m: spacing of the button's samples in the patella's coronal plane. Chosen: about the facets
+    of a mesh."""
     sample_range: float = 14.0 * patch_depth
-    """m: samples farther than this behind the nearest one get no weight. Their weight is
+    """m: samples farther than this behind the nearest one get no weight. Chosen: their weight is
     exp(-14) = 8e-7, by which the gap of a patch of twenty samples jumps by 3e-11 m."""
     coarse_samples: int = 60
-    """Samples of a coarse evaluation."""
+    """Samples of a coarse evaluation. Chosen: enough for an initial guess."""
     lateral_compliance: float = 0.01
-    """m: c of the module's equations, the shift if the contact force were purely lateral."""
+    """m: c of the module's equations, the shift if the contact force were purely lateral. Chosen:
+    soft enough to keep the search smooth."""
     tilt_compliance: float = 10.0
-    """rad/m: d of the module's equations, the tilt (5.7 deg) if the whole force acted 10 mm
-    beside the middle."""
+    """rad/m: d of the module's equations, the tilt (5.7 deg) if the whole force acted 10 mm beside
+    the middle. Chosen: soft enough to keep the search smooth."""
     least_sagittal_part: float = 1e-9
-    """1: sagittal part of a unit normal below which the normal has no sagittal direction."""
+    """1: sagittal part of a unit normal below which the normal has no sagittal direction. Chosen:
+    above rounding."""
 
 
 PATELLOFEMORAL = PatellofemoralSettings()

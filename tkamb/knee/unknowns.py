@@ -24,10 +24,10 @@ class UnknownsSettings:
     """Solvability of the equations for the unknown forces."""
 
     max_condition: float = 1e4
-    """1: condition number (unit columns) above which a frame counts as singular. It grows as
-    one over the arm d at which the patellar ligament passes the femorotibial contact: 7 to
-    9 m / d. The shipped knee has d = 43 to 45 mm and 148 to 218. The limit is d = 0.8 mm,
-    where an error of 1 mm in a line of action exceeds the whole force."""
+    """1: condition number (unit columns) above which a frame counts as singular. Chosen: it grows
+    as one over the arm d at which the patellar ligament passes the femorotibial contact: 7 to 9 m /
+    d. The shipped knee has d = 43 to 45 mm and 148 to 218. The limit is d = 0.8 mm, where an error
+    of 1 mm in a line of action exceeds the whole force."""
 
 
 UNKNOWNS = UnknownsSettings()

@@ -48,9 +48,9 @@ class CohortReportSettings:
     """How much a cohort's page shows."""
 
     most_maps: int = 24
-    """Pressure maps on the page; more make it slow to open."""
+    """Pressure maps on the page. Chosen: more make it slow to open."""
     most_failed: int = 100
-    """Failed runs that the page lists."""
+    """Failed runs that the page lists. Chosen: the page stays readable."""
 
 
 COHORT_REPORT = CohortReportSettings()

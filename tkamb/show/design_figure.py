@@ -30,7 +30,7 @@ class DesignFigureSettings:
 
     spread: float = 0.5
     """1: share of the width of a place on the horizontal axis over which its dots stand side by
-    side."""
+    side. Chosen by looks."""
 
 
 DESIGN_FIGURE = DesignFigureSettings()

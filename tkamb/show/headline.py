@@ -27,17 +27,18 @@ class HeadlineSettings:
     """Limits of the report's headline."""
 
     most_inputs: int = 2
-    """How many inputs a sentence names."""
+    """Number of inputs that a sentence names. Chosen: a sentence stays short."""
     most_muscles: int = 4
-    """How many saturated muscles are named."""
+    """Number of saturated muscles that a sentence names. Chosen: a sentence stays short."""
     notable_failed_share: float = 0.05
-    """1: share of failed samples above which the bands are cut off at one end."""
+    """1: share of failed samples above which the bands are cut off at one end. Chosen: fewer do not
+    move the 5th or 95th percentile far."""
     residual_percent: float = 0.05
-    """% of the SI contact force: residuals below this are left by the tolerance of the
-    equilibrium."""
+    """% of the SI contact force: smaller residuals are not mentioned. Chosen: the tolerance of the
+    equilibrium leaves them."""
     distant_frames_deg: float = 5.0
-    """deg: if an event lies between frames that are farther apart than this, both frames are
-    named."""
+    """deg: if an event lies between frames that are farther apart than this, both frames are named.
+    Chosen: an event is read to some degrees."""
 
 
 HEADLINE = HeadlineSettings()

@@ -16,11 +16,13 @@ class LevelSettings:
     """Conversion of a pressure map to a picture."""
 
     edge_tolerance: float = 1e-9
-    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge."""
+    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge.
+    Chosen: above rounding."""
     largest_gap: float = 10 * MILLIMETRE
-    """A gap above this, infinite where nothing lies above, counts as this."""
+    """m: a larger gap, also an infinite one where nothing lies above, counts as this. Chosen: far
+    above any contact."""
     margin_points: int = 2
-    """Grid points kept around contacts."""
+    """Number of grid points kept around contacts. Chosen: the edge of a contact is drawn whole."""
 
 
 LEVELS = LevelSettings()

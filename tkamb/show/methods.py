@@ -17,7 +17,7 @@ class MethodsTextSettings:
     """How `tkamb methods` prints its text."""
 
     line_width: int = 92
-    """Letters per line: a terminal and a mail show it without breaks."""
+    """Letters per line. Chosen: a terminal and a mail show it without breaks."""
 
 
 METHODS_TEXT = MethodsTextSettings()

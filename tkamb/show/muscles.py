@@ -51,7 +51,7 @@ class MuscleFigureSettings:
     """Pictures of muscle activations."""
 
     axis_top: float = 1.02
-    """Upper end of the axis of activations; lines at 1 stay visible."""
+    """Upper end of the axis of activations. Chosen: lines at 1 stay visible."""
 
 
 MUSCLE_FIGURE = MuscleFigureSettings()

@@ -42,8 +42,8 @@ class PanelSettings:
     """When one curve of a plot hides another."""
 
     line_width_share: float = 0.005
-    """Of the curves' height: two that are nowhere farther apart are drawn over each other. A line
-    is 1.5 points wide in a plot of 220."""
+    """Of the curves' height: two that are nowhere farther apart are drawn over each other. Chosen:
+    a line is 1.5 points wide in a plot of 220."""
 
 
 PANEL = PanelSettings()

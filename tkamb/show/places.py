@@ -14,11 +14,11 @@ class LabelPlaceSettings:
     """Room around the labels of a figure."""
 
     edge_points: float = 3.0
-    """Points around all labels of a figure."""
+    """Points around all labels of a figure. Chosen by looks."""
     tick_points: float = 6.5
-    """Points that ticks with their gap take."""
+    """Points that ticks with their gap take. Chosen by looks."""
     tick_label_points: float = 9.0
-    """Points, size of letters."""
+    """Points: size of letters. Chosen by looks."""
 
 
 LABEL_PLACE = LabelPlaceSettings()

@@ -48,13 +48,13 @@ class PlotSettings:
     """Looks of the report's plots."""
 
     label_offset_points: float = 12.0
-    """Points from a plot's edge to the near side of an axis' label."""
+    """Points from a plot's edge to the near side of an axis' label. Chosen by looks."""
     side_gap: float = 0.01
-    """Of the width, between the axes and what is written beside them."""
+    """1: share of the width between the axes and what is written beside them. Chosen by looks."""
     band_opacity: float = 0.16
-    """Opacity of the band around a line, 0 to 1."""
+    """1: opacity of the band around a line, 0 to 1. Chosen by looks."""
     wide_band_opacity: float = 0.07
-    """Opacity of the band that includes the model's discrepancy, 0 to 1."""
+    """1: opacity of the band that includes the model's discrepancy, 0 to 1. Chosen by looks."""
 
 
 PLOT = PlotSettings()

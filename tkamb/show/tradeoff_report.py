@@ -22,9 +22,10 @@ class TradeoffPictureSettings:
     """Looks of the trade-off's picture."""
 
     unlabelled_mm: float = 2.0
-    """The cell size at which most points lie."""
+    """mm: cell size that is not written beside its point. Chosen: most points have it."""
     short_axis_ratio: float = 30.0
-    """Largest over smallest value up to which a logarithmic axis has numbers within its decades."""
+    """Largest over smallest value up to which a logarithmic axis has numbers within its decades.
+    Chosen: with more decades, those alone have numbers."""
 
 
 TRADEOFF_PICTURE = TradeoffPictureSettings()

@@ -18,7 +18,7 @@ class WearPageSettings:
     """The wear page."""
 
     max_bytes: float = 64 * MEGABYTE
-    """Bytes of a file of results; those of 10,000 updates have 10 MB."""
+    """Bytes of a file of results. Chosen: those of 10,000 updates have 10 MB."""
 
 
 WEAR_PAGE = WearPageSettings()

@@ -32,10 +32,11 @@ class AuditSettings:
     """Tolerances of the checks that need no reference."""
 
     force_tolerance: float = 0.005
-    """Relative: forces, pressures and condyles against the load."""
+    """Relative: forces, pressures and condyles against the load. Chosen: a few times the solver's
+    tolerance."""
     penetration_tolerance: float = 5e-3
-    """1: largest depth of a node inside the femoral component, as a share of the approach; a few
-    times the solver's tolerance."""
+    """1: largest depth of a node inside the femoral component, as a share of the approach. Chosen:
+    a few times the solver's tolerance."""
 
 
 AUDIT = AuditSettings()

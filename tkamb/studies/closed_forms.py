@@ -50,9 +50,10 @@ class ClosedFormSettings:
     """Bodies with an analytic solution."""
 
     block_side_mm: float = 24.0
-    """Of the block under the plate: divides by the cells of 2 and 3 mm."""
+    """mm: side of the block under the plate. Chosen: cells of 2 and 3 mm divide it."""
     kept_grid_mm: float = 0.9
-    """mm: cell size at which the operator of the block is large enough to be stored in a file."""
+    """mm: cell size of the block whose operator is stored in a file. Chosen: the operator is large
+    enough to be stored."""
     sharma_approach_ratio: float = 0.6808
     """Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
 0.35 whatever the material, and they are too stiff at free sides. The number is measured, and

@@ -28,10 +28,11 @@ class ErrorCaseSettings:
     """The cases from which known errors are measured."""
 
     insert_mm: float = 16.0
-    """mm; edge of the inserts. Small enough for fine cells, wide enough that contact ends
+    """mm; edge of the inserts. Chosen: small enough for fine cells, wide enough that contact ends
     inside."""
     vertex_spacing_mm: float = 0.25
-    """mm; distance between the vertices of the surfaces."""
+    """mm; distance between the vertices of the surfaces. Chosen: facets then change no pressure
+    noticeably."""
 
 
 ERROR_CASE = ErrorCaseSettings()

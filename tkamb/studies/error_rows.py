@@ -22,7 +22,7 @@ class ErrorReferenceSettings:
     """The reference of the known errors."""
 
     resolution_mm: float = 0.5
-    """mm; resolution of the reference, half of the finest that is compared with it."""
+    """mm; resolution of the reference. Chosen: half of the finest that is compared with it."""
 
 
 ERROR_REFERENCE = ErrorReferenceSettings()

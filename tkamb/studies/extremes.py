@@ -22,7 +22,8 @@ class ExtremeMeshSettings:
     """Meshes of the study of extreme cases."""
 
     sectors: int = 48
-    """Sectors of the rings of the condyles; all compared models use the same mesh."""
+    """Number of sectors of the rings of the condyles. Chosen: all compared models use the same
+    mesh."""
 
 
 EXTREME_MESH = ExtremeMeshSettings()

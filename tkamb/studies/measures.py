@@ -33,13 +33,15 @@ class MeasureSettings:
     """How times of the trade-off study are measured."""
 
     longest_seconds: float = 300.0
-    """A job that takes longer is stopped and says so."""
+    """s: a job that takes longer is stopped and says so. Chosen: the whole page takes minutes."""
     repeats: int = 3
-    """Repeats of the preparation and the first press; smallest number of warm presses."""
+    """Repeats of the preparation and the first press; also the smallest number of warm presses.
+    Chosen: enough for a median."""
     warm_presses: int = 7
-    """Presses from a neighbouring pose that are timed."""
+    """Presses from a neighbouring pose that are timed. Chosen: enough for a median."""
     enough_seconds: float = 3.0
-    """s: no more repeats after this time of measurement, except `repeats` warm presses."""
+    """s: no more repeats after this time of measurement, except `repeats` warm presses. Chosen: the
+    whole page takes minutes."""
 
 
 MEASURE = MeasureSettings()

@@ -37,7 +37,8 @@ class PeerSettings:
     """When a result of the peer finite-element program is accepted."""
 
     max_residual: float = 0.01
-    """Share of the load; largest difference of the summed contact forces from it."""
+    """Share of the load: largest difference of the summed contact forces from it. Chosen: above
+    what a converged solution leaves."""
 
 
 PEER = PeerSettings()

@@ -41,9 +41,10 @@ class ReferenceSettings:
     """How the studies' reference solutions are computed."""
 
     large_volume: float = 2e-5
-    """m³: volume of an insert's bounding box from which only the coarser grids are used."""
+    """m³: volume of an insert's bounding box from which only the coarser grids are used. Chosen:
+    finer grids of it do not fit into memory."""
     tolerance: float = 1e-6
-    """Relative tolerance of the reference solutions."""
+    """Relative tolerance of the reference solutions. Chosen: far below what is compared."""
     width_effect: float = 0.005
     """Relative: a block 3.4 times as wide as high against an endless layer."""
 

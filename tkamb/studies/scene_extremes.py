@@ -39,8 +39,8 @@ class InertiaStudySettings:
     """How the effect of inertia is found."""
 
     slow_factor: float = 10.0
-    """Times as slow as recorded; the difference from the recorded motion is the effect of
-    inertia."""
+    """Ratio of the time of the slow motion to the recorded one; the difference from the recorded
+    motion is the effect of inertia. Chosen: inertia is then negligible."""
 
 
 INERTIA_STUDY = InertiaStudySettings()

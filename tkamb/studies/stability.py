@@ -32,17 +32,17 @@ class StabilitySettings:
     """Limits of the stability study."""
 
     longest_seconds: float = 120.0
-    """A case whose model takes longer hangs."""
+    """s: a case whose model takes longer counts as hanging. Chosen: usual cases take seconds."""
     longest_reference_seconds: float = 900.0
-    """A case whose reference takes longer is unverified."""
+    """s: a case whose reference takes longer is unverified. Chosen: the study ends within a day."""
     workers: int = 2
-    """Processes of the study."""
+    """Number of processes of the study. Chosen: a small computer has as many cores."""
     quick_share: int = 13
-    """The quick study takes one of this number of cases."""
+    """Ratio of all cases to those of the quick study. Chosen: it takes minutes."""
     quick_grid_mm: float = 3.0
-    """mm; the quick study takes no finer grid."""
+    """mm; finest grid of the quick study. Chosen: it takes minutes."""
     quick_with_peer: int = 4
-    """Number of cases beside CalculiX in the quick study."""
+    """Number of cases of the quick study that CalculiX solves too. Chosen: it takes minutes."""
 
 
 STABILITY = StabilitySettings()

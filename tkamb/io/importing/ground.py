@@ -37,8 +37,8 @@ class ImportedForceSettings:
     """Settings of the ground reaction in an imported scene."""
 
     hold_below: float = 40.0
-    """N; vertical force below which the imported scene holds the centre of pressure. The shipped
-    imports use it: below 40 N the quotient of moment and force is noise."""
+    """N; vertical force below which the imported scene holds the centre of pressure. Chosen: the
+    shipped imports use it: below 40 N the quotient of moment and force is noise."""
 
 
 IMPORTED_FORCE = ImportedForceSettings()

@@ -16,8 +16,8 @@ class LinkFitSettings:
     """How the links of the URDF are placed in the bodies of an OpenSim model."""
 
     max_implant_rotation: float = 35.0 * DEGREE
-    """rad; largest rotation between the implant's axes and the bone's. A wrong axis is off by 90
-    deg, a real implantation by a few degrees."""
+    """rad; largest rotation between the implant's axes and the bone's. Chosen: a wrong axis is off
+    by 90 deg, a real implantation by a few degrees."""
 
 
 LINK_FIT = LinkFitSettings()

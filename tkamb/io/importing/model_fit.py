@@ -27,10 +27,11 @@ class ModelFitSettings:
     """How the poses of a model are fitted to markers."""
 
     block_frames: int = 128
-    """Frames that are fitted in one call; trades memory for speed and changes no result."""
+    """Frames that are fitted in one call. Chosen: it trades memory for speed and changes no
+    result."""
     coarse_stride: int = 8
-    """Frames between those that are fitted first; the others begin from their poses. It changes the
-    initial guesses only."""
+    """Frames between those that are fitted first; the others begin from their poses. Chosen: it
+    changes the initial guesses only."""
 
 
 MODEL_FIT = ModelFitSettings()

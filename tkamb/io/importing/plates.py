@@ -25,17 +25,19 @@ class FootContactSettings:
     """N: vertical force from which a plate counts as loaded. Chosen: the noise of a plate is a few
     newtons."""
     min_duration: float = 0.1
-    """s: a shorter load is a knock, not a step."""
+    """s: a shorter load is no step. Chosen: it is a knock."""
     max_foot_distance: float = 0.25
-    """m; horizontal distance from the centre of pressure to the middle of the foot's markers: about
-    the length of a foot."""
+    """m; horizontal distance from the centre of pressure to the middle of the foot's markers.
+    Chosen: about the length of a foot."""
     min_step_height: float = 0.15
-    """m; a foot whose markers are this far above the plate stands on something else. The lowest
-    stair of the data sets is 0.17 m high."""
+    """m; a foot whose markers are this far above the plate stands on something else. Chosen: the
+    lowest stair of the data sets is 0.17 m high."""
     marker_height: float = 0.055
-    """m; height of the middle of a foot's markers above the ground on which it stands."""
+    """m; height of the middle of a foot's markers above the ground on which it stands. Chosen: a
+    usual foot's markers have it on level ground."""
     same_height: float = 0.05
-    """m; heights that differ by less belong to one step."""
+    """m; heights that differ by less belong to one step. Chosen: the steps of stairs differ by
+    more."""
     max_standing_speed: float = 0.15
     """m/s; a foot off the plates that moves less stands on something that was not measured."""
 

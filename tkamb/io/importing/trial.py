@@ -33,8 +33,8 @@ class TrialFrameSettings:
     """How many frames of a trial an imported scene holds."""
 
     frames_per_period: float = 5.0
-    """Frames per period of the cut-off frequency. A low-pass-filtered motion has no content between
-    them."""
+    """Frames per period of the cut-off frequency. Chosen: a low-pass-filtered motion has no content
+    between them."""
 
 
 TRIAL_FRAMES = TrialFrameSettings()

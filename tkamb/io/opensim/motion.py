@@ -17,12 +17,13 @@ class AngleUnitSettings:
     """How angles in degrees are told from angles in radians."""
 
     max_radians: float = 6.5
-    """rad: largest joint angle that can be in radians. A joint never exceeds a whole turn, 6.28; in
-    degrees the number is larger in most movements."""
+    """rad: largest joint angle that can be in radians. Chosen: a joint never exceeds a whole turn,
+    6.28; in degrees the number is larger in most movements."""
     min_rotation_deg: float = 0.2
-    """deg; a joint that rotates by less in a whole recording stands still, in either unit."""
+    """deg; a joint that rotates by less in a whole recording stands still, in either unit. Chosen:
+    noise of a recording is of this size."""
     max_angle: float = 2.0 * np.pi
-    """rad; no joint of a leg rotates further."""
+    """rad; no joint of a leg rotates further. Chosen: a whole turn."""
 
 
 ANGLE_UNIT = AngleUnitSettings()

@@ -35,8 +35,8 @@ class PathSettings:
     condition_tolerance: float = 1e-5
     """rad or m; OpenSim widens the range of a conditional point by as much."""
     block_frames: int = 256
-    """Frames that are evaluated in one call; keeps arrays to some tens of megabytes and changes no
-    result."""
+    """Frames that are evaluated in one call. Chosen: keeps arrays to some tens of megabytes and
+    changes no result."""
 
 
 PATH = PathSettings()

@@ -19,11 +19,14 @@ class StringSettings:
     """The shortest string over several wrap objects, object by object."""
 
     max_sweeps: int = 100
-    """Sweeps over all objects, after which a string without convergence is reported as failed."""
+    """Sweeps over all objects, after which a string without convergence is reported as failed.
+    Chosen: strings that converge need fewer."""
     max_extrapolation: float = 10.0
-    """Largest extrapolation, as a multiple of the last step; two sweeps do not predict farther."""
+    """Largest extrapolation, as a multiple of the last step. Chosen: two sweeps do not predict
+    farther."""
     tolerance: float = 1e-10
-    """m; a string has converged when the last sweep moves no touching point by more."""
+    """m; a string has converged when the last sweep moves no touching point by more. Chosen: far
+    below what changes a muscle's length."""
 
 
 STRING = StringSettings()

@@ -44,12 +44,13 @@ class SplineFilterSettings:
     """The low-pass filter by splines."""
 
     degree: int = 5
-    """Degree of the splines: accelerations are then cubic and continuous."""
+    """Degree of the splines. Chosen: accelerations are then cubic and continuous."""
     knots_per_period: int = 16
-    """Knots per period of the cut-off frequency; where samples are denser, knots are thinned to
-    it."""
+    """Knots per period of the cut-off frequency; where samples are denser, knots are thinned to it.
+    Chosen: the splines follow all that the filter passes."""
     min_periods: float = 1.0
-    """Periods of the cut-off frequency; a shorter motion is refused."""
+    """Periods of the cut-off frequency; a shorter motion is refused. Chosen: the filter's ends
+    would cover all of it."""
 
 
 SPLINE_FILTER = SplineFilterSettings()

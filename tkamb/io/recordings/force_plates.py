@@ -45,18 +45,20 @@ class PlateSettings:
     """How the channels of a force plate are read."""
 
     steady_N: float = 10.0
-    """N; largest standard deviation of the vertical force over the frames of ZERO. A foot that
-    comes or goes makes more."""
+    """N; largest standard deviation of the vertical force over the frames of ZERO. Chosen: a foot
+    that comes or goes makes more."""
     baseline_N: float = 20.0
-    """N; a vertical force over the frames of ZERO up to this is drift of the amplifier."""
+    """N; a vertical force over the frames of ZERO up to this is drift of the amplifier. Chosen: a
+    foot makes more."""
     baseline_share: float = 0.2
-    """Share of the largest change that the plate shows. A larger force over the frames of ZERO
-    is drift too where it is at most this; a person who stands on the plate makes more."""
+    """Share of the largest change that the plate shows. Chosen: a larger force over the frames of
+    ZERO is drift too where it is at most this; a person who stands on the plate makes more."""
     loaded_N: float = 100.0
-    """N; force from which the centre of pressure of a plate is checked."""
+    """N; force from which the centre of pressure of a plate is checked. Chosen: with less it is a
+    quotient of small numbers."""
     beside: float = 0.2
-    """Share of the plate's half width by which the centre of pressure may lie outside the
-    corners."""
+    """1: share of the plate's half width by which the centre of pressure may lie outside the
+    corners. Chosen: errors of a loaded plate are smaller."""
 
 
 SETTINGS = PlateSettings()

@@ -39,13 +39,17 @@ class GroundReactionSettings:
     """How a measured ground reaction is read and checked."""
 
     level_tolerance: float = 0.01
-    """m: a centre of pressure whose height varies by more is not on a level plate."""
+    """m: a centre of pressure whose height varies by more is not on a level plate. Chosen: rounding
+    of a level plate is smaller."""
     window: float = 0.5
-    """s: samples farther from the frames than this do not affect them through the filter."""
+    """s: samples farther from the frames than this do not affect them through the filter. Chosen:
+    several times as long as the filter's response."""
     moment_tolerance: float = 1e-6
-    """N·m; horizontal moments above this belong to a point other than the centre of pressure."""
+    """N·m. Chosen: horizontal moments above this belong to a point other than the centre of
+    pressure."""
     max_ankle_distance: float = 0.5
-    """m: a centre of pressure farther from the ankle is not under the foot of that leg."""
+    """m: a centre of pressure farther from the ankle is not under the foot of that leg. Chosen:
+    more than the length of a foot."""
 
 
 GROUND_REACTION = GroundReactionSettings()

@@ -27,12 +27,15 @@ class InverseKinematicsSettings:
     """The fit of the poses of a leg to its markers, frame by frame."""
 
     step_tolerance: float = 1e-6
-    """m and rad; a frame has converged when its step is smaller."""
+    """m and rad; a frame has converged when its step is smaller. Chosen: far below the noise of
+    markers."""
     newton_below: float = 0.1
-    """m and rad: after a smaller step the curvature of the residuals is included (Newton's method;
-    before that Gauss-Newton)."""
+    """m and rad: after a smaller step the curvature of the residuals is included (Newton's method),
+    before that it is not (Gauss-Newton). Chosen: nearer to the solution Newton's method
+    converges."""
     max_iterations: int = 60
-    """Iterations after which a frame without convergence fails."""
+    """Iterations after which a frame without convergence fails. Chosen: frames that converge need
+    fewer."""
 
 
 INVERSE_KINEMATICS = InverseKinematicsSettings()

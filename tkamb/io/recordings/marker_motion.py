@@ -43,8 +43,8 @@ class MarkerMotionSettings:
     """The motion of a leg from markers."""
 
     max_joint_gap: float = 0.1
-    """m: largest distance of a joint from where the markers show it. At the hip, skin moves by a
-    third of this; the other foot is farther away."""
+    """m: largest distance of a joint from where the markers show it. Chosen: at the hip, skin moves
+    by a third of this; the other foot is farther away."""
 
 
 MARKER_MOTION = MarkerMotionSettings()

@@ -21,7 +21,8 @@ class MarkerFitSettings:
     """When fitted markers are refused."""
 
     max_median_residual: float = 0.05
-    """m: a larger median residual is due to a wrong marker, unit or set, not to soft tissue."""
+    """m: largest median residual. Chosen: a larger one is due to a wrong marker, unit or set, not
+    to soft tissue."""
 
 
 MARKER_FIT = MarkerFitSettings()

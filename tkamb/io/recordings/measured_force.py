@@ -20,7 +20,7 @@ class ForceSampleSettings:
     """Interpolation between the samples of a measured force."""
 
     max_gap: float = 2.5
-    """Multiple of the median step: a wider gap is not interpolated."""
+    """Multiple of the median step: a wider gap is not interpolated. Chosen: one lost sample is."""
 
 
 FORCE_SAMPLES = ForceSampleSettings()

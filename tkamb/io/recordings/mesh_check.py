@@ -26,11 +26,13 @@ class MeshUnitSettings:
     """How the unit of a mesh is recognized, and how many notices are listed."""
 
     typical_size: float = 0.08
-    """m: largest extent of a typical component of a knee, to choose the likely unit."""
+    """m: largest extent of a typical component of a knee. Chosen to tell metres, millimetres and
+    inches apart."""
     min_size_share: float = 0.12
-    """Share of the largest mesh; a smaller one is in another unit."""
+    """Share of the largest mesh; a smaller one is in another unit. Chosen: the parts of a knee
+    differ by less."""
     max_listed: int = 10
-    """Places of a fault that one message lists."""
+    """Places of a fault that one message lists. Chosen: a message stays short."""
 
 
 MESH_UNIT = MeshUnitSettings()

@@ -34,15 +34,17 @@ class MeshFileSettings:
     """Which meshes of components are used."""
 
     min_size: float = 0.034
-    """m: smallest whole component of a knee that is accepted. Real ones are at least 50 mm wide."""
+    """m: smallest whole component of a knee that is accepted. Chosen: real ones are at least 50 mm
+    wide."""
     rounding_notice: float = 1e-6
-    """m; a mesh whose coordinates are rounded more coarsely gets a notice: forces change by about
-    half a per cent."""
+    """m; a mesh whose coordinates are rounded more coarsely gets a notice. Chosen: forces change by
+    about half a per cent."""
     rounding_limit: float = 5e-6
-    """m; a mesh whose coordinates are rounded more coarsely is refused: 8 µm change forces by 4
-    %."""
+    """m; a mesh whose coordinates are rounded more coarsely is refused. Chosen: 8 µm change forces
+    by 4 %."""
     sheet_opening: float = 1.0 / 3.0
-    """Share of a part's length; a wider opening makes the part an open sheet."""
+    """Share of a part's length; a wider opening makes the part an open sheet. Chosen: holes of
+    damaged files are smaller."""
 
 
 MESH_FILE = MeshFileSettings()

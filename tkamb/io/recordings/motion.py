@@ -53,7 +53,8 @@ class PatellaMotionSettings:
     """Which recorded poses of the patella are plausible."""
 
     max_rotation_deg: int = 180
-    """deg; largest rotation of the patella against the femur, either way."""
+    """deg; largest rotation of the patella against the femur, either way. Chosen: half a turn,
+    which no patella reaches."""
 
 
 PATELLA_MOTION = PatellaMotionSettings()

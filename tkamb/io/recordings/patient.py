@@ -37,10 +37,10 @@ class PatellaLinkSettings:
     mass: float = 0.1
     """kg; mass of the patella at its link's origin unless the URDF says otherwise."""
     radius_of_gyration: float = 0.015
-    """m; about that of a disc 40 mm across and 20 mm thick."""
+    """m; chosen: about that of a disc 40 mm across and 20 mm thick."""
     max_lateral_share: float = 0.5
     """Share of a link's length by which its other end may lie beside the link's y axis, which
-    points up."""
+    points up. Chosen: a link that leans more is not along its y axis."""
 
 
 PATELLA_LINK = PatellaLinkSettings()

@@ -20,14 +20,15 @@ class SampleSettings:
     """How samples that were not measured are recognized."""
 
     neighbours: int = 12
-    """Samples on either side whose median deviation is the usual one."""
+    """Samples on either side whose median deviation is the usual one. Chosen: enough for a median,
+    few enough to follow a movement."""
     outlier_factor: float = 8.0
-    """Times the usual deviation: normal noise reaches it once in 10 million samples."""
+    """Times the usual deviation. Chosen: normal noise reaches it once in 10 million samples."""
     max_step: float = 5.0
-    """s: samples farther apart than this do not record a movement."""
+    """s: largest step between samples. Chosen: samples farther apart do not record a movement."""
     end_factor: float = 4.0
-    """A cubic that is extrapolated by one sample has an error larger by this factor than one
-    between samples."""
+    """Factor on `outlier_factor` at the ends of a recording. Chosen: a cubic that is extrapolated
+    by one sample has a larger error than one between samples."""
 
 
 SAMPLE = SampleSettings()

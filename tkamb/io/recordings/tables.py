@@ -22,8 +22,8 @@ class TableValueSettings:
     """Which numbers of a table are measurements."""
 
     trc_time_rounding: float = 1e-3
-    """s; cameras write the times of a `.trc` rounded to the millisecond; the header's rate is
-    exact."""
+    """s; rounding of the times of a `.trc`. Chosen: cameras write milliseconds; the header's rate
+    is exact."""
     max_value: float = 1e12
     """Largest number in any unit: a larger one was not measured, and its square may overflow."""
 

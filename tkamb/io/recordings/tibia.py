@@ -35,14 +35,16 @@ class TibiaPoseSettings:
     """Which recorded poses of the tibia are plausible."""
 
     max_lean_deg: float = 150.0
-    """deg; lean of a shank from the vertical, either way. A sprinter's shank swings back by 110
-    deg."""
+    """deg; lean of a shank from the vertical, either way. Chosen: a sprinter's shank swings back by
+    110 deg."""
     max_distance: float = 100.0
     """m: distance from the laboratory's origin that is beyond the view of any camera."""
     shank_length: float = 0.4
-    """m: distance from the ankle at which the upper end of the shank is compared."""
+    """m: distance from the ankle at which the upper end of the shank is compared. Chosen: about the
+    length of an adult's shank."""
     window: float = 0.5
-    """s: samples farther from the frames than this do not affect them through the filter."""
+    """s: samples farther from the frames than this do not affect them through the filter. Chosen:
+    several times as long as the filter's response."""
 
 
 TIBIA_POSE = TibiaPoseSettings()

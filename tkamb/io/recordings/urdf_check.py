@@ -69,7 +69,7 @@ class UrdfAngleSettings:
     """Which angles of a URDF are in radians."""
 
     max_angle: float = 8.0 * np.pi
-    """rad; a larger number is in degrees: angles in a URDF are below one turn."""
+    """rad; a larger number is in degrees. Chosen: four turns, as angles in a URDF are below one."""
 
 
 URDF_ANGLE = UrdfAngleSettings()

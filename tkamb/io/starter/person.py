@@ -39,18 +39,19 @@ class LegProportionSettings:
     thigh: float = 0.245
     """Knee to hip centre over body height; Winter (2009)."""
     insert_below_knee: float = 0.018662
-    """m: depth of the insert's bottom below the knee's centre, as in the shipped patient."""
+    """m: depth of the insert's bottom below the knee's centre. Chosen: as in the shipped
+    patient."""
     hip_below_thigh_end: float = 0.004367
     """m: height of the femoral component's origin above the knee's centre, as in the shipped
     patient."""
     lightest: float = 20.0
-    """kg; lightest body that is accepted."""
+    """kg; lightest body that is accepted. Chosen: it leaves out masses in other units."""
     heaviest: float = 300.0
-    """kg; heaviest body that is accepted."""
+    """kg; heaviest body that is accepted. Chosen: it leaves out masses in other units."""
     shortest: float = 1.0
-    """m; smallest height that is accepted."""
+    """m; smallest height that is accepted. Chosen: it leaves out heights in other units."""
     tallest: float = 2.3
-    """m; greatest height that is accepted."""
+    """m; greatest height that is accepted. Chosen: it leaves out heights in other units."""
 
 
 LEG_PROPORTIONS = LegProportionSettings()

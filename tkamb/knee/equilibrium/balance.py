@@ -34,27 +34,31 @@ class BalanceSettings:
     """The iteration that finds the released coordinates."""
 
     force_tolerance: float = 0.05
-    """N (moments are divided by the lever arm): residual below which a coordinate has
-    converged. The noise of the forces counts instead where it is larger."""
+    """N (moments are divided by the lever arm): residual below which a coordinate has converged;
+    the noise of the forces counts instead where it is larger. Chosen: far below what is
+    reported."""
     step_tolerance: float = 2e-6
-    """m: Newton step below which a coordinate has converged."""
+    """m: Newton step below which a coordinate has converged. Chosen: below the size at which a
+    force changes by more than its tolerance."""
     least_stiffness: float = 100.0
-    """N/m: a state with a smaller stiffness is indeterminate: it moves by more than 10 mm per
-    newton."""
+    """N/m: a state with a smaller stiffness is indeterminate. Chosen: it moves by more than 10 mm
+    per newton."""
     narrow_radius: float = 1e-6
-    """m: trust radius below which an approximate stiffness is replaced by finite differences,
-    because the steps that it proposes do not reduce the residual."""
+    """m: trust radius below which an approximate stiffness is replaced by finite differences.
+    Chosen: the steps that it proposes do not reduce the residual."""
     max_travel: float = 20e-3
-    """m: if a coordinate moves this far from its initial guess, no load holds it and the search
-    ends."""
+    """m: largest distance of a coordinate from its initial guess; beyond it the search ends.
+    Chosen: no load holds a coordinate that moves as far."""
     difference_step: float = 2e-6
-    """m: step of the finite differences where the stiffness is not given."""
+    """m: step of the finite differences where the stiffness is not given. Chosen: the same as the
+    tolerance of a step."""
     max_prediction_error: float = 0.5
-    """1: an approximate stiffness is not used along a step if the change of force differs from
-    the predicted one by more than this share."""
+    """1: an approximate stiffness is not used along a step if the change of force differs from the
+    predicted one by more than this share. Chosen: at half of the change the step would no longer
+    reduce the residual reliably."""
     max_steps: int = 200
-    """Steps at most. A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs
-    80."""
+    """Steps at most. Chosen: a lightly loaded knee that slides 16 mm over lattice cells of 2 mm
+    needs 80."""
 
 
 BALANCE = BalanceSettings()

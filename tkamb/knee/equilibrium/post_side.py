@@ -21,8 +21,8 @@ class PostSideSettings:
     """On which side of the post the cam is."""
 
     pose_error: float = 0.5 * MILLIMETRE
-    """m: error of a position from fluoroscopy. A deeper overlap of cam and post becomes a
-    question to the user."""
+    """m: error of a position from fluoroscopy; a deeper overlap of cam and post becomes a question
+    to the user. Chosen: above its usual error."""
 
 
 POST_SIDE = PostSideSettings()

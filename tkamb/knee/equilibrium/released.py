@@ -47,29 +47,32 @@ class ReleasedKneeSettings:
     """The knee with released coordinates and its patella."""
 
     knee_tolerance: float = 2e-6
-    """m: the iteration between knee and patella has converged when the knee moves by less."""
+    """m: the iteration between knee and patella has converged when the knee moves by less. Chosen:
+    the same as the tolerance of the knee's own step."""
     contact_force_tolerance: float = 0.1
     """N: it must also change the contact force by less than this, or by less than
-    `contact_force_share` of it."""
+    `contact_force_share` of it. Chosen: a ten-thousandth of a usual contact force."""
     contact_force_share: float = 2e-4
-    """1: see `contact_force_tolerance`. The patella's changes from facet to facet alter the
+    """1: see `contact_force_tolerance`. Chosen: the patella's changes from facet to facet alter the
     force by about as much."""
     max_passes: int = 24
-    """Passes between knee and patella at most; each halves the remaining change where the knee
-    is soft."""
+    """Passes between knee and patella at most. Chosen: each halves the remaining change where the
+    knee is soft."""
     inner_tolerance_share: float = 0.1
-    """1: residual of a pass as a share of its own change. With muscles a few passes are needed in
-    any case, so that a pass need not converge further."""
+    """1: residual of a pass as a share of its own change. Chosen: with muscles a few passes are
+    needed in any case, so that a pass need not converge further."""
     muscle_force_range: float = 3e-3
     """m: distance from a contact like the last frame's within which extrapolated muscle forces
-    hold."""
+    hold. Chosen: contacts move by less from frame to frame."""
     slack_force: float = 1e-3
-    """N: an extensor group with a smaller tension is slack."""
+    """N: an extensor group with a smaller tension is slack. Chosen: far below any force that
+    matters."""
     initial_load_error: float = 0.5
     """1: largest relative difference between the load at an initial guess and the load of the last
-    frame."""
+    frame. Chosen: from there the search converges."""
     max_height_steps: int = 4
-    """Largest number of heights that are tried to bring the load within `initial_load_error`."""
+    """Largest number of heights that are tried to bring the load within `initial_load_error`.
+    Chosen: each costs one contact."""
 
 
 RELEASED_KNEE = ReleasedKneeSettings()

@@ -21,10 +21,11 @@ class ReleasedForceSettings:
     """The forces on released coordinates."""
 
     lever_arm: float = 0.025
-    """m: arm that makes rotations comparable to translations; half the usual distance of the
-    condyles."""
+    """m: arm that makes rotations comparable to translations. Chosen: half the usual distance of
+    the condyles."""
     difference_step: float = 1e-7
-    """m: step of the finite differences of joint axes and ligaments."""
+    """m: step of the finite differences of joint axes and ligaments. Chosen: far above rounding,
+    far below a curvature's radius."""
 
 
 RELEASED_FORCE = ReleasedForceSettings()

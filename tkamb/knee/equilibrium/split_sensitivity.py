@@ -18,9 +18,9 @@ class SplitSensitivitySettings:
     """How the medial share of the force changes with adduction."""
 
     adduction_step: float = 0.02 * DEGREE
-    """rad: step of the finite difference. It is small against the 0.2 to 0.5 deg that unload a
-    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to
-    0.1 deg agree within 5 to 15 %."""
+    """rad: step of the finite difference. Chosen: small against the 0.2 to 0.5 deg that unload a
+    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to 0.1 deg
+    agree within 5 to 15 %."""
 
 
 SPLIT_SENSITIVITY = SplitSensitivitySettings()

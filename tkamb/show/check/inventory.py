@@ -30,7 +30,8 @@ class InventorySettings:
     """What `tkamb check` lists."""
 
     high_strain: float = 0.1
-    """1: strain from which a bundle is listed; ligaments of the knee rupture at 12 to 20 %."""
+    """1: strain from which a bundle is listed. Chosen: ligaments of the knee rupture at 12 to 20
+    %."""
 
 
 INVENTORY = InventorySettings()

@@ -41,11 +41,11 @@ class LegPictureSettings:
     """Sizes in the picture of a leg."""
 
     arrow_metres_per_BW: float = 0.35
-    """Length of the force's arrow."""
+    """m per body weight: length of the force's arrow. Chosen: it fits beside the leg."""
     knee_half_width: float = 0.085
-    """m, that the picture of the knee shows around its middle."""
+    """m: half width of the picture of the knee around its middle. Chosen: a total knee fits."""
     margin: float = 0.08
-    """m, around what is shown."""
+    """m: margin around what is shown. Chosen: labels fit."""
 
 
 LEG_PICTURE = LegPictureSettings()

@@ -38,7 +38,7 @@ class CompareSettings:
     """How many runs are compared."""
 
     max_runs: int = 8
-    """Number of runs that a picture can tell apart by colour."""
+    """Number of runs in a picture. Chosen: so many can be told apart by colour."""
 
 
 COMPARE = CompareSettings()

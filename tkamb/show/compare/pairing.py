@@ -17,7 +17,8 @@ class PairingSettings:
     """When frames of two runs are the same instant."""
 
     tolerance: float = 1e-6
-    """deg, per cent or s; frames nearer on the axis are the same instant of one recording."""
+    """deg, per cent or s: frames nearer on the axis are the same instant of one recording. Chosen:
+    above the rounding of files."""
 
 
 PAIRING = PairingSettings()

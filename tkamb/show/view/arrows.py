@@ -24,7 +24,7 @@ class ArrowSettings:
     """Arrows of the viewer."""
 
     contact_point_radius: float = 0.6 * MILLIMETRE
-    """m; radius of the sphere at a centre of pressure."""
+    """m; radius of the sphere at a centre of pressure. Chosen: it is seen and hides little."""
 
 
 ARROW = ArrowSettings()

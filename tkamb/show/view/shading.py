@@ -16,8 +16,8 @@ class ShadingSettings:
     """How surfaces of the viewer are simplified."""
 
     max_triangles: int = 6_000
-    """Triangles per surface; a finer one is decimated before it is drawn. With two of that size and
-    the smaller parts a frame takes less than 100 ms without a graphics card."""
+    """Triangles per surface; a finer one is decimated before it is drawn. Chosen: with two of that
+    size and the smaller parts a frame takes less than 100 ms without a graphics card."""
 
 
 SHADING = ShadingSettings()

@@ -63,9 +63,10 @@ class ViewSolidSettings:
     """Sizes of what the viewer draws beside the implant."""
 
     ankle_radius_mm: float = 20.0
-    """mm: radius of the ball that is drawn at the ankle."""
+    """mm: radius of the ball that is drawn at the ankle. Chosen: it looks like an ankle."""
     plate_centre: float = 60.0 * MILLIMETRE
-    """m: distance of the floor's centre in front of the ankle."""
+    """m: distance of the floor's centre in front of the ankle. Chosen: the middle of a foot lies in
+    front of the ankle."""
 
 
 VIEW_SOLID = ViewSolidSettings()

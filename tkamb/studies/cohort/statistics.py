@@ -30,7 +30,8 @@ class CohortStatisticsSettings:
     """Statistics over the runs of a cohort."""
 
     bin_tolerance: float = 1e-9
-    """Share of a bin; 60 deg, which radians make 59.99999999999999, begins the bin from 60 on."""
+    """Share of a bin. Chosen: 60 deg, which radians make 59.99999999999999, begins the bin from 60
+    on."""
 
 
 COHORT_STATISTICS = CohortStatisticsSettings()

@@ -36,7 +36,7 @@ class BenchmarkSettings:
     sensel: float = 1.27 * MILLIMETRE
     """m; edge of a sensel of the pressure film in the publications."""
     resolution_mm: float = 2.0
-    """mm; resolution of every press on an implant, so that the whole page takes minutes."""
+    """mm: resolution of every press on an implant. Chosen: the whole page takes minutes."""
 
 
 BENCHMARK = BenchmarkSettings()

@@ -23,11 +23,11 @@ class CycleMotionSettings:
     """How the motion of a wear cycle is read."""
 
     lever_arm: float = 0.025
-    """m; displacement of a condyle per rotation, to compare rotations with translations. Half the
-    distance of the condyles."""
+    """m; displacement of a condyle per rotation, to compare rotations with translations. Chosen:
+    half the distance of the condyles."""
     notable_gap: float = 0.1
-    """1: share of the motion's extent. If the ends of a cycle lie farther apart, the report asks
-    whether the closing is right; the cycle is not changed."""
+    """1: share of the motion's extent. If the ends of a cycle lie farther apart, the report
+    mentions it; the cycle is not changed. Chosen: recorded cycles close better."""
 
 
 CYCLE_MOTION = CycleMotionSettings()

@@ -47,11 +47,12 @@ class WearProfileSettings:
     """Which load profiles of a simulator are accepted."""
 
     max_force: float = 1e4
-    """N; fifteen body weights."""
+    """N: largest force. Chosen: fifteen body weights."""
     step_tolerance: float = 1e-9
-    """Share of a step by which it may exceed the longest one."""
+    """Share of a step by which it may exceed the longest one. Chosen: above rounding."""
     closure_tolerance: float = 0.01
-    """Share of a column's range by which its last row may differ from its first."""
+    """Share of a column's range by which its last row may differ from its first. Chosen: noise of a
+    profile is smaller."""
 
 
 WEAR_PROFILE = WearProfileSettings()

@@ -41,10 +41,11 @@ class WearReportSettings:
     """Limits from which a wear report adds a question."""
 
     max_frame_change: float = 0.02
-    """Share of a cycle's volume by which it may change with half as many frames; beyond that the
-    frames are too few."""
+    """1: share of a cycle's volume by which it may change with half as many frames; beyond that the
+    report says that the frames are too few. Chosen: smaller than the error of a wear law."""
     max_map_correction: float = 0.05
-    """Share of a map's force; where its correction is larger the map is too coarse."""
+    """1: share of a map's force that its correction may have; beyond that the report says that the
+    map is too coarse. Chosen: smaller than the error of a wear law."""
     max_published_ratio: float = 3.0
     """Times the published rates; a higher rate is asked about."""
 
