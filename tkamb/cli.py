@@ -4,6 +4,7 @@ import argparse
 import gc
 import json
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,6 +73,8 @@ class _Parser(argparse.ArgumentParser):
     """Bad arguments are one line too, without the usage before it."""
 
     def error(self, message: str) -> NoReturn:
+        for kind, words in (("float", "is not a number"), ("int", "is not a whole number")):
+            message = re.sub(rf"invalid {kind} value: ('.*')", rf"\1 {words}", message)
         self.exit(2, f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help\n")
 
 

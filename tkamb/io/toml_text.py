@@ -66,7 +66,9 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # the parser's own error is a ValueError
-        raise InputError(f"is not TOML ({str(error)[:200]})", where) from None
+        raise InputError(
+            f"is not TOML ({str(error)[:200]})", where, "correct that line, or give a TOML file"
+        ) from None
 
 
 def check_key(dotted: str, where: object) -> None:

@@ -192,19 +192,23 @@ def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
 def _check_cutoff(time: Array, cutoff_Hz: float, name: str) -> None:
     duration, half_rate = time[-1] - time[0], 0.5 / np.diff(time).max()
     if not (math.isfinite(cutoff_Hz) and cutoff_Hz > 0):
-        raise InputError(f"cut-off {cutoff_Hz:g} Hz is not a positive number", name)
+        raise InputError(
+            f"cut-off {cutoff_Hz:g} Hz is not a positive number",
+            name,
+            'set cutoff_Hz of the scene to a positive number, or "none" to trust the samples',
+        )
     if cutoff_Hz >= half_rate:
         raise InputError(
             f"cut-off {cutoff_Hz:g} Hz is not below {half_rate:g} Hz, half the sampling rate "
             "at the widest step",
             name,
-            'lower cutoff_Hz, or "none" to trust the samples',
+            'lower cutoff_Hz of the scene, or set it to "none" to trust the samples',
         )
     if duration * cutoff_Hz < SPLINE_FILTER.min_periods:
         raise InputError(
             f"{duration:g} s are shorter than one period of the cut-off {cutoff_Hz:g} Hz",
             name,
-            'record longer, raise cutoff_Hz, or "none" to trust the samples',
+            'record longer, raise cutoff_Hz of the scene, or set it to "none" to trust the samples',
         )
 
 

@@ -144,8 +144,8 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
             ask for different axes.
     """
     if not 2 <= len(folders) <= COMPARE.max_runs:
-        what = f"{len(folders)} folders of results"
-        raise InputError(what, "compare", f"give two to {COMPARE.max_runs}")
+        what = f"needs two to {COMPARE.max_runs} folders of results, not {len(folders)}"
+        raise InputError(what, "compare", "name each folder that `tkamb run` wrote")
     paths = [Path(folder) for folder in folders]
     read = [read_results(path) for path in paths]
     for path, results in zip(paths, read, strict=True):

@@ -312,6 +312,8 @@ def _complaint(error: ValidationError, path: Path) -> InputError:
     rank = {"extra_forbidden": 0, "missing": 2}
     first = min(error.errors(), key=lambda one: rank.get(one["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
+    if {one["loc"][:1] for one in error.errors()} >= {("motion",), ("implant",)}:
+        return InputError("is a scene, not a cohort", path, "docs/cohort.md shows a cohort file")
     if first["type"] == "extra_forbidden":
         near = names_near(str(first["loc"][-1]), _keys_beside(first["loc"]))
         return InputError(f"unknown key '{key}'", path, f"remove it, or rename it: {near}")
