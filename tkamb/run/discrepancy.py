@@ -50,8 +50,8 @@ class DiscrepancySettings:
     """How the discrepancy is fitted and added to the samples."""
 
     quantiles: int = 41
-    """Values of Student's t that are added to each sample; more changes the ends of a band by less
-    than 1 %."""
+    """Values of Student's t that are added to each sample. Chosen: more changes the ends of a band
+    by less than 1 %."""
     published_total_BW: float = 0.43
     """BW: error of a published blind prediction of the total force in walking, 281 N (parametric
     model, third Grand Challenge, PMC3627216), over JW's weight."""
@@ -61,7 +61,8 @@ class DiscrepancySettings:
     published_lateral_BW: float = 0.43
     """BW: likewise of the lateral force: the middle of 238 to 326 N."""
     fewest_frames: int = 5
-    """Frames of a trial below which its bias and scatter say too little."""
+    """Frames of a trial below which its bias and scatter say too little. Chosen: a standard
+    deviation of fewer is itself uncertain by more than a third."""
 
 
 DISCREPANCY = DiscrepancySettings()
@@ -81,7 +82,7 @@ class TrialError:
         scatter_BW: standard deviation about it.
         inputs_BW: root mean square of the band of inputs' standard deviation.
         correlation_s: time over which the scatter's correlation falls to 1/e.
-        nominal_rmse_BW: root mean square error of the run as the inputs stand.
+        nominal_rmse_BW: root mean square error of the run with the inputs as given.
         nominal_bias_BW: its mean error, predicted minus measured.
     """
 
@@ -132,7 +133,7 @@ def trial_error(
         time: (f,) s.
         samples: (n, f) N; NaN where a sample has none.
         measured: (f,) N; NaN where nothing was measured.
-        nominal: (f,) N, of the run as the inputs stand.
+        nominal: (f,) N, of the run with the inputs as given.
         body_weight: N.
     """
     enough = np.isfinite(samples).sum(axis=0) > samples.shape[0] / 2

@@ -25,23 +25,23 @@ class LatticeFlagSettings:
     """When a result of the lattice gets a flag."""
 
     edge_distance_cells: float = 2.0
-    """Cells: distance from the peak at which the femoral normal is looked at. A peak at an
+    """Cells: distance from the peak at which the femoral normal is looked at. Chosen: a peak at an
     edge lies one or two cells inside it."""
     least_edge_distance: float = 2.0 * MILLIMETRE
-    """m: smallest distance from the peak at which the femoral normal is looked at, so that an
-    edge of 6 mm radius counts as an edge with fine cells too."""
+    """m: smallest distance from the peak at which the femoral normal is looked at. Chosen: an edge
+    of 6 mm radius counts as an edge with fine cells too."""
     sharp_edge_angle: float = 20.0 * DEGREE
-    """rad: turn of the femoral normal over that distance from which a peak is flagged. It is
-    the turn of a radius of 6 cells."""
+    """rad: turn of the femoral normal over that distance from which a peak is flagged. Chosen: the
+    turn of a radius of 6 cells."""
     strain_flag: float = -0.4
     """1: principal strain below which a result is flagged. The material law has no barrier at
     -1, and measured curves end before -0.4."""
     max_unseen_height: float = 0.2e-3
-    """m: height of the femoral surface between nodes that may stay unseen. A node of a 3 mm
+    """m: height of the femoral surface between nodes that may stay unseen. Chosen: a node of a 3 mm
     cell misses the bottom of a ball of 15 mm radius by 0.15 mm."""
     collapse_strain: float = -1.0
-    """1: principal strain at which a cell is compressed to nothing; the result is out of
-    range."""
+    """1: principal strain at which a cell is compressed to nothing; the result is out of range. By
+    definition of the strain."""
 
 
 LATTICE_FLAG = LatticeFlagSettings()
