@@ -114,7 +114,7 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
     """Return the flags and whether the insert is compressed to nothing."""
     if solution.field is not None:
         solid = state.problem.solid
-        least = solid.least_principal_strain(solution.field, solution.noticed)
+        least = solid.least_principal_strain(solution.field)
         kind = "principal strain"
     else:
         # A linear solver keeps no field of displacements: the mean strain of a column stands for
@@ -151,7 +151,8 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
 
 def unsettled_flag(solution: Solution) -> str:
     """Return in words how far a solution that has not converged is from rest."""
+    left = 100 * solution.residual.reported
     return (
-        f"the solver has not converged: {100 * solution.residual:.2g} % of the force or of the way "
-        f"to the femoral surface is left after {solution.passes} passes; is the femoral mesh rough?"
+        f"the solver has not converged: {left:.2g} % of the force or of the way to the femoral "
+        f"surface is left after {solution.passes} passes; is the femoral mesh rough?"
     )
