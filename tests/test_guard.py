@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import tkamb.__main__
 from scenes import MODEL, write_scene
 from tkamb import files
 from tkamb.cli import main
@@ -76,6 +77,21 @@ def test_a_load_that_is_not_carried_is_said_on_standard_error(capfd, monkeypatch
     assert main(line) == 1
     printed, said = capfd.readouterr()
     assert printed and said.count("\n") == 1 and "not carried" in said
+
+
+def test_an_interrupt_while_the_program_is_read_is_one_line(monkeypatch, capsys):
+    """Ctrl-C within the first tenth of a second gave a traceback of imports."""
+
+    class Interrupted:
+        def find_spec(self, name, path=None, target=None):
+            if name == "tkamb.cli":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "tkamb.cli")
+    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    assert tkamb.__main__.main() == 130
+    said = capsys.readouterr().err
+    assert said.startswith("tkamb: interrupted") and said.count("\n") == 1
 
 
 def refused(capfd, *arguments):
