@@ -1,9 +1,10 @@
 """`tkamb` on the command line, and `python -m tkamb`."""
 
 import sys
+from collections.abc import Sequence
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status.
 
     An interrupt while the program itself is still being read is one line too.
@@ -11,7 +12,7 @@ def main() -> int:
     try:
         from tkamb.cli import main as command
 
-        return command()
+        return command(arguments)
     except KeyboardInterrupt:
         print("tkamb: interrupted: nothing is kept", file=sys.stderr)
         return 130
