@@ -1,7 +1,6 @@
 """`tkamb uncertainty`: arguments in, exit status out."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,7 +69,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
     for line in warnings_of(result):
-        print(f"tkamb: {line}", file=sys.stderr)
+        say(line)
     print("\n".join([*headline(result), f"bands: {directory / 'bands.csv'}"]))
     if all(one.failed.all() for one in result.samples):
         say("every frame of every sample failed")
@@ -113,7 +112,10 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         "insert"
     )
     print("\n".join([*screen_lines(rows), *(f"({line})" for line in text)]))
-    return 0 if rows else 1
+    if not rows:
+        say("no sample could be computed")
+        return 1
+    return 0
 
 
 def headline(uncertainty: "Uncertainty") -> list[str]:
