@@ -160,7 +160,7 @@ class Bench {
   // One request is under way at most; the newest state waits, and is asked next.
   ask(moving) {
     clearTimeout(this.timer);
-    if (moving) this.timer = setTimeout(() => this.ask(false), SETTLE_MS);
+    this.timer = moving ? setTimeout(() => this.ask(false), SETTLE_MS) : 0;
     const request = structuredClone(this.state);
     if (moving) [request.contact, request.resolution_mm] = this.coarse;
     if (this.waiting) this.count.dropped++;
