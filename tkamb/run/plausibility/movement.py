@@ -26,8 +26,8 @@ class MovementLimitSettings:
     min_duration: float = 0.15
     """s; no movement of a leg is shorter."""
     min_translation: float = 0.1 * MILLIMETRE
-    """m; the femur of a knee that bends by 20 deg moves by more than this on the insert. Millimetres
-    that are metres in the file stay below."""
+    """m; the femur of a knee that bends by 20 deg moves by more than this on the insert.
+    Millimetres that are metres in the file stay below."""
 
 
 MOVEMENT_LIMITS = MovementLimitSettings()
