@@ -119,7 +119,7 @@ def headline(found: "Uncertainty") -> list[str]:
     """Return the peak's band and what moves it most, in lines of text."""
     from numpy import isfinite, nanargmax
 
-    from tkamb.show.headline import peak_legend, peak_words, peaks_of
+    from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
 
     total = found.results["force_total_BW"]
     if not isfinite(total).any():
@@ -140,6 +140,8 @@ def headline(found: "Uncertainty") -> list[str]:
     lines = [f"peak {name} force: {peak_words(one)} BW" for name, one in peaks.items()]
     lines += [f"({peak_legend(peaks)})"] if peaks else []
     lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
+    limits = muscle_limits(found.results)
+    lines += [limits.line()] if limits is not None else []
     of_chance = TERMS / found.results.summary["uncertainty"]["samples"]
     chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):

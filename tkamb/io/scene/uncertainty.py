@@ -141,8 +141,8 @@ class UncertaintyTable(SceneTable):
     ground_reaction: Share = Field(0.02, description="relative, force and free moment" + _ASSUMED)
     centre_of_pressure_ap_mm: Length = Field(
         3.0,
-        description="laboratory x; default: Exell et al. 2012 (PMID 23259242), 3 ± 2 mm for a wheel "
-        "that rolled from one force plate to the next, against markers",
+        description="laboratory x; default: Exell et al. 2012 (PMID 23259242), 3 ± 2 mm for a "
+        "wheel that rolled from one force plate to the next, against markers",
     )
     centre_of_pressure_ml_mm: Length = Field(3.0, description="laboratory z; likewise")
     segment_mass: Share = Field(0.1, description="relative, all segments together" + _ASSUMED)

@@ -15,7 +15,7 @@ from tkamb.show.compare.figures import (
     run_colour,
     shown_frame,
 )
-from tkamb.show.headline import peak_legend, peak_words, peaks_of
+from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import svg_text
 
@@ -128,6 +128,8 @@ def peak_lines(comparison: Comparison) -> list[str]:
         if found:
             words = ", ".join(f"{name} {peak_words(one)}" for name, one in found.items())
             lines.append(f"{run.label}: peak {words} BW, {peak_legend(found)}")
+        limits = muscle_limits(run.results)
+        lines += [f"{run.label}: {limits.line()}"] if limits is not None else []
     return lines
 
 
