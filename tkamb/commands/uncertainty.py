@@ -122,7 +122,7 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
     """Return the peak's band and the inputs with the largest influence, in lines of text."""
     from numpy import isfinite, nanargmax
 
-    from tkamb.show.headline import peak_legend, peak_words, peaks_of
+    from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
 
     total = uncertainty.results["force_total_BW"]
     if not isfinite(total).any():
@@ -143,6 +143,8 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
     lines = [f"peak {name} force: {peak_words(one)} BW" for name, one in peaks.items()]
     lines += [f"({peak_legend(peaks)})"] if peaks else []
     lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
+    limits = muscle_limits(uncertainty.results)
+    lines += [limits.line()] if limits is not None else []
     of_chance = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
     chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):

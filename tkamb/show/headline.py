@@ -87,7 +87,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
         _band(results, axis),
         _measured(results),
         _discrepancy(results),
-        _muscle_limits(results),
+        muscle_limits(results),
         _shares(results),
         _peak_pressure(results, axis),
         _post(results, axis),
@@ -164,8 +164,8 @@ def _discrepancy(results: "Results") -> Card | None:
     return Card("Error of this method in measured knees", value, f"total force; {words}")
 
 
-def _muscle_limits(results: "Results") -> Card | None:
-    """Return the moment of the hip's reserves, and the saturated muscles."""
+def muscle_limits(results: "Results") -> Card | None:
+    """Return what the hip's reserves carry, and which muscles pull as hard as they can."""
     reserves = results.summary.get("reserves") or {}
     saturated = results.summary.get("saturated_muscles") or {}
     if not reserves:

@@ -16,7 +16,7 @@ from tkamb.show.compare.figures import (
     run_colour,
     shown_frame,
 )
-from tkamb.show.headline import peak_legend, peak_words, peaks_of
+from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import svg_text
 
@@ -135,6 +135,8 @@ def peak_lines(comparison: Comparison) -> list[str]:
             words += f", at {pressure['time_s']:.4g} s"
             words += f", where {pressure['doubt']}" if pressure["doubt"] else ""
             lines.append(f"{run.label}: {words}")
+        limits = muscle_limits(run.results)
+        lines += [f"{run.label}: {limits.line()}"] if limits is not None else []
     return lines
 
 
