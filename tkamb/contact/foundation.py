@@ -19,6 +19,7 @@ from tkamb.contact.samples import (
     gaps_along_normals,
     gaps_and_facets,
 )
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse, rotate, transform
 
@@ -104,7 +105,7 @@ class ElasticFoundation(ContactModel):
     law: Law = "nonlinear"
 
     def evaluate(
-        self, state: SampledContact, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():
@@ -123,7 +124,7 @@ class ElasticFoundation(ContactModel):
         return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=tuple(flags))
 
     def press(
-        self, state: SampledContact, load: float, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, load: float, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
         """Find the approach that carries `load` (N); see `ContactModel`.
 
@@ -156,7 +157,7 @@ class ElasticFoundation(ContactModel):
             and reaction < FOUNDATION.reached_share * load - FOUNDATION.reached_force
         )
 
-    def probe(self, state: SampledContact, guess: ContactResult | None = None) -> Any:
+    def probe(self, state: SampledContact, guess: Guess | None = None) -> Any:
         """Return the probe with near columns and exact stiffness; see `ContactModel`."""
         return FoundationProbe(self.law, state)
 
@@ -179,9 +180,7 @@ class _NearColumns:
         beyond: m, the smallest approach so far that is out of range; inf: none.
     """
 
-    def __init__(
-        self, law: Law, state: SampledContact, pose: Array, guess: ContactResult | None
-    ) -> None:
+    def __init__(self, law: Law, state: SampledContact, pose: Array, guess: Guess | None) -> None:
         self._law, self.state, self.pose = law, state, pose
         self._reach, self._near, self._around = -np.inf, state.surface, Neighbourhood(state)
         if guess is not None and guess.points is state.points and not np.isnan(guess.gap).any():
@@ -274,7 +273,7 @@ class FoundationProbe:
         loaded = gap < 0
         return self._of(samples.part(loaded), gap[loaded], femoral_normal[loaded], pose)
 
-    def seen(self, result: ContactResult) -> ProbedContact:
+    def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return the contact at a result's pose, from its loaded columns; see `at`."""
         if np.isnan(result.gap).any():
             return self.at(result.pose)

@@ -11,6 +11,7 @@ from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
 from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
+from tkamb.contact.warm_start import Guess
 from tkamb.geometry.frames import SIDES, Array, Index
 
 
@@ -89,7 +90,7 @@ class Hertz(ContactModel):
     patch_radius: float = 4e-3
 
     def evaluate(
-        self, state: SampledContact, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():

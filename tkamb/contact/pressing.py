@@ -12,6 +12,7 @@ import numpy as np
 
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
@@ -60,19 +61,22 @@ Reaction = Callable[[float], float]
 class Evaluates(Protocol):
     """What the search needs of a contact model."""
 
-    def evaluate(
-        self, state: Any, pose: Array, guess: ContactResult | None = None
-    ) -> ContactResult:
+    def evaluate(self, state: Any, pose: Array, guess: Guess | None = None) -> ContactResult:
         """Return the contact at a pose."""
 
 
 class Presses(Evaluates, Protocol):
-    """A contact model that finds the approach of a load, too."""
+    """A contact model that finds the approach of a load, too, and says where to go on."""
 
-    def press(
-        self, state: Any, load: float, pose: Array, guess: ContactResult | None = None
-    ) -> ContactResult:
-        """Return the contact under a load (N)."""
+    def evaluate_from(
+        self, state: Any, pose: Array, start: Guess | None = None
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact at a pose, and the start of the next."""
+
+    def press_from(
+        self, state: Any, load: float, pose: Array, start: Guess | None = None
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact under a load (N), and the start of the next."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ def press_by_search(
     state: Any,
     load: float,
     pose: Array,
-    guess: ContactResult | None = None,
+    guess: Guess | None = None,
     reaction: Reaction | None = None,
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
@@ -116,7 +120,7 @@ def press_by_search(
         state: what its `prepare` returned.
         load: N, superior-inferior.
         pose: (4, 4) pose_femoral_in_insert.
-        guess: an earlier result; its approach starts the search.
+        guess: an earlier result or warm start; its approach starts the search.
         reaction: a faster way to the reaction (N) at an approach (m) than `evaluate`; inf
             where it is out of range.
 
@@ -165,9 +169,7 @@ def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactR
 class _Evaluations:
     """Evaluates a model at approaches and keeps the last result."""
 
-    def __init__(
-        self, model: Evaluates, state: Any, pose: Array, guess: ContactResult | None
-    ) -> None:
+    def __init__(self, model: Evaluates, state: Any, pose: Array, guess: Guess | None) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
         self._last: ContactResult | None = None

@@ -12,6 +12,7 @@ import numpy as np
 
 from tkamb.contact.pressing import Presses
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points, wrench_of
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.frames import Array, cross
 
 
@@ -86,50 +87,51 @@ class ProbedContact:
 
 
 class Probe:
-    """The probe of any model: `evaluate`, each answer the next one's guess.
+    """The probe of any model: `evaluate`, each pose the start of the next.
 
     Args:
         model: any contact model.
         state: what its `prepare` returned.
-        guess: an earlier result.
+        start: an earlier result or warm start.
 
     Attributes:
         exact: every answer brings the tangent, and it costs less than a press.
+        start: where the next evaluation begins.
     """
 
     exact: ClassVar[bool] = False
 
-    def __init__(self, model: Presses, state: Any, guess: ContactResult | None = None) -> None:
-        self._model, self._state, self._guess = model, state, guess
+    def __init__(self, model: Presses, state: Any, start: Guess | None = None) -> None:
+        self._model, self._state, self.start = model, state, start
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""
-        result = self.evaluated(pose)
+        result, start = self.evaluated(pose)
         if result.status is not ContactStatus.OK:
             return ProbedContact({}, known=False)
-        self._guess = result
-        return self.seen(result)
+        self.start = start
+        return self.seen(result, start)
 
-    def evaluated(self, pose: Array) -> ContactResult:
+    def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
         """Return the contact at a pose (4, 4), of which only the forces need be right."""
-        return self._model.evaluate(self._state, pose, self._guess)
+        return self._model.evaluate_from(self._state, pose, self.start)
 
     def pressed(
         self,
         load: float,
         pose: Array,
-        guess: ContactResult,
-        like: tuple[ContactResult, ContactResult] | None = None,
-    ) -> ContactResult:
+        start: Guess | None,
+        like: tuple[WarmStart, WarmStart] | None = None,
+    ) -> tuple[ContactResult, WarmStart]:
         """Return the contact under a load (N), of which only the forces need be right.
 
         Args:
             load: N.
             pose: (4, 4) pose_femoral_in_insert.
-            guess: a contact at a neighbouring pose.
+            start: of a contact at a neighbouring pose.
             like: start and end of a similar step near by, as a guide to the end of this one.
         """
-        return self._model.press(self._state, load, pose, guess)
+        return self._model.press_from(self._state, load, pose, start)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with a stiffness averaged over a finite displacement.
@@ -140,8 +142,8 @@ class Probe:
         """
         return contact
 
-    def seen(self, result: ContactResult) -> ProbedContact:
-        """Return what a result says of the condyles."""
+    def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
+        """Return what a result, and the warm start that came with it, say of the condyles."""
         return ProbedContact(condyle_wrenches(result, self._state.pair.split))
 
 

@@ -88,8 +88,6 @@ class ContactResult:
         iterations: of the model's own solver.
         residual: relative residual of that solver.
         flags: plain words for what a reader must know (strain below -0.4, ...).
-        warm_start: where the solver of the same state may begin when this result is handed
-            back as a guess; None for a model that needs none.
     """
 
     pair: ContactPair
@@ -107,7 +105,6 @@ class ContactResult:
     iterations: int = 0
     residual: float = 0.0
     flags: tuple[str, ...] = ()
-    warm_start: Any = None
 
     def __repr__(self) -> str:
         """Return force, area and peak of each condyle in one line."""
@@ -158,7 +155,7 @@ class ContactResult:
             covered: (n,) m², in contact around each point, for the condyles' areas; by
                 default `area`.
             medial: (n,) points under the medial condyle; by default `medial_points`.
-            ending: status, iterations, residual, flags, warm_start.
+            ending: status, iterations, residual, flags.
         """
         surface, pose = state.surface, np.array(pose, float)
         if not np.isfinite(pressure).all():

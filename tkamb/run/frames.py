@@ -85,9 +85,9 @@ class FrameSolver:
         return k, frame_row(self._case, k, body, contact, self.slips, status), arrays
 
     def _keep(self, contact: "FrameContact") -> None:
-        """Keep a contact as a guess; only the last that was found says where a solver begins."""
+        """Keep a contact; only the last that was found keeps its warm start, which is large."""
         if contact.result is not None:
-            self.before = [_without_warm_start(earlier) for earlier in self.before]
+            self.before = [replace(each, start=None, turned=None) for each in self.before]
         self.before.append(contact)
         del self.before[: -FRAME_LOOP.kept_contacts]
 
@@ -99,13 +99,6 @@ class FrameSolver:
         from tkamb.run.contact_side import ContactSide
 
         return ContactSide(self._case, self.mechanics)
-
-
-def _without_warm_start(contact: "FrameContact") -> "FrameContact":
-    result = contact.result
-    if result is None or (result.warm_start is None and contact.turned is None):
-        return contact
-    return replace(contact, result=replace(result, warm_start=None), turned=None)
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]

@@ -324,7 +324,9 @@ def _press(
         return model.press(state, load, femoral_pose), None
     pair: ContactPair = state.pair
     query = ClosestPointQuery(pair.femoral, pair.insert, condyle_split(pair.femoral))
-    return press_adjusted(model, state, load, adjusted(query, femoral_pose, settings), query)
+    adjustment = adjusted(query, femoral_pose, settings)
+    result, adjustment, _ = press_adjusted(model, state, load, adjustment, query)
+    return result, adjustment
 
 
 def load_pair(

@@ -23,6 +23,7 @@ from tkamb.contact.model import ContactModel
 from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import Guess
 from tkamb.errors import ComputationError, TkambError
 from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form
@@ -220,14 +221,15 @@ def _by_steps(
     extreme: Extreme,
     state: Any,
     shares: tuple[float, ...],
-    guess: ContactResult | None,
+    start: Guess | None,
 ) -> ContactResult | None:
     """Return Newton's answer after shares of the load; None where it finds none."""
     for share in shares:
         try:
-            guess = newton.press(state, share * extreme.load_N, extreme.pose, guess)
+            load = share * extreme.load_N
+            result, start = newton.press_from(state, load, extreme.pose, start)
         except ComputationError:
             return None
-        if guess.status is not ContactStatus.OK:
+        if result.status is not ContactStatus.OK:
             return None
-    return guess
+    return result

@@ -51,7 +51,7 @@ def result_of(
         residual=solution.residual,
     )
     flags: tuple[str, ...] = ()
-    if solution.seen:  # a sketch close by knows the strains of its region alone
+    if solution.seen:  # forces alone, close by: it knows the strains of its region alone
         flags, collapsed = strain_flags(state, solution)
         if collapsed:
             return ContactResult.failed(state, pose, *flags)
