@@ -118,7 +118,7 @@ def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> s
     if isinstance(error, str):
         return f"error of this setting: {error}"
     parts = ", ".join(f"{100 * error[name]:.2g} % in {name.replace('_', ' ')}" for name in names)
-    words = f"on {error['cases']} reference cases off by {parts}"
+    words = f"in {error['cases']} reference cases the contact model was off by {parts}"
     situations = error.get("situations") or {}
     stated = [name for name in names if name in ("peak_pressure", "area")]
     places = [

@@ -359,11 +359,13 @@ def _agreement(table: ContactTable) -> str:
     """Return how body and contact were brought together."""
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
-        return f"{names} are not the recorded ones: body and contact are at rest in them."
-    sentence = "The contact model presses in the superior-inferior force at the measured rotation; "
+        return f"{names} are not the recorded ones: the equilibrium of body and contact gives them."
+    sentence = (
+        "The contact model is loaded with the superior-inferior force at the measured rotation; "
+    )
     if table.coupling == "points":
         return sentence + "the deformed contact's resultants act in the body's equations."
-    return sentence + "it does not feed back into the body."
+    return sentence + "its result does not change the forces of the body."
 
 
 def _bearing(scene: Scene) -> tuple[str, ...]:
