@@ -129,7 +129,8 @@ class Probe:
             load: N.
             pose: (4, 4) pose_femoral_in_insert.
             start: of a contact at a neighbouring pose.
-            like: start and end of a similar step near by, as a guide to the end of this one.
+            like: warm starts before and after a similar step near by, from which the one after this
+                            step can be guessed.
         """
         return self._model.press_from(self._state, load, pose, start)
 

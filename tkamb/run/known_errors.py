@@ -47,9 +47,8 @@ class KnownError:
         cases: number of cases on which it was measured.
         situations: where contact lies ("interior", "flank", "edge") -> quantity -> largest error
             there, of contact that carried no flag but that of the edge.
-        covered: share of the errors on held-out pairs that are within the stated ones; None where
-        none
-            was held out.
+        covered: share of the errors on held-out pairs that are within the stated ones; None
+            where none was held out.
     """
 
     approach: float

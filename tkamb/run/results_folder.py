@@ -29,7 +29,7 @@ MAPS_NAME = "contact.h5"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
 INDICES_NAME = "indices.csv"
 UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
-"""Stand beside the results that they belong to, and go with them."""
+"""Files beside the results that they belong to; they are removed with them."""
 SUMMARY_LIMIT = 256 * MEGABYTE
 """Bytes of a summary: a line for every failed frame."""
 
@@ -114,7 +114,7 @@ def write_results(
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
     Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
-    for this run's. The shards of a run under way (`tkamb.run.shards`) have served and go.
+    for this run's. The shards of the run (`tkamb.run.shards`) are no longer needed and are removed.
 
     Args:
         results: what to write.
@@ -130,7 +130,9 @@ def write_results(
     from tkamb.run.shards import remove_shards
 
     if BANDS_NAME not in (more or {}):
-        results = replace(results, bands={})  # the page shows none that stand beside it nowhere
+        results = replace(
+            results, bands={}
+        )  # the page shows only bands that a file beside it holds
     with claimed_directory(directory, force, "run") as folder:
         with replaced_together(folder) as files:
             _put_maps(results.maps, files)
@@ -146,8 +148,8 @@ def put_numbers(results: Results, files: Replacement) -> None:
 
     Args:
         results: what to write.
-        files: among which a new contact.h5 is already, else the one in place is kept; so are
-            the bands of these results, else those in place are removed.
+        files: with a new contact.h5, else the old one is kept; and with new bands, else the
+            old ones are removed.
     """
     write_synced(files.path(CSV_NAME), csv_text(results.columns))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
@@ -167,7 +169,7 @@ def put_numbers(results: Results, files: Replacement) -> None:
 
 
 def _summary_hash(summary: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of all of a summary but this."""
+    """Return the SHA-256 of a summary without its own hash."""
     content = {key: value for key, value in summary.items() if key != "summary_sha256"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
