@@ -241,8 +241,8 @@ def operator_error(
 
     with K summed from the cells. A random u is as rough as the grid, so that f is as large as
     K and u allow, and the relative rounding error does not depend on the condition of K (float32
-    1e-6, 16-bit integers 5e-4). The second measures
-    the soft, smooth displacements, and the third compares the stored response with the factor.
+    1e-6, 16-bit integers 5e-4). The second measures the soft, smooth displacements, and the third
+    compares the stored response with the factor.
     Random numbers reach every entry of factor and response.
 
     Args:
