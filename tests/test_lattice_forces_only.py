@@ -51,7 +51,7 @@ def test_forces_alone_are_those_of_the_whole_answer(state):
 
 
 def test_beyond_the_bound_all_is_looked_at(state, monkeypatch):
-    """Without the bound the same step leaves elements out that count, and nobody knows."""
+    """Without the bound the same step leaves out elements that count, without a notice."""
     _, first = MODEL.press_from(state, LOAD, place(0.0))
     far = place(3e-3)
     sound, start = MODEL.press_from(state, LOAD, far, first, forces_only=True)
