@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Build the sdist, and the wheel from it, out of the files that git knows.
+"""Build the sdist from the files that git knows, and the wheel from the sdist.
 
 Usage: scripts/build_package.py FOLDER
 """
@@ -39,7 +39,7 @@ def build(folder: Path) -> tuple[Path, Path]:
 
 
 def known_files() -> list[str]:
-    """Return the paths that git knows and that are there."""
+    """Return the paths of the files that git knows and that exist."""
     listed = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, text=True
     ).stdout

@@ -1,4 +1,4 @@
-"""Folders of results that somebody forged, from a seed: their hashes are right, the content not."""
+"""Forged folders of results, made from a seed: their hashes are right, their content is wrong."""
 
 import hashlib
 import json
@@ -147,7 +147,7 @@ def _table(out: Path, chance: random.Random) -> None:
 
 
 def _rehash(out: Path) -> None:
-    """Have summary.json hold the SHA-256 of what is there, as a forger would."""
+    """Put the SHA-256 of the changed files into summary.json, as a forger would."""
     path = out / "summary.json"
     content = json.loads(path.read_text(encoding="utf-8"))
     if isinstance(content.get("files"), dict):

@@ -1,4 +1,4 @@
-"""The tables of docs/known_errors.md, from scripts/data/known_error_cases.json alone."""
+"""Makes the tables of docs/known_errors.md from scripts/data/known_error_cases.json."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Runs that are broken off, and folders that somebody else writes into."""
+"""Runs that are interrupted, and folders into which another process writes."""
 
 import tempfile
 import threading

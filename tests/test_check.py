@@ -134,7 +134,7 @@ def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp
 
 
 def test_a_solver_that_is_not_installed_is_named_before_a_run(checked, monkeypatch):
-    """The muscles' solver is an extra: the check says so first, and still shows the leg."""
+    """The muscles' solver is an extra: the check names it first, and still shows the leg."""
     monkeypatch.setattr(static_optimisation, "find_spec", lambda name: None)
     plain = checked.mechanics.case
     assert _missing(plain) == ()

@@ -1,4 +1,4 @@
-"""The docs site: built without a warning, and asks nobody else for anything."""
+"""The docs site: built without a warning, and loads nothing from other sites."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""Folders of results from somebody else: nothing outside is read, one line refuses them."""
+"""Folders of results from other people: no file outside is read, one line refuses them."""
 
 import json
 import shutil

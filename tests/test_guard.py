@@ -1,4 +1,4 @@
-"""Whatever happens, a user sees one line: streams that are gone, odd files, what nobody foresaw."""
+"""Every error is one line for the user: closed streams, odd files, unforeseen exceptions."""
 
 import json
 import os

@@ -19,7 +19,7 @@ def plain():
 
 
 def on_fixed_insert(plain, joints, coordinates, mass, **parts):
-    """Return a knee whose insert is the universe and whose femur hangs on a chain of joints."""
+    """Return a knee whose insert is fixed to the universe; a chain of joints carries the femur."""
     model = pin.Model()
     model.gravity = pin.Motion(np.array([0.0, -9.81, 0.0]), np.zeros(3))
     model.addFrame(pin.Frame("tibia", 0, 0, pin.SE3.Identity(), pin.FrameType.BODY))

@@ -83,7 +83,7 @@ def only_file(folder):
 
 
 def check_made_again_with_one_notice(folder, caplog, words=""):
-    """A file that cannot be used is replaced, once, and one line says so."""
+    """A file that cannot be used is replaced once, with a one-line notice."""
     caplog.clear()
     assert cached()[1]
     assert len(caplog.records) == 1, caplog.text

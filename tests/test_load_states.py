@@ -1,4 +1,4 @@
-"""Six sets of loads at one knee: which acts is told by where the ground reaction passes."""
+"""Six sets of loads at one knee: the place of the ground reaction decides which of them acts."""
 
 from dataclasses import replace
 from itertools import product
@@ -113,7 +113,7 @@ def test_a_knee_without_contact_that_must_be_extended_is_no_slack_one():
     st.tuples(*[st.floats(-20, 20)] * 3),
 )
 def test_no_random_load_is_answered_with_a_wrong_sign(knee, aside, up, place, moment):
-    """Signs hold, what is left out is asked for what it cannot do, and the shank balances."""
+    """Signs hold, loads that are left out would have the wrong sign, and the shank balances."""
     force = np.array([aside[0], up, aside[2]])
     geometry = loaded(knee, force, [place[0], -0.45, place[1]], moment)
     loads = solve_knee(geometry, FRICTION)

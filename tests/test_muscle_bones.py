@@ -149,7 +149,7 @@ def test_a_muscle_past_the_tibia_loads_it_through_the_foot_alone():
 
 
 def test_quadriceps_that_end_on_the_patella_are_named():
-    """DM's patella hangs on a ligament that is no muscle; Rajagopal's lines go on to the tibia."""
+    """DM's patella is held by a ligament, not a muscle; Rajagopal's lines continue to the tibia."""
     chain = kinematics("DM")
     q = chain.coupled({})[None]
     with pytest.raises(InputError, match=r"recfem_r.* end on 'patella_r'"):

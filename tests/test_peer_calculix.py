@@ -90,7 +90,7 @@ def test_what_calculix_has_not_is_refused():
     with pytest.raises(InputError, match="bottom"):
         _ = deck(bearing="mobile").text
     tabulated = tabulated_material("table", [0.0, 0.01, 0.05], [0.0, 5e6, 15e6], 0.45)
-    with pytest.raises(InputError, match="no law that CalculiX knows"):
+    with pytest.raises(InputError, match="a law that CalculiX does not have"):
         _ = deck(material=tabulated).text
 
 

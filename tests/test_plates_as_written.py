@@ -172,7 +172,7 @@ def with_zero(path, zero):
 
 
 def two_plates(folder, level):
-    """Write a foot on plate 1 from frame 6, and plate 2 that nobody stands on; both drift."""
+    """Write a foot on plate 1 from frame 6, and plate 2 without a foot; both drift."""
     clean, _ = offset_signals()
     beside = np.zeros_like(clean)
     signals = np.concatenate([clean, beside])

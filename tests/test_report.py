@@ -1,4 +1,4 @@
-"""report.html: stands by itself, shows the numbers of the run, survives runs with holes."""
+"""report.html: is self-contained, shows the numbers of the run, copes with failed frames."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The five knee coordinates that nobody measured, from contact and ligaments."""
+"""The five knee coordinates that were not measured, from contact and ligaments."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Signs that nobody notices in the numbers are asked about; right recordings raise no question."""
+"""Wrong signs that the numbers do not show raise a question; right recordings raise none."""
 
 import csv
 import shutil

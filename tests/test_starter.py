@@ -1,4 +1,4 @@
-"""`tkamb new`: what it lays out runs as it is, and it takes nothing that is somebody's."""
+"""`tkamb new`: its files run as they are, and it replaces no file of the user."""
 
 import re
 

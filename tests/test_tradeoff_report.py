@@ -189,7 +189,7 @@ def test_the_statement_covers_the_held_out_half_at_1_mm(contact):
 def test_an_error_is_stated_on_its_cases_and_by_situation():
     said = error_json(known_error("lattice", 1.0, "polyethylene"))
     words = known_error_words(said, ("peak_pressure", "area", "approach"))
-    assert words.startswith(f"on {said['cases']} reference cases off by ")
+    assert words.startswith(f"in {said['cases']} reference cases the contact model was off by ")
     assert "up to" not in words
     for place in ("in the interior", "on a flank", "at an edge"):
         assert place in words

@@ -38,7 +38,7 @@ def verified(out, capfd):
 
 def test_untouched_results_are_fine(run, capfd):
     status, said = verified(run[1], capfd)
-    assert status == 0 and "input file(s) are as they were" in said
+    assert status == 0 and "input file(s) have not changed" in said
     assert main(["report", str(run[1])]) == 0
     assert verified(run[1], capfd)[0] == 0
 

@@ -205,8 +205,8 @@ def _check_femoral_frame(
 ) -> None:
     """Describe the femoral mesh in another frame, with the same relative placement.
 
-    The insert frame is the contract's own, so this is what moving both bodies together
-    amounts to. The other frame is turned about z, which keeps the sides.
+    The contract fixes the insert frame, so this has the same effect as moving both bodies
+    together. The other frame is turned about z, which keeps the sides.
     """
     other = knee_pose([3e-3, -5e-3, 0.5e-3, 0.0, 0.0, np.radians(25)])
     pair = ContactPair(

@@ -1,4 +1,4 @@
-"""What is shipped against what the script makes: equal bytes, or equal numbers.
+"""Compares the shipped files with those that the script makes: equal bytes, or equal numbers.
 
 Libraries of another platform may round the last digit differently, so texts are equal when
 their words are and their numbers differ by less than 2e-6 (mm, deg, N), and meshes when

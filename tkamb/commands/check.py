@@ -1,4 +1,4 @@
-"""`tkamb check`: arguments in; out come lines, a picture or a page, and the exit status."""
+"""`tkamb check`: from its arguments to lines, a picture or a page, and the exit status."""
 
 import argparse
 import json

@@ -23,9 +23,9 @@ class ContactModel(ABC):
     """A frozen set of parameters that answers the contract.
 
     A subclass is a frozen dataclass whose fields are its options; every model takes
-    `resolution` (m), the spacing of its map points. `guess`, an earlier
-    result or a `WarmStart`, may change the time that an answer takes, never the answer beyond
-    tolerance; nothing is remembered from call to call. `mobile_bearing`: whether a mobile
+    `resolution` (m), the spacing of its map points. `guess`, an earlier result or
+    a `WarmStart`, may change the time that an answer takes, but not the answer beyond the
+    tolerance; nothing is kept from call to call. `mobile_bearing`: whether a mobile
     bearing's bottom slides; a model that presses it like a fixed one leaves False, and every
     press and run says so.
     """

@@ -3,10 +3,10 @@
 Every triangle is compared with the grid lines in its own projected rectangle. Three signed areas
 tell whether a line passes through it. Their signs are computed in whole numbers and exact
 (`tkamb.geometry.winding.PlanGrid`), so that no line slips between two triangles. A line that meets
-an edge exactly is moved by an
-infinitesimal into each of the four quadrants around it (simulation of simplicity, Edelsbrunner
-& Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639); what is inside for any of the
-four is inside, so that a line along a wall belongs to the part.
+an edge exactly is moved by an infinitesimal distance into each of the four quadrants around it
+(simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990),
+doi:10.1145/77635.77639); what is inside for any of the four is inside, so that a line along a wall
+belongs to the part.
 
 A place is inside where the surface winds around it (`tkamb.geometry.winding`): the number of
 entries below it is larger than the number of exits. So a wall between two touching bodies divides

@@ -108,7 +108,7 @@ def write_body(path: str | Path, number: int, out: str | Path) -> str:
         What was written, in a line.
 
     Raises:
-        InputError: the mesh cannot be read, it has no such body, or `out` is there already, of
+        InputError: the mesh cannot be read, it has no such body, or `out` exists already, has
             another format, or cannot be written.
     """
     out = Path(out)

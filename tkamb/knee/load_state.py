@@ -20,7 +20,7 @@ class LoadStateSettings:
     """Which parts of the extensor carry load."""
 
     force_rounding: float = 1e-6
-    """N: a force of the wrong sign that is smaller is rounding. Chosen: above rounding."""
+    """N: a force of the wrong sign that is smaller counts as zero. Chosen: above rounding."""
     patella_moment: float = 0.25
     """N m: moment of the patella's own weight and inertia, up to 5 N on an arm of 45 mm. Chosen: it
     separates an extensor that carries from one that is slack."""

@@ -1,9 +1,9 @@
-"""Do the two sides of a frame agree: what contradicts the recorded pose, and how well it is known.
+"""Checks of a frame: whether its two estimates of the split contradict each other.
 
 Two estimates of the medial/lateral split stand side by side, by deformation (the contact model
 at the recorded rotation) and by coronal equilibrium. Where they differ by much, where balance
-needs a large force that nothing modelled gives, or where a condyle carries nothing though nobody
-asked for that, something in the input is wrong or unknown: the frame is flagged.
+needs a large force that no modelled part gives, or where a condyle carries nothing though
+the load state leaves it loaded, something in the input is wrong or unknown: the frame is flagged.
 """
 
 from dataclasses import dataclass

@@ -24,7 +24,7 @@ LOCAL = "local"
 
 @dataclass(frozen=True)
 class ClusterSettings:
-    """Patience with a Dask cluster."""
+    """How long a Dask cluster is waited for."""
 
     answer_seconds: float = 10.0
     """s that a scheduler may take to answer. Chosen: an idle scheduler answers within one
@@ -94,7 +94,7 @@ def check_cluster(address: str) -> None:
 
 
 def _library() -> Any:
-    """Return Dask's `distributed`, set up for us."""
+    """Return Dask's `distributed`, with the options that tkamb needs."""
     try:
         import dask
         import distributed
@@ -131,13 +131,15 @@ def _answers(
             yield futures.pop(future), future.result()
     except distributed.KilledWorker:
         what = f"a job killed {CLUSTER.most_deaths} workers"
-        raise ComputationError(what, "--dask", f"is there memory for it? {LOST}") from None
+        raise ComputationError(
+            what, "--dask", f"check that a worker has enough memory; {LOST}"
+        ) from None
     except OSError as error:  # dask's CommClosedError among them
         raise ComputationError(f"the Dask scheduler is gone ({error})", "--dask", LOST) from None
 
 
 _one_at_a_time = threading.Lock()
-"""A worker of many threads does one job at a time: what they share is not made for threads."""
+"""Held while a worker of many threads does a job: what its jobs share does not stand threads."""
 
 
 def answer(packed: bytes, number: int, job: Any) -> Any:

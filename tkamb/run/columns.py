@@ -12,11 +12,12 @@ class Column:
     """One column of results.csv.
 
     Args:
-        name: as in the file, with its unit.
-        meaning: one line; vectors are in the insert frame unless it says otherwise.
+        name: the column's name in the file, with its unit.
+        meaning: one line; vectors are in the insert frame unless the line says otherwise.
         needs: scene tables without which the column is empty.
         kind: how its cells are written.
-        optional: left out of the file, not empty, where nothing asks for it.
+        optional: whether the column is left out of the file, instead of empty, where it is not
+        needed.
     """
 
     name: str
@@ -104,8 +105,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("quadriceps_wrap_deg", "angle over which the quadriceps wraps the femur", _MUSCLE),
     Column(
         "quadriceps_per_dome_mm_N",
-        "change of quadriceps_N as the button, its dome, sits 1 mm higher on the patella, "
-        "its place kept",
+        "change of quadriceps_N if the button, and its dome, sits 1 mm higher on the patella, "
+        "and the patella stays where it is",
         _MUSCLE,
     ),
     Column("patellofemoral_per_dome_mm_N", "the same, of patellofemoral_N", _MUSCLE),
@@ -132,13 +133,15 @@ COLUMNS: tuple[Column, ...] = (
     Column(LIGAMENT, "tension of the ligament bundle <name>", "[[ligament]]"),
     Column(
         "medial_slip_mm",
-        "slip of the medial condyle since the first frame, by arcs, without what axial rotation "
+        "slip of the medial condyle since the first frame, by arc lengths, without what axial "
+        "rotation "
         "alone would do",
         _SLIP,
     ),
     Column(
         "lateral_slip_mm",
-        "slip of the lateral condyle since the first frame, by arcs, without what axial rotation "
+        "slip of the lateral condyle since the first frame, by arc lengths, without what axial "
+        "rotation "
         "alone would do",
         _SLIP,
     ),
@@ -185,9 +188,9 @@ COLUMNS: tuple[Column, ...] = (
     Column("ap_mm", "femoral origin, insert x, at which the contact holds", _CONTACT),
     Column("si_mm", "the same, insert y", _CONTACT),
     Column("ml_mm", "the same, insert z", _CONTACT),
-    Column("coupling_iterations", "of body and contact until they agreed", _COUPLED, "integer"),
-    Column("coupling_change_N", "by the last of these, in the contact force", _COUPLED),
-    Column("coupling_change_mm", "the same, in the centres of pressure", _POINTS),
+    Column("coupling_iterations", "iterations until body and contact agreed", _COUPLED, "integer"),
+    Column("coupling_change_N", "change of the contact force by the last iteration", _COUPLED),
+    Column("coupling_change_mm", "the same, of the centres of pressure", _POINTS),
     Column("contact_trials", "contacts computed to find the released pose", _FREE, "integer"),
     Column(
         "smallest_stiffness_N_per_mm",
@@ -224,7 +227,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("flexion_chain_deg", "flexion by the chain, unfiltered", _MARKERS),
     Column(
         "knee_centre_distance_mm",
-        "between the knee centres that shank and thigh markers carry, each by itself",
+        "distance of the knee centre by the shank's markers from that by the thigh's",
         _MARKERS,
     ),
     Column(
@@ -282,13 +285,13 @@ COLUMNS: tuple[Column, ...] = (
 )
 
 RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}
-"""Names in results of earlier releases, and today's."""
+"""Name in results of earlier releases -> name of this release."""
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
 
 
 def _ends(family: str) -> tuple[str, str]:
-    """Return what stands before and after the name in a family's columns."""
+    """Return the text before and after the name in the columns of a family."""
     return family[: family.index("<")], family[family.index(">") + 1 :]
 
 

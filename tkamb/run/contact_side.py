@@ -4,7 +4,7 @@
   contact points from the undeformed meshes, and the contact model presses that load in at
   the recorded rotation.
 - `coupling = "points"`: each condyle's resultant then takes the place of point and normal in
-  the equations, and so on until load and centres of pressure change no more.
+  the equations, and this is repeated until load and centres of pressure no longer change.
 - `released = [...]`: these coordinates find their own equilibrium under contact, ligaments
   and muscle line (`tkamb.knee.equilibrium.released`); the equations then use the resultants found.
 """
@@ -66,7 +66,7 @@ COUPLING = CouplingSettings()
 
 
 class ContactSide:
-    """The contact model of a case, prepared once, and the body that it has to agree with.
+    """The contact model of a case, prepared once, and the body side that it must agree with.
 
     Args:
         case: a case with [contact].
@@ -114,12 +114,12 @@ class ContactSide:
             self.starts = InitialPoses(recorded, self.released, self.state.pair, self.post)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact of frame k, as coupled as the scene asks.
+        """Return body and contact of frame k, coupled as the scene asks.
 
         Args:
             k: frame.
-            before: the contacts of the frames before: the last one's warm start saves time,
-                and the last that were found are where released coordinates begin.
+            before: contacts of the earlier frames. The last one's warm start saves time, and the
+                search for released coordinates begins at the last that were found.
         """
         if self.released is None:
             body, contact = self._press_recorded(k, before)
@@ -142,7 +142,7 @@ class ContactSide:
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact at the recorded rotation."""
         begin, pose = before[-1].start if before else None, self.mechanics.poses[k]
-        # Every press asks where the bodies first touch, of which the body's equations need nothing.
+        # The body's equations do not need the place of first touch, but every press does.
         body, _ = both(lambda: self.mechanics.frame(k), lambda: self.state.pair.touch_at(pose))
         contact = self.carry(body, self.mechanics.poses[k], begin)
         if contact.adjustment and contact.adjustment.restored:
@@ -153,7 +153,7 @@ class ContactSide:
         return self._couple(k, body, contact)
 
     def carry(self, body: FrameLoads, pose: Array, begin: WarmStart | None) -> FrameContact:
-        """Press in what the body asks for, at the measured (or adjusted) rotation.
+        """Press with the load of the body side, at the measured (or adjusted) rotation.
 
         Args:
             body: the body side of the frame.
@@ -179,7 +179,7 @@ class ContactSide:
     def _couple(
         self, k: int, body: FrameLoads, contact: FrameContact
     ) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact once the one's resultants and post act in the other."""
+        """Return body and contact after the contact's resultants and post force act on the body."""
         seconds, place = contact.seconds, self.case.motion.coordinates[k]
         for iteration in range(1, COUPLING.max_iterations + 1):
             if contact.result is None:
@@ -210,18 +210,18 @@ class ContactSide:
             )
             if change < COUPLING.force_tolerance and moved < COUPLING.point_tolerance:
                 return body, contact
-        problem = "body and contact do not come to agree"
+        problem = "the iteration of body and contact does not converge"
         return replace(body, loads=unsolved([problem])), replace(
             contact, result=None, problem=problem
         )
 
     def _release(self, k: int, before: Sequence[FrameContact]) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact with the released coordinates at rest.
+        """Return body and contact with the released coordinates in equilibrium.
 
         Args:
             k: frame.
-            before: the contacts of the frames before; where the last three that were found
-                go on is where the search begins.
+            before: contacts of the earlier frames; the search begins where the last three that
+                were found extrapolate to.
         """
         released, began = self.released, clock.perf_counter()
         assert released is not None

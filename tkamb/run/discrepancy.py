@@ -354,4 +354,5 @@ def discrepancy_words(summary: Mapping[str, Any]) -> str:
     )
     if "muscles" in (summary.get("scene_tables") or {}):
         return words
-    return f"{words}; those runs had all muscles, so of this run, without [muscles], it says less"
+    reason = "those runs had all muscles, so this run, without [muscles], may be farther off"
+    return f"{words}; {reason}"

@@ -1,4 +1,4 @@
-"""Frames of a case, one by one: both sides of the equilibrium in, a row of the results out."""
+"""Computes the frames of a case, one by one: a row of the results from both sides of each."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -48,7 +48,7 @@ class FrameSolver:
     Args:
         case: the scene with its files read.
         frames: those that are asked for; None: any may be.
-        slips: those of another solver of this case, which spares finding them anew.
+        slips: those of another solver of this case; they are then not computed again.
 
     Attributes:
         mechanics: the body side.
@@ -102,12 +102,12 @@ class FrameSolver:
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
-"""Frames in a row, and the slips of the recorded motion (`FrameSolver`)."""
+"""Successive frames, and the slips of the recorded motion (`FrameSolver`)."""
 
 
 @contextmanager
 def _said_already() -> Iterator[None]:
-    """Print no warnings: the process that hands out the work reads the same scene."""
+    """Print no warnings: the process that hands out the work has printed them already."""
     log = logging.getLogger("tkamb")
     usual = log.level
     log.setLevel(logging.ERROR)
@@ -118,10 +118,10 @@ def _said_already() -> Iterator[None]:
 
 
 class ChunkSolver:
-    """What a worker does: reads the scene once, and computes chunk after chunk.
+    """The work of a worker process: reads the scene once, and computes chunk after chunk.
 
     Its contact side waits for the first chunk: by then the process that hands out the work has
-    prepared its own, and what takes long is found where that kept it.
+    prepared its own, and has put what takes long into the cache.
     """
 
     @_said_already()

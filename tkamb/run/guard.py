@@ -1,7 +1,7 @@
-"""What stands between a command and its user: one line for whatever goes wrong.
+"""Runs a command so that every error reaches the user as one line.
 
-A command ends with a status: 0 done, 1 nothing computed, 2 bad input, 130 interrupted. What
-nobody foresaw is one line too; its traceback goes into a file beside the output.
+A command ends with a status: 0 done, 1 nothing computed, 2 bad input, 130 interrupted. An
+unforeseen error is one line too; its traceback goes into a file beside the output.
 """
 
 import argparse
@@ -25,11 +25,11 @@ from tkamb import __version__
 from tkamb.errors import TkambError
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""What the system says of a write when the disk, the quota or the limit of a file is full."""
+"""Error numbers of a write when the disk, the quota or the limit of a file is reached."""
 
 
 def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
-    """Run a command and return its exit status; nothing but a line ever reaches the user.
+    """Run a command and return its exit status; an error reaches the user as one line.
 
     Args:
         command: returns its own status.
@@ -68,9 +68,9 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
 
 @contextmanager
 def interrupt_as_such() -> Iterator[None]:
-    """Raise what an interrupt within a compiled loop becomes as the KeyboardInterrupt that it was.
+    """Raise KeyboardInterrupt where an interrupt within a compiled loop became a SystemError.
 
-    Python tells of it where the loop hands back its result, as a SystemError caused by it.
+    Python raises the SystemError, caused by the interrupt, where the loop returns its result.
     """
     try:
         yield
@@ -88,7 +88,7 @@ class StreamError(TkambError):
 
 
 def say(line: str) -> None:
-    """Print a line on standard error; where that is gone there is nobody to tell."""
+    """Print a line on standard error, if that is still open."""
     with suppress(OSError, ValueError):
         print(f"tkamb: {printable(line)}", file=sys.stderr, flush=True)
 
@@ -119,7 +119,7 @@ def log_to_stderr() -> None:
 
 
 def open_streams() -> None:
-    """Have the three standard streams there, whatever the process was started with.
+    """Open those of the three standard streams that the process was started without.
 
     A stream that is closed would leave its number to the next file that is opened, and what is
     printed would end in it. Standard output is opened for reading then: printing fails, as it
@@ -167,7 +167,7 @@ def _watch(stream: TextIO) -> None:
 
 
 def _silence(stream: object) -> None:
-    """Lead a standard stream to nowhere, so that the interpreter's last flush does not fail."""
+    """Redirect a standard stream to the null device, so that the last flush does not fail."""
     with suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # type: ignore[attr-defined]
 

@@ -1,4 +1,4 @@
-"""What a case is prepared with before its first frame, and what a sample of it takes over."""
+"""What is prepared for a case before its first frame, and which of it its samples reuse."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any

@@ -1,9 +1,9 @@
 """By how much each contact model is known to err, and what it leaves out of a bearing.
 
 The errors are relative, against converged references: the largest over the cases on which a
-setting was measured. They are a statement on these cases, and no bound for others. The cases are
+setting was measured. They hold for these cases, and are no bound for others. The cases are
 those of the trade-off study and half of the pairs of bodies of `tkamb.studies.error_cases`; the
-other half is held out, and judges how many of the errors there the statement covers
+other half is held out, and shows how many of its errors are within the stated ones
 (docs/known_errors.md). `run/known_errors.json` is written by `scripts/make_tradeoff_table`. What
 was not measured is said to be so, never interpolated.
 """
@@ -44,11 +44,11 @@ class KnownError:
         mean_pressure: of a condyle.
         peak_pressure: of a condyle.
         area: of a condyle.
-        cases: on how many cases it was measured.
+        cases: number of cases on which it was measured.
         situations: where contact lies ("interior", "flank", "edge") -> quantity -> largest error
             there, of contact that carried no flag but that of the edge.
-        covered: share of the errors on held-out pairs that the statement covers; None where none
-            was held out.
+        covered: share of the errors on held-out pairs that are within the stated ones; None
+            where none was held out.
     """
 
     approach: float
@@ -109,7 +109,7 @@ def as_json(error: KnownError | None) -> dict[str, Any] | str:
 
 
 def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return in words what `as_json` made, for some of its quantities.
+    """Return the errors of some quantities in words.
 
     Args:
         error: what summary.json holds under `known_error`.
@@ -118,7 +118,7 @@ def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> s
     if isinstance(error, str):
         return f"error of this setting: {error}"
     parts = ", ".join(f"{100 * error[name]:.2g} % in {name.replace('_', ' ')}" for name in names)
-    words = f"on {error['cases']} reference cases off by {parts}"
+    words = f"in {error['cases']} reference cases the contact model was off by {parts}"
     situations = error.get("situations") or {}
     stated = [name for name in names if name in ("peak_pressure", "area")]
     places = [

@@ -201,7 +201,7 @@ class MapWriter:
 
     @contextmanager
     def _written(self) -> Iterator[None]:
-        """Have what HDF5 says of a disk that is full or gone in one line."""
+        """Turn HDF5's error on a disk that is full or gone into one line."""
         try:
             yield
             if self._stream is not None:
@@ -241,7 +241,7 @@ class ContactMaps:
     given_attributes: Mapping[str, Any] | None = None
 
     def __repr__(self) -> str:
-        """Return in a line how much there is."""
+        """Return one line with the numbers of frames and points."""
         return f"<tkamb.ContactMaps: {len(self)} frames of {len(self.points_m)} points>"
 
     @cached_property
@@ -281,9 +281,9 @@ class ContactMaps:
 
     @cached_property
     def contact_points_m(self) -> Array:
-        """(f, 3, 3) where medial condyle, lateral condyle and patella touch in the equations.
+        """(f, 3, 3) contact points of medial condyle, lateral condyle and patella in the equations.
 
-        NaN where they do not; NaN throughout in a file from before they were kept.
+        NaN where there is no contact; NaN throughout in a file of a release that did not keep them.
         """
         return self._kept_since("contact_points_m")
 
@@ -387,7 +387,7 @@ def _is_plain(value: Any) -> bool:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Have what h5py says of a missing or damaged file in one line, and only our own file read."""
+    """Turn h5py's error on a missing or damaged file into one line; refuse files not of tkamb."""
     try:
         with h5py.File(path, "r") as file:
             check_maps_file(file, path)

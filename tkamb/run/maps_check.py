@@ -93,7 +93,7 @@ def _check_link(file: Any, name: str, path: str | Path) -> None:
 def _dataset(file: Any, name: str, path: str | Path) -> Any:
     """Return an array of numbers that the file keeps in itself."""
     if name not in file:
-        raise InputError(f"has no '{name}'", path, "is it a contact.h5 of tkamb?")
+        raise InputError(f"has no '{name}'", path, "give a contact.h5 that tkamb wrote")
     dataset = file[name]
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"'{name}' is no array", path, WRITTEN)

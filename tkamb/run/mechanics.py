@@ -50,7 +50,7 @@ class FrameLoads:
         adjustment: the femoral adjustment, if asked for and possible.
         query_seconds: computing time of the closest points on the meshes.
         seconds: computing time of the equations, contact points given.
-        effect: what the adjustment does to the forces; None without one, or where the recorded
+        effect: change of the forces by the adjustment; None without one, or where the recorded
             pose has no solution.
     """
 
@@ -101,7 +101,7 @@ class Mechanics:
         return self._known.query if self._known else contact_query(self.case)
 
     def _check_near(self) -> None:
-        """Raise where the condyles are nowhere near the insert, whatever the frame."""
+        """Raise where the condyles are far from the insert in all frames."""
         contact = self.case.scene.contact
         if contact is None or contact.released or self.query is None:
             return

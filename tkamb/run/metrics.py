@@ -121,7 +121,7 @@ def split_undetermined(results: "Results") -> NDArray[np.bool_]:
 
 
 def moved_per_half_degree(results: "Results") -> Array:
-    """Return what 0.5 deg of adduction moves (f,) between the condyles by the tangent, N.
+    """Return the force (f,), N, that 0.5 deg of adduction moves between the condyles, by its slope.
 
     Never more than the whole load; NaN where one condyle carries all of it, since that slope
     holds only until the other touches.
@@ -157,7 +157,7 @@ def residual_share(results: "Results") -> Array:
 
 
 def residual_effect(results: "Results") -> Array:
-    """Return how much the total force hangs on where the residuals act (f,), same ratio.
+    """Return how much the total force depends on where the residuals act (f,), same ratio.
 
     It is the change of the total by 10 mm higher or lower over the SI contact force.
     """

@@ -1,7 +1,7 @@
 """Which code of another package computes contact or wear: the hash of that package.
 
-It stands in a run's identity beside the code of tkamb, since a default that is changed there
-changes numbers and neither the scene nor tkamb.
+The hash is part of a run's identity, as that of tkamb's code: a changed default in that package
+changes numbers, but neither the scene nor tkamb.
 """
 
 import hashlib
@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 CONTACT_CODE = "code of the contact model"
-"""What it is called in a run's identity."""
+"""Its name in a run's identity."""
 SUFFIXES = (".py", ".so", ".pyd")
 
 

@@ -1,4 +1,4 @@
-"""Contact alone: two meshes, a pose, a load; what `tkamb press` does and what it found."""
+"""Contact alone: presses two meshes together at a pose with a load, as `tkamb press` does."""
 
 import math
 import time
@@ -59,7 +59,7 @@ _ERRORS_TOLD = ("peak_pressure", "mean_pressure", "area", "approach")
 
 @dataclass(frozen=True, eq=False)
 class PressReport:
-    """What a press found, and what it took.
+    """The result of a press, with its computing time and memory.
 
     Args:
         contact: name of the contact model.

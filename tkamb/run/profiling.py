@@ -1,4 +1,4 @@
-"""What a run touched: parts built, files read, modules imported, frames evaluated, time per part.
+"""What a run used: parts built, files read, modules imported, frames evaluated, time per part.
 
 `tkamb run --profile`. Only what the scene requires should appear here.
 """
@@ -38,7 +38,7 @@ class Profile:
         sys.addaudithook(self._hear)
 
     def report(self, results: "Results", scene: Path) -> dict[str, Any]:
-        """Return what was touched, JSON-able.
+        """Return what was used, JSON-able.
 
         Args:
             results: of the run.

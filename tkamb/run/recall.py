@@ -1,4 +1,4 @@
-"""A frame's contact as arrays, and the warm start that they give a resumed run's next frame.
+"""The contact of a frame as arrays, from which the next frame of a resumed run begins.
 
 The start is as good as the one that the frame left, but for what is not kept: the lattice's
 displacements, and the contact and muscle forces that a released knee begins from. Answers stay
@@ -31,7 +31,7 @@ RESULT_ARRAYS = ("pose", "pressure", "gap", "nodal_force")
 def contact_arrays(
     contact: FrameContact | None, geometry: "KneeGeometry"
 ) -> dict[str, Array] | None:
-    """Return what is worth keeping of a frame's contact by name; None without a result.
+    """Return the arrays to keep of a frame's contact, by name; None without a result.
 
     Args:
         contact: of the frame.

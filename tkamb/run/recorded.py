@@ -1,4 +1,4 @@
-"""What was recorded beside a run held against what it predicts: measured force, EMG."""
+"""Compares what a run predicts with what was recorded: measured force, EMG."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ PREDICTED = {
     "medial": ("medial_force_N", "medial_force_equilibrium_N"),
     "lateral": ("lateral_force_N", "lateral_force_equilibrium_N"),
 }
-"""What is measured -> the columns that predict it, the first that holds a number."""
+"""Measured quantity -> the columns that predict it; the first that holds a number is used."""
 LAGS = np.arange(-40, 41) * 0.005
 """s: where the largest cross-correlation is sought, 0.2 s to either side."""
 
@@ -190,10 +190,10 @@ def fitted_normalisation(
 ) -> dict[str, float | None]:
     """Return each channel's normalising value with which its envelope e fits the activations a.
 
-    That is v / s, v the value that e is over, and s the scale of least Σ (a - s e)² over the
-    computed frames and the muscles of the channel, Σ a e / Σ e². Without a maximal contraction
-    no better one is known: it takes the course from the EMG, and how strong from the sharing.
-    None where s is not above zero.
+    That is v / s, with v the value by which e was divided, and s the scale of least Σ (a - s e)²
+    over the computed frames and the muscles of the channel, Σ a e / Σ e². Without a maximal
+    contraction no better one is known: the course over time is that of the EMG, the size that of
+    the activations. None where s is not above zero.
 
     Args:
         envelopes: of the muscles.

@@ -55,7 +55,7 @@ class Recorder:
         self._stack = ExitStack()
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
-        """Make ready for pressure maps on these points; not called without contact."""
+        """Prepare to record pressure maps on these points; not called without contact."""
         from tkamb.run.maps import MapWriter
 
         self._writer = MapWriter(self._maps_path, points, triangles, labels)
@@ -86,11 +86,11 @@ class Recorder:
     """Whether what is finished survives the process."""
 
     def due(self) -> bool:
-        """Say whether what is finished should be shown to the outside."""
+        """Say whether it is time to write the finished frames for readers."""
         return False
 
     def publish(self, make_results: "Callable[[], Results]") -> "Results":
-        """Show what is finished to the outside, and return it.
+        """Write the finished frames for readers, and return them.
 
         Args:
             make_results: function that makes the results.
@@ -120,7 +120,7 @@ class FolderRecorder(Recorder):
 
     Args:
         directory: a folder that this process has claimed (`tkamb.io.claim`).
-        identity: what makes two runs the same.
+        identity: what two equal runs have in common.
         resume: go on with the frames that an earlier run left there.
 
     Raises:
@@ -176,12 +176,12 @@ class FolderRecorder(Recorder):
         return None if self._writer is None else ContactMaps(self._directory / MAPS_NAME)
 
     def finish(self) -> None:
-        """See `Recorder`; what is published afterwards is whole."""
+        """See `Recorder`; all frames are then published."""
         with interrupt_later():
             self.close()
 
     def publish(self, make_results: "Callable[[], Results]") -> "Results":
-        """Put results.csv, summary.json and contact.h5 in their places together; a report goes."""
+        """Put results.csv, summary.json and contact.h5 in place together; remove an old report."""
         start = clock.perf_counter()
         results = make_results()
         with interrupt_later(), replaced_together(self._directory) as files:

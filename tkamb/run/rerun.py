@@ -1,4 +1,4 @@
-"""The case that results came from: their scene read anew, if it is still what was run."""
+"""The case of results: reads their scene again, if it has not changed since the run."""
 
 import json
 import shlex

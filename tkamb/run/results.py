@@ -1,4 +1,4 @@
-"""What a run found: one row per frame, the contact maps, and where it all came from."""
+"""The results of a run: one row per frame, the contact maps, and their provenance."""
 
 import csv
 import io
@@ -69,7 +69,7 @@ class Results:
         return len(self.columns["status"])
 
     def __repr__(self) -> str:
-        """Return in a line how much there is, of what."""
+        """Return one line with the numbers of frames, columns and map points."""
         failures = sum(status.startswith("failed") for status in self.status)
         contact = self.summary.get("contact") or {}
         parts = [
@@ -97,7 +97,7 @@ class Results:
 
     @property
     def questions(self) -> list[str]:
-        """Return what of the inputs is possible but unlikely, each with the likely mistake."""
+        """Return the questions about inputs that are unlikely, each with the likely mistake."""
         return list(self.summary.get("questions") or [])
 
     @property

@@ -1,4 +1,4 @@
-"""A folder of results: written as one, read back bit for bit, and held against its hashes."""
+"""A folder of results: written as a whole, read back bit for bit, and checked by its hashes."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ MAPS_NAME = "contact.h5"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
 INDICES_NAME = "indices.csv"
 UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
-"""Stand beside the results that they belong to, and go with them."""
+"""Files beside the results that they belong to; they are removed with them."""
 SUMMARY_LIMIT = 256 * MEGABYTE
 """Bytes of a summary: a line for every failed frame."""
 
@@ -37,11 +37,11 @@ SUMMARY_LIMIT = 256 * MEGABYTE
 def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """Read what `write_results` wrote; numbers come back bit for bit.
 
-    What a kill left to be put in place is put there first.
+    Files that a killed run left under temporary names are renamed first.
 
     Args:
         directory: the folder.
-        check: hold the files against the SHA-256 in summary.json.
+        check: compare the files with the SHA-256 in summary.json.
 
     Raises:
         InputError: a file is missing, is not what it should be, or not what was written.
@@ -62,7 +62,7 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
             what = f"holds {len(maps)} frames, and {CSV_NAME} {frames}"
             raise InputError(what, directory / MAPS_NAME, "run it again")
     if check and (changes := differences(directory, summary)):
-        raise InputError(changes[0], directory, "`tkamb verify` tells all; run it again")
+        raise InputError(changes[0], directory, "`tkamb verify` lists all changes; run it again")
     has_bands = (directory / BANDS_NAME).exists()
     bands = read_bands(directory / BANDS_NAME) if has_bands else {}
     return Results(columns, summary, maps, directory, bands)
@@ -83,9 +83,9 @@ def read_summary(directory: Path) -> dict[str, Any]:
 
 
 def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Return in words what of a folder's files is not what was written with the summary.
+    """Return in words how the files of a folder differ from those written with the summary.
 
-    Results of a release that kept no SHA-256 differ in nothing that could be known.
+    Results of a release that kept no SHA-256 show no difference.
     """
     messages, recorded = [], summary.get("files")
     if not isinstance(recorded, Mapping):
@@ -114,7 +114,7 @@ def write_results(
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
     Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
-    for this run's. The shards of a run under way (`tkamb.run.shards`) have served and go.
+    for this run's. The shards of the run (`tkamb.run.shards`) are no longer needed and are removed.
 
     Args:
         results: what to write.
@@ -130,7 +130,9 @@ def write_results(
     from tkamb.run.shards import remove_shards
 
     if BANDS_NAME not in (more or {}):
-        results = replace(results, bands={})  # the page shows none that stand beside it nowhere
+        results = replace(
+            results, bands={}
+        )  # the page shows only bands that a file beside it holds
     with claimed_directory(directory, force, "run") as folder:
         with replaced_together(folder) as files:
             _put_maps(results.maps, files)
@@ -146,8 +148,8 @@ def put_numbers(results: Results, files: Replacement) -> None:
 
     Args:
         results: what to write.
-        files: among which a new contact.h5 is already, else the one in place is kept; so are
-            the bands of these results, else those in place are removed.
+        files: with a new contact.h5, else the old one is kept; and with new bands, else the
+            old ones are removed.
     """
     write_synced(files.path(CSV_NAME), csv_text(results.columns))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
@@ -167,7 +169,7 @@ def put_numbers(results: Results, files: Replacement) -> None:
 
 
 def _summary_hash(summary: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of all of a summary but this."""
+    """Return the SHA-256 of a summary without its own hash."""
     content = {key: value for key, value in summary.items() if key != "summary_sha256"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -201,12 +203,12 @@ def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was found of a folder of results.
+    """The verdict on a folder of results.
 
     Args:
-        differs: what is not as it was written, a line each.
-        notes: what a reader should know though the results are whole.
-        inputs: how many input files were looked at.
+        differs: what has changed since it was written, a line each.
+        notes: what a reader should know although nothing has changed.
+        inputs: number of input files that were checked.
     """
 
     differs: tuple[str, ...]
@@ -215,14 +217,14 @@ class Verdict:
 
     def lines(self) -> list[str]:
         """Return the verdict as lines of text."""
-        end = f"results and {self.inputs} input file(s) are as they were when it was written"
+        end = f"results and {self.inputs} input file(s) have not changed since the run"
         return [*self.differs, *self.notes, *([] if self.differs else [end])]
 
 
 def verify_results(directory: str | Path) -> Verdict:
-    """Hold a folder against the SHA-256 that its summary.json records.
+    """Compare a folder with the SHA-256 that its summary.json records.
 
-    What a kill left to be put in place is put there first.
+    Files that a killed run left under temporary names are renamed first.
 
     Raises:
         InputError: it is not a folder of results.
@@ -234,7 +236,7 @@ def verify_results(directory: str | Path) -> Verdict:
         raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
     changes = differences(directory, summary)
     if not isinstance(summary.get("files"), Mapping):
-        changes.append("carries no SHA-256: written by an earlier tkamb, nothing can be checked")
+        changes.append("has no SHA-256: written by an earlier tkamb, so nothing can be checked")
     try:
         read_results(directory, check=False)
     except InputError as error:

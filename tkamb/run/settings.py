@@ -25,7 +25,7 @@ class Setting:
     """One number that decides how something is computed.
 
     Args:
-        name: dotted, as in "lattice_solver.residual_tolerance".
+        name: dotted, as in "lattice_solver.force_tolerance".
         value: value of this process.
         default: value that it has unless somebody changes it.
         meaning: unit, meaning and origin.
@@ -156,7 +156,7 @@ def _settings(options: argparse.Namespace) -> int:
             print(f"\n{algorithm} ({row.module})")
         print(
             f"  {row.name} = {row.value:g}"
-            if isinstance(row.value, int | float)
+            if isinstance(row.value, float)
             else f"  {row.name} = {row.value}"
         )
         print(f"      {row.meaning}")

@@ -1,4 +1,4 @@
-"""The finished frames of a run that is under way: one file each, whole or not there.
+"""The finished frames of a run in progress: one file each, written whole or not at all.
 
 They lie in the folder `.frames` of the output folder, beside a file that says which run they
 belong to, and go when the run's results are written. Each carries a SHA-256 over the run's
@@ -133,7 +133,7 @@ class Shards:
         try:
             return dict(read_json(path))
         except (ValueError, TypeError, InputError) as error:
-            what = f"does not say whose the frames beside it are ({error})"
+            what = f"does not say which run the frames beside it belong to ({error})"
             raise InputError(what, path, "leave out --resume to begin again") from None
 
 
@@ -160,7 +160,7 @@ def check_same_run(
 
 
 def remove_shards(directory: Path, name: str = FOLDER) -> None:
-    """Remove the finished frames; what says whose they are goes first."""
+    """Remove the finished frames, and first the file that says which run they belong to."""
     folder = directory / name
     if folder.is_symlink():
         return

@@ -60,7 +60,7 @@ def simulate(
             keeps them in memory.
         scene_path: where the scene came from, for the summary.
         progress: wraps the frame indices, a progress bar for example.
-        stage: is told what begins before the frames, by name.
+        stage: called with the name of each part that begins before the frames.
         resume: go on with what an earlier, interrupted run of the same scene and frames left
             in the folder; needs one.
         force: write into the folder even if it holds things that are not tkamb's.
@@ -127,7 +127,7 @@ class _Run:
     start: float
 
     def prepare(self) -> None:
-        """Build both sides of the equilibrium; whatever is wrong with the input shows here."""
+        """Build both sides of the equilibrium; errors of the input are raised here."""
         if self.case.scene.muscles:
             from tkamb.run.muscles.static_optimisation import solver_is_installed, solver_missing
 

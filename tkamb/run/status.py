@@ -30,9 +30,8 @@ class StatusSettings:
     Chosen: the condyle then runs against eminence or lip; check the recorded position, above all
     ML."""
     adjusted_total_BW: float = 0.01
-    """BW: a femoral adjustment that changes the total force by more decides more than the split.
-    Chosen: a femoral adjustment that changes the total force by more decides more than the
-    split."""
+    """BW: a femoral adjustment that changes the total force by more is flagged. Chosen: it then
+        decides more than the split."""
     marker_distance: float = 20.0 * MILLIMETRE
     """m; skin that has moved by more against the other segment's is flagged. Chosen: at 700 N it is
     14 N·m."""
@@ -134,7 +133,7 @@ def _patella_flags(case: Case, body: FrameLoads) -> list[str]:
         return []
     return [
         f"recorded patella is not held by its lines: {across:.0f} N across the button's normal, "
-        f"beside {normal:.0f} N along it; nothing real carries that"
+        f"beside {normal:.0f} N along it; no part of a knee carries that"
     ]
 
 

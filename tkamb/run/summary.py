@@ -1,4 +1,4 @@
-"""What a run was made of: the summary that stands beside the numbers."""
+"""The summary of a run: its inputs, versions, assumptions and largest values."""
 
 import hashlib
 import sys
@@ -31,7 +31,8 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
     "Residuals are the forces along AP (anterior–posterior) and ML (medial–lateral) and the moment "
-    "about the tibia's long axis that balance still needs at the midpoint of the contact points; "
+    "about the tibia's long axis that the equilibrium still lacks at the midpoint of the contact "
+    "points; "
     "an exact model would leave none. "
     "residual_sensitivity_N is the change of the total force when that point moves by 10 mm in y."
 )
@@ -48,7 +49,7 @@ one."""
 
 @dataclass(frozen=True)
 class SummarySettings:
-    """What a summary warns of."""
+    """Limits beyond which a summary warns."""
 
     notable_reserve: float = 0.05
     """1: share of a coordinate's largest moment; more reserve than this is a warning. Chosen: less
@@ -148,7 +149,7 @@ def _gait(case: Case) -> dict[str, Any]:
 
 
 def notes_of(scene: Scene) -> list[str]:
-    """Return the scene's notes, without those on a part that it has by now."""
+    """Return the scene's notes, without those on the absence of a part that it now has."""
     return [
         note
         for note in scene.output.notes
@@ -212,7 +213,7 @@ def scene_hash(case: Case) -> str:
 
 
 def run_identity(case: Case, frames: range) -> dict[str, Any]:
-    """Return what makes two runs the same: scene, what its files hold, frames, version, code.
+    """Return the identity of a run: hashes of scene, files and code, frames and version.
 
     A contact model of another package adds that package's code.
     """
@@ -271,7 +272,7 @@ def not_modelled(case: Case) -> list[str]:
 
 
 def assumptions(case: Case) -> list[str]:
-    """Return what the numbers rest on, in plain words."""
+    """Return the assumptions behind the numbers, in plain words."""
     scene = case.scene
     sentences = [
         "Segments are rigid; the hip carries the force and moment of all that crosses it.",
@@ -297,7 +298,7 @@ def assumptions(case: Case) -> list[str]:
     if scene.generic_ligaments:
         sentences.append(
             f"{', '.join(scene.generic_ligaments.ligaments)}: a generic set scaled to the "
-            "implant, not this patient's; look at the strains."
+            "implant, not this patient's; check the strains."
         )
     if case.motion.markers:
         sentences.append(_marker_reading(case))
@@ -311,7 +312,7 @@ def assumptions(case: Case) -> list[str]:
         sentences.append("The ground reaction is recorded as the force on the plate: signs turned.")
     if not scene.patella:
         sentences.append(
-            "No muscles: the knee's flexion moment is carried by nothing (a residual)."
+            "No muscles: no part carries the knee's flexion moment, which remains as a residual."
         )
     if scene.muscles:
         sentences.append(_sharing(scene.muscles))
@@ -363,7 +364,7 @@ def _agreement(table: ContactTable) -> str:
     sentence = "The contact model presses in the superior-inferior force at the measured rotation; "
     if table.coupling == "points":
         return sentence + "the deformed contact's resultants act in the body's equations."
-    return sentence + "it does not feed back into the body."
+    return sentence + "its result does not change the forces of the body."
 
 
 def _bearing(scene: Scene) -> tuple[str, ...]:

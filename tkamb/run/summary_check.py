@@ -21,7 +21,7 @@ ANY_KEY = "*"
 
 @dataclass(frozen=True)
 class SummaryLimits:
-    """What a summary is held to beside its kinds."""
+    """Limits of a summary besides its kinds."""
 
     largest_number: float = 1e15
     """Absolute value; no quantity of a run in its unit comes near it, and its square is finite."""
@@ -233,16 +233,16 @@ def check_summary(summary: object, path: object) -> None:
         path: of the file, for the message.
 
     Raises:
-        InputError: naming the first key that does not, or a number beyond all measure.
+        InputError: names the first key that does not, or a number that is too large.
     """
     _check_depth(summary, path)
     wrong = _difference(summary, SUMMARY, "")
     if wrong is not None:
-        raise InputError(wrong, path, "is it a folder that `tkamb run` wrote? Run it again")
+        raise InputError(wrong, path, "give a folder that `tkamb run` wrote, or run it again")
 
 
 def _check_depth(value: object, path: object) -> None:
-    """Raise for a number or a nesting that no part of tkamb can work with, under any key."""
+    """Raise for a number that is too large or values nested too deep, under any key."""
     waiting: list[tuple[object, int]] = [(value, 0)]
     while waiting:
         one, depth = waiting.pop()

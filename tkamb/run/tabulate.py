@@ -37,7 +37,7 @@ WHY_IT_FAILED = (
     *("body_seconds", "query_seconds", "contact_seconds", "condition_number", "contact_trials"),
     *("coupling_iterations", "smallest_stiffness_N_per_mm"),
 )
-"""Columns that say of a frame that failed how far it came."""
+"""Columns that a failed frame keeps: they show how far it was computed."""
 
 Columns = dict[str, Any]
 

@@ -1,8 +1,8 @@
 """The map that follows the report's slider: every frame's pressure as bytes of one grey picture.
 
-A byte is `FRAME_MAP.rim_byte` where the contact ends, above it in contact (the run's largest
-pressure is
-255) and below it apart; the page draws between the bytes linearly and colours what lies above.
+A byte is `FRAME_MAP.rim_byte` where the contact ends, larger in contact (255 for the largest
+pressure of the run) and smaller outside. The page interpolates linearly between the bytes and
+colours the larger ones.
 """
 
 from dataclasses import dataclass

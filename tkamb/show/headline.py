@@ -290,7 +290,7 @@ def _adduction(results: "Results", unknown: int) -> list[str]:
     shift = metrics.moved_per_half_degree(results)
     words = []
     if unknown:
-        where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
+        where = "in any frame" if unknown == len(results) else f"in {unknown} frames"
         words.append(f"the split by deformation is not determined {where}")
     if np.isfinite(shift).any():
         text = _range(shift, " N")
@@ -368,11 +368,17 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
     detail += f"{ligament}, patellofemoral force (PF/Q) {patella}"
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
-        detail += "; wraps nowhere" if first is None else f"; {_wraps_from(results, first)}"
+        detail += (
+            "; it does not wrap the femur"
+            if first is None
+            else f"; it {_wraps_from(results, first)}"
+        )
     slope = results.columns.get("quadriceps_per_dome_mm_N")
     if slope is not None and np.isfinite(slope[result.frame]) and result.value > 0:
         percent = 100 * abs(slope[result.frame]) / result.value
-        detail += f"; ± {percent:.1f} % per mm of the button's height on the patella"
+        detail += (
+            f"; changes by {percent:.1f} % if the button sits 1 mm higher or lower on the patella"
+        )
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 
 
@@ -400,7 +406,9 @@ def _residuals(results: "Results") -> Card | None:
     change = 100 * metrics.residual_effect(results)
     if np.isfinite(change).any():
         largest = np.nanmax(change)
-        detail += f"; acting 10 mm higher or lower changes the total by ≤ {largest:.1f} % of it"
+        detail += (
+            f"; if it acted 10 mm higher or lower, the total would change by ≤ {largest:.1f} %"
+        )
     axial = np.abs(results["residual_axial_Nm"])
     if np.isfinite(axial).any():
         detail += f"; and a residual axial moment of up to {np.nanmax(axial):.1f}\u00a0N·m"

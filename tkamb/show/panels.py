@@ -420,8 +420,8 @@ def _motion(results: "Results") -> Panel:
 
 def _slip(results: "Results") -> Panel:
     note = (
-        "From arc lengths, without the part that is due to axial rotation alone; condyles of equal "
-        "radius then slip alike."
+        "From the lengths of both paths of contact, without axial rotation alone; condyles of "
+        "equal radius then slip equally."
     )
     return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"), note)
 

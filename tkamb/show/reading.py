@@ -95,10 +95,10 @@ def _pressure(results: "Results") -> tuple[list[str], list[str]]:
     ]
     if isinstance(error, str):
         return bears, [f"Pressures and areas as absolute values: their error is {error}."]
-    words = f"{known_error_words(error, PRESSURE_AND_AREA)} by the contact model alone"
+    words = f"{known_error_words(error, PRESSURE_AND_AREA)}; load, pose and shape add their own"
     if is_large(error, PRESSURE_AND_AREA):
         return bears, [f"Pressures and areas as absolute values: {words}."]
-    return [f"Pressures and areas of unworn surfaces, {words}.", *bears], []
+    return [f"Pressures and areas of unworn surfaces: {words}.", *bears], []
 
 
 def _certainty(results: "Results") -> tuple[list[str], list[str]]:

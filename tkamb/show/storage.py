@@ -64,7 +64,7 @@ def write_results_storage(results: "Results", path: Path) -> str:
         What was written, in a line.
 
     Raises:
-        InputError: another format, a file that is there already, times that do not rise, or no
+        InputError: another format, a file that exists already, times that do not rise, or no
             place to write.
     """
     if path.suffix.lower() not in STORAGE:

@@ -46,7 +46,7 @@ class ReferenceSettings:
     tolerance: float = 1e-6
     """Relative tolerance of the reference solutions. Chosen: far below what is compared."""
     width_effect: float = 0.005
-    """Relative: a block 3.4 times as wide as high against an endless layer."""
+    """Relative difference of a block 3.4 times as wide as high from an endless layer. Computed."""
 
 
 REFERENCE = ReferenceSettings()

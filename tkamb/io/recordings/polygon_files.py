@@ -66,7 +66,7 @@ def read_obj(path: str | Path) -> Polygons:
 
 @dataclass(frozen=True)
 class _Element:
-    """What a PLY file has several of: its name, how many, and each one's properties.
+    """A kind of element of a PLY file: its name, its number of items and their properties.
 
     A property is its name, its type and, for a list, the type of the list's length, else "".
     """

@@ -1,4 +1,4 @@
-"""CalculiX: one contact problem as it reads it.
+"""CalculiX: one contact problem as an input file.
 
 Hexahedra, a rigid patch, penalty contact, a load. The femoral patch is a rigid layer of
 wedges that may move along y only. It begins at a guessed depth in the insert and is let go under
@@ -22,7 +22,7 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class CalculixDeckSettings:
-    """What a deck for CalculiX states."""
+    """Numbers of a deck for CalculiX."""
 
     penalty: float = 1e5
     """N/mm³; contact stiffness. Chosen: at 30 MPa surfaces overlap by 0.3 µm."""
@@ -40,7 +40,7 @@ ELEMENT = "C3D8I"
 
 @dataclass(frozen=True, eq=False)
 class Deck:
-    """What CalculiX is asked.
+    """A contact problem for CalculiX.
 
     Args:
         lattice: nodes and hexahedra of the insert.
@@ -49,7 +49,7 @@ class Deck:
         bearing: how the bottom is held.
         load: N, along -y.
         element: "C3D8" (fully integrated, locks as nu nears 0.5), "C3D8I" (incompatible modes).
-        comments: for whoever opens the deck, a line each.
+        comments: lines for the reader of the deck.
     """
 
     lattice: Lattice
@@ -115,7 +115,7 @@ class Deck:
 
     def _step(self) -> list[str]:
         if self.bearing != "fixed":
-            raise InputError("holds its inserts by the whole bottom", "CalculiX's deck")
+            raise InputError("can only fix the whole bottom of the insert", "CalculiX's deck")
         centre, finite = self._centre, "" if self.material.is_linear else ", NLGEOM"
         return [
             *("*BOUNDARY", "NBOTTOM,1,3", f"{centre},1,1", f"{centre},3,3", f"{centre + 1},1,3"),
@@ -134,7 +134,7 @@ def _law(material: Material) -> list[str]:
         return ["*DEFORMATION PLASTICITY", f"{modulus},{ratio},{stress},{law.exponent},{law.alpha}"]
     if isinstance(law, LinearElastic):
         return ["*ELASTIC", f"{modulus},{ratio}"]
-    raise InputError("has no law that CalculiX knows", f"material '{material.name}'")
+    raise InputError("has a law that CalculiX does not have", f"material '{material.name}'")
 
 
 def _numbered(first: int, members: Index) -> list[str]:

@@ -26,7 +26,7 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class FebioDeckSettings:
-    """What a deck for FEBio states."""
+    """Numbers of a deck for FEBio."""
 
     load_steps: int = 10
     """Steps in which the displacement is applied. Chosen: FEBio halves them by itself where one
@@ -45,14 +45,14 @@ def febio_text(problem: PressProblem, approach: float, comments: Iterable[str] =
     Args:
         problem: the press.
         approach: m, by which the femoral component is lowered from first touch.
-        comments: for whoever opens the file, a line each.
+        comments: lines for the reader of the file.
 
     Raises:
         InputError: a bearing that is not fixed, or a material that is not linear.
     """
     pair = problem.pair
     if pair.bearing != "fixed":
-        raise InputError("holds its inserts by the whole bottom", "FEBio's deck")
+        raise InputError("can only fix the whole bottom of the insert", "FEBio's deck")
     root = Element("febio_spec", version="4.0")
     for line in comments:
         root.append(Comment(f" {line.replace('--', '–')} "))
@@ -109,7 +109,7 @@ def _control(root: Element) -> None:
 
 def _materials(root: Element, material: Material) -> None:
     if not isinstance(material.law, LinearElastic):
-        what = "has no law that FEBio's deck knows"
+        what = "has a law that FEBio's deck does not have"
         hint = "run the frame with material = 'polyethylene-linear'"
         raise InputError(what, f"material '{material.name}'", hint)
     block = SubElement(root, "Material")

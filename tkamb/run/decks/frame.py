@@ -29,9 +29,9 @@ class FramePress:
             of its nodal forces.
         approach: m, of that pose.
         peak_pressure: Pa, of the map.
-        origin: which frame of what, by which contact model.
+        origin: number of the frame, its run and the contact model, in words.
         lateral: what insert z points to, "lateral" or "medial".
-        notes: what else of the run whoever compares must know.
+        notes: differences between run and deck that matter in a comparison.
     """
 
     problem: PressProblem
@@ -42,7 +42,7 @@ class FramePress:
     notes: tuple[str, ...] = ()
 
     def comments(self) -> tuple[str, ...]:
-        """Return what whoever opens the deck must know."""
+        """Return the lines for the reader of the deck."""
         problem, millimetres = self.problem, self.approach / MILLIMETRE
         return (
             f"{self.origin}; written by tkamb; mm, N, MPa.",
@@ -115,7 +115,7 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
 
 
 def _notes(results: Results, frame: int, pair: ContactPair) -> Iterator[str]:
-    """Yield what a deck's answer differs from the run's by, beside the discretisation."""
+    """Yield why a deck's answer differs from the run's, apart from the discretisation."""
     law, contact = pair.material, results.summary.get("contact") or {}
     yield (
         f"Material '{law.name}', {'linear' if law.is_linear else 'nonlinear'}: "
@@ -123,7 +123,7 @@ def _notes(results: Results, frame: int, pair: ContactPair) -> Iterator[str]:
         f"assumes {contact_class(contact['model']).assumes}."
     )
     if results.summary.get("side") == "left":
-        yield "A left knee's mirror image, a right one, as the run's files are."
+        yield "A left knee, computed as its mirror image, a right one, as in the run's files."
     if "post_force_N" in results.columns:
         force, peak = (results[name][frame] for name in ("post_force_N", "post_peak_pressure_MPa"))
         yield (

@@ -1,4 +1,4 @@
-"""A trial whose knee is somebody else's: the muscles' sharing but for its flexion row.
+"""Sharing of the muscles of a leg whose knee is not the OpenSim model's.
 
 The leg's other rows (hip, ankle, subtalar) are those of the OpenSim model. The knee's comes from
 the equations of the knee itself, frame by frame: the moment, the arm of the extensor group and
@@ -22,10 +22,10 @@ from tkamb.run.muscles.trial import trial_problems
 
 @dataclass(frozen=True, eq=False)
 class KneeTrial:
-    """The frames' problems, and the lines across the knee.
+    """The optimisation problems of all frames, and the muscle lines across the knee.
 
     Args:
-        problems: of all frames; their row of the knee's flexion is not looked at.
+        problems: of all frames; their row of the knee's flexion is not used.
         flexion: place of that row among the coordinates.
         extensor: (m,) bool, muscles of the extensor group.
         crossing: (c,) places of the other muscles that cross the knee.

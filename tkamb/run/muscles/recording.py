@@ -24,7 +24,7 @@ from tkamb.run.muscles.sharing import Sharing
 
 @dataclass(frozen=True, eq=False)
 class LegRecording:
-    """What is read of a leg and its muscles.
+    """The files and options from which a leg and its muscles are read.
 
     Args:
         model: the .osim file.

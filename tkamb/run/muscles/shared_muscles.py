@@ -78,7 +78,7 @@ class SharedMuscles:
     def share(
         self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
     ) -> MuscleShare:
-        """Return what each muscle carries in frame k with the knee as it stands.
+        """Return the force of each muscle in frame k with the knee where it is.
 
         Args:
             k: frame.
@@ -95,7 +95,7 @@ class SharedMuscles:
     def share_of_yielding_knee(
         self, k: int, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> MuscleShare:
-        """Return what each muscle carries in frame k while released coordinates yield to it.
+        """Return the force of each muscle in frame k while released coordinates yield to it.
 
         Args:
             k: frame.
@@ -138,7 +138,7 @@ class SharedMuscles:
         )
 
     def tension(self, share: MuscleShare) -> float:
-        """Return what the extensor group pulls with, N."""
+        """Return the tension of the extensor group, N."""
         return float(share.force[self.trial.extensor].sum())
 
     def solve(
@@ -159,7 +159,7 @@ class SharedMuscles:
             if loads.problems or loads.lifted == lifted:
                 return geometry, loads
             lifted = loads.lifted
-        return geometry, unsolved(["muscles and load state do not come to agree"])
+        return geometry, unsolved(["the iteration of muscles and load state does not converge"])
 
     def _failed(self, lines: CrossingLines, status: str) -> MuscleShare:
         nothing = np.full(len(self._names), np.nan)

@@ -100,12 +100,12 @@ class FrameProblems:
             else:
                 if shared.kkt_residual < SHARING.kkt_tolerance:
                     return shared.activation, shared.others, shared.kkt_residual, "ok"
-                reason = f"the optimum is met to {shared.kkt_residual:.1g} only"
+                reason = f"the conditions of the optimum are violated by {shared.kkt_residual:.1g}"
         nothing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)
         return *nothing, np.nan, f"failed: {reason}"
 
     def _unknown(self, k: int) -> str | None:
-        """Return why frame k cannot be asked for, None if it can."""
+        """Return why frame k cannot be solved; None if it can."""
         if not np.isfinite(self.moment[k]).all():
             return "an external load is not known"
         for missing, why in (

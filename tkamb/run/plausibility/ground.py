@@ -132,8 +132,8 @@ def _runs(mask: Mask) -> list[tuple[int, int]]:
 def direction_questions(case: Case) -> Iterator[Question]:
     """Whether the horizontal force points where it does in a leg that bears the body.
 
-    The ground reaction passes near the body's centre of mass, which rides near the hip: its
-    slope forward goes with that of the line from the centre of pressure to the hip, and it
+    The ground reaction passes near the body's centre of mass, which is near the hip: it leans
+    forward or back as the line from the centre of pressure to the hip does, and it
     points to the other leg, not away from it.
     """
     ground, loaded = case.ground, _well_loaded(case)

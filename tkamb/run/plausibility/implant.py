@@ -40,8 +40,8 @@ class ImplantShapeLimitSettings:
     """Coulomb coefficient of metal on polyethylene. Chosen: lubricated joints have 0.01 to 0.1, dry
     ones 0.2."""
     outline_offset: float = 0.25
-    """Share of an insert's width, to either side, at which its outline is looked at: under the
-    condyles. Chosen: it lies under the condyles."""
+    """Share of an insert's width, to either side, at which its outline is compared. Chosen: it lies
+        under the condyles."""
 
 
 IMPLANT_SHAPE_LIMITS = ImplantShapeLimitSettings()

@@ -1,6 +1,6 @@
 """A question: what of a declared case is possible but unlikely, with the likely mistake.
 
-What cannot be is refused where it is read. What is only unlikely is run, but nobody shall read
+What is impossible is refused where it is read. What is only unlikely is run, but nobody shall read
 "ok" beside it: a question stands in the summary, on the report and in the status of every frame
 that it concerns. The limits say where they come from. They are wide: they separate mistakes,
 which err by factors and signs, from rare patients.

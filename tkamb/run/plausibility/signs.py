@@ -1,9 +1,9 @@
 """Questions about the signs of a recorded pose: does the femur follow the insert's surface?
 
 A recorded contact keeps its gaps: condyles that bear roll and slide over the dishes without
-leaving them or sinking in. With the sign of AP turned they ride up the lips, with that of axial
+leaving them or sinking in. With the sign of AP turned they move up the lips, with that of axial
 rotation or adduction turned alone one condyle rises while the other sinks. So each sign is turned
-in turn, and asked about where the gaps are much steadier then.
+in turn, and the user is asked about it where the gaps are then much steadier.
 """
 
 from collections.abc import Iterator
@@ -26,17 +26,18 @@ class SignSettings:
     """When a sign is asked about."""
 
     frames: int = 15
-    """Looked at, evenly over the motion. Chosen: more change the spreads by some per cent."""
+    """Number of frames that are checked, evenly spread over the motion. Chosen: more frames change
+        the spreads by some per cent."""
     ap_spread: float = 0.6 * MILLIMETRE
-    """M, of the mean gap, below which AP is not asked about. Fluoroscopy of subject DM has 0.3 mm,
-    and 1.3 mm with the sign turned."""
+    """m: spread of the mean gap below which AP is not asked about. Fluoroscopy of subject DM has
+    0.3 mm, and 1.3 mm with the sign turned."""
     ap_share: float = 0.5
-    """Of that spread, what is left with the sign turned: 0.25 for DM."""
+    """1: largest share of that spread with the sign turned. Chosen: 0.25 for subject DM."""
     turn_spread: float = 0.1 * MILLIMETRE
     """m: spread of the difference between the condyles' gaps below which rotation is not asked
     about. Chosen: a mesh of 1 mm facets makes 0.05 mm."""
     turn_share: float = 0.7
-    """Of that spread, what is left with the sign turned: 0.43 to 0.62 for the two readings of DM;
+    """1: largest share of that spread with the sign turned. Chosen: 0.43 to 0.62 for subject DM;
     1.6 and more where the signs are right."""
 
 

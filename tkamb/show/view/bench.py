@@ -45,10 +45,10 @@ class BenchLimitSettings:
     """How far the sliders of `tkamb live` go."""
 
     flexion_deg: tuple[float, float] = (-20.0, 160.0)
-    """deg; least and largest flexion. With a component turned by `placement_deg` it stays within
-    what a scene accepts, so that every state can be saved."""
+    """deg; least and largest flexion. Chosen: with a component turned by `placement_deg` it stays
+    within what a scene accepts, so that every state can be saved."""
     adduction_deg: float = 20.0
-    """deg; largest varus or valgus, likewise."""
+    """deg; largest varus or valgus. Chosen: as `flexion_deg`."""
     axial_rotation_deg: float = 60.0
     """deg; largest axial rotation either way, likewise."""
     length_mm: float = 60.0

@@ -38,7 +38,7 @@ READY = (
     "new Promise((done, fail) => { setTimeout(() => fail('not drawn in 60 s'), 60000); "
     "setInterval(() => document.body.dataset.ready && done(), 20); })"
 )
-"""The page's policy forbids what the driver would wait with."""
+"""Waits until the page is drawn: the page's security policy forbids the driver's own waiting."""
 INSTALL = "install chromium (Debian: apt install chromium)"
 
 
@@ -104,10 +104,10 @@ def film_frames(html: str, count: int, progress: Progress) -> Iterator[bytes]:
 
 
 def _write_gif(pictures: Iterator[bytes], path: Path, rate: float) -> None:
-    """Write a GIF whose 256 colours a picture are spread over those that occur.
+    """Write a GIF; the 256 colours of each picture are spread evenly over the colours that occur.
 
-    The usual choice by frequency gives them to the grey ground, and the scales come out wrong.
-    """
+    Chosen by frequency, as usual, most would be greys of the background, and scales would look
+    wrong."""
     spread, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
     first, *rest = (
         Image.open(io.BytesIO(one)).convert("RGB").quantize(256, method=spread, dither=plain)

@@ -57,8 +57,8 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Connection": "close",
 }
-"""Of every answer. The page's own policy says what it may load (`tkamb.show.view.page.POLICY`);
-who may frame it can only be said here."""
+"""Headers of every answer. The page's own policy says what it may load
+(`tkamb.show.view.page.POLICY`); which sites may embed it in a frame must be said in a header."""
 
 
 class ContactSwitch:
@@ -297,7 +297,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.switch is not None and self._path_below_token == "contact":
             frame, model = question["frame"], question["model"]
             if type(frame) is not int or not isinstance(model, str):
-                raise TkambError("frame is an integer, model a name")
+                raise TkambError("'frame' must be an integer, and 'model' a name")
             return self.switch.answer(frame, model)
         if self.switch is not None and self._path_below_token == "lattice":
             return self.switch.lattice()
@@ -319,10 +319,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _question(self) -> dict[str, Any]:
         length = int(self.headers.get("Content-Length") or 0)
         if not 0 < length <= VIEW_SERVER.most_request_bytes:
-            raise TkambError("a question of no or too many bytes")
+            raise TkambError("the question has no bytes, or too many")
         question = json.loads(self.rfile.read(length))
         if not isinstance(question, dict):
-            raise TkambError("a question is an object")
+            raise TkambError("the question must be a JSON object")
         return question
 
     def _is_allowed(self) -> bool:

@@ -103,8 +103,8 @@ def estimate_uncertainty(
         scene: a scene, or the path of its file.
         samples: how many, at least 20.
         workers: processes; 1 computes in this one.
-        dask: address of a Dask scheduler that has the samples computed, or "local" for one with
-            so many workers.
+        dask: address of a Dask scheduler that has the samples computed, or "local" for one on this
+            machine with `workers` processes.
         method: "lhs" or "sobol", see `tkamb.studies.uncertainty.sampling`.
         indices: find Sobol' indices too, by Saltelli's design: `samples` (d + 2) are computed
             with d inputs, and the bands are those of twice `samples`.

@@ -103,7 +103,7 @@ class Sampler:
         """Return the sample at a point; a frame begins its search at the one before.
 
         Args:
-            number: of the sample; what workers tell samples by, it changes nothing.
+            number: of the sample; workers need it, but it does not change the sample.
             point: where it lies.
         """
         draw = self.draw(point)

@@ -1,1 +1,1 @@
-"""The linear operator: factorisation, response of the contact nodes, what is kept on disk."""
+"""The linear operator: factorisation, response of the contact nodes, the cache on disk."""

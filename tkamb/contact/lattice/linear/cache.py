@@ -1,21 +1,21 @@
-"""Prepared operators on disk, found again by what they were made of.
+"""Prepared operators on disk, found by a hash of everything that they depend on.
 
 The key is the SHA-256 of everything that the operator depends on: nodes, cells, held unknowns,
 contact nodes, elastic constants, kind of solid, and the code that makes it. A file is
 
     magic (16 bytes) | two sums (16) | length of the header (8) | header (JSON) | arrays
 
-The sums are those of all 64-bit words that follow, plain and times their number, modulo 2^64: they
-tell any one bit, and words that changed places, in an eighth of the time of CRC-32. It is written
-beside its place and moved there in one step, so that two processes at once see a whole file or
-none. A file is used only if it is a regular one of the user's own that nobody else may write, its
-size is what its header says, its sums and key are right, and its operator inverts the stiffness
-that is assembled afresh (`operator_error`). Any other is made again, with one notice. The least
-recently used go when the folder outgrows its limit, and with them what a killed process left half
-written.
+The two sums are over all 64-bit words that follow: of the words, and of each word times its
+position, modulo 2^64. They detect any changed bit, and words that changed places, in an eighth of
+the time of CRC-32. A file is written beside its place and moved there in one step, so that another
+process sees a whole file or none. A file is used only if it is a regular one of the user's own that
+nobody else may write, its size is what its header says, its sums and key are right, and its
+operator inverts the stiffness that is assembled anew (`operator_error`). Otherwise the operator is
+made again, with one notice. The files used longest ago are removed when the folder exceeds its
+limit, and with them files that a killed process left half written.
 
 The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Operators that
-are made again in about a second are not kept.
+can be made in about a second are not kept.
 """
 
 import fcntl
@@ -94,7 +94,7 @@ def cache_folder() -> Path:
 def operator_key(
     solid: Solid, fixed: NDArray[Any], contact_nodes: NDArray[Any], coarse: bool = True
 ) -> str:
-    """Return the content hash of an operator: of all that it depends on, and of the code."""
+    """Return the hash of an operator: of everything that it depends on, and of the code."""
     material = solid.material
     made_by = code_identity("contact/lattice")
     kind = (type(solid).__name__, "16 bits" if coarse else "single")
@@ -147,7 +147,7 @@ def cached_operator(
 
 
 class DamagedOperator(Exception):
-    """A file is there, but it does not hold the operator that was asked for."""
+    """The file exists, but does not hold the operator that was asked for."""
 
 
 def check_operator(
@@ -157,10 +157,10 @@ def check_operator(
     fixed: Mask,
     contact_nodes: Index,
 ) -> None:
-    """Hold an operator that was read against the solid that it is to be of.
+    """Check an operator that was read against the solid that it should belong to.
 
-    Its file is given back as soon as it has been read: what a motion reads of the response is a
-    small part. Pages that are read again come from the system's memory of the file.
+    The memory of its file is released as soon as it has been checked: a motion reads only a
+    small part of the response. Pages that are read again come from the system's file cache.
 
     Raises:
         DamagedOperator: it is of other unknowns, or does not invert the solid's stiffness.
@@ -252,14 +252,15 @@ def read_operator(
             operator = _operator_of(arrays)
         except (OSError, ValueError, KeyError, TypeError, IndexError, MemoryError) as error:
             raise DamagedOperator(f"is damaged ({error})") from None
-        # Says when it was last used. Another process may have removed it, or nobody may say so.
+        # Records when it was last used. Another process may have removed it, or writing is
+        # forbidden.
         with suppress(OSError):
             os.utime(file.fileno())
     return operator, mapped
 
 
 def _arrays(file: BinaryIO, size: int, key: str) -> tuple[mmap.mmap, list[NDArray[Any]]]:
-    """Return a file of that size in memory and its arrays, after a look at key and sums."""
+    """Return a file of that size, mapped, and its arrays, after key and sums were checked."""
     start = file.read(PREFIX)
     length = int.from_bytes(start[-8:], "little")
     if len(start) < PREFIX or start[: len(MAGIC)] != MAGIC or length > FACTOR_CACHE.longest_header:
@@ -294,7 +295,7 @@ def _words(content: bytes | memoryview) -> NDArray[np.uint64]:
 
 @compiled
 def _add_sums(words: NDArray[np.uint64], first: int, sums: NDArray[np.uint64]) -> None:
-    """Add 64-bit words, plain and times their number, to two sums; the first has a number."""
+    """Add 64-bit words to one sum, and times their position to another; `first` is the first's."""
     plain, weighted, number = sums[0], sums[1], np.uint64(first)
     for i in range(len(words)):
         plain += words[i]
@@ -310,7 +311,7 @@ def _padding(length: int) -> int:
 def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
     """Return the operator of the arrays of `_parts`.
 
-    Compiled code looks at no bounds: every index is held against them here.
+    Compiled code does not check bounds, so every index is checked here.
     """
     free, contact_nodes, *of_factor, rank, blocks, columns = arrays
     factor = CholeskyFactor(*of_factor)
@@ -363,7 +364,7 @@ def prune(folder: Path, limit: float) -> None:
 
 
 def _remove_orphans(folder: Path) -> int:
-    """Remove what killed processes left half written; return the bytes of what stays."""
+    """Remove files that killed processes left half written; return the bytes of the others."""
     stays = removed = freed = 0
     for path in [*folder.glob(".tkamb-*.part"), *folder.glob("tmp*.part")]:  # the latter: 0.1.0
         try:

@@ -1,7 +1,7 @@
-"""The memory that a factorisation will take, counted before it begins.
+"""The memory that a factorisation will need, computed before it begins.
 
 The fronts' sizes follow from the dissection and the pattern alone (symbolic factorisation, on
-nodes instead of unknowns). Nothing is known of a machine here but what it has left.
+nodes instead of unknowns). Of the machine only the memory that is left is used.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class MemoryNeedSettings:
     """Bytes of a cell while its stiffness is put into the global matrix. Measured: 9 to 22 kB."""
     entry_bytes: int = 36
     """Bytes of an entry of the global matrix: 20 for itself and its lower half in elimination
-    order; the rest stands for what the compliance is made of meanwhile. Measured: without
+    order; the rest stands for the arrays of the compliance at that time. Measured: without
     it the estimate is 12 % low."""
     safety_factor: float = 1.1
     """1: factor for what the estimate leaves out. Chosen: a proposal that fits is better than one
@@ -60,7 +60,7 @@ class TooLittleMemoryError(ComputationError):
         super().__init__(what, "lattice", "take a coarser resolution")
 
     def advice(self, size: float) -> str:
-        """Return what to do about it: the cells that fit, for those of a size (m) that do not."""
+        """Return the advice: the cell size that fits instead of a size (m) that does not."""
         fits = size * (self.likely / max(self.left, 1.0)) ** (1.0 / MEMORY_NEED.memory_exponent)
         if fits > MEMORY_NEED.largest_cell_size:
             return "free some memory"
@@ -71,11 +71,11 @@ class TooLittleMemoryError(ComputationError):
 
 
 def check_memory(need: float, likely: float = 0.0) -> None:
-    """Raise unless so many bytes are left.
+    """Raise unless a number of bytes is left.
 
     Args:
         need: bytes.
-        likely: bytes that it will come to in the end, where more follows; for the advice.
+        likely: bytes that the whole computation is expected to need, for the advice.
 
     Raises:
         TooLittleMemoryError: they are not left.
@@ -88,13 +88,14 @@ def check_memory(need: float, likely: float = 0.0) -> None:
 
 
 def check_assembly_memory(cells: int) -> None:
-    """Raise unless the stiffness of so many cells can be assembled.
+    """Raise unless the stiffness of a number of cells can be assembled.
 
     Raises:
         TooLittleMemoryError: the memory is not left.
     """
     need = MEMORY_NEED.cell_bytes * cells
-    # A factor grows as cells^1.25 and overtakes at about 3,000 cells (measured on inserts).
+    # The factor grows as cells^1.25; from about 3,000 cells it needs more memory than the assembly
+    # (measured on inserts).
     check_memory(need, likely=1.5 * need * max(cells / 3000, 1.0) ** 0.25)
 
 
@@ -107,7 +108,7 @@ def factor_memory(
         tree: dissection of n nodes.
         joined: (n, n) pattern: which nodes are joined.
         touched: (n,) nodes whose response is wanted.
-        itemsize: bytes of a number that is kept; the factor is worked out in 8.
+        itemsize: bytes of a number that is kept; the factor is computed with 8.
     """
     rank = np.empty(joined.shape[0], np.int64)
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
@@ -124,7 +125,8 @@ def factor_memory(
             MEMORY_NEED.unknowns_per_node * len(own),
             MEMORY_NEED.unknowns_per_node * len(boundary),
         )
-        # W in 8 bytes and as it is kept, the update (m, m), and those not taken yet.
+        # W in 8 bytes and as it is kept, the update (m, m), and updates that no parent has added
+        # yet.
         block = float(k + m) * k
         stored += block
         peak = max(peak, itemsize * stored + 8.0 * (live + block + float(m) * m))

@@ -10,9 +10,9 @@ doi:10.1145/356044.356047). The factor keeps, per member, W = [L11⁻¹; L21 L11
 either half of a solve is one product per member. Forces on few members need only the members
 above them, and so do displacements of few.
 
-The products of a solve read every W once, without the zeros of L11⁻¹: memory is what they wait
-for. A compiled loop over one row after the other reads at two thirds of what memory gives, twice as
-fast as over four rows at a time, and faster than `einsum` and BLAS.
+The products of a solve read every W once, without the zeros of L11⁻¹. Their time is that of reading
+memory. A compiled loop over one row after the other reads at two thirds of the memory's speed,
+twice as fast as over four rows at a time, and faster than `einsum` and BLAS.
 """
 
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import both
 
 CUTS = 16
-"""Ways in which fronts are divided between two threads, to take the best."""
+"""Number of ways to divide fronts between two threads that are tried; the best is taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def dissect(index: Index, joined: sparse.csr_matrix, leaf: int = 48) -> Dissecti
     Args:
         index: lattice position of each node.
         joined: (n, n) pattern: which nodes are joined.
-        leaf: parts of at most so many nodes are not cut further.
+        leaf: parts of at most this number of nodes are not cut further.
     """
     own: list[Index] = []
     parent: list[int] = []
@@ -127,7 +127,7 @@ class Front:
     block: NDArray[Any]
 
     def rows(self, coarse: bool) -> tuple[NDArray[Any], Array]:
-        """Return W row by row without the zeros of L11⁻¹, each row over its scale; the scales.
+        """Return W row by row without the zeros of L11⁻¹, rows over their scales, and the scales.
 
         Args:
             coarse: in 16-bit integers, entries to 1.5e-5 of the largest in their row; else as
@@ -181,7 +181,7 @@ class CholeskyFactor:
         edges: (f + 1,) first place of each front's boundary in `boundary`, and its length.
         boundary: (b,) later unknowns that the fronts touch, increasing within a front.
         values: the rows of W, without the zeros of L11⁻¹, each over its scale.
-        scale: (n + b,) of the rows; the type of all that is worked out with them.
+        scale: (n + b,) of the rows; its type is that of all products with them.
     """
 
     order: Index
@@ -201,7 +201,7 @@ class CholeskyFactor:
         boundaries: list[Index],
         rows: list[tuple[NDArray[Any], Array]],
     ) -> "CholeskyFactor":
-        """Return the factor of fronts' boundaries and `Front.rows`, which are taken away."""
+        """Return the factor of fronts' boundaries and `Front.rows`; the lists are emptied."""
         values, scales = map(list, zip(*rows, strict=True)) if rows else ([], [])
         rows.clear()
         edges = np.cumsum([0, *map(len, boundaries)])
@@ -213,12 +213,12 @@ class CholeskyFactor:
 
     @property
     def entries(self) -> int:
-        """How many numbers the factor holds."""
+        """Number of entries of the factor."""
         return self.values.size
 
     @cached_property
     def firsts(self) -> Index:
-        """Where the rows of each front (f + 1,) begin in `values`, and how long that has to be."""
+        """Where the rows of each front begin in `values`, and its length at the end (f + 1,)."""
         own, touched = np.diff(self.starts), np.diff(self.edges)
         return np.cumsum(np.concatenate([[0], own * (own + 1) // 2 + own * touched]))
 
@@ -245,11 +245,11 @@ class CholeskyFactor:
         """Turn x (n,) into L⁻¹ x in place, in elimination order.
 
         Args:
-            x: zero but on the fronts.
+            x: zero except on the fronts.
             fronts: with everything above each of them; all by default.
         """
         some = self.everything if fronts is None else fronts
-        # Both threads take from what is above: each in a vector of its own, added in one order.
+        # Both threads change unknowns above: each in a vector of its own, added in a fixed order.
         other = np.zeros_like(x)
         _copy(some.second, self.starts, x, other)
         both(
@@ -280,7 +280,7 @@ class CholeskyFactor:
 
 
 def joined(parts: list[NDArray[Any]], number: DTypeLike) -> NDArray[Any]:
-    """Return what the parts hold one after the other; each is freed when it has been copied."""
+    """Return the parts joined into one array; each is freed when it has been copied."""
     whole = np.empty(sum(part.size for part in parts), number)
     at = len(whole)
     while parts:
@@ -356,7 +356,7 @@ def _backward(
 
 @compiled
 def _copy(fronts: Index, starts: Index, source: Array, target: Array) -> None:
-    """Copy what belongs to some fronts from one vector to another."""
+    """Copy the unknowns of some fronts from one vector to another."""
     for front in fronts:
         for i in range(starts[front], starts[front + 1]):
             target[i] = source[i]
@@ -364,7 +364,7 @@ def _copy(fronts: Index, starts: Index, source: Array, target: Array) -> None:
 
 @compiled
 def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
-    """Add what belongs to some fronts in one vector to another."""
+    """Add the unknowns of some fronts in one vector to another."""
     for front in fronts:
         for i in range(starts[front], starts[front + 1]):
             target[i] += source[i]
@@ -372,10 +372,10 @@ def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
 
 @compiled
 def _divided(fronts: Index, parents: Index, sizes: Index) -> Index:
-    """Return for each of some fronts (k,), increasing, whose it is: 0, 1, or 2 for above both.
+    """Return the thread of each of some fronts (k,), increasing: 0, 1, or 2 for above both.
 
-    The heaviest subtree is cut below its top, again and again, and each time the subtrees go
-    to whoever has less, the heaviest first; kept is what lets the two be done soonest.
+    The subtree with the most work is cut below its top, repeatedly, and each time the subtrees go
+    to the thread with less work, the largest first; the division that ends soonest is kept.
     """
     count = len(fronts)
     place = np.full(len(parents), -1)
@@ -433,7 +433,7 @@ def fronts_of(
         rank: (n,) place of each unknown in elimination order, -1 for one left out.
         starts: (f + 1,) first place of each tree member, and how many there are.
         parent: index of the parent of each member, -1 for a root.
-        precision: in which the fronts are yielded; they are worked out in float64.
+        precision: in which the fronts are yielded; they are computed in float64.
 
     Raises:
         ComputationError: the matrix is not positive definite.
@@ -487,7 +487,7 @@ def _fill_lower(
     rows: Index,
     values: Array,
 ) -> None:
-    """Put rows and values where each column's edge says."""
+    """Put rows and values at the place of their column in `edges`."""
     for i in range(len(rank)):
         if rank[i] >= 0:
             free = edges[rank[i]]
@@ -536,9 +536,9 @@ def _eliminate(
         rest = blas.dsyrk(-1.0, mixed, 1.0, rest, lower=1, overwrite_c=1)
     block = np.empty((k + m, k), precision)
     block[:k], block[k:] = inverse, mixed
-    if m:  # in the precision in which W is kept: nothing else of the factor is made of it
+    if m:  # in the precision in which W is kept: it is used for nothing else of the factor
         times = get_blas_funcs("trmm", dtype=precision)
-        # Of an array kept row by row BLAS, which reads column by column, sees the transpose.
+        # BLAS reads column by column, so it sees the transpose of an array that is kept row by row.
         times(1.0, block[:k].T, block[k:].T, overwrite_b=1)
     return boundary, block, rest
 

@@ -66,7 +66,7 @@ class ElasticOperator:
         """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
 
         Args:
-            force: N; zero but on the nodes that the fronts are for.
+            force: N; zero except on the nodes of the fronts.
             fronts: from `fronts_of`; all by default.
         """
         y = force.ravel()[self._unknown]
@@ -76,13 +76,13 @@ class ElasticOperator:
     def nodal(self, x: Array, nodes: Index | None = None) -> Array:
         """Return values (m, 3) of nodes, by default of all, from a vector in elimination order.
 
-        They are 0 where held.
+        Held unknowns have 0.
         """
         return _at_places(x, self._place if nodes is None else self._place[nodes])
 
     @cached_property
     def _unknown(self) -> Index:
-        """Which of the 3n unknowns each in elimination order is."""
+        """Unknown, of the 3n, at each place of the elimination order."""
         return np.flatnonzero(self.free)[self.factor.order]
 
     @cached_property
@@ -168,15 +168,15 @@ def prepare_operator(
     precision: type[np.floating] = np.float64,
     coarse: bool = False,
 ) -> ElasticOperator:
-    """Factorise a stiffness matrix (3n, 3n) and work out the contact nodes' half response.
+    """Factorise a stiffness matrix (3n, 3n) and compute the contact nodes' half response.
 
     Args:
         stiffness: symmetric, positive definite on the free unknowns.
         index: (n, 3) lattice index of each node.
         fixed: (3n,) unknowns that are zero.
         contact_nodes: (c,).
-        precision: in which the numbers are kept, and the response is worked out; the factor is
-            worked out in float64.
+        precision: in which the numbers are kept and the response is computed; the factor is
+            computed in float64.
         coarse: keep the factor, not the response, in 16-bit integers: half the memory of single
             precision, and half to read in every solve.
 
@@ -213,7 +213,7 @@ def prepare_operator(
         half.add(member, front)
         return front.rows(coarse)
 
-    # The response follows the factor in a thread of its own: BLAS lets both go on.
+    # The response follows the factor in its own thread: BLAS lets both threads run.
     with ThreadPoolExecutor(1) as other:
         waiting: list[Future[tuple[NDArray[Any], Array]]] = []
         boundaries = []
@@ -240,14 +240,14 @@ def operator_error(
         |Z g - L⁻¹ E g| / |L⁻¹ E g|    g random on the contact nodes
 
     with K summed from the cells. A random u is as rough as the grid, so that f is as large as
-    K and u allow, and rounding leaves its share of it whatever the condition of K (float32 1e-6,
-    16-bit integers 5e-4); the second looks at
-    the soft, smooth displacements, and the third holds the stored response against the factor.
-    Nothing of factor or response is left out by random numbers.
+    K and u allow, and the relative rounding error does not depend on the condition of K (float32
+    1e-6, 16-bit integers 5e-4). The second measures the soft, smooth displacements, and the third
+    compares the stored response with the factor.
+    Random numbers reach every entry of factor and response.
 
     Args:
-        operator: to be looked at.
-        solid: that it should be of.
+        operator: the operator to check.
+        solid: the solid whose operator it should be.
         response_read: called when all of the response has been read, and nothing of the factor.
     """
     chance = np.random.default_rng(OPERATOR.test_vector_seed)

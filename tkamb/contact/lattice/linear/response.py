@@ -1,10 +1,10 @@
 """Response of the contact nodes to unit forces on them, from half a solve.
 
 With K = L Lᵀ and Z = L⁻¹ E (E picks the contact nodes' unknowns) the compliance between them
-is Eᵀ K⁻¹ E = Zᵀ Z: the backward half of the solves is never done. A column of Z is zero but on
-the path from its node to the root of the elimination tree, and the columns of one subtree
-follow each other, so Z is kept as one dense block per member of the tree, column by column:
-what is asked of few nodes reads their columns alone.
+is Eᵀ K⁻¹ E = Zᵀ Z, so that the backward half of the solves is not needed. A column of Z is zero
+except on the path from its node to the root of the elimination tree, and the columns of one subtree
+follow each other, so Z is kept as one dense block per member of the tree, column by column.
+A product with few nodes then reads only their columns.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from tkamb.geometry.threads import both, in_halves
 Precision = type[np.floating[Any]]
 
 SINGLE: Precision = np.float32
-"""What a stored operator is kept in: it halves what every solve has to read."""
+"""Precision of a stored operator: every solve then reads half as many bytes."""
 
 
 @dataclass(frozen=True)
@@ -125,12 +125,12 @@ class HalfResponse:
 
     @property
     def entries(self) -> int:
-        """How many numbers Z holds."""
+        """Number of entries of Z."""
         return self.values.size
 
     @property
     def columns(self) -> int:
-        """How many columns Z has."""
+        """Number of columns of Z."""
         return int((self.rank >= 0).sum())
 
     @property
@@ -139,12 +139,12 @@ class HalfResponse:
 
     @cached_property
     def _edges(self) -> Index:
-        """Where the places of each block (b + 1,) begin, and how many there are."""
+        """Where the places of each block begin, and their number at the end (b + 1,)."""
         return np.cumsum(np.concatenate([[0], self.blocks[:, 3] - self.blocks[:, 2]]))
 
     @cached_property
     def _middle(self) -> int:
-        """How many of the blocks hold half of the numbers."""
+        """Number of blocks that hold half of the entries."""
         # Blocks are halved by their work, which is rows times columns, for two threads.
         sizes = (self.blocks[:, 1] - self.blocks[:, 0]) * (self.blocks[:, 3] - self.blocks[:, 2])
         return int(np.searchsorted(np.cumsum(sizes), sizes.sum() / 2))
@@ -254,16 +254,16 @@ def unknowns_of(nodes: Index) -> Index:
 
 
 class HalfSolves:
-    """L⁻¹ of unit forces on some unknowns, worked out front by front as the factor is.
+    """L⁻¹ of unit forces on some unknowns, computed front by front, together with the factor.
 
-    Work and memory go along the paths to the root only. It is worked out in `precision`: in
+    Only fronts on the paths to the root take time and memory. It is computed in `precision`: in
     single precision compliances are right to 1e-6 of the largest.
 
     Args:
         starts: (f + 1,) first unknown of each front in elimination order, and how many there are.
         parents: front above each, -1 at a root.
         unknowns: (q,) in elimination order, -1 = held.
-        precision: of what is worked out and kept.
+        precision: of the numbers that are computed and kept.
     """
 
     def __init__(
@@ -292,14 +292,14 @@ class HalfSolves:
         count = front.stop - front.start
         if len(front.boundary):
             self._pass_up(member, front.boundary, right @ front.block[count:].T)
-        # Of arrays kept row by row BLAS, which reads column by column, sees the transposes.
+        # BLAS reads column by column, so it sees the transposes of arrays that are kept row by row.
         times = get_blas_funcs("trmm", dtype=self._precision)
         own = times(1.0, front.block[:count].T, right.T, trans_a=1, overwrite_b=1).T
         self._blocks.append((front.start, front.stop, first, last))
         self._columns.append(own)
 
     def response(self) -> HalfResponse:
-        """Return what all fronts have made; it is taken away."""
+        """Return the response from all fronts, and release its memory here."""
         blocks = np.array(self._blocks, np.int64).reshape(-1, 4)
         return HalfResponse.of(self._rank, blocks, joined(self._columns, self._precision))
 

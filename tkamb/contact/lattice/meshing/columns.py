@@ -43,7 +43,7 @@ COLUMN = ColumnSettings()
 
 @dataclass(eq=False)
 class NodeField:
-    """Every node of the structured grid while it is being settled; arrays are (nx, ny, nz).
+    """Every node of the structured grid while nodes are placed; arrays are (nx, ny, nz).
 
     Args:
         lines: x and z coordinates (m) of the grid lines along y.
@@ -80,7 +80,7 @@ class NodeField:
 class Ends:
     """First and last node of intervals, in layers.
 
-    `single` marks an interval held by one node; of these `held` ones leave it where it is.
+    `single` marks an interval of one node; where `held` is true too, that node is not moved.
     """
 
     first: Index
@@ -90,7 +90,7 @@ class Ends:
 
 
 def settle_columns(surface: Surface, spacing: Array) -> NodeField:
-    """Return the grid over the surface's bounding box with its columns settled along y.
+    """Return the grid over the surface's bounding box with the nodes of its columns placed along y.
 
     Args:
         surface: closed insert in the insert frame.
@@ -215,8 +215,8 @@ def refired_inwards(
 ) -> Array:
     """Return the heights (n,) of nodes at places on walls; a miss moves the target inwards.
 
-    A wall is rough by the mesh's noise: a vertical ray on it may pass the part. Where one
-    does, it is fired again INSIDE_WALL inside the wall and the target (n, 3) is moved there.
+    The mesh's noise makes a wall rough, so that a vertical ray on it may miss the part. Such a ray
+    is fired again, `wall_inset` inside the wall, and the target (n, 3) is moved there.
 
     Args:
         field: nodes.

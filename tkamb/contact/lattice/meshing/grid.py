@@ -75,7 +75,7 @@ class Lattice:
         mended_rays: (3,) lines along x, y, z mended from their neighbours.
         closed_gaps: gaps narrower than a cell, filled.
         thin_intervals: parts thinner than half a cell, left out or held by one node.
-        size_notices: what was told of the cells' size.
+        size_notices: notices about the cells' size, in words.
     """
 
     nodes: Array
@@ -131,7 +131,7 @@ class Lattice:
 def build_grid(insert: Surface, target_size: float) -> Lattice:
     """Return the lattice of a closed insert, whatever its volume; see `whole_lattice`.
 
-    Mended rays and a post (cam-post contact is not modelled) are told on the logger "tkamb".
+    Mended rays and a post (cam-post contact is not modelled) are logged, by the logger "tkamb".
 
     Args:
         insert: closed surface in the insert frame (flat bottom in y = 0 facing -y).

@@ -8,8 +8,8 @@ stretched, column by column, to the top surface, as far as the edge ratio permit
     y_j(x, z) = j H(x, z) / J          0 <= j <= J
 
 Above the reference layer (a post, an eminence) and below the bottom (a peg) the spacing is the
-grid's own. H is the top where that is smooth, and is carried on underneath what stands out.
-"""
+grid's own. H is the top where that is smooth, and is continued smoothly underneath a post or
+eminence."""
 
 from dataclasses import dataclass
 
@@ -96,7 +96,7 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
 
     Where the top is more than half a layer too low for them, the layers end in a step, whose
     edge has a cell on one side only and half the support: no number is taken that puts such
-    steps into the dishes. On a step higher up no condyle stands.
+    steps into the dishes. No condyle stands on the steps higher up.
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])

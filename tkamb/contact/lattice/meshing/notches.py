@@ -1,7 +1,7 @@
-"""Notches that steps of the grid leave under a surface, filled.
+"""Fills the notches that steps of the grid leave under a surface.
 
 A grid that meets a surface at an angle follows it in steps, and each step leaves a wedge that
-belongs to no cell. The node outside the wedge is drawn into the corner of the part, or, where
+belongs to no cell. The node outside the wedge is moved into the corner of the part, or, where
 the surface runs straight on, almost onto the line between its two neighbours.
 """
 
@@ -25,7 +25,7 @@ class NotchSettings:
     """1: share of the way inwards by which a node stays inside its corner. Chosen: rays along y
     hit."""
     ray_start_cells: float = 0.1
-    """Cells below a node on the top, or above one underneath, at which rays ask what is inside.
+    """Cells below a node on the top, or above one underneath, from which rays test what is inside.
     Chosen: above the rounding of a mesh, within the cell."""
     max_move_diagonals: float = 0.75
     """Diagonals of a cell's face: largest move of a node. Chosen: a larger one would turn the cell
@@ -83,7 +83,7 @@ class Notch:
 
 
 def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> None:
-    """Draw missing nodes into the corner of the part, or onto the line between neighbours."""
+    """Move missing nodes into the corner of the part, or onto the line between neighbours."""
     first, second, across = (field.points[n] for n in (notch.first, notch.second, notch.across))
     own, middle = before[notch.node], 0.5 * (first + second)
     flat = notch.axes == (0, 2)

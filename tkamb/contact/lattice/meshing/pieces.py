@@ -1,4 +1,4 @@
-"""The pieces of a lattice: which are kept, and what a lattice lacks of its mesh."""
+"""The pieces of a lattice: which are kept, and which parts of its mesh the lattice lacks."""
 
 from dataclasses import dataclass
 

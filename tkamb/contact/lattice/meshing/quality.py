@@ -1,4 +1,4 @@
-"""How good a lattice is: volume against the mesh, edges, corners, shear, and what was mended."""
+"""Quality of a lattice: volume compared with the mesh, edges, corners, shear, and repairs."""
 
 from dataclasses import dataclass
 

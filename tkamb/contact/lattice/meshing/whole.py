@@ -1,8 +1,8 @@
-"""The lattice that a contact model takes: of the same volume as its mesh, or refused.
+"""The lattice of a contact model: of the same volume as its mesh, or refused.
 
 A grid that follows a surface in cells can lose what is thinner than a cell, and a whole part where
-something goes wrong. No number of a contact shows that, so the two volumes are compared every time.
-"""
+something goes wrong. The results of a contact do not show that, so both volumes are always
+compared."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ _log = logging.getLogger("tkamb")
 
 @dataclass(frozen=True)
 class VolumeSettings:
-    """How the volume of a lattice is held to that of its mesh."""
+    """Limits of the difference between the volumes of a lattice and its mesh."""
 
     tolerance: float = 0.02
     """Largest difference, as a share of the mesh's volume. Chosen: stiffness and pressure of an
@@ -38,7 +38,7 @@ def whole_lattice(insert: Surface, target_size: float) -> Lattice:
     """Return the lattice of a closed insert, of the same volume as the mesh within 2 %.
 
     Where cells of the wanted size lose more, somewhat smaller ones are taken, with a notice: how
-    much of thin rims is lost varies with the size. What is told on the logger "tkamb": mended
+    much of thin rims is lost varies with the size. The logger "tkamb" logs mended
     rays, smaller cells, and a post (cam-post contact is not modelled).
 
     Args:
