@@ -41,7 +41,7 @@ def test_a_census_tells_read_from_part_and_refused(tmp_path):
         "a.csv": [],  # no second reader reads tables of text
         "cut.c3d": [],
         "deeper/plate.c3d": ["time", "markers"],
-        "good.c3d": ["time", "markers"],  # ezc3d wants FORCE_PLATFORM:USED a whole number
+        "good.c3d": ["time", "markers", "plate 1"],
     }
     assert "compared with a second reader: 2" in said
     assert "1 part, 2 read, 1 refused" in said and "cut short" in said
