@@ -53,6 +53,8 @@ def _add_plates(c: ezc3d.c3d, plates: list[dict], scale: float) -> None:
     c.add_parameter("FORCE_PLATFORM", "ORIGIN", origins)
     channels = np.stack([np.array(p["channels"], float) for p in plates], axis=1)
     c.add_parameter("FORCE_PLATFORM", "CHANNEL", channels)
+    for key in ("USED", "TYPE", "CHANNEL"):  # `add_parameter` makes all numbers floating-point
+        c["parameters"]["FORCE_PLATFORM"][key]["type"] = ezc3d.ezc3d.INT
     if any("matrix" in p for p in plates):
         matrices = np.stack([p.get("matrix", np.eye(6)) for p in plates], axis=2)
         c.add_parameter("FORCE_PLATFORM", "CAL_MATRIX", matrices)

@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
+from pendulum_leg import pendulum_osim
 from recordings import standing_markers, write_c3d
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "census_recordings"
@@ -25,26 +27,35 @@ def test_a_census_tells_read_from_part_and_refused(tmp_path):
     (folder / "cut.c3d").write_bytes(path.read_bytes()[:-4000])
     (folder / "a.csv").write_text("time,x\n0,1\n", encoding="utf-8")
     (folder / "read.me").write_text("not a recording", encoding="utf-8")
+    pendulum_osim(folder / "leg.osim")
+    trimesh.creation.box().export(folder / "box.stl")
+    trimesh.Trimesh(np.eye(3), [[0, 1, 2]]).export(folder / "open.stl")
     command = [sys.executable, str(SCRIPT), str(folder), "--json", str(tmp_path / "rows.json")]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     rows = {row["file"]: row for row in json.loads((tmp_path / "rows.json").read_text())}
     results = {name: row["result"] for name, row in rows.items()}
     assert results == {
         "a.csv": "read",
+        "box.stl": "read",
         "cut.c3d": "refused",
         "deeper/plate.c3d": "part",
         "good.c3d": "read",
+        "leg.osim": "read",
+        "open.stl": "part",
     }
     assert "type 7" in rows["deeper/plate.c3d"]["why"][0]
     compared = {name: row["compared"] for name, row in rows.items()}
     assert compared == {
         "a.csv": [],  # no second reader reads tables of text
+        "box.stl": ["extents", "volume"],
         "cut.c3d": [],
         "deeper/plate.c3d": ["time", "markers"],
-        "good.c3d": ["time", "markers"],  # ezc3d wants FORCE_PLATFORM:USED a whole number
+        "good.c3d": ["time", "markers", "plate 1"],
+        "leg.osim": rows["leg.osim"]["compared"],  # only where OpenSim is installed
+        "open.stl": ["extents"],
     }
-    assert "compared with a second reader: 2" in said
-    assert "1 part, 2 read, 1 refused" in said and "cut short" in said
+    assert f"compared with a second reader: {sum(map(bool, compared.values()))}" in said
+    assert "2 part, 4 read, 1 refused" in said and "cut short" in said
 
 
 def test_a_census_finds_what_a_second_reader_reads_otherwise(tmp_path):

@@ -152,6 +152,19 @@ def test_xml_that_opensim_reads_is_read(tmp_path, case):
     assert len(read.notices) == 1 and words in read.notices[0]
 
 
+@pytest.mark.parametrize("gravity", ["(0 -9.5 0)", "~[0,-9.5,0]", "0, -9.5, 0"])
+def test_three_numbers_in_brackets_or_between_commas(tmp_path, gravity):
+    text = re.sub("<gravity>.*?</gravity>", f"<gravity>{gravity}</gravity>", NEW)
+    np.testing.assert_array_equal(read_osim(written(tmp_path, text)).gravity, [0.0, -9.5, 0.0])
+
+
+@pytest.mark.parametrize("gravity", ["0 -9,5 0,1", "0 -9,5", "(0 1)"])
+def test_decimal_commas_are_not_taken_for_several_numbers(tmp_path, gravity):
+    text = re.sub("<gravity>.*?</gravity>", f"<gravity>{gravity}</gravity>", NEW)
+    with pytest.raises(InputError, match="is not 3 numbers"):
+        read_osim(written(tmp_path, text))
+
+
 def test_a_byte_order_mark_is_no_fault(tmp_path):
     read = read_osim(written(tmp_path, b"\xef\xbb\xbf" + NEW.encode()))
     assert read.notices == ()
@@ -162,6 +175,7 @@ def test_a_byte_order_mark_is_no_fault(tmp_path):
     [
         ("</gravity>", "</gravitas>", ("mismatched tag: line 9, column", "correct that line")),
         ("<gravity>", "<gravity", ("not well-formed (invalid token): line 9, column", "correct")),
+        ("<gravity>", "<credits>m < 5 & > 3</credits><gravity>", ("line 9", "write &lt; for a <")),
     ],
 )
 def test_xml_that_nobody_reads_names_line_column_and_remedy(tmp_path, old, new, words):

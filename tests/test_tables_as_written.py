@@ -50,6 +50,49 @@ def test_blanks_for_tabs_in_a_trc(tmp_path, labels, rows, counts):
     np.testing.assert_array_equal(table.column("R.Toe_z"), [6.0, np.nan, 6.0])
 
 
+STORAGE = "Coordinates\nnRows={rows}\nnColumns=2\ninDegrees={degrees}\n{more}endheader\n"
+
+
+def storage(folder, rows="2", degrees="yes", more="", encoding="utf-8"):
+    text = STORAGE.format(rows=rows, degrees=degrees, more=more) + "time\tknee\n0\t1\n0.1\t2\n"
+    (folder / "a.mot").write_bytes(text.encode(encoding))
+    return read_table(folder / "a.mot")
+
+
+def test_a_header_that_states_another_number_of_rows_is_noticed(tmp_path):
+    """A file cut short by a copy or a program that stopped is no error; but it is said."""
+    assert storage(tmp_path).notices == ()
+    for rows in ("1", "5"):
+        (notice,) = storage(tmp_path, rows).notices
+        assert f"has 2 rows, but its header says {rows}" in notice
+    labels = "Frame#\tTime\tA\t\t\tB\t\t"
+    (notice,) = trc(tmp_path, labels, counts="100\t100\t9\t2\tmm").notices
+    assert "has 3 rows, but its header says 9" in notice
+
+
+@pytest.mark.parametrize(
+    ("word", "degrees"), [("yes", True), ("TRUE", True), ("0", False), ("No", False), ("?", None)]
+)
+def test_words_for_degrees(tmp_path, word, degrees):
+    assert storage(tmp_path, degrees=word).in_degrees is degrees
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16"])
+def test_bytes_of_remarks_that_are_no_numbers_refuse_no_table(tmp_path, encoding):
+    table = storage(tmp_path, more="gemessen für Müller, 20 °C\n", encoding=encoding)
+    np.testing.assert_array_equal(table.column("knee"), [1.0, 2.0])
+
+
+def test_a_storage_file_of_vectors_is_refused_as_such(tmp_path):
+    with pytest.raises(InputError, match=r"values of the type vec3.*DataType=double"):
+        storage(tmp_path, more="DataType=Vec3\n")
+
+
+def test_quoted_cells_of_a_csv(tmp_path):
+    (tmp_path / "a.csv").write_text('"time","x"\n"0","1.5"\n"0.1","2"\n', encoding="utf-8")
+    np.testing.assert_array_equal(read_table(tmp_path / "a.csv").column("x"), [1.5, 2.0])
+
+
 def test_labels_with_blanks_in_them_between_tabs_or_many_blanks(tmp_path):
     for labels in ("Frame#\tTime\tR heel\t\t\tR toe\t\t", "Frame#   Time   R heel    R toe"):
         np.testing.assert_array_equal(trc(tmp_path, labels).column("R heel_y"), 2.0)

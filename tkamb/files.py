@@ -179,6 +179,8 @@ def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
     """Return a hint for an error of the parser, from the bytes around its place."""
     at = max(parser.ErrorByteIndex, 0)
     near = content[max(at - 1, 0) : at + 12]
+    if re.match(rb"<[\s\d=]", near):
+        return "write &lt; for a < in a text"
     if re.search(rb"&(?!\w{1,8};|#)", near):
         return "write &amp; for a & in a text"
     if any(byte > 127 for byte in near):

@@ -97,6 +97,8 @@ class CellContact(ContactModel):
 
     direction: ClassVar[Direction] = "normal"
     """Nodes are pressed along the femoral normal, or vertically."""
+    ends_held: ClassVar[bool] = False
+    """A mobile bearing's end nodes are held, see `fixed_unknowns`."""
 
     @abstractmethod
     def solid(self, lattice: Lattice, material: Material) -> Solid:
@@ -107,7 +109,11 @@ class CellContact(ContactModel):
         lattice = whole_lattice(pair.insert, self.resolution)
         solid = self.solid(lattice, pair.material)
         held = fixed_unknowns(
-            lattice.nodes, lattice.bottom_nodes, pair.bearing, lattice.piece_of_node
+            lattice.nodes,
+            lattice.bottom_nodes,
+            pair.bearing,
+            lattice.piece_of_node,
+            self.ends_held,
         )
         nodes, surface = contact_map(lattice, pair.insert)
         operator = self._operator(solid, lattice, held, nodes)

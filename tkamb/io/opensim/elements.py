@@ -107,14 +107,14 @@ class Document:
     def numbers(
         self, element: Element, *tags: str, count: int | None = None, default: str | None = None
     ) -> Array:
-        """Return the numbers (count,) of a child.
+        """Return the numbers (count,) of a child; several may be in brackets, or between commas.
 
         Raises:
             InputError: missing, not numbers, not finite or not as many.
         """
         text = self.text(element, *tags, default=default)
         try:
-            values = np.array(text.split(), float)
+            values = np.array(_number_words(text, count), float)
         except ValueError:
             values = np.array([np.nan])
         if not np.isfinite(values).all() or count not in (None, len(values)):
@@ -201,3 +201,15 @@ class Document:
                 "needs as many y as x, two at least, and x increasing", self.where(element)
             )
         return x, y
+
+
+def _number_words(text: str, count: int | None) -> list[str]:
+    """Return the words of a list of numbers.
+
+    OpenSim's own reader takes `(0 1 0)`, `~[0,1,0]` and `0, 1, 0` for three numbers too. Commas
+    separate only where there is one between each two: else they may be decimal.
+    """
+    if count is None or count < 2:
+        return text.split()
+    plain = text.strip().lstrip("~([").rstrip(")]")
+    return plain.split(",") if plain.count(",") == count - 1 else plain.split()

@@ -1,5 +1,6 @@
 """Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
 
+import codecs
 import contextlib
 import math
 import re
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import FILE_LIMITS, read_text
+from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.geometry.frames import Array
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 from tkamb.units import LENGTH
@@ -38,6 +39,8 @@ _OF_NUMBERS = "0123456789+-.eE "
 """Characters of plain decimal numbers."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
+STATED_DEGREES = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
+"""What a storage file may say after `inDegrees=`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,8 +180,18 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file that is no larger than a table may be."""
-    return read_text(path, FILE_LIMITS.table_bytes, "utf-8-sig").splitlines()
+    """Return the lines of a text file that is no larger than a table may be.
+
+    UTF-8, UTF-16 where the file begins with its mark, and else Latin-1: older programs write
+    remarks and names so, and numbers are the same in it.
+    """
+    content = read_bytes(path, FILE_LIMITS.table_bytes)
+    try:
+        marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = content.decode("utf-16" if marked else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n").splitlines()
 
 
 def read_csv(path: Path) -> Table:
@@ -188,13 +201,13 @@ def read_csv(path: Path) -> Table:
     """
     lines = read_lines(path)
     rows = [
-        (number, line.split(","))
+        (number, line.replace('"', "").split(","))
         for number, line in enumerate(lines, 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not rows:
         raise InputError("is empty", path)
-    names = [name.strip().strip('"') for name in rows[0][1]]
+    names = [name.strip() for name in rows[0][1]]
     for sign, word in ((";", "semicolons"), ("\t", "tabs")):
         if len(names) == 1 and sign in names[0]:
             hint = "save it with commas between the cells and points in the numbers"
@@ -226,9 +239,20 @@ def read_storage(path: Path) -> Table:
     ]
     if not rows:
         raise InputError("has no columns after 'endheader'", path)
-    degrees = {"yes": True, "no": False}.get(header.get("indegrees", ""))
+    if header.get("datatype", "double") != "double":
+        what = f"holds values of the type {header['datatype']}, not single numbers"
+        raise InputError(what, path, "export it with DataType=double")
     columns, equal = _columns(path, rows[0][1], rows[1:])
-    return Table(path, columns, in_degrees=degrees, equal=equal, notices=_of_equal(equal))
+    notices = (*_of_equal(equal), *_row_notices(header.get("nrows"), len(rows) - 1))
+    degrees = STATED_DEGREES.get(header.get("indegrees", ""))
+    return Table(path, columns, in_degrees=degrees, equal=equal, notices=notices)
+
+
+def _row_notices(stated: str | None, rows: int) -> tuple[str, ...]:
+    """Return a remark on a table whose header states another number of rows."""
+    if stated is None or not stated.isdecimal() or int(stated) == rows:
+        return ()
+    return (f"has {rows} rows, but its header says {int(stated)}; it may be cut short",)
 
 
 def read_trc(path: Path) -> Table:
@@ -262,6 +286,7 @@ def read_trc(path: Path) -> Table:
     notices = [f"has two markers '{name}'; neither is used" for name in twice]
     if unlabelled := markers.count(""):
         notices.append(f"has {unlabelled} marker(s) without a label; they are not used")
+    notices += _row_notices(header.get("NumFrames"), len(rows))
     return Table(
         path,
         table,

@@ -6,7 +6,10 @@ lists below; any other is refused where the quantity is needed, never guessed.
 
 from dataclasses import dataclass
 
-from tkamb.units import MILLIMETRE
+from tkamb.units import LENGTH, MILLIMETRE, STANDARD_GRAVITY
+
+POUND_FORCE = 0.45359237 * STANDARD_GRAVITY
+"""N; the international avoirdupois pound (1959) under standard gravity."""
 
 LENGTH_WORDS = {
     **dict.fromkeys(("m", "mete", "meter", "meters", "metre", "metres"), 1.0),
@@ -14,13 +17,20 @@ LENGTH_WORDS = {
     **dict.fromkeys(
         ("mm", "mill", "millimeter", "millimeters", "millimetre", "millimetres"), MILLIMETRE
     ),
+    **dict.fromkeys(("in", "inch", "inches"), LENGTH["inch"]),
+    **dict.fromkeys(("ft", "foot", "feet"), 12 * LENGTH["inch"]),
 }
 """Metres per unit. Four letters alone are what some programs leave of a longer word."""
 FORCE_WORDS = {
     **dict.fromkeys(("n", "nt", "newt", "newton", "newtons"), 1.0),
+    **dict.fromkeys(("dan", "decanewton", "decanewtons"), 10.0),
     **dict.fromkeys(("kn", "kilonewton", "kilonewtons"), 1e3),
+    **dict.fromkeys(("kgf", "kp", "kilopond", "kiloponds"), STANDARD_GRAVITY),
+    **dict.fromkeys(("lb", "lbs", "lbf", "pound", "pounds"), POUND_FORCE),
 }
 """Newtons per unit."""
+LENGTH_FIRST = ("in", "inch", "ft", "foot")
+"""Lengths that may stand before the force, as in `in-lb`; `mN` would be a millinewton."""
 
 _SEPARATORS = str.maketrans("", "", " .*-·⋅_\x00\t")
 
@@ -30,7 +40,7 @@ class GivenUnits:
     """Units that the user states for words of a recording that are missing or not understood.
 
     Args:
-        length: of markers and plates: m, cm or mm; None: the recording says.
+        length: of markers and plates, like mm; None: the recording says.
         force: of force channels, like N; None: the recording says.
         moment: of moment channels, like Nmm; None: the recording says.
     """
@@ -56,8 +66,14 @@ def newtons(word: str) -> float | None:
 
 
 def newton_metres(word: str) -> float | None:
-    """Return newton metres per unit of moment, a force word and a length word; else None."""
+    """Return newton metres per unit of moment, a force word and a length word; else None.
+
+    Inches and feet may stand first.
+    """
     plain = plain_unit(word)
+    for length in LENGTH_FIRST:
+        if plain.startswith(length) and plain[len(length) :] in FORCE_WORDS:
+            return LENGTH_WORDS[length] * FORCE_WORDS[plain[len(length) :]]
     for cut in range(1, len(plain)):
         force, length = FORCE_WORDS.get(plain[:cut]), LENGTH_WORDS.get(plain[cut:])
         if force is not None and length is not None:

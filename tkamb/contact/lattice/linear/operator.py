@@ -129,19 +129,26 @@ def _at_places(x: Array, places: Index) -> Array:
 
 
 def fixed_unknowns(
-    nodes: Array, bottom: Index, bearing: Bearing, piece: Index | None = None
+    nodes: Array,
+    bottom: Index,
+    bearing: Bearing,
+    piece: Index | None = None,
+    ends_held: bool = False,
 ) -> Mask:
     """Return which of the 3n unknowns are held.
 
-    Fixed bearing: all of the bottom nodes' unknowns. Mobile bearing: their y, and x and z of
-    the two end nodes along z, which takes away the rigid modes (those nearest to x = 0). Each of
-    several pieces slides by itself.
+    Fixed bearing: all of the bottom nodes' unknowns. Mobile bearing: their y, and what takes away
+    the rigid modes and hinders no strain: x of the two end nodes along z (those nearest to
+    x = 0), and z of the node nearest to the middle between them. Each of several pieces slides
+    by itself.
 
     Args:
         nodes: (n, 3) m.
         bottom: (b,) nodes in the flat bottom.
         bearing: "fixed" or "mobile".
         piece: (n,) of each node; None: all belong together.
+        ends_held: hold x and z of both end nodes, as Sharma (2008), section 4.5.4. The insert
+            then cannot grow wider between them, and a uniform pressure is uneven by up to 10 %.
     """
     fixed = np.zeros((len(nodes), 3), bool)
     if bearing == "fixed":
@@ -152,12 +159,19 @@ def fixed_unknowns(
     if piece is not None:
         pieces = [bottom[piece[bottom] == each] for each in np.unique(piece[bottom])]
     for own in pieces:
-        x, z = np.abs(nodes[own, 0]), nodes[own, 2]
-        tolerance = 1e-9 + 1e-6 * np.ptp(z)
+        z = nodes[own, 2]
         for end in (z.min(), z.max()):
-            at_end = own[np.abs(z - end) <= tolerance]
-            fixed[at_end[np.argmin(x[np.abs(z - end) <= tolerance])], [0, 2]] = True
+            fixed[_nearest(nodes, own, end), [0, 2] if ends_held else 0] = True
+        if not ends_held:
+            fixed[_nearest(nodes, own, (z.min() + z.max()) / 2.0), 2] = True
     return fixed.ravel()
+
+
+def _nearest(nodes: Array, some: Index, z: float) -> int:
+    """Return the node nearest to a place along z; of those as near the one nearest to x = 0."""
+    away = np.abs(nodes[some, 2] - z)
+    tied = some[away <= away.min() + 1e-9 + 1e-6 * np.ptp(nodes[some, 2])]
+    return int(tied[np.argmin(np.abs(nodes[tied, 0]))])
 
 
 def prepare_operator(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.contact.lattice.meshing.columns import NodeField, Nodes, refired_inwards
+from tkamb.contact.lattice.meshing.columns import COLUMN, NodeField, Nodes, refired_inwards
 from tkamb.contact.lattice.meshing.notches import fill_notches
 from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.height_field import inside_intervals
@@ -118,10 +118,12 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
     move = np.zeros((*field.member.shape, 2))
     for column, axis in ((0, 0), (1, 2)):
         forth, back = (hit.distance for hit in hits[axis : axis + 2])
-        near = np.minimum(forth, back)
-        chosen = near <= 0.5 * field.spacing[axis]
-        move[..., column] = np.where(chosen, np.where(forth <= back, forth, -back), 0.0)
-        _leave_far_side(hits[axis : axis + 2], chosen & (forth > back), chosen & (forth <= back))
+        tie = COLUMN.tie * field.spacing[axis]
+        chosen = np.minimum(forth, back) <= 0.5 * field.spacing[axis] + tie
+        forwards = forth <= back + tie
+        way = np.where(forwards, forth, -back)
+        move[..., column] = np.where(chosen & (np.abs(way) > tie), way, 0.0)
+        _leave_far_side(hits[axis : axis + 2], chosen & ~forwards, chosen & forwards)
     nodes: Nodes = np.nonzero((move != 0.0).any(axis=-1))
     target = _corner_or_wall(firing[nodes], move[nodes], rays)
     height = refired_inwards(field, nodes, target, -move[nodes], rays)
@@ -163,7 +165,8 @@ def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCas
     height = np.full(field.member.shape, np.nan)
     for (axis, sign), hit in zip(STEPS, hits, strict=True):
         spacing = field.spacing[axis]
-        near = hit.open & (hit.distance < spacing)
+        tie = COLUMN.tie * spacing
+        near = hit.open & (hit.distance < spacing + tie)
         i, j, k = np.nonzero(near)
         to = [i, j, k]
         to[axis] = to[axis] + sign
@@ -173,7 +176,7 @@ def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCas
         outside = ~field.member[goal]
         node, goal = tuple(n[outside] for n in node), tuple(g[outside] for g in goal)
         column = 0 if axis == 0 else 1
-        move[..., column][goal] = -sign * (spacing - hit.distance[node])
+        move[..., column][goal] = -sign * np.maximum(spacing - hit.distance[node], tie)
         upper[goal] &= field.upper_end[node]
         lower[goal] &= field.lower_end[node]
         top[goal] &= field.top[node]

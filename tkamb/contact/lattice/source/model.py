@@ -84,6 +84,7 @@ class SourceLattice(CellContact):
     law: Literal["nonlinear", "linear"] = "nonlinear"
     loops: Literal["stored", "source"] = "stored"
 
+    ends_held: ClassVar[bool] = True
     direction: ClassVar[Direction] = "vertical"
 
     def solid(self, lattice: Lattice, material: Material) -> Solid:
