@@ -134,7 +134,9 @@ class ContactSwitch:
         if result is None:
             nothing = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
             return packed_map(nothing, self.peak, f"{model}: {contact.problem}")
-        found = PressureMap(points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None])
+        pressure_map = PressureMap(
+            points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None]
+        )
         parts = []
         for name in SIDE_COLOURS:
             condyle = getattr(result, name)
@@ -144,9 +146,9 @@ class ContactSwitch:
                     f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
                 )
         words = [f"{model}: {'; '.join(parts)}", f"{contact.seconds:.2f} s", *contact.flags]
-        if found.peak > self.peak:
+        if pressure_map.peak > self.peak:
             words.append(f"the map exceeds the colour scale ({self.peak:.1f} MPa)")
-        return packed_map(found, self.peak, "; ".join(words))
+        return packed_map(pressure_map, self.peak, "; ".join(words))
 
     def _side(self, model: str) -> ContactSide:
         if model not in self._sides:
@@ -213,6 +215,10 @@ class ViewServer:
     def url(self) -> str:
         """Address of the page, token included."""
         return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
+
+    def _repr_html_(self) -> str:
+        """Return a link, which a notebook shows."""
+        return f'<a href="{self.url}" target="_blank" rel="noopener">{self.url}</a>'
 
     def serve(self) -> None:
         """Answer until `close`, or until the user interrupts."""
@@ -320,11 +326,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_allowed(self) -> bool:
         origin = self.headers.get("Origin")
-        given = self.path[: len(self.root)].encode(errors="replace")
+        path_start = self.path[: len(self.root)].encode(errors="replace")
         return (
             self.headers.get("Host") in self.names
             and (origin is None or origin in {f"http://{name}" for name in self.names})
-            and secrets.compare_digest(given, self.root.encode())
+            and secrets.compare_digest(path_start, self.root.encode())
         )
 
     def _refuse(self) -> None:
