@@ -1,5 +1,6 @@
 """A run that is killed or interrupted: whole files, a readable part, and the same end."""
 
+import json
 import random
 import re
 import signal
@@ -235,6 +236,27 @@ def test_a_torn_shard_counts_as_absent(tmp_path):
         path.write_bytes(whole[:size])
         assert shards.get(3) is None
     assert shards.get(4) is None
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        Shard({"time_s": 0.0, "status": "ok", "x": [1]}, None),
+        Shard({"time_s": "0", "status": "ok"}, None),
+        Shard({"status": 1, "time_s": 0.0}, None),
+        Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.zeros(3)}),
+        Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.array(["x"])}),
+    ],
+)
+def test_a_frame_that_somebody_forged_is_computed_anew(tmp_path, forged):
+    """Its digest is right: it ended a run with an error that nobody foresaw."""
+    frames = slice(0, 8)
+    stop_after(tmp_path, 3, frames=frames)
+    identity = json.loads((tmp_path / ".frames" / "run.json").read_text())
+    Shards(tmp_path, identity, resume=True).put(1, forged)
+    found = simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
+    assert found.summary["resumed_frames"] == 1
+    assert np.isfinite(found["force_si_N"]).all()
 
 
 def test_an_interrupt_waits_until_a_frame_is_written():

@@ -1,5 +1,6 @@
 """Bands: known propagation, samples by number alone, and the case with its inputs moved."""
 
+import json
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from tkamb.io.claim import settle
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.run.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
+from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import simulate
 from tkamb.studies.uncertainty.bands import (
     band_columns,
@@ -208,6 +210,9 @@ def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_
     with pytest.raises(KeyboardInterrupt, match="4 of 40 samples are kept"):
         estimate_uncertainty(scene, **options, directory=folder, progress=broken_off(4))
     assert not (folder / BANDS_NAME).exists()
+    identity = json.loads((folder / ".frames" / "run.json").read_text())
+    forged = Shard({}, {"values": np.zeros(2)})  # of right digest: it counts as absent
+    Shards(folder, identity, resume=True).put(1, forged)
     one = estimate_uncertainty(scene, **options)
     two = estimate_uncertainty(scene, **options, directory=folder, resume=True, workers=2)
     for name, band in one.bands.items():

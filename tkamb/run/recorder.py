@@ -140,11 +140,12 @@ class FolderRecorder(Recorder):
         self._map_arguments = (points, triangles, labels)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
-        """See `Recorder`; in order, up to the first gap."""
+        """See `Recorder`; in order, up to the first gap, or frame that is none of this run's."""
         shards = {}
+        points = None if self._map_arguments is None else len(self._map_arguments[0])
         for frame in frames if self._shards.resumed else ():
             shard = self._shards.get(frame)
-            if shard is None:
+            if shard is None or not _is_frame(shard, points):
                 break
             shards[frame] = shard.contact
             self._record(frame, shard.row, shard.contact)
@@ -195,6 +196,31 @@ class FolderRecorder(Recorder):
             RECORDER.shortest_pause_seconds, (self._shown - start) / RECORDER.largest_time_share
         )
         return results
+
+
+def _is_frame(shard: Shard, points: int | None) -> bool:
+    """Return whether what was kept has the kinds and shapes of a frame of this run.
+
+    Args:
+        shard: read from a folder that may be somebody else's.
+        points: of the pressure map; None where there is none.
+    """
+    row = shard.row
+    numbers = [value for name, value in row.items() if name != "status"]
+    plain = all(value is None or type(value) in (int, float, bool) for value in numbers)
+    if not plain or not isinstance(row.get("status"), str) or type(row.get("time_s")) is not float:
+        return False
+    if shard.contact is None:
+        return True
+    if points is None:
+        return False
+    n = points
+    shapes = dict.fromkeys(("pressure", "gap", "area"), (n,))
+    shapes |= dict.fromkeys(("nodal_force", "normals"), (n, 3))
+    shapes |= {"pose": (4, 4), "wrench_on_insert": (6,)} | dict.fromkeys(CONTACT_PLACES, (3, 3))
+    kept = shard.contact
+    whole = all(array.dtype.kind == "f" for array in kept.values())
+    return whole and all(name in kept and kept[name].shape == shapes[name] for name in shapes)
 
 
 @contextmanager

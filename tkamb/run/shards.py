@@ -10,11 +10,13 @@ the first frame is there.
 import hashlib
 import io
 import json
+import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -29,6 +31,12 @@ OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
 """What the folder holds, and all that is ever removed from it."""
 LARGEST = 2e9
 """Bytes of a frame; a map of 100,000 points has 5 MB."""
+
+UNREADABLE = (
+    *(ValueError, TypeError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError),
+    *(MemoryError, BadZipFile, zlib.error),
+)
+"""What numpy, zipfile and json raise for damaged bytes."""
 
 CONTACT_PLACES = ("contact_points", "contact_normals")
 """(3, 3) m and unit: where medial condyle, lateral condyle and patella touch; NaN without."""
@@ -113,9 +121,12 @@ class Shards:
         digest, content = packed[:32], packed[32:]
         if self._digest(frame, content) != digest:
             return None
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            row = json.loads(arrays["row"].tobytes())
-            contact = {name: arrays[name] for name in arrays.files if name != "row"}
+        try:  # the digest finds accidents; who forged a frame has written its digest too
+            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+                row = dict(json.loads(arrays["row"].tobytes()))
+                contact = {name: arrays[name] for name in arrays.files if name != "row"}
+        except UNREADABLE:
+            return None
         return Shard(row, contact or None)
 
     def _digest(self, frame: int, content: bytes) -> bytes:

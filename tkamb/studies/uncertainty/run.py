@@ -1,6 +1,6 @@
 """All samples of a scene: computed by workers, stored when finished, then turned into bands."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -198,7 +198,7 @@ class _Job:
         """Compute the samples that are not there yet and return all with their bands."""
         names = banded_names(self.nominal)
         count = len(self.points)
-        samples = _kept(shards, count)
+        samples = _kept(shards, count, len(names))
         remaining = [n for n in range(count) if n not in samples]
         new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
         try:
@@ -280,11 +280,20 @@ def banded_names(results: Results) -> list[str]:
     ]
 
 
-def _kept(shards: Shards | None, count: int) -> dict[int, Sample]:
-    """Return the samples that an earlier run left."""
+def _kept(shards: Shards | None, count: int, names: int) -> dict[int, Sample]:
+    """Return the samples that an earlier run left; one of other shapes counts as absent."""
     samples: dict[int, Sample] = {}
     for number in range(count) if shards is not None and shards.resumed else ():
         shard = shards.get(number) if shards is not None else None
-        if shard is not None and shard.contact is not None:
+        if shard is not None and shard.contact is not None and _is_sample(shard.contact, names):
             samples[number] = Sample(**shard.contact)
     return samples
+
+
+def _is_sample(arrays: Mapping[str, Array], names: int) -> bool:
+    """Return whether kept arrays have the kinds and shapes of a `Sample` of so many columns."""
+    kinds = {name: (array.dtype.kind, array.ndim) for name, array in arrays.items()}
+    if kinds != {"values": ("f", 2), "problems": ("U", 1), "errors": ("f", 2)}:
+        return False
+    frames = len(arrays["problems"])
+    return arrays["values"].shape == (names, frames) and len(arrays["errors"]) == frames

@@ -3,11 +3,9 @@
 import hashlib
 import json
 import math
-import zlib
 from dataclasses import fields
 from io import BytesIO
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -16,15 +14,11 @@ from tkamb.code_identity import code_identity
 from tkamb.errors import InputError
 from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.run.plug_ins import foreign_code
+from tkamb.run.shards import UNREADABLE
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase, WearState
 
 STATE_NAME = ".wear.npz"
-UNREADABLE = (
-    *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError),
-    *(MemoryError, BadZipFile, zlib.error),
-)
-"""What numpy and zipfile raise for damaged bytes."""
 
 
 def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -> str:
