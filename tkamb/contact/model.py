@@ -1,7 +1,7 @@
 """The contract that every contact model answers (see docs/contact_model.md).
 
 *Given this pose of the femoral component in the insert, what pressure and what wrench?*
-What depends on geometry alone is paid once, in `prepare`. All vectors are in the insert
+The work that depends on geometry alone is done once, in `prepare`. All vectors are in the insert
 frame (x anterior, y superior, z to the subject's right), SI units.
 """
 

@@ -1,7 +1,7 @@
-"""What a search for equilibrium asks of a contact model: wrenches at neighbouring poses.
+"""Wrenches at neighbouring poses, for searches of equilibrium.
 
-A probe answers many poses in a row and may keep what it has learnt; the answers are those
-of `evaluate`. A model that knows its tangent brings a faster probe with stiffness.
+A probe evaluates many poses in a row and may reuse earlier evaluations; its answers are those
+of `evaluate`. A model that knows its tangent offers a faster probe with stiffness.
 """
 
 from dataclasses import dataclass
@@ -57,13 +57,13 @@ class CondyleWrench:
 
 @dataclass(frozen=True, eq=False)
 class ProbedContact:
-    """The contact at one pose, condyle by condyle; a side that carries nothing is absent.
+    """The contact at one pose, condyle by condyle; an unloaded side is absent.
 
     Args:
         condyles: side -> wrench.
         known: False where the model is out of range or has not converged.
-        tangent: the condyles' stiffness is known,
-        exact: and is the tangent, no guide to it.
+        tangent: whether the condyles' stiffness is known.
+        exact: whether that stiffness is the exact tangent, not an approximation.
         accuracy: share of the contact force to which the model knows it.
         post: what a cam does to the insert's post; None where it carries nothing.
     """
@@ -77,7 +77,7 @@ class ProbedContact:
 
     @property
     def loads(self) -> tuple[CondyleWrench, ...]:
-        """What each condyle, and the post, takes."""
+        """Wrench of each condyle, and of the post."""
         return (*self.condyles.values(), *(() if self.post is None else (self.post,)))
 
     @property
@@ -132,11 +132,11 @@ class Probe:
         return self._model.press_from(self._state, load, pose, start)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
-        """Return the contact with a stiffness that holds on the mean of a finite displacement.
+        """Return the contact with a stiffness averaged over a finite displacement.
 
         Args:
             pose: (4, 4) pose_femoral_in_insert.
-            contact: there; a model that does not know better returns it.
+            contact: contact at that pose. A model without an averaged stiffness returns it.
         """
         return contact
 

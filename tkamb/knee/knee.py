@@ -9,6 +9,7 @@ call changes the next: what may save time is a `KneeData` that the caller makes 
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
@@ -61,13 +62,16 @@ class KneeSettings:
     """The knee object: frames and poses."""
 
     frame_tolerance: float = 1e-9
-    """m and rad: an insert frame this near to that of its flat bottom is the same frame."""
+    """m and rad: an insert frame this near to that of its flat bottom is the same frame. Chosen:
+    above rounding."""
     pose_tolerance: float = 1e-12
-    """m and rad: residual of the joint coordinates that make a given pose of the knee."""
+    """m and rad: residual of the joint coordinates that make a given pose of the knee. Chosen: near
+    the rounding of double precision."""
     accepted_pose_error: float = 1e-8
-    """m and rad: at most what is left after the last Newton step of a pose that is reached."""
+    """m and rad: at most what is left after the last Newton step of a pose that is reached. Chosen:
+    far below what changes a force."""
     max_pose_steps: int = 30
-    """Newton steps at most to find these coordinates."""
+    """Newton steps at most to find these coordinates. Chosen: poses that converge need fewer."""
 
 
 KNEE = KneeSettings()
@@ -520,6 +524,25 @@ class Knee:
         from tkamb.knee.show import show_knee
 
         show_knee(self, viewer, q, **options)
+
+    def live(self, q: Array, load: float = 1000.0, folder: Any = None) -> Any:
+        """Serve a page on which the knee is pressed and moved by hand; see docs/live.md.
+
+        The load acts along the insert's y axis; ligaments between femur and tibia pull. Nothing
+        that is done there changes this object.
+
+        Args:
+            q: (nq,), or (f, nq) for the slider "recorded frame".
+            load: N, at first.
+            folder: for what is kept; None: out/live.
+
+        Returns:
+            The server: its address is `url`, and it answers until `close()`.
+
+        Raises:
+            InputError: no contact model, or one without a name (`tkamb.contact_model`).
+        """
+        return import_module("tkamb.show.view.knee_on_bench").live_knee(self, q, load, folder)
 
     def at(self, q: Array, data: KneeData) -> KneePlace:
         """Return where the knee is at q, and bring the placements in `data` up to date."""

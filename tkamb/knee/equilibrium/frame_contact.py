@@ -29,9 +29,9 @@ class FrameContact:
         seconds: computing time.
         problem: why there is no result, or empty.
         flags: plain words that a reader must know.
-        iterations: of body and contact, until they agreed; 0 if not coupled.
-        load_change: N, by the last of them.
-        point_change: m, likewise, of the centres of pressure.
+        iterations: iterations between body and contact until convergence; 0 if not coupled.
+        load_change: N, change of the load in the last iteration.
+        point_change: m, change of the centres of pressure in the last iteration.
         equilibrium: the search for the released coordinates, if there are any.
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.

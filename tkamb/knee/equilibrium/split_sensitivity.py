@@ -1,4 +1,4 @@
-"""How the split between the condyles answers to the adduction, at a constant load."""
+"""Change of the medial-lateral split with adduction, at a constant load."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -19,9 +19,9 @@ class SplitSensitivitySettings:
     """How the medial share of the force changes with adduction."""
 
     adduction_step: float = 0.02 * DEGREE
-    """rad: step of the finite difference. It is small against the 0.2 to 0.5 deg that unload a
-    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to
-    0.1 deg agree within 5 to 15 %."""
+    """rad: step of the finite difference. Chosen: small against the 0.2 to 0.5 deg that unload a
+    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to 0.1 deg
+    agree within 5 to 15 %."""
 
 
 SPLIT_SENSITIVITY = SplitSensitivitySettings()
@@ -37,8 +37,8 @@ def split_sensitivity(
 ) -> float:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
-    Zero where one condyle carries everything: it then holds only until the other touches. NaN
-    where the turned press does not succeed.
+    Zero where one condyle carries everything: the value then holds until the other condyle touches.
+    NaN where the press with more adduction fails.
 
     Args:
         probe: of the contact model.

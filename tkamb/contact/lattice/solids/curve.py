@@ -23,8 +23,8 @@ class StressCurveSettings:
     """A measured stress-strain curve."""
 
     least_strain: float = 1e-9
-    """1: below this strain the secant modulus is that at this strain, because stress over
-    strain is 0/0 at zero."""
+    """1: below this strain the secant modulus is that at this strain. Chosen: above zero, where
+    stress over strain is 0/0."""
 
 
 STRESS_CURVE = StressCurveSettings()

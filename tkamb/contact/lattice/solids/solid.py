@@ -1,4 +1,4 @@
-"""A solid made of cells: linear stiffness, what nonlinearity takes away, tangent."""
+"""A solid made of cells: linear stiffness, nonlinear residual, tangent."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
@@ -123,7 +123,7 @@ class Scatter:
         return total
 
     def mean(self, values: Array, forces: Array, chosen: Index) -> Array:
-        """Return at nodes (n,) the mean of what elements have, by their forces; 0 where none is.
+        """Return the force-weighted mean of elements' values at nodes (n,); 0 without elements.
 
         Args:
             values: (k,) of the chosen elements.
@@ -140,7 +140,7 @@ def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
 
 @compiled
 def _add_up(parts: Array, elements: Index, chosen: Index, which: Index, total: Array) -> None:
-    """Add vectors (k, p, 3) of chosen elements (k,), some of them, to those of nodes (n, 3)."""
+    """Add vectors (k, p, 3) of some of the chosen elements (k,) to nodal vectors (n, 3)."""
     for k in which:
         element = chosen[k]
         for corner in range(parts.shape[1]):
@@ -236,14 +236,14 @@ class Solid(ABC):
         """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
 
         Args:
-            displacement: (n, 3) m; only the chosen elements' nodes are looked at.
+            displacement: (n, 3) m; only the chosen elements' nodes are used.
             chosen: (k,) elements; all by default.
         """
 
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
-        """Return what a displacement (n, 3), m, asks of the solid, element by element.
+        """Return the forces that hold a displacement (n, 3), m, summed element by element.
 
-        No factor is involved: this is what a solution is measured by.
+        No stored factor is involved, so that they measure the error of a solution.
 
         Returns:
             Internal forces f(u) (n, 3), N; h = K u - f(u) of each element (k, 3p), N; and
@@ -279,8 +279,8 @@ class Solid(ABC):
     def least_principal_strain(self, displacement: Array) -> float:
         """Return the smallest principal strain of the mean gradients of all cells.
 
-        It is no smaller than minus the norm of its tensor: where the cell of largest norm is
-        compressed, only cells whose norm exceeds that compression are looked at.
+        A principal strain is no smaller than minus the norm of its tensor. Where the cell of
+        largest norm is compressed, only cells whose norm exceeds that compression are evaluated.
         """
         strain = self.strain(displacement)
         norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
@@ -311,7 +311,7 @@ class Solid(ABC):
 
 
 def chunks(count: int) -> Iterator[slice]:
-    """Yield stretches of so many cells."""
+    """Yield slices of at most `SOLID.cells_at_once` cells."""
     for first in range(0, count, SOLID.cells_at_once):
         yield slice(first, min(first + SOLID.cells_at_once, count))
 
