@@ -160,16 +160,14 @@ def test_compliance_at_hand_changes_no_answer(state):
 
 
 def test_the_compliance_at_hand_stays_within_its_bound(state, monkeypatch):
-    """Spare nodes are worked out along with those wanted, unless there are too many."""
-    wanted, spare = np.array([3, 5]), np.arange(2, 9)
-    for most, kept in ((7, spare), (6, wanted)):
+    """Nodes are kept beside new ones, unless there are too many."""
+    for most, kept in ((4, [3, 5, 9, 10]), (3, [9, 10])):
         settings = compliance.ComplianceSettings(max_nodes=most)
         monkeypatch.setattr(compliance, "COMPLIANCE", settings)
         cache = ComplianceCache(state.problem.operator.half)
-        cache.among(wanted, spare)
-        assert cache.nodes.tolist() == kept.tolist()
-        cache.among(np.array([9]), np.array([9, 10]))  # fits beside two, not beside seven
-        assert cache.nodes.tolist() == ([9, 10] if most == 7 else [3, 5, 9, 10])
+        cache.among(np.array([3, 5]))
+        cache.among(np.array([9, 10]))
+        assert cache.nodes.tolist() == kept
 
 
 def test_the_compliance_grows_node_by_node(state, monkeypatch):
@@ -182,9 +180,9 @@ def test_the_compliance_grows_node_by_node(state, monkeypatch):
         monkeypatch.setattr(response, "RESPONSE", response.ResponseSettings(few_columns=few))
         cache = ComplianceCache(half)
         for some in ([20], [5, 8], [2], [8, 21, 30], [3, 5]):
-            cache.among(np.array(some), np.array(some))
+            cache.among(np.array(some))
         assert sorted(cache.nodes) == nodes.tolist() and cache.nodes.tolist() != nodes.tolist()
-        found = cache.among(nodes, nodes).compliance
+        found = cache.among(nodes).compliance
         assert found == pytest.approx(whole, rel=1e-5, abs=1e-6 * np.abs(whole).max())
         force = np.random.default_rng(1).normal(size=(2, 3))
         moved = cache.moved(nodes[[1, 3, 6]], nodes[[2, 3]], force)

@@ -503,7 +503,7 @@ class Knee:
         if loads is None:
             unsolvable = replace(knee.geometry, problems=(knee.problem,))
             loads = self._solved(unsolvable, data)
-        left_over = float(np.abs(knee.balance.force).max())
+        left_over = knee.residual
         return Equilibrium(
             q_end,
             knee.coordinates,

@@ -322,10 +322,12 @@ def insert_material_as_json(scene: Scene) -> dict[str, Any]:
 
 
 def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
-    """Return a flag where the response of the coordinates to the muscles has not converged."""
+    """Return what a reader must know of a search: a second equilibrium, a response left open."""
+    second = (knee.second,) if knee.second else ()
     if knee.doubt <= COUPLING.stiffness_error:
-        return ()
+        return second
     return (
+        *second,
         "the response of the knee's coordinates to the muscles has not converged "
         f"({100 * knee.doubt:.0f} % of it is open): from other initial guesses such frames "
         "differed by up to 3 % in the total force and 60 N in the force of one condyle",

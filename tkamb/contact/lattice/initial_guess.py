@@ -10,9 +10,6 @@ from tkamb.contact.lattice.settings import LATTICE_SOLVER
 from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.frames import Array, Index, Mask
 
-SPARE_DEPTH = 1.6
-"""The stored compliance covers nodes down to this many times the depth asked for."""
-
 
 @dataclass(frozen=True, eq=False)
 class LatticeStart(WarmStart):
@@ -99,9 +96,8 @@ def initial_guess(
     lowest = float(gaps.min())
     reach = lowest + (1 + margin) * depth
     nodes = np.flatnonzero(gaps <= reach)
-    spare = np.flatnonzero(gaps <= lowest + SPARE_DEPTH * depth)
     active = gaps[nodes] < (0.0 if at_pose else lowest + 0.6 * depth)
-    guess = InitialGuess(nodes, cache.among(nodes, spare), active, planes.part(nodes), reach=reach)
+    guess = InitialGuess(nodes, cache.among(nodes), active, planes.part(nodes), reach=reach)
     if start is None:
         return guess
     return replace(

@@ -115,7 +115,7 @@ def force_changes(state: LatticeState, result: ContactResult, moved: Array, node
     size = np.linalg.norm(force, axis=1)
     normals = force / size[:, None]
     where = problem.surface_points[nodes] + moved[nodes]
-    response = state.compliance.among(nodes, nodes)
+    response = state.compliance.among(nodes)
     femoral = np.zeros((len(nodes), 3, 6))
     femoral[:, :, :3] = np.eye(3)
     femoral[:, :, 3:] = np.cross(np.eye(3)[None], where[:, None, :]).transpose(0, 2, 1)

@@ -52,6 +52,14 @@ class ReleasedKneeSettings:
     contact_force_tolerance: float = 0.1
     """N: it must also change the contact force by less than this, or by less than
     `contact_force_share` of it. Chosen: a ten-thousandth of a usual contact force."""
+    residual_tolerance: float = 0.5
+    """N (moments are divided by the lever arm): largest force left on a released coordinate at the
+    returned pose, with patella, lines and contact found anew there. Above it, and above
+    `residual_share` of the contact force and what the contact model's tolerance leaves open, the
+    frame has no result. Chosen: measured residuals are below 0.1 N."""
+    residual_share: float = 1e-3
+    """1: see `residual_tolerance`. Chosen: the patella's changes from facet to facet alter the
+    force by 2e-4 of it."""
     contact_force_share: float = 2e-4
     """1: see `contact_force_tolerance`. Chosen: the patella's changes from facet to facet alter the
     force by about as much."""
@@ -95,6 +103,11 @@ class KneeEquilibrium:
         change: N, what the last pass changed in the contact force.
         problem: why this is no result, or empty.
         doubt: see `Relaxation`.
+        residual: N, largest generalised force (moments over the lever arm) that is left on a
+            released coordinate at the returned pose: patella, lines and contact as they are
+            there; inf where it was not measured.
+        second: where another initial guess led, in words; empty: to this equilibrium, or there
+            was no need to try (`InitialPoses`).
     """
 
     coordinates: Array
@@ -107,6 +120,8 @@ class KneeEquilibrium:
     change: float
     problem: str
     doubt: float = 0.0
+    residual: float = np.inf
+    second: str = ""
 
 
 def released_indices(names: Sequence[str]) -> tuple[int, ...]:
@@ -222,9 +237,33 @@ class ReleasedKnee:
                     RELEASED_KNEE.contact_force_share * float(np.linalg.norm(force)),
                 )
             ):
-                return replace(knee, doubt=mixing.doubt)
+                knee = self._measured(k, replace(knee, doubt=mixing.doubt), middle, slack)
+                if knee.problem or knee.residual <= self._allowed(knee.contact):
+                    return knee
         assert knee is not None
         return replace(knee, problem="the iteration between knee and patella does not converge")
+
+    def _allowed(self, contact: "ProbedContact") -> float:
+        """Return the residual (N) below which a frame has converged."""
+        share = max(RELEASED_KNEE.residual_share, contact.accuracy)
+        force = float(np.linalg.norm(contact.wrench[:3]))
+        return max(RELEASED_KNEE.residual_tolerance, share * force)
+
+    def _measured(
+        self, k: int, knee: KneeEquilibrium, middle: Array, slack: bool
+    ) -> KneeEquilibrium:
+        """Return the knee with patella, lines and residual as they are at its own pose."""
+        if knee.problem:
+            return knee
+        patella = self._patella(k, knee.coordinates, knee.patella)
+        geometry = self._mechanics.geometry(k, knee.coordinates, patella)
+        joint = self._joint(k, geometry, middle, slack)
+        if knee.geometry.share is not None:
+            geometry = replace(geometry, share=knee.geometry.share)
+            joint = replace(joint, share=knee.geometry.share)
+        left = self._forces(k, joint, knee.coordinates, knee.contact).left()
+        problem = "; ".join(geometry.problems)
+        return replace(knee, geometry=geometry, patella=patella, residual=left, problem=problem)
 
     def _carrying(
         self, place: Array, like: "ProbedContact"

@@ -129,6 +129,10 @@ class FreeForces(Generic[J]):
         tangent = -(change + gain @ stiffness @ twists.T)
         return Trial(forces[-1], tangent, contact.exact, force_noise)
 
+    def left(self) -> float:
+        """Return the largest scaled force, N, at the place where the search would begin."""
+        return float(np.abs(self.trial(self._start).force).max())
+
     def at(self, balance: Balance) -> Array:
         """Return the knee coordinates (6,) of a balance."""
         return self._with(balance.coordinates)

@@ -1,7 +1,7 @@
 """Initial guesses of the released coordinates, and the equilibrium that is found from them."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
 from tkamb.knee.equilibrium.balance import BalanceStatus
 from tkamb.knee.equilibrium.released import KneeEquilibrium, ReleasedKnee
 from tkamb.knee.equilibrium.released_forces import SCALE
+from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
@@ -35,6 +36,16 @@ class InitialPoseSettings:
     first_penetration: float = 5e-5
     """m: penetration of the initial guess of a first frame. Chosen: a loaded contact of
     polyethylene is deeper, a loose one is found from it too."""
+    max_continuation: float = 1e-3
+    """m (rotations times the lever arm): a search that ends farther from its initial guess has
+    not merely followed the last frame; other initial guesses then say whether there is a second
+    equilibrium. Chosen: frame by frame the shipped knee moves by 0.5 mm at most."""
+    other_shift: float = 5e-3
+    """m: anterior and posterior of the recorded pose, where a frame without earlier ones is
+    searched from again. Chosen: about a third of a dish."""
+    same_place: float = 0.5e-3
+    """m (rotations times the lever arm): equilibria farther apart are two. Chosen: well above what
+    the tolerances leave open."""
 
 
 INITIAL_POSE = InitialPoseSettings()
@@ -62,6 +73,9 @@ class InitialPoses:
     ) -> KneeEquilibrium:
         """Return the equilibrium from the first initial guess that converges.
 
+        Where it lies farther than `INITIAL_POSE.max_continuation` from that start, the search is
+        repeated from the other starts; one that ends elsewhere is told in `second`.
+
         Args:
             k: frame.
             previous: the last three frames that were found.
@@ -71,7 +85,8 @@ class InitialPoses:
             ComputationError: no start lies over the insert, or no muscle forces carry the frame.
         """
         knee, failure = None, "the femoral component does not lie over the insert"
-        for place in self._starts(k, [knee.coordinates for knee in previous]):
+        starts = list(self._starts(k, [knee.coordinates for knee in previous]))
+        for place in starts:
             if not np.isfinite(place).all():
                 continue
             try:
@@ -83,7 +98,40 @@ class InitialPoses:
                 break
         if knee is None:
             raise ComputationError(failure)
-        return knee
+        if knee.problem or _apart(place, knee.coordinates) <= INITIAL_POSE.max_continuation:
+            return knee
+        others = [one for one in starts[1:] if one is not place] or self._beside(k)
+        return replace(knee, second=self._second(k, knee, others, points))
+
+    def _beside(self, k: int) -> list[Array]:
+        """Return the recorded pose moved forwards and backwards, just touching."""
+        places = [self._recorded[k].copy(), self._recorded[k].copy()]
+        for place, sign in zip(places, (1.0, -1.0), strict=True):
+            place[AP] += sign * INITIAL_POSE.other_shift * (AP in self._knee.released)
+        return [self.on_the_insert(place) for place in places]
+
+    def _second(
+        self, k: int, knee: KneeEquilibrium, starts: list[Array], points: dict[str, Array]
+    ) -> str:
+        """Return in words where other starts lead that do not lead to an equilibrium; or empty."""
+        for place in starts:
+            if not np.isfinite(place).all():
+                continue
+            try:
+                other = self._knee.find(k, place, points)
+            except ComputationError:
+                continue
+            apart = _apart(other.coordinates, knee.coordinates)
+            if other.problem or apart <= INITIAL_POSE.same_place:
+                continue
+            moved = np.abs(other.coordinates - knee.coordinates)
+            forces = [np.linalg.norm(one.contact.wrench[:3]) for one in (knee, other)]
+            return (
+                f"a second equilibrium: from another initial guess the search ends "
+                f"{moved[:3].max() / MILLIMETRE:.1f} mm and {moved[3:].max() / DEGREE:.1f} deg "
+                f"away, with {forces[1]:.0f} N instead of {forces[0]:.0f} N of contact force"
+            )
+        return ""
 
     def _starts(self, k: int, previous: list[Array]) -> Iterator[Array]:
         """Yield initial guesses: extrapolated from the last frames, the last frame, as recorded.
@@ -115,6 +163,11 @@ class InitialPoses:
     def _on_the_dishes(self, place: Array) -> Array:
         height = self._pair.first_touch_height(knee_pose(place))
         return np.array([place[0], height - INITIAL_POSE.first_penetration, *place[2:]])
+
+
+def _apart(first: Array, second: Array) -> float:
+    """Return the largest distance (m) between coordinates (6,), rotations times the lever arm."""
+    return float(np.abs((second - first) * SCALE).max())
 
 
 def carried_on(previous: list[Array]) -> Array:

@@ -93,15 +93,10 @@ class ComplianceCache:
     stored: Array = field(default_factory=lambda: np.zeros((3, 0, 3, 0), SINGLE))
     _lock: Lock = field(default_factory=Lock)
 
-    def among(self, needed: Index, spare: Index) -> ContactResponse:
-        """Return the response among contact nodes.
-
-        Args:
-            needed: (m,) increasing positions among the contact nodes.
-            spare: a superset that is worked out when `needed` is not at hand, if not too many.
-        """
+    def among(self, needed: Index) -> ContactResponse:
+        """Return the response among contact nodes, increasing positions (m,)."""
         with self._lock:
-            at = self._at(needed, spare)
+            at = self._at(needed)
             compliance = _taken(_taken(self.stored, at, 1), at, 3)
         return ContactResponse(self.whole, needed, compliance)
 
@@ -114,21 +109,20 @@ class ComplianceCache:
             force: (k, 3) N.
         """
         with self._lock:
-            both = self._at(np.concatenate([nodes, pushed]), np.union1d(nodes, pushed))
+            both = self._at(np.concatenate([nodes, pushed]))
             columns, rows = both[: len(nodes)], both[len(nodes) :]
             compliance = _taken(_taken(self.stored, columns, 1), rows, 3)
         return np.einsum("aibj,jb->ia", compliance, force)
 
-    def _at(self, needed: Index, spare: Index) -> Index:
-        """Return where nodes (m,) are stored; what is not at hand is worked out, spare and all."""
+    def _at(self, needed: Index) -> Index:
+        """Return where nodes (m,) are stored; what is not at hand is worked out."""
         place = np.full(len(self.whole.rank) // 3, -1)
         place[self.nodes] = np.arange(len(self.nodes))
         if (place[needed] < 0).any():
-            if len(spare) > COMPLIANCE.max_nodes:
-                spare = np.unique(needed)
-            if len(self.nodes) + np.count_nonzero(place[spare] < 0) > COMPLIANCE.max_nodes:
+            wanted = np.unique(needed)
+            if len(self.nodes) + np.count_nonzero(place[wanted] < 0) > COMPLIANCE.max_nodes:
                 self.nodes, place[:] = self.nodes[:0], -1
-            self._take(spare[place[spare] < 0])
+            self._take(wanted[place[wanted] < 0])
             place[self.nodes] = np.arange(len(self.nodes))
         return place[needed]
 

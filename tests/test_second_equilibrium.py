@@ -1,0 +1,103 @@
+"""A frame whose released coordinates have more than one equilibrium says so."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import tkamb
+from tkamb.cli import main
+from tkamb.knee.equilibrium import balance, released
+from tkamb.knee.equilibrium.balance import BalanceStatus
+from tkamb.knee.equilibrium.released import RELEASED_KNEE, KneeEquilibrium
+from tkamb.knee.equilibrium.starts import INITIAL_POSE, InitialPoses
+
+MODEL = Path(__file__).parents[1] / "models" / "deep_knee_bend"
+JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
+RELEASED = ["adduction", "axial_rotation", "ap", "ml"]
+
+
+def equilibrium(place, force=1000.0, problem=""):
+    """Return an equilibrium at a place (6,)."""
+    contact = SimpleNamespace(wrench=np.array([0.0, force, 0.0, 0.0, 0.0, 0.0]))
+    end = SimpleNamespace(status=BalanceStatus.OK)
+    return KneeEquilibrium(np.array(place), None, None, contact, end, 1, 1, 0.0, problem)
+
+
+class Wells:
+    """A knee that comes to rest in the nearest of some places along AP."""
+
+    released, muscles = (0, 1), False
+
+    def __init__(self, *places):
+        self.places, self.searches = places, 0
+
+    def find(self, k, start, points=None, before=None):
+        self.searches += 1
+        nearest = min(self.places, key=lambda x: abs(x - start[0]))
+        return equilibrium([nearest, *start[1:]], 1000.0 + 1e5 * nearest)
+
+
+def found(knee, recorded, *previous):
+    """Return where a frame comes to rest that was recorded at an AP place, m."""
+    pair = SimpleNamespace(first_touch_height=lambda pose: 0.0)
+    poses = InitialPoses(np.array([[recorded, 0, 0, 0, 0, 0.0]]), knee, pair, None)
+    return poses.rest(0, [equilibrium([place, 0, 0, 0, 0, 0.0]) for place in previous], {})
+
+
+def test_a_search_that_follows_the_last_frame_is_not_repeated():
+    knee = Wells(0.0, 20e-3)
+    assert found(knee, 20e-3, 0.5 * INITIAL_POSE.max_continuation).second == ""
+    assert knee.searches == 1
+
+
+def test_another_start_that_leads_elsewhere_is_told():
+    rest = found(Wells(0.0, 20e-3), 20e-3, 3e-3)
+    assert rest.coordinates[0] == 0.0
+    assert "20.0 mm and 0.0 deg away, with 3000 N instead of 1000 N" in rest.second
+    assert found(Wells(0.0), 20e-3, 3e-3).second == ""
+
+
+def test_a_frame_without_earlier_ones_is_searched_from_both_sides():
+    assert "second" in found(Wells(0.0, 7e-3), 3e-3).second
+    assert found(Wells(0.0, 30e-3), 3e-3).second == ""
+
+
+@pytest.mark.skipif(not JW.is_dir(), reason="subject JW's files are not beside the project")
+def test_jw_at_3_275_s_has_two_equilibria(tmp_path, capsys):
+    """466 N from the frame 0.2 s before, 442 N at 17 deg of adduction from the recorded pose."""
+    given = ["--c3d", f"{JW}/motion/jw_ngait_og3.c3d", "--side", "right", "--mass-kg", "66.7"]
+    for part, name in (("femoral", "femoral_component"), ("insert", "tibial_insert")):
+        given += [f"--{part}", f"{JW}/geometry/{name}.stl"]
+    given += ["--mesh-unit", "m", "--mesh-axes=-x,+y,-z", "--out", str(tmp_path)]
+    assert main(["import", f"{JW}/JW.osim", *given]) == 0
+    changes = {"contact.model": "foundation", "contact.resolution_mm": 3.0}
+    scene = tkamb.load_scene(tmp_path / "scene.toml", changes)
+    status = tkamb.simulate(scene, frames=slice(18, 43, 6))["status"]
+    assert "second equilibrium" in status[3]
+    assert sum("second equilibrium" in one for one in status) == 1
+
+
+def test_a_frame_is_ok_only_if_its_measured_residual_is_small(monkeypatch):
+    """A search that ends too early is not believed: what is left at its pose is measured."""
+    changes = {
+        "contact.model": "foundation", "contact.resolution_mm": 2.0, "contact.released": RELEASED,
+    }  # fmt: skip
+    scene = tkamb.load_scene(MODEL / "scene.toml", changes)
+    measured, measure = [], released.ReleasedKnee._measured
+
+    def kept(self, *given):
+        knee = measure(self, *given)
+        measured.append(knee.residual)
+        return knee
+
+    monkeypatch.setattr(released.ReleasedKnee, "_measured", kept)
+    assert "does not converge" not in tkamb.simulate(scene, frames=slice(60, 61))["status"][0]
+    assert 0.0 < measured[-1] < RELEASED_KNEE.residual_tolerance
+    loose = replace(balance.BALANCE, force_tolerance=200.0, step_tolerance=1.0)
+    monkeypatch.setattr(balance, "BALANCE", loose)
+    results = tkamb.simulate(scene, frames=slice(60, 61))
+    assert "does not converge" in results["status"][0]
+    assert np.isnan(results["force_total_N"][0]) and measured[-1] > 2.0
