@@ -268,6 +268,10 @@ def test_no_hand_breaks_it(knee):
         {"released": ["flexion"]},
         {"flexion_deg": True},
         {"resolution_mm": 0.001},
+        {"load_N": 10**400},
+        {"femoral": {"slope_deg": -(10**400)}},
+        {"released": [["ap"]]},
+        {"released": [{}, "ap"]},
     ],
 )
 def test_a_page_cannot_ask_for_nonsense(values):
@@ -291,6 +295,15 @@ def test_the_window_answers_its_own_page_only(knee, tmp_path):
             assert (tmp_path / "kept-1" / "scene.toml").samefile(words(saved.read())["saved"])
     finally:
         server.close()
+
+
+def test_what_nobody_foresaw_of_a_preparation_is_said_to_the_page(knee, monkeypatch, tmp_path):
+    """The thread ended with a traceback, and the page waited for ever."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(knee, "_side", lambda request: 1 / 0)
+    request = replace(states(knee)["pressed"], resolution_mm=7.0)
+    with pytest.raises(TkambError, match="not foreseen: ZeroDivisionError"):
+        list(iter(lambda: knee.preparing(request), ""))
 
 
 def test_a_scene_without_contact_is_refused(tmp_path, capfd):

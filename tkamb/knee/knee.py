@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ContactModel
     from tkamb.contact.probe import ProbedContact
     from tkamb.contact.result import ContactResult
+    from tkamb.contact.warm_start import Guess, WarmStart
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.geometry.surface import Surface
     from tkamb.knee.contact import KneeContact
@@ -404,14 +405,14 @@ class Knee:
         self,
         q: Array,
         load: float,
-        guess: "ContactResult | None" = None,
+        guess: "Guess | None" = None,
     ) -> "ContactResult":
         """Return the contact when the femur carries a load, at the rotation, AP and ML of q.
 
         Args:
             q: (nq,).
             load: N, along the insert's y axis, pressing; not negative.
-            guess: an earlier result, to save time.
+            guess: an earlier result or warm start, to save time.
 
         Returns:
             Pressure, area and forces of both condyles, in the insert frame of a right knee: a
@@ -420,13 +421,25 @@ class Knee:
         Raises:
             InputError: no contact model, or a load that is negative or not finite.
         """
+        return self.press_from(q, load, guess)[0]
+
+    def press_from(
+        self, q: Array, load: float, start: "Guess | None" = None
+    ) -> "tuple[ContactResult, WarmStart]":
+        """Return what `press` does, and the warm start of a press near by.
+
+        Args:
+            q: (nq,).
+            load: N, as of `press`.
+            start: the warm start that the last press returned; it saves time.
+        """
         contact = self._need_contact()
         if not (np.isfinite(load) and load >= 0):
             raise InputError(f"load {load} N", "press", "give a load of 0 or more")
         place = self._kinematics(self.create_data_for_kinematics(), q)
-        return contact.model.press(contact.state, float(load), place.pose, guess)
+        return contact.model.press_from(contact.state, float(load), place.pose, start)
 
-    def evaluate(self, q: Array, guess: "ContactResult | None" = None) -> "ContactResult":
+    def evaluate(self, q: Array, guess: "Guess | None" = None) -> "ContactResult":
         """Return the contact at q: pressure, area and forces by the overlap of the bodies there.
 
         As `press`, but for the height, which is that of q.

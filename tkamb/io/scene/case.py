@@ -301,8 +301,8 @@ def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, 
         from tkamb.knee.generic_ligaments import generic_ligaments
 
         assert parts.femoral is not None and parts.insert is not None
-        wanted = scene.generic_ligaments.ligaments
-        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, wanted)
+        names = scene.generic_ligaments.ligaments
+        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, names)
     return bundles
 
 

@@ -6,7 +6,6 @@ origin as recorded. It is computed by the same code as a frame of a run, so that
 `bench_scene.write_bench` writes gives the same numbers by `tkamb run`.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -189,8 +188,8 @@ def _range(key: str) -> tuple[float, float]:
 
 def _number(key: str, value: Any, low: float, high: float) -> float:
     good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or not low <= value <= high:
-        raise InputError(f"{key} = {value!r}", "bench", f"give {low:g} to {high:g}")
+    if not good or not low <= value <= high:  # not a number is in no range
+        raise InputError(f"{key} = {value!r:.60}", "bench", f"give {low:g} to {high:g}")
     return float(value)
 
 
@@ -217,7 +216,7 @@ def _placement(name: str, values: Any) -> Placement:
 
 def _released(values: Any) -> tuple[str, ...]:
     known = [name for name in KNEE_COORDINATES if name != "flexion"]
-    if not isinstance(values, list | tuple) or not set(values) <= set(known):
+    if not isinstance(values, list | tuple) or any(name not in known for name in values):
         raise InputError("released names no coordinates", "bench", f"of {', '.join(known)}")
     chosen = set(values) | ({"si"} if values else set())
     return tuple(name for name in known if name in chosen)
@@ -317,8 +316,8 @@ class Bench:
         about = cross(transform(moved, chain.insert_in_tibia[:3, 3]), axial) + cross(centre, weight)
         point = np.array([about[2], 0.0, -about[0]]) / force[1]
         moment = about - cross(point, force)
-        rows = (np.tile(values, (ROWS, 1)) for values in (force, point, moment))
-        return GroundReaction(*rows, np.ones(ROWS, bool))
+        forces, points, moments = (np.tile(values, (ROWS, 1)) for values in (force, point, moment))
+        return GroundReaction(forces, points, moments, np.ones(ROWS, bool))
 
     def _bone(self, request: BenchRequest) -> Array:
         """Return the pose (4, 4) of the tibia as recorded in the tibia of the moved insert.

@@ -30,7 +30,7 @@ def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
     """
     scene, side = case.scene, -1.0 if case.scene.patient.side == "left" else 1.0
     times = case.motion.time
-    write_motion(folder, times, case.motion.coordinates, side)
+    write_motion(folder, times.tolist(), case.motion.coordinates, side)
     _write_table(folder / "tibia.csv", ["time_s", "lean_rad"], [[t, 0.0] for t in times])
     assert case.ground is not None
     force, point = (

@@ -1,5 +1,6 @@
 """The knee live: what `tkamb live` computes and answers, apart from its page."""
 
+import argparse
 import shutil
 import tempfile
 import weakref
@@ -19,6 +20,7 @@ from tkamb.io.scene.si import in_si
 from tkamb.knee.chain import Chain
 from tkamb.knee.equilibrium.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
+from tkamb.run.guard import unforeseen_words
 from tkamb.run.known import SharedState
 from tkamb.run.known_errors import as_json, known_error
 from tkamb.run.mechanics import FrameLoads, Mechanics
@@ -165,6 +167,8 @@ class LiveKnee:
             self._side(request)
         except TkambError as error:
             self._refused[key] = error
+        except Exception as error:  # the last handler of this thread: the page says it
+            self._refused[key] = TkambError(unforeseen_words(error, argparse.Namespace()))
         finally:
             del self._threads[key]
 
