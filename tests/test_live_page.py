@@ -1,6 +1,10 @@
 """The page of `tkamb live` in a headless browser: keys, sliders, states that fail, what is kept."""
 
+import io
+
+import numpy as np
 import pytest
+from PIL import Image
 
 import tkamb
 from headless import Page
@@ -83,6 +87,17 @@ def test_what_is_kept_stands_in_a_row_and_runs(page):
     peak = tkamb.simulate(path, frames=slice(0, 1))["medial_peak_pressure_MPa"][0]
     assert f"{peak:.1f}" in row
     assert page.problems == []
+
+
+def test_the_saved_picture_holds_the_map_and_words_below_it(page):
+    at_rest(page, "() => document.getElementById('reset').click()")
+    assert page.evaluate("() => tkamb.bench.answer.request.tibial.slope_deg") == 0.0
+    picture = np.asarray(Image.open(io.BytesIO(page.saved("#picture"))).convert("RGB"), int)
+    pane = page.evaluate("() => document.getElementById('pane').clientHeight")
+    assert picture.shape[0] > pane
+    colourful = np.ptp(picture[:pane], axis=2) > 60  # viridis; bones and metal are nearly grey
+    assert colourful.any(axis=0).sum() > 30
+    assert (picture[pane:] < 100).any() and (picture[pane:] == 255).mean() > 0.8
 
 
 def test_every_text_has_enough_contrast(page):

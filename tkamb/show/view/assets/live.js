@@ -47,7 +47,7 @@ class Bench {
       SLIDERS[group] = rows.filter(([key]) => this.applies(key));
       for (const row of SLIDERS[group]) this.addSlider(group, row);
     }
-    element("reset").addEventListener("click", () => this.toFrame(this.frame));
+    element("reset").addEventListener("click", () => this.reset());
     element("reference").addEventListener("click", () => this.makeReference());
     element("keep").addEventListener("click", () => this.keep());
     element("picture").addEventListener("click", () => this.savePicture());
@@ -137,6 +137,13 @@ class Bench {
       position.array[k] = this.insert[k] + rise * Math.min(1, this.insert[k] / whole);
     }
     position.needsUpdate = true;
+  }
+
+  reset() {
+    const {contact, resolution_mm} = this.state;
+    Object.assign(this.state, structuredClone(this.start), {contact, resolution_mm});
+    if (this.thickness_mm !== null) this.drawInsert(this.thickness_mm);
+    this.toFrame(this.frame);
   }
 
   showState() {
@@ -337,15 +344,47 @@ class Bench {
     }
   }
 
+  // The knee as it is seen, with the colour bar and what the state is.
   savePicture() {
     tkamb.viewer.render();
-    element("pane").querySelector("canvas").toBlob((blob) => {
+    const seen = element("pane").querySelector("canvas"), {answer} = this;
+    const scale = seen.width / seen.clientWidth, sheet = document.createElement("canvas");
+    const lines = this.captions(answer), foot = 20 * lines.length + 16;
+    [sheet.width, sheet.height] = [seen.width, seen.height + foot * scale];
+    const pen = sheet.getContext("2d");
+    pen.fillStyle = "#ffffff";
+    pen.fillRect(0, 0, sheet.width, sheet.height);
+    pen.drawImage(seen, 0, 0);
+    pen.scale(scale, scale);
+    pen.fillStyle = "#1a1a1a";
+    pen.font = "13px system-ui, sans-serif";
+    lines.forEach((line, k) => pen.fillText(line, 14, seen.clientHeight + 20 * (k + 1)));
+    const {data} = tkamb, x = seen.clientWidth - 96, height = 170;
+    pen.fillText("pressure, MPa", x, 26);
+    for (let k = 0; k < 256; k++) {
+      pen.fillStyle = `rgb(${data.pressure_scale.slice(3 * k, 3 * k + 3).join(",")})`;
+      pen.fillRect(x, 40 + height * (255 - k) / 256, 18, 1.5);
+    }
+    pen.fillStyle = "#1a1a1a";
+    for (const share of [0, 0.5, 1]) {
+      pen.fillText((share * answer.scale_MPa).toFixed(1), x + 26, 44 + height * (1 - share));
+    }
+    sheet.toBlob((blob) => {
       const link = document.createElement("a");
       link.href = URL.createObjectURL(blob);
       link.download = "knee.png";
       link.click();
       URL.revokeObjectURL(link.href);
     });
+  }
+
+  captions({request, numbers, label, status}) {
+    const of = (name, digits) => inWords(numbers[name], digits);
+    const condyle = (side) => `${side} ${of(`${side}_force_N`, 0)} N, peak ` +
+      `${of(`${side}_peak_pressure_MPa`, 1)} MPa, ${of(`${side}_area_mm2`, 0)} mm²`;
+    return [`${element("titles").textContent}: ${inWords(request.flexion_deg, 1)}° of flexion, load ` +
+      `${inWords(request.load_N, 0)} N; ${label}`, `${condyle("medial")}; ${condyle("lateral")}`,
+      ...(status === "ok" ? [] : [status])];
   }
 }
 

@@ -85,13 +85,28 @@ function addSideNames(viewer, view) {
     low[k % 3] = Math.min(low[k % 3], points[k]);
     high[k % 3] = Math.max(high[k % 3], points[k]);
   }
-  const middle = low.map((x, k) => (x + high[k]) / 2), away = 0.011;
-  const places = {medial: [middle[0], low[1], low[2] - away],
-    lateral: [middle[0], low[1], high[2] + away], anterior: [high[0] + away, low[1], middle[2]]};
-  for (const [word, place] of Object.entries(places)) {
+  const middle = low.map((x, k) => (x + high[k]) / 2);
+  const places = {medial: [middle[0], low[1], low[2]], lateral: [middle[0], low[1], high[2]],
+    anterior: [high[0], low[1], middle[2]]};
+  const outwards = {medial: [0, 0, -1], lateral: [0, 0, 1], anterior: [1, -0.4, 0]};
+  view.names = Object.entries(places).map(([word, place]) => {
     const sprite = wordSprite(word);
-    sprite.position.set(...place);
+    Object.assign(sprite.userData, {place, outwards: outwards[word]});
     viewer.set_object(tkamb.split(`${view.root}/insert/name ${word}`), sprite);
+    return sprite;
+  });
+}
+
+// They stay legible from afar, where the whole leg is in sight.
+const NAME = {away: 0.011, width: 0.024, height: 0.006, near: 0.6};
+
+function sizeSideNames(viewer) {
+  const distance = viewer.camera.position.distanceTo(viewer.controls.target);
+  const factor = Math.max(1, distance / NAME.near);
+  for (const sprite of tkamb.views.flatMap((view) => view.names || [])) {
+    const {place, outwards} = sprite.userData;
+    sprite.scale.set(factor * NAME.width, factor * NAME.height, 1);
+    sprite.position.set(...place.map((x, k) => x + factor * NAME.away * outwards[k]));
   }
 }
 
@@ -110,7 +125,6 @@ function wordSprite(word) {
   const material = new THREE.SpriteMaterial({map: new THREE.CanvasTexture(canvas),
     transparent: true, depthTest: false});
   const sprite = new THREE.Sprite(material);
-  sprite.scale.set(0.024, 0.006, 1);
   sprite.renderOrder = 6;
   return sprite;
 }
@@ -232,6 +246,7 @@ function renderSideBySide(viewer) {
     this.camera.aspect = part / height;
     this.camera.updateProjectionMatrix();
     this.renderer.setScissorTest(true);
+    sizeSideNames(this);
     roots.forEach((root, number) => {
       roots.forEach((other) => { other.visible = other === root; });
       this.renderer.setViewport(number * part, 0, part, height);
