@@ -63,8 +63,8 @@ CONTACT_WORDS = {
     "of constant curvature, a rigid femoral component on a linear elastic half-space",
     "foundation": "an elastic foundation of independent columns under a rigid femoral component "
     "(Blankevoort 1991, Bei 2004), p = sigma(-(M/E) ln(1 - d/h)) with d the penetration along the "
-    "insert's normal, h the local thickness, M = E(1 - nu)/((1 + nu)(1 - 2 nu)) and sigma the uniaxial "
-    "curve of the material",
+    "insert's normal, h the local thickness, M = E(1 - nu)/((1 + nu)(1 - 2 nu)) and sigma the "
+    "uniaxial curve of the material",
     "foundation-linear": "an elastic foundation of independent linear columns under a rigid "
     "femoral component (Blankevoort 1991), p = M d/h with d the penetration along the insert's "
     "normal, h the local thickness and M = E(1 - nu)/((1 + nu)(1 - 2 nu))",
