@@ -156,3 +156,19 @@ def test_wear_keys_change_no_run_and_materials_do(tmp_path):
         for one, name in ((plain, "a"), (worn, "b"), (other, "c"))
     ]
     assert texts[0] == texts[1] != texts[2]
+
+
+def test_an_override_of_the_material_replaces_what_the_scene_gives():
+    scene = MODEL / "scene.toml"  # names [contact] material and [output] yield_stress_MPa
+    own = load_scene(scene, {"material.base": "polyethylene", "material.yield_stress_MPa": 25.0})
+    assert own.material is not None and own.material.yield_stress_MPa == 25.0
+    whole = load_scene(scene, {"material": {"base": "polyethylene", "young_modulus_MPa": 900.0}})
+    assert given_material(whole.insert_material).young_modulus == pytest.approx(900e6)
+    with pytest.raises(InputError, match="two materials"):
+        load_scene(scene, {"material.base": "polyethylene", "contact.material": "polyethylene"})
+
+
+def test_an_override_by_a_built_in_name_replaces_the_scene_s_own_material(tmp_path):
+    own = write_scene(tmp_path, contact__material=None, material__base="polyethylene")
+    named = load_scene(own, {"contact.material": "polyethylene-linear"})
+    assert named.material is None and named.contact.material == "polyethylene-linear"

@@ -8,6 +8,7 @@ import tkamb
 from scenes import MODEL
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.knee.generic_ligaments import BUNDLES
 from tkamb.show.methods import methods
 
 
@@ -57,6 +58,18 @@ def test_what_the_scene_changes_the_paragraph_says(run, key, value, words, absen
     assert absent not in text
 
 
+def test_generic_bundles_are_told_with_their_numbers_and_sources(run):
+    overrides = {"ligament": [], "generic_ligaments": {"ligaments": ["LCL"]}}
+    scene = tkamb.load_scene(MODEL / "scene.toml", overrides)
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True)
+    told = methods(summary)
+    text = " ".join(told.sentences)
+    assert "LCL k = 72.22 N/mm, strain -0.05" in text and "PCL_" not in text
+    assert any("Ligament-bone interaction" in one for one in told.references)
+    assert any("Abdel-Rahman" in one for one in told.references)
+
+
 def test_a_paragraph_cites_only_what_it_names(run):
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     cited = " ".join(methods(summary).references)
@@ -78,3 +91,11 @@ def test_a_setting_whose_error_was_not_measured_is_said_to_be_so(run):
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     summary["known_error"] = "not measured"
     assert "was not measured" in " ".join(methods(summary).sentences)
+
+
+def test_the_page_of_equations_has_every_generic_bundle():
+    text = (MODEL.parents[1] / "docs" / "equations.md").read_text(encoding="utf-8")
+    for name, bundle in BUNDLES.items():
+        ends = [f"({', '.join(f'{v:g}' for v in p)})" for p in (bundle.proximal, bundle.distal)]
+        row = [name, f"{bundle.stiffness_N_per_mm:g}", f"{bundle.reference_strain:g}", *ends]
+        assert f"| {' | '.join(row)} |" in text

@@ -32,9 +32,9 @@ def script():
 def attempt(script, tmp_path, monkeypatch):
     """Return what tries a scene's content in a folder of its own, meshes read once."""
     keep_meshes(monkeypatch)
-    before = signal.signal(signal.SIGALRM, script._too_long)
+    before = signal.signal(signal.SIGPROF, script._too_long)
     yield lambda content: script.attempt(as_toml(content), tmp_path / "scene.toml")
-    signal.signal(signal.SIGALRM, before)
+    signal.signal(signal.SIGPROF, before)
 
 
 def content_of(script, path=SCENE):

@@ -5,11 +5,12 @@ left out, which software did it, and what to cite. It reads `scene_tables` of su
 """
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.knee.generic_ligaments import BUNDLES
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,12 @@ METHODS_TEXT = MethodsTextSettings()
 
 
 REFERENCES = {
+    "Abdel-Rahman 1998": "Abdel-Rahman EM, Hefzy MS (1998). Three-dimensional dynamic behaviour of "
+    "the human knee joint under impact loading. Med Eng Phys 20:276.",
+    "Bei 2004": "Bei Y, Fregly BJ (2004). Multibody dynamic simulation of knee contact mechanics. "
+    "Med Eng Phys 26:777. doi:10.1016/j.medengphy.2004.07.004",
+    "Blankevoort and Huiskes 1991": "Blankevoort L, Huiskes R (1991). Ligament-bone interaction in "
+    "a three-dimensional model of the knee. J Biomech Eng 113:263. doi:10.1115/1.2894883",
     "Blankevoort 1991": "Blankevoort L et al. (1991). Articular contact in a three-dimensional "
     "model of the knee. J Biomech 24:1019. doi:10.1016/0021-9290(91)90019-J",
     "Carpentier 2019": "Carpentier J et al. (2019). The Pinocchio C++ library. Proc IEEE/SICE SII, "
@@ -55,9 +62,9 @@ CONTACT_WORDS = {
     "hertz": "Hertz's theory (Johnson 1985): on each condyle an elliptical patch between surfaces "
     "of constant curvature, a rigid femoral component on a linear elastic half-space",
     "foundation": "an elastic foundation of independent columns under a rigid femoral component "
-    "(Blankevoort 1991), p = sigma(-(M/E) ln(1 - d/h)) with d the penetration along the insert's "
-    "normal, h the local thickness, M = E(1 - nu)/((1 + nu)(1 - 2 nu)) and sigma the uniaxial "
-    "curve of the material",
+    "(Blankevoort 1991, Bei 2004), p = sigma(-(M/E) ln(1 - d/h)) with d the penetration along the "
+    "insert's normal, h the local thickness, M = E(1 - nu)/((1 + nu)(1 - 2 nu)) and sigma the "
+    "uniaxial curve of the material",
     "foundation-linear": "an elastic foundation of independent linear columns under a rigid "
     "femoral component (Blankevoort 1991), p = M d/h with d the penetration along the insert's "
     "normal, h the local thickness and M = E(1 - nu)/((1 + nu)(1 - 2 nu))",
@@ -88,7 +95,7 @@ LAWS = {
     ),
     "quadratic-toe": (
         "F = k eps^2/0.12 up to a strain of 0.06 and F = k(eps - 0.03) beyond it",
-        "Blankevoort 1991",
+        "Blankevoort and Huiskes 1991",
     ),
 }
 
@@ -250,12 +257,23 @@ def _ligaments(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterato
             )
     generic = tables.get("generic_ligaments")
     if generic:
+        words, source = LAWS["two-line"]
         yield (
-            f"Generic bundles ({', '.join(generic['ligaments'])}) were attached relative to the "
-            "implant, with stiffness and reference strain of Blankevoort 1991."
+            "Generic bundles, nobody's own, were attached in proportion to the implant's width and "
+            f"carried tension only: {words}, with L0 the slack length ({source}); stiffness of "
+            "Abdel-Rahman 1998 and strain in extension of Blankevoort and Huiskes 1991: "
+            f"{'; '.join(_generic_words(generic['ligaments']))}."
         )
     if not bundles and not generic:
         yield "No ligaments were modelled."
+
+
+def _generic_words(chosen: Sequence[str]) -> Iterator[str]:
+    for name, bundle in BUNDLES.items():
+        if name.split("_")[0] in chosen:
+            yield (
+                f"{name} k = {bundle.stiffness_N_per_mm:g} N/mm, strain {bundle.reference_strain:g}"
+            )
 
 
 def _ligament_words(bundle: Mapping[str, Any]) -> str:

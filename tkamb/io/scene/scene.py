@@ -6,6 +6,7 @@ unknown key is an error. `load_scene` reads and validates it; nothing else is op
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, get_args
 
@@ -175,8 +176,7 @@ def load_scene(
     path = Path(path)
     content = _content(path)
     applied = None if preset is None else _apply_preset(content, preset, overrides or {}, path)
-    for key, value in (overrides or {}).items():
-        _override(content, key, value)
+    _apply_overrides(content, overrides or {})
     try:
         scene = Scene.model_validate(content)
     except ValidationError as error:
@@ -222,15 +222,34 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
 
 
 def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
-    """Return the scene of a content with overrides applied."""
-    for key, value in overrides.items():
-        _override(content, key, value)
+    """Return the scene of a content with overrides laid over it."""
+    _apply_overrides(content, overrides)
     try:
         result = Scene.model_validate(content)
     except ValidationError as error:
         raise _complaint(error, Path("scene"), overrides) from None
     result._overrides = overrides
     return result
+
+
+def _apply_overrides(content: dict[str, Any], overrides: Mapping[str, Any]) -> None:
+    """Lay overrides over a content; a material or yield stress replaces the one given elsewhere."""
+    for key, value in overrides.items():
+        _override(content, key, value)
+    tables = {key.partition(".")[0] for key in overrides}
+    if "material" in tables and "contact.material" not in overrides:
+        _drop(content, "contact", "material")
+    elif "contact.material" in overrides and "material" not in tables:
+        content.pop("material", None)
+    own = content.get("material")
+    has_yield = isinstance(own, dict) and "yield_stress_MPa" in own
+    if "material" in tables and has_yield and "output.yield_stress_MPa" not in overrides:
+        _drop(content, "output", "yield_stress_MPa")
+
+
+def _drop(content: dict[str, Any], table: str, key: str) -> None:
+    if isinstance(content.get(table), dict):
+        content[table].pop(key, None)
 
 
 def _apply_preset(

@@ -126,10 +126,10 @@ def peak_lines(comparison: Comparison) -> list[str]:
     """Return each run's peak forces with their bands, and its peak pressure, a line each."""
     lines = []
     for run in comparison.runs:
-        found = peaks_of(run.results.summary)
-        if found:
-            words = ", ".join(f"{name} {peak_words(one)}" for name, one in found.items())
-            lines.append(f"{run.label}: peak {words} BW, {peak_legend(found)}")
+        peaks = peaks_of(run.results.summary)
+        if peaks:
+            words = ", ".join(f"{name} {peak_words(one)}" for name, one in peaks.items())
+            lines.append(f"{run.label}: peak {words} BW, {peak_legend(peaks)}")
         if pressure := metrics.peak_pressure(run.results):
             words = f"peak pressure {pressure['MPa']:.1f} MPa, {pressure['side']}"
             words += f", at {pressure['time_s']:.4g} s"
