@@ -221,32 +221,32 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
         force: total, medial or lateral.
         activity: of the scene; None or one without a trial has no bias of its own.
     """
-    known = [one for one in errors if one.force == force]
-    if not known:
+    chosen = [one for one in errors if one.force == force]
+    if not chosen:
         return None
-    own = [one.bias for one in known if one.activity == activity]
-    biases = np.array([one.bias**2 for one in known])
-    scatters = np.array([one.scatter**2 for one in known])
+    own = [one.bias for one in chosen if one.activity == activity]
+    biases = np.array([one.bias**2 for one in chosen])
+    scatters = np.array([one.scatter**2 for one in chosen])
     published = float(getattr(DISCREPANCY, f"published_{force}_BW")) / DISCREPANCY.walking_load_BW
     published **= 2
     share = float(biases.sum() / max((biases + scatters).sum(), np.finfo(float).tiny))
     offset = float(np.mean([share * published, *biases]))
     scatter = float(np.mean([(1.0 - share) * published, *scatters]))
-    inputs = float(np.mean([one.inputs**2 for one in known]))
+    inputs = float(np.mean([one.inputs**2 for one in chosen]))
     of_trial = offset / 2 * (1 + 1 / (len(own) + 1))
-    frames = sum(max(1.0, one.independent_frames - 1.0) for one in known)
-    freedom = (of_trial + scatter) ** 2 / (of_trial**2 / (len(known) + 1) + scatter**2 / frames)
+    frames = sum(max(1.0, one.independent_frames - 1.0) for one in chosen)
+    freedom = (of_trial + scatter) ** 2 / (of_trial**2 / (len(chosen) + 1) + scatter**2 / frames)
     return Discrepancy(
         mean=sum(own) / (len(own) + 1),
         deviation=float(np.sqrt(max(0.0, of_trial + scatter - inputs))),
         freedom=float(freedom),
         own_trials=len(own),
-        trials=len(known),
+        trials=len(chosen),
     )
 
 
 def band_with_discrepancy(
-    samples: Array, found: Discrepancy, load: Array, percents: Sequence[float] = (5.0, 95.0)
+    samples: Array, discrepancy: Discrepancy, load: Array, percents: Sequence[float] = (5.0, 95.0)
 ) -> Array:
     """Return the band of inputs and discrepancy together, (percents, f), of the samples' unit.
 
@@ -255,22 +255,24 @@ def band_with_discrepancy(
 
     Args:
         samples: (n, f) NaN where a sample has no number.
-        found: the discrepancy.
+        discrepancy: of the model, as `fitted` returns it.
         load: (f,) in the samples' unit, as `load_of` returns it.
         percents: of the distribution below the ends of the band.
     """
-    added = stdtrit(found.freedom, _middles(DISCREPANCY.quantiles))
-    added = found.mean + found.deviation * added
+    added = stdtrit(discrepancy.freedom, _middles(DISCREPANCY.quantiles))
+    added = discrepancy.mean + discrepancy.deviation * added
     ends = np.full((len(percents), samples.shape[1]), np.nan)
-    there = np.isfinite(samples).any(axis=0) & np.isfinite(load)
+    finite = np.isfinite(samples).any(axis=0) & np.isfinite(load)
     of_samples = np.nanpercentile(
-        samples[:, there],
+        samples[:, finite],
         100.0 * _middles(DISCREPANCY.sample_quantiles),
         axis=0,
         method=QUANTILE_METHOD,
     )
-    every = np.maximum(of_samples[:, None, :] + added[:, None] * load[there], 0.0)
-    ends[:, there] = np.percentile(every.reshape(-1, there.sum()), list(percents), axis=0)
+    every = np.maximum(of_samples[:, None, :] + added[:, None] * load[finite], 0.0)
+    ends[:, finite] = np.percentile(
+        every.reshape(len(of_samples) * len(added), -1), list(percents), axis=0
+    )
     return ends
 
 
@@ -314,9 +316,9 @@ def discrepancy_of(summary: Mapping[str, Any]) -> dict[str, Discrepancy]:
 
 def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Return the summary's key `discrepancy`: numbers per force, and all that in words."""
-    found = discrepancy_of(summary)
+    discrepancy = discrepancy_of(summary)
     return {
-        "forces": {force: asdict(one) for force, one in found.items()},
+        "forces": {force: asdict(one) for force, one in discrepancy.items()},
         "trials": [one.trial for one in known_errors() if one.force == FORCES[0]],
         "rmse_BW": rms_error(known_errors(), FORCES[0], summary.get("activity")),
         "subjects": len({one.subject for one in known_errors()}),
@@ -324,26 +326,26 @@ def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _of_activity(known: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
+def _of_activity(errors: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
     """Return the trials of an activity; of one that was not compared, all."""
-    return [one for one in known if one.activity == activity] or known
+    return [one for one in errors if one.activity == activity] or errors
 
 
-def rms_error(known: Sequence[TrialError], force: str, activity: str | None) -> float:
+def rms_error(errors: Sequence[TrialError], force: str, activity: str | None) -> float:
     """Return the root mean square over trials of the nominal runs' errors (body weights)."""
-    rms = [one.nominal_rmse_BW for one in _of_activity(known, activity) if one.force == force]
+    rms = [one.nominal_rmse_BW for one in _of_activity(errors, activity) if one.force == force]
     return float(np.sqrt(np.mean(np.square(rms))))
 
 
 def discrepancy_words(summary: Mapping[str, Any]) -> str:
     """Return in a sentence how far the method was off when it was compared with measured knees."""
-    known, activity = known_errors(), summary.get("activity")
-    own = _of_activity(known, activity)
-    of_what = f"in {activity}" if any(one.activity == activity for one in known) else "in all"
+    errors, activity = known_errors(), summary.get("activity")
+    own = _of_activity(errors, activity)
+    of_what = f"in {activity}" if any(one.activity == activity for one in errors) else "in all"
     parts = []
     for force in FORCES:
         if any(one.force == force for one in own):
-            parts.append(f"{rms_error(known, force, activity):.2f} BW ({force})")
+            parts.append(f"{rms_error(errors, force, activity):.2f} BW ({force})")
     trials = len({one.trial for one in own})
     subjects = len({one.subject for one in own})
     words = (

@@ -35,15 +35,15 @@ def in_si(table: SceneTable) -> Any:
 
     Keys that the class does not have concern the scene alone.
     """
-    made = CLASSES[type(table)]
-    wanted = {one.name for one in fields(made)}
+    kind = CLASSES[type(table)]
+    names = {one.name for one in fields(kind)}
     values = {}
     for key, value in table:
         unit = next((unit for unit in SCALES if key.endswith(unit)), "")
         name = NAMES.get(key, key.removesuffix(unit))
-        if name in wanted:
+        if name in names:
             values[name] = _value(value, SCALES.get(unit, 1.0))
-    return made(**values)
+    return kind(**values)
 
 
 def _value(value: Any, scale: float) -> Any:
