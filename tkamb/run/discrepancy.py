@@ -263,6 +263,8 @@ def band_with_discrepancy(
     added = discrepancy.mean + discrepancy.deviation * added
     ends = np.full((len(percents), samples.shape[1]), np.nan)
     finite = np.isfinite(samples).any(axis=0) & np.isfinite(load)
+    if not finite.any():
+        return ends
     of_samples = np.nanpercentile(
         samples[:, finite],
         100.0 * _middles(DISCREPANCY.sample_quantiles),

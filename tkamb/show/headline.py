@@ -158,6 +158,7 @@ def _peaks(results: "Results") -> Card | None:
         return None
     value = ", ".join(f"{name} {peak_words(one)}" for name, one in peaks.items()) + " BW"
     detail = peak_legend(peaks) + "; each at the frame where it is largest as the inputs stand"
+    detail += "; total along the insert's axis, as an instrumented tray measures it"
     return Card("Peak total, medial and lateral force", value, detail)
 
 
