@@ -99,6 +99,7 @@ def test_a_band_with_discrepancy_is_never_below_zero_and_empty_without_samples()
     low, high = band_with_discrepancy(samples, found, np.full(2, 700.0))
     assert low[0] == 0.0 and high[0] > 100.0 + 1.64 * 700.0  # Student's t is wider
     assert np.isnan([low[1], high[1]]).all()
+    assert np.isnan(band_with_discrepancy(samples[:, 1:], found, np.full(1, 700.0))).all()
 
 
 SUMMARY = {"scene_tables": {"muscles": {}}, "activity": "squat"}

@@ -63,7 +63,7 @@ def test_opensim_reads_it(folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("run.csv", "none of .sto, .mot"), ("there.sto", "there already"), ("no/run.sto", "no/run")],
+    [("run.csv", "none of .sto, .mot"), ("there.sto", "exists already"), ("no/run.sto", "no/run")],
 )
 def test_what_cannot_be_written_is_one_line(folder, tmp_path, capsys, name, words):
     (tmp_path / "there.sto").write_text("mine")

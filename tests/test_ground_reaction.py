@@ -139,7 +139,7 @@ def test_force_on_the_plate_is_the_opposite_of_that_on_the_foot(tmp_path):
     on_plate = load_ground_reaction(plate(file, force="on the plate"), AT, "left")
     for name in ("force", "point", "moment", "loaded"):
         np.testing.assert_array_equal(getattr(on_plate, name), getattr(on_foot, name))
-    with pytest.raises(InputError, match='Then say force = "on the plate"'):
+    with pytest.raises(InputError, match='say force = "on the plate"'):
         load_ground_reaction(plate(file), AT, "left")
     with pytest.raises(InputError, match="leave out force"):
         load_ground_reaction(plate(foot, force="on the plate"), AT, "left")

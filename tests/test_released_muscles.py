@@ -40,7 +40,7 @@ def side_with_flexors(scene, left=False):
     trial = two_flexors(len(case.motion.time), least=0.02)
     if left:
         trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
-    mechanics.muscles = SharedMuscles(trial, left=left)
+    mechanics.muscles = SharedMuscles(trial, is_left=left)
     return ContactSide(case, mechanics)
 
 
@@ -85,7 +85,7 @@ def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
 
 
 def test_the_sharing_is_that_of_the_released_knee(resting):
-    """Quadriceps of sharing and equations agree to 1 N; residuals that equilibrium removes are zero."""
+    """Quadriceps of sharing and equations agree to 1 N; equilibrium removes the residuals."""
     for body, contact in resting:
         quadriceps = body.geometry.extensor.tension(body.loads.values)
         assert quadriceps == pytest.approx(body.geometry.share.force[0], abs=1.0)

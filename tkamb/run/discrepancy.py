@@ -247,7 +247,7 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
 
 
 def band_with_discrepancy(
-    samples: Array, found: Discrepancy, load: Array, percents: Sequence[float] = (5.0, 95.0)
+    samples: Array, discrepancy: Discrepancy, load: Array, percents: Sequence[float] = (5.0, 95.0)
 ) -> Array:
     """Return the band of inputs and discrepancy together, (percents, f), of the samples' unit.
 
@@ -256,22 +256,26 @@ def band_with_discrepancy(
 
     Args:
         samples: (n, f) NaN where a sample has no number.
-        found: the discrepancy.
+        discrepancy: of the model, as `fitted` returns it.
         load: (f,) in the samples' unit, as `load_of` returns it.
         percents: of the distribution below the ends of the band.
     """
-    added = stdtrit(found.freedom, _middles(DISCREPANCY.quantiles))
-    added = found.mean + found.deviation * added
+    added = stdtrit(discrepancy.freedom, _middles(DISCREPANCY.quantiles))
+    added = discrepancy.mean + discrepancy.deviation * added
     ends = np.full((len(percents), samples.shape[1]), np.nan)
-    there = np.isfinite(samples).any(axis=0) & np.isfinite(load)
+    finite = np.isfinite(samples).any(axis=0) & np.isfinite(load)
+    if not finite.any():
+        return ends
     of_samples = np.nanpercentile(
-        samples[:, there],
+        samples[:, finite],
         100.0 * _middles(DISCREPANCY.sample_quantiles),
         axis=0,
         method=QUANTILE_METHOD,
     )
-    every = np.maximum(of_samples[:, None, :] + added[:, None] * load[there], 0.0)
-    ends[:, there] = np.percentile(every.reshape(-1, there.sum()), list(percents), axis=0)
+    every = np.maximum(of_samples[:, None, :] + added[:, None] * load[finite], 0.0)
+    ends[:, finite] = np.percentile(
+        every.reshape(len(of_samples) * len(added), -1), list(percents), axis=0
+    )
     return ends
 
 

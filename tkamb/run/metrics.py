@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.contact.articular_edge import AT_EDGE
-from tkamb.contact.narrow import TOO_NARROW
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run.agreement import AGREEMENT
@@ -33,12 +31,6 @@ class MetricSettings:
 
 
 METRICS = MetricSettings()
-
-PEAK_DOUBTS = {
-    AT_EDGE: AT_EDGE,
-    TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
-}
-"""Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +74,17 @@ def peak(results: "Results", column: str) -> Peak | None:
 def doubt_of_peak(results: "Results", side: str, frame: int) -> str:
     """Return in words why the peak pressure of a condyle at a frame is in doubt; "" if it is not.
 
-    A run's status tells the flags of each frame.
+    A run's status has the flags of each frame.
     """
+    from tkamb.contact.articular_edge import AT_EDGE
+    from tkamb.contact.narrow import TOO_NARROW
+
+    doubts = {
+        AT_EDGE: AT_EDGE,
+        TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
+    }
     status = str(results.status[frame])
-    words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
+    words = [word for flag, word in doubts.items() if f"the {side} {flag}" in status]
     return " and ".join(words)
 
 

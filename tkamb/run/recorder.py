@@ -214,9 +214,8 @@ def _is_frame(shard: Shard, points: int | None) -> bool:
         return True
     if points is None:
         return False
-    n = points
-    shapes = dict.fromkeys(("pressure", "gap", "area"), (n,))
-    shapes |= dict.fromkeys(("nodal_force", "normals"), (n, 3))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pressure", "gap", "area"), (points,))
+    shapes |= dict.fromkeys(("nodal_force", "normals"), (points, 3))
     shapes |= {"pose": (4, 4), "wrench_on_insert": (6,)} | dict.fromkeys(CONTACT_PLACES, (3, 3))
     kept = shard.contact
     whole = all(array.dtype.kind == "f" for array in kept.values())

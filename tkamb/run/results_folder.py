@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -48,7 +49,7 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """
     directory = Path(directory)
     settle(directory)
-    if not (directory / CSV_NAME).exists():
+    if not os.path.exists(directory / CSV_NAME):  # False too for a name that no file can have
         raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
     columns = read_csv(directory / CSV_NAME)
     summary = read_summary(directory)

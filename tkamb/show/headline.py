@@ -150,8 +150,15 @@ def _peaks(results: "Results") -> Card | None:
     peaks = peaks_of(results.summary)
     if not peaks:
         return None
-    value = ", ".join(f"{name} {peak_words(one)}" for name, one in peaks.items()) + " BW"
-    detail = peak_legend(peaks) + "; each at its own frame of the largest value"
+    values, bands = [], []
+    for name, one in peaks.items():
+        number, _, band = peak_words(one).partition(" (")
+        values.append(f"{name} {number}")
+        bands += [f"{name} {band.removesuffix(')').replace('; ', ' and ')}"] if band else []
+    value = ", ".join(values) + " BW"
+    detail = peak_legend(peaks) + (": " + ", ".join(bands) if bands else "")
+    detail += "; each at the frame where it is largest as the inputs stand"
+    detail += "; total along the insert's axis, as an instrumented tray measures it"
     return Card("Peak total, medial and lateral force", value, detail)
 
 

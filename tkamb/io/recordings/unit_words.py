@@ -75,7 +75,7 @@ def newton_metres(word: str) -> float | None:
         if plain.startswith(length) and plain[len(length) :] in FORCE_WORDS:
             return LENGTH_WORDS[length] * FORCE_WORDS[plain[len(length) :]]
     for cut in range(1, len(plain)):
-        force, length = FORCE_WORDS.get(plain[:cut]), LENGTH_WORDS.get(plain[cut:])
-        if force is not None and length is not None:
-            return force * length
+        force_unit, length_unit = FORCE_WORDS.get(plain[:cut]), LENGTH_WORDS.get(plain[cut:])
+        if force_unit is not None and length_unit is not None:
+            return force_unit * length_unit
     return None
