@@ -31,7 +31,7 @@ def solved(where, least=0.05):
         PointForces("femur", strap[0][None], -strap[1][None]),
     )
     knee = replace(bent_knee(), ground=ground, ligaments=pull)
-    return SharedMuscles(two_flexors(1, reserve=2.0, least=least)).solve(0, knee, FRICTION)
+    return SharedMuscles(two_flexors(1, reserve=2.0, least=least)).frame(0).solve(knee, FRICTION)
 
 
 @pytest.mark.parametrize("where", PLACES)

@@ -13,6 +13,7 @@ from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
 from tkamb.knee.equilibrium.balance import BalanceStatus
 from tkamb.knee.equilibrium.released import KneeEquilibrium, ReleasedKnee
 from tkamb.knee.equilibrium.released_forces import SCALE
+from tkamb.knee.instant import Instant
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
@@ -41,27 +42,24 @@ AP = KNEE_COORDINATES.index("ap")
 
 
 class InitialPoses:
-    """The initial guesses of the frames of a motion, the likeliest first.
+    """The initial guesses of a search, the likeliest first.
 
     Args:
-        recorded: (f, 6) knee coordinates of the motion, m and rad.
         knee: it searches from an initial guess.
         pair: femoral component and insert.
         post: cam and post, if they are modelled.
     """
 
-    def __init__(
-        self, recorded: Array, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None"
-    ) -> None:
-        self._recorded, self._knee, self._pair, self._post = recorded, knee, pair, post
+    def __init__(self, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None") -> None:
+        self._knee, self._pair, self._post = knee, pair, post
 
     def rest(
-        self, k: int, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
+        self, instant: Instant, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
     ) -> KneeEquilibrium:
         """Return the knee at rest, from the first start that leads there.
 
         Args:
-            k: frame.
+            instant: the knee.
             previous: the last three frames that were found.
             points: side -> where a condyle that carries nothing is nearest to the insert.
 
@@ -69,26 +67,27 @@ class InitialPoses:
             ComputationError: no start lies over the insert, or no muscle forces carry the frame.
         """
         knee, failure = None, "the femoral component does not lie over the insert"
-        for place in self._starts(k, [knee.coordinates for knee in previous]):
+        recorded = instant.coordinates
+        for place in self._starts(recorded, [knee.coordinates for knee in previous]):
             if not np.isfinite(place).all():
                 continue
             try:
-                knee = self._knee.find(k, place, points, previous[-1] if previous else None)
+                knee = self._knee.find(instant, place, points, previous[-1] if previous else None)
             except ComputationError as error:
                 failure = error.what
                 continue
-            if knee.balance.status not in ASTRAY and not (knee.problem and self._knee.muscles):
+            if knee.balance.status not in ASTRAY and not (knee.problem and instant.muscles):
                 break
         if knee is None:
             raise ComputationError(failure)
         return knee
 
-    def _starts(self, k: int, previous: list[Array]) -> Iterator[Array]:
+    def _starts(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
         """Yield where a search may begin: as the last frames went on, as the last, as recorded.
 
         The first keeps its height, the others just touch.
         """
-        recorded, rows = self._recorded[k], list(self._knee.released)
+        rows = list(self._knee.released)
         for number, place in enumerate([carried_on(previous), previous[-1]] if previous else []):
             start = recorded.copy()
             start[rows] = place[rows]

@@ -17,9 +17,9 @@ from tkamb.io.scene.si import in_si
 from tkamb.knee.chain import Chain
 from tkamb.knee.equilibrium.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
-from tkamb.run.known import SharedState
 from tkamb.run.known_errors import as_json, known_error
 from tkamb.run.mechanics import FrameLoads, Mechanics
+from tkamb.run.read_scene import SharedState, contact_side, mechanics_of
 from tkamb.show.view.bench import ROWS, Bench, BenchRequest, write_bench
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
@@ -72,7 +72,7 @@ class LiveKnee:
         if case.scene.patient.scale != 1.0:
             raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
         self.case = _without_muscles(case)
-        self.bench = Bench(self.case, Mechanics(self.case, near=True).ligaments)
+        self.bench = Bench(self.case, mechanics_of(self.case, near=True).ligaments)
         self._sides: dict[tuple[str, float], ContactSide] = {}
         self._known: SharedState | None = None
         self._threads: dict[tuple[str, float], Thread] = {}
@@ -190,9 +190,10 @@ class LiveKnee:
         key = (request.contact, request.resolution_mm)
         if key not in self._sides:
             case = self.bench.case_of(request)
-            mechanics = Mechanics(case, self._known, near=True)
-            self._sides[key] = ContactSide(case, mechanics)
-            self._known = SharedState(mechanics.query, None, None, range(ROWS))
+            mechanics = mechanics_of(case, self._known, near=True)
+            self._sides[key] = contact_side(case, mechanics)
+            assert mechanics.knee.contact is not None
+            self._known = SharedState(mechanics.knee.contact.pair, None, None, range(ROWS))
         return self._sides[key]
 
     def _compute(self, request: BenchRequest) -> LiveAnswer:
@@ -209,8 +210,9 @@ class LiveKnee:
             return replace(empty, status=words)
         key = (request.contact, request.resolution_mm)
         try:
-            mechanics = Mechanics(case, self._known, near=True)
-            side = ContactSide(case, mechanics, state, sensitivity=False, model=prepared.model)
+            contact = prepared.mechanics.knee.contact
+            mechanics = mechanics_of(case, self._known, near=True, contact=contact)
+            side = contact_side(case, mechanics, sensitivity=False)
             before = [self._before[key]] if key in self._before and not request.released else []
             body, contact = side.frame(0, before)
         except TkambError as error:
