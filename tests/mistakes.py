@@ -115,7 +115,7 @@ class Bench:
             contact_model(contact.model, contact.resolution_mm, **contact.options)
             material(contact.material)
         mechanics = mechanics_of(case)
-        plausibility = Plausibility(mechanics)
+        plausibility = Plausibility(case, mechanics)
         words = {NUMBER.sub("#", question.text) for question in plausibility.questions}
         forces = []
         for k in self.frames:

@@ -147,8 +147,12 @@ class Instant:
         """
         place = self.coordinates if coordinates is None else coordinates
         motion = self.motion
+        problems: tuple[str, ...] = ()
         if self.extensor is not None and patella is None:
-            patella = self.extensor.patella(None if coordinates is None else knee_pose(place))
+            try:
+                patella = self.extensor.patella(None if coordinates is None else knee_pose(place))
+            except ComputationError as error:
+                problems = (str(error),)
         joints = motion.joints.copy()
         joints[0, :6] = place
         if patella is not None and patella.status.found:
@@ -157,10 +161,11 @@ class Instant:
             self.chain, replace(motion, joints=joints), self.shank, self.thigh, self.on_patella
         )
         tensions, pulls = self._pulls(state)
-        geometry = KneeGeometry(state, self.ground, pulls, coordinates=place, tensions=tensions)
-        if self.extensor is None:
+        geometry = KneeGeometry(
+            state, self.ground, pulls, coordinates=place, tensions=tensions, problems=problems
+        )
+        if self.extensor is None or patella is None:
             return geometry
-        assert patella is not None
         try:
             extensor, muscle = self.extensor.lines.loads(place[5], state, patella)
         except ComputationError as error:
