@@ -80,14 +80,14 @@ def error_cases() -> list[ErrorCase]:
     """Return all pairs."""
     result: list[ErrorCase] = []
     for situation, rows in (("interior", _interior()), ("flank", _flank()), ("edge", _edge())):
-        for number, (name, *given) in enumerate(rows):
+        for number, (name, *settings) in enumerate(rows):
             keys = ("femoral", "insert", "load", "shift_mm", "width_mm")
             result.append(
                 ErrorCase(
                     f"{situation}: {name}",
                     situation,  # type: ignore[arg-type]
                     number % 2 == 1,
-                    **dict(zip(keys, given, strict=False)),
+                    **dict(zip(keys, settings, strict=False)),
                 )
             )
     return result

@@ -159,7 +159,7 @@ def pressed(
     model, state = prepared(query)
     settings = AdjustmentSettings(restore_when=restore_when)
     adjustment = adjust(query, tilted(angle_deg, height), settings)
-    return press_adjusted(model, state, load, adjustment, query)
+    return press_adjusted(model, state, load, adjustment, query)[:2]
 
 
 def medial_share(result: ContactResult) -> float:

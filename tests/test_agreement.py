@@ -58,11 +58,14 @@ def test_a_foreseen_turned_press_tells_the_same_to_a_hundredth(tmp_path):
     before = []
     for k in (50, 51, 52):
         before.append(side.frame(k, before[-2:])[1])
-    probe, results = side.model.probe(side.state), [contact.result for contact in before]
-    alone = [split_sensitivity(probe, result)[0] for result in results]
-    assert before[-1].sensitivity == pytest.approx(alone[-1], rel=0.01)
-    assert before[-1].sensitivity != alone[-1]
-    assert before[-1].turned.iterations < split_sensitivity(probe, results[-1])[1].iterations
+    probe, last = side.model.probe(side.state), before[-1]
+    alone, (turned, _) = split_sensitivity(probe, last.result, last.start)
+    assert last.sensitivity == pytest.approx(alone, rel=0.01)
+    assert last.sensitivity != alone
+    like = before[-2].start, before[-2].turned
+    assert split_sensitivity(probe, last.result, last.start, like)[1][0].iterations < (
+        turned.iterations
+    )
 
 
 def test_a_frame_far_away_foretells_no_turned_press(tmp_path):
@@ -72,7 +75,7 @@ def test_a_frame_far_away_foretells_no_turned_press(tmp_path):
     side = contact_side(case, mechanics_of(case))
     before = [side.frame(50)[1]]
     contact = side.frame(56, before)[1]
-    alone, _ = split_sensitivity(side.model.probe(side.state), contact.result)
+    alone, _ = split_sensitivity(side.model.probe(side.state), contact.result, contact.start)
     assert contact.sensitivity == alone
 
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
-from tkamb.contact.lattice.initial_guess import WarmStart, initial_guess
+from tkamb.contact.lattice.initial_guess import LatticeStart, initial_guess, lattice_start
 from tkamb.contact.lattice.linear import compliance, response
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component
 from tkamb.contact.lattice.linear.response import unknowns_of
-from tkamb.contact.lattice.model import warm_start_of
 from tkamb.contact.lattice.nonlinear_balance import elements_that_count
 from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.settings import LatticeSolverSettings
@@ -238,7 +237,8 @@ def test_a_warm_start_of_another_insert_is_not_used(state):
     """A guess of another state saves nothing and harms nothing."""
     model = contact_model("lattice", 2.0)
     other = replace(state, problem=replace(state.problem))
-    stranger = model.press(other, LOAD, POSE)
-    assert isinstance(stranger.warm_start, WarmStart)
-    assert warm_start_of(state, stranger) is None
-    assert warm_start_of(other, stranger) is stranger.warm_start
+    result, stranger = model.press_from(other, LOAD, POSE)
+    assert isinstance(stranger, LatticeStart)
+    assert lattice_start(state, stranger) is None
+    assert lattice_start(other, stranger) is stranger
+    assert lattice_start(other, result) is None

@@ -74,7 +74,7 @@ def test_the_reported_residual_is_the_one_that_others_measure(name, load, monkey
         return solutions[-1]
 
     monkeypatch.setattr(lattice_model, "solve", kept)
-    before = model.press(state, 1.5 * load, POSE)
+    _, before = model.press_from(state, 1.5 * load, POSE)
     for start in (None, before):
         result = model.press(state, load, POSE, start)
         found, settings = solutions[-1], LatticeSolverSettings()
@@ -105,13 +105,13 @@ def worst(model, state, exact, wanted, rng, cases):
         if kind == 0:
             start = None
         elif kind == 1:
-            start = model.press(state, load, neighbour)
+            _, start = model.press_from(state, load, neighbour)
         elif kind == 2:
-            start = model.press(state, min(4 * load, 24e3), pose)
+            _, start = model.press_from(state, min(4 * load, 24e3), pose)
         else:
             start = starts[-1]  # a wrong pose and another load
-        found = model.press(state, load, pose, start)
-        starts.append(found)
+        found, end = model.press_from(state, load, pose, start)
+        starts.append(end)
         assert found.status is ContactStatus.OK, (load, kind)
         sides = [
             sum(c.area for c in (one.medial, one.lateral) if c is not None) for one in (found, best)

@@ -39,7 +39,7 @@ def side_with_flexors(scene, left=False):
     trial = two_flexors(len(case.motion.time), least=0.02)
     if left:
         trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
-    mechanics.muscles = SharedMuscles(trial, left=left)
+    mechanics.muscles = SharedMuscles(trial, is_left=left)
     return contact_side(case, mechanics)
 
 

@@ -40,7 +40,7 @@ class ViscoelasticBed:
         self._memory = np.zeros((len(series.times), len(bed.points)))
 
     def press(self, load, pose, step):
-        """Go on by `step` s to a load (N) at a pose whose y is free; return the pressure (n,) Pa."""
+        """Go on by `step` s to a load (N) at a pose whose y is free; pressure (n,) Pa."""
 
         def missing(fall):
             result = self._pressed(pose, fall, step)[1]

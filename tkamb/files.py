@@ -222,9 +222,9 @@ def named_files(path: Path) -> list[Path]:
     result: list[Path] = []
     waiting = [path]
     while waiting:
-        here = waiting.pop()
-        for name in _NAMED.findall(read_bytes(here)):
-            other = here.parent / os.fsdecode(name).replace("\\", "/")
+        folder = waiting.pop()
+        for name in _NAMED.findall(read_bytes(folder)):
+            other = folder.parent / os.fsdecode(name).replace("\\", "/")
             if other.is_file() and other not in (path, *result):
                 result.append(other)
                 waiting.append(other)

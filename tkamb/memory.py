@@ -63,8 +63,8 @@ def _group() -> float:
     )
     for limit, used in pairs:
         try:
-            most, taken = ((GROUP / name).read_text().strip() for name in (limit, used))
-            return float("inf") if most == "max" else float(most) - float(taken)
+            most, used_text = ((GROUP / name).read_text().strip() for name in (limit, used))
+            return float("inf") if most == "max" else float(most) - float(used_text)
         except (OSError, ValueError):
             continue
     return float("inf")

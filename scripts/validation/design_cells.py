@@ -201,11 +201,11 @@ class PressedDesign:
         radius = profile.radii[np.searchsorted(profile.joints, flexion)]
         apex = np.array([*profile.point(flexion), sign * femoral.ridge_half])
         pose = knee_pose([0.0, 0.0, 0.0, case.axial_rotation, 0.0, float(flexion)])
-        carried = pose[:3, :3] @ apex * MILLIMETRE
+        apex_point = pose[:3, :3] @ apex * MILLIMETRE
         outer = dish[0] if case.ap > 0 else dish[1]
         low = insert.low_point_ap * MILLIMETRE
-        pose[0, 3] = low + (1.0 - radius / outer) * case.ap / case.size - carried[0]
-        pose[2, 3] = sign * insert.dish_half * MILLIMETRE - carried[2]
+        pose[0, 3] = low + (1.0 - radius / outer) * case.ap / case.size - apex_point[0]
+        pose[2, 3] = sign * insert.dish_half * MILLIMETRE - apex_point[2]
         return pose
 
 

@@ -117,12 +117,12 @@ def implied_mass() -> Array:
     force over area, so this is the mass by which the forces in BW were multiplied, up to the
     difference between a mean of ratios and a ratio of means.
     """
-    carried = sum(
+    force = sum(
         table(area).mean * table(pressure).mean
         for area, pressure in ((MEDIAL_AREA, MEDIAL_PRESSURE), (LATERAL_AREA, LATERAL_PRESSURE))
     )
     weights = table(MEDIAL_FORCE).mean + table(LATERAL_FORCE).mean
-    return np.asarray(carried / weights / GRAVITY)
+    return np.asarray(force / weights / GRAVITY)
 
 
 def si_surplus(corrected_columns: bool) -> Array:

@@ -54,19 +54,19 @@ def _check(options: argparse.Namespace) -> int:
     return 0
 
 
-def _write_picture(found: "SceneCheck", path: Path) -> None:
+def _write_picture(check: "SceneCheck", path: Path) -> None:
     from tkamb.atomic import replaced_file, write_text
     from tkamb.show.check.leg_picture import draw_leg
 
-    figure = draw_leg(found.case, found.mechanics)
+    figure = draw_leg(check.case, check.mechanics)
     if path.suffix.lower() == ".html":
-        write_text(path, check_html(found, figure))
+        write_text(path, check_html(check, figure))
         return
     with replaced_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130)
 
 
-def check_html(found: "SceneCheck", figure: "Figure") -> str:
+def check_html(check: "SceneCheck", figure: "Figure") -> str:
     """Return the page: questions first, then the picture, then what each file gave."""
     from tkamb.show.pages import asset, policy_sources, render
     from tkamb.show.style import svg_text
@@ -77,7 +77,7 @@ def check_html(found: "SceneCheck", figure: "Figure") -> str:
         "check.html",
         policy=POLICY.format(style=policy_sources(style)),
         style=style,
-        title=f"Check of {found.scene.resolve().parent.name}/{found.scene.name}",
-        found=found,
+        title=f"Check of {check.scene.resolve().parent.name}/{check.scene.name}",
+        found=check,
         picture=svg_text(figure, "leg"),
     )

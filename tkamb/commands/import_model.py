@@ -244,15 +244,17 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
 def _meshes(options: argparse.Namespace) -> Any:
     from tkamb.io.importing.scene_text import Meshes
 
-    given = (options.femoral, options.insert)
-    if not any(given):
+    meshes = (options.femoral, options.insert)
+    if not any(meshes):
         return None
-    if not all(given):
+    if not all(meshes):
         raise InputError("go together", "--femoral and --insert", "give both or none")
     if options.mesh_unit is None or options.mesh_axes is None:
         missing = "--mesh-unit" if options.mesh_unit is None else "--mesh-axes"
         raise InputError("is not given, and is not guessed", missing, "`tkamb mesh check` helps")
-    return Meshes(*given, options.patella, options.mesh_unit, options.mesh_axes, options.femur_bone)
+    return Meshes(
+        *meshes, options.patella, options.mesh_unit, options.mesh_axes, options.femur_bone
+    )
 
 
 def _poses(options: argparse.Namespace) -> Any:

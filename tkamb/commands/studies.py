@@ -62,25 +62,27 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.row import as_json, with_fronts
 
-    wanted = study.jobs(options.quick, options.scene, options.full)
-    cases = study.cases_of(wanted)
-    kept = KeptRows(directory, options.resume)
-    references = study.references_for(cases, options.recompute, _announce, kept)
+    jobs = study.jobs(options.quick, options.scene, options.full)
+    cases = study.cases_of(jobs)
+    kept_rows = KeptRows(directory, options.resume)
+    references = study.references_for(cases, options.recompute, _announce, kept_rows)
     rows, whole = gather(
-        study.run_tradeoff(wanted, references, kept), study.expected_seconds(wanted, cases)
+        study.run_tradeoff(jobs, references, kept_rows), study.expected_seconds(jobs, cases)
     )
     result = len(rows)
     if whole and options.peer:
-        sizes = {job.resolution_mm for job in wanted if job.label == DEFAULT}
-        more, whole = gather(study.run_peer(cases, references, kept, sizes), [1.0] * len(cases))
+        sizes = {job.resolution_mm for job in jobs if job.label == DEFAULT}
+        more, whole = gather(
+            study.run_peer(cases, references, kept_rows, sizes), [1.0] * len(cases)
+        )
         rows += more
     body: list[BodyRow] = []
     planned = 0
     if whole and not options.quick:
         planned = len(CHANGES)
-        body, whole = gather(run_body_trade(kept), [1.0] * planned)
+        body, whole = gather(run_body_trade(kept_rows), [1.0] * planned)
     rows = with_fronts(rows)
-    lines = [*unfinished(result + len(body), len(wanted) + planned), *table(rows, references)]
+    lines = [*unfinished(result + len(body), len(jobs) + planned), *table(rows, references)]
     lines += ["", *comparison(rows), "", *recommendations(rows)]
     if body:
         lines += ["", *body_table(body)]
@@ -128,11 +130,11 @@ def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies.stability import table
 
     cases = study.stability_cases(options.quick)
-    kept = KeptRows(directory, options.resume)
-    judged = study.run_stability(cases, kept=kept, workers=max(1, options.workers))
+    rows = KeptRows(directory, options.resume)
+    judged = study.run_stability(cases, kept=rows, workers=max(1, options.workers))
     verdicts, whole = gather(judged, [1.0] * len(cases))
     if not whole:
-        verdicts = study.kept_verdicts(cases, kept)
+        verdicts = study.kept_verdicts(cases, rows)
     text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
     lines = [*unfinished(len(verdicts), len(cases)), *table(verdicts)]
     _write(directory, "stability", text, lines, picture(verdicts) if verdicts else None)

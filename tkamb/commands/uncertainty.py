@@ -105,8 +105,8 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     )
     from tkamb.studies.uncertainty.inputs import held_inputs
 
-    if held := held_inputs(load_case(scene)):
-        text.append(f"not varied: {', '.join(held)}")
+    if constants := held_inputs(load_case(scene)):
+        text.append(f"not varied: {', '.join(constants)}")
     text.append("one input at a time by one standard deviation: minus, plus; no interactions")
     text.append(
         "an offset either way may raise a force: it climbs one flank of the insert or other"
@@ -115,52 +115,52 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     return 0 if rows else 1
 
 
-def headline(found: "Uncertainty") -> list[str]:
+def headline(uncertainty: "Uncertainty") -> list[str]:
     """Return the peak's band and what moves it most, in lines of text."""
     from numpy import isfinite, nanargmax
 
     from tkamb.show.headline import peak_legend, peak_words, peaks_of
 
-    total = found.results["force_total_BW"]
+    total = uncertainty.results["force_total_BW"]
     if not isfinite(total).any():
         return ["no frame of the nominal run has a force"]
     peak = int(nanargmax(total))
-    flexion = found.results["flexion_deg"][peak]
-    of_samples = found.results.summary["uncertainty"]["peak_force_total_BW"]
+    flexion = uncertainty.results["flexion_deg"][peak]
+    of_samples = uncertainty.results.summary["uncertainty"]["peak_force_total_BW"]
     words = of_samples["words"]
     if of_samples["median"] is None:
-        why = found.results.why_no_band(peak)
+        why = uncertainty.results.why_no_band(peak)
         value = f"{total[peak]:.2f} BW as the inputs stand, no median or band: {why}"
     else:
         value = (
             f"median {of_samples['median']:.2f} BW, 5 to 95 %: {of_samples['p05']:.2f} to "
             f"{of_samples['p95']:.2f}"
         )
-    peaks = peaks_of(found.results.summary)
+    peaks = peaks_of(uncertainty.results.summary)
     lines = [f"peak {name} force: {peak_words(one)} BW" for name, one in peaks.items()]
     lines += [f"({peak_legend(peaks)})"] if peaks else []
     lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
-    of_chance = TERMS / found.results.summary["uncertainty"]["samples"]
+    of_chance = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
     chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):
-        rows = [row for row in found.tornado if row.result == result][:SHOWN]
+        rows = [row for row in uncertainty.tornado if row.result == result][:SHOWN]
         parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= LEAST_SHOWN)
         if parts:
             lines.append(f"{result} varies by {parts} (shares of variance, by regression{chance})")
-    for name, one in found.results.summary["uncertainty"].get("measured_inside", {}).items():
+    for name, one in uncertainty.results.summary["uncertainty"].get("measured_inside", {}).items():
         more = one.get("share_with_discrepancy")
         lines.append(
             f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
             f"{one['frames']} frames"
             + ("" if more is None else f", with the discrepancy in {more:.0%}")
         )
-    if words := (found.results.summary.get("discrepancy") or {}).get("words"):
+    if words := (uncertainty.results.summary.get("discrepancy") or {}).get("words"):
         lines.append(words)
     for result in ("force_total_N", "medial_force_N"):
         parts = ", ".join(
             f"{one.name} {_with_error(one.first, one.first_error)} alone, "
             f"{_with_error(one.total, one.total_error)} in all"
-            for one in [row for row in found.indices if row.result == result][:SHOWN]
+            for one in [row for row in uncertainty.indices if row.result == result][:SHOWN]
         )
         if parts:
             lines.append(f"{result}, Sobol' indices and standard errors: {parts}")
@@ -171,13 +171,13 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.2f} ± {error:.2f}".replace("-", "−")
 
 
-def warnings_of(found: "Uncertainty") -> list[str]:
+def warnings_of(uncertainty: "Uncertainty") -> list[str]:
     """Return what the bands leave out."""
-    lines, summary = [], found.results.summary["uncertainty"]
+    lines, summary = [], uncertainty.results.summary["uncertainty"]
     if summary["not_varied"]:
         names = ", ".join(summary["not_varied"])
         lines.append(f"not varied, so the bands are too narrow for them: {names}")
-    share = found.bands["failed_share"]
+    share = uncertainty.bands["failed_share"]
     if (share > NOTABLE_FAILED).any():
         causes = summary["causes_of_failure"].items()
         why = ", ".join(f"{text} ({part:.0%} of the failures)" for text, part in causes)
@@ -186,6 +186,6 @@ def warnings_of(found: "Uncertainty") -> list[str]:
             f"{NOTABLE_FAILED:.0%} of the samples failed (at most {share.max():.0%}), most often: "
             f"{why}; their bands hold for the poses that are possible, see failed_share"
         )
-    if not found.tornado:
+    if not uncertainty.tornado:
         lines.append("too few samples for tornado.csv: give 6 per input or more")
     return lines

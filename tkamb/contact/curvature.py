@@ -61,9 +61,9 @@ def osculate(
     """Fit both surfaces about a contact point and move it to where the quadrics are nearest.
 
     On a disc of `radius` in the tangent plane both meshes are sampled by rays along the
-    normal (uniformly, whatever their triangles), z = c0 + c1 u + c2 v + c3 u² + c4 uv +
-    c5 v² is fitted to each by least squares, and the disc is centred anew at the minimum of
-    the difference, with the mean normal there, until it stays. Facets smaller than the disc
+    normal, evenly spaced. z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each by
+    least squares. The disc is then moved to the minimum of the difference, with the mean normal
+    there, until it no longer moves. Facets smaller than the disc
     average out; on a sphere of radius R curvature comes out too large by radius²/(4 R²),
     relative (the quartic term).
 

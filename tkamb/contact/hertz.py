@@ -11,6 +11,7 @@ from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
 from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
+from tkamb.contact.warm_start import Guess
 from tkamb.geometry.frames import SIDES, Array, Index
 
 
@@ -59,9 +60,9 @@ class Hertz(ContactModel):
     quadrics fitted there give normal and relative curvatures (`curvature.osculate`), the
     elliptic solution gives the law F = c delta^1.5 with E* = E/(1 - nu²) of the insert at
     zero strain (`ellipse.contact_ellipse`). Both condyles move down together, so each has
-    delta = travel beyond its own touch times n_y: the tilt decides how they share. Contact
-    point and curvatures stay those of first touch; E is the slope at the origin whatever
-    the material's curve.
+    delta = travel beyond its own touch times n_y: the tilt decides how they share the load.
+    Contact point and curvatures stay those of first touch. E is the slope of the material's
+    curve at the origin.
 
     The map holds the semi-ellipsoid, averaged over each grid cell and scaled so that its
     vertical force is the law's exactly; the wrench is the sum over the map. Area and peak
@@ -89,7 +90,7 @@ class Hertz(ContactModel):
     patch_radius: float = 4e-3
 
     def evaluate(
-        self, state: SampledContact, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():

@@ -20,11 +20,11 @@ class FlatBottomSettings:
     flatness: float = 5e-5
     """m; corners of one flat may lie this far from its plane (noise of the mesh)."""
     comparable_share: float = 0.5
-    """Flats whose area is at least this share of the largest compete with it."""
+    """1: a flat whose area is at least this share of the largest may be the bottom, too."""
     clear_share: float = 0.9
     """Between two flats that face down, the larger wins below this ratio of areas."""
     uneven_noise: float = 1e-6
-    """m; a bottom that is rougher than this gets a notice: noise, or no flat at all."""
+    """m: a rougher bottom gets a notice: its mesh is noisy, or it is not flat."""
     level_tilt: float = 1e-6
     """rad; a smaller tilt is rounding and stays as it is."""
 
@@ -112,7 +112,9 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
     rotation = np.eye(3) if rotation is None else rotation
     flats = find_flats(surface)
     if not flats:
-        raise InputError(f"{surface.name} has no flat bottom", None, "is it a tibial insert?")
+        raise InputError(
+            f"{surface.name} has no flat bottom", None, "give the mesh of a tibial insert"
+        )
     down = [flat for flat in flats if -flat.normal[1] >= math.cos(TILT_LIMIT)]
     if len(down) > 1:  # the wall between two touching bodies faces down too
         outer = [flat for flat in down if not _is_inner(surface, flat)]

@@ -56,7 +56,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
             (`tkamb.io.occupants`), or another process holds it; or from the block.
     """
     path = Path(path)
-    made = [folder for folder in (path, *path.parents) if not _exists(folder)]
+    new_folders = [folder for folder in (path, *path.parents) if not _exists(folder)]
     fresh = None
     try:
         claim_directory(path)
@@ -86,7 +86,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
                 _held.discard(key)
     except InputError:
         with suppress(OSError, ValueError):  # no longer empty, or never made
-            for folder in made:
+            for folder in new_folders:
                 folder.rmdir()
         raise
 
@@ -246,10 +246,10 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
 def _object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; an empty one if there is none."""
     try:
-        found = read_json(path)
+        claim = read_json(path)
     except InputError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return claim if isinstance(claim, dict) else {}
 
 
 def _exists(path: Path) -> bool:

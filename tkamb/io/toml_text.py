@@ -78,12 +78,12 @@ def check_key(dotted: str, where: object) -> None:
 def check_limits(text: str, where: object) -> None:
     """Raise an InputError for TOML text, or a value of it, beyond `TomlLimits`."""
     structure = _STRINGS.sub('""', text)
-    for found in _KEYS.finditer(structure):
-        check_key(found.group(), where)
+    for match in _KEYS.finditer(structure):
+        check_key(match.group(), where)
     if _DIGITS.search(structure):
         raise InputError(f"has a number of more than {LIMITS.digits} digits", where)
     depth = 0
-    for found in _BRACKETS.finditer(structure):
-        depth = depth + 1 if found.group() in "[{" else max(depth - 1, 0)
+    for match in _BRACKETS.finditer(structure):
+        depth = depth + 1 if match.group() in "[{" else max(depth - 1, 0)
         if depth > LIMITS.depth:
             raise InputError(f"nests values more than {LIMITS.depth} deep", where)

@@ -167,20 +167,18 @@ def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "E
 
 
 def prepared_contact(
-    contact: "ContactModel | str",
-    implant: Implant,
-    surfaces: Surfaces,
-    friction: float,
-    cache: bool,
+    contact: "ContactModel | KneeContact | str", implant: Implant, surfaces: Surfaces, cache: bool
 ) -> "KneeContact":
-    """Return a contact model, prepared for the surfaces of an implant."""
+    """Return a contact model, prepared for the surfaces of an implant, or as it was given."""
     from tkamb.contact.pair import ContactPair
     from tkamb.contact.registry import contact_model
     from tkamb.knee.contact import KneeContact
 
+    if isinstance(contact, KneeContact):
+        return contact
     model = contact_model(contact) if isinstance(contact, str) else contact
     if hasattr(model, "cache") and not cache:
         model = replace(model, cache=False)  # type: ignore[type-var]
     assert surfaces.femoral is not None and surfaces.insert is not None
     pair = ContactPair(surfaces.femoral, surfaces.insert, implant.insert_material, implant.bearing)
-    return KneeContact(model, pair, friction, model.prepare(pair))
+    return KneeContact(model, pair, 0.0, model.prepare(pair))

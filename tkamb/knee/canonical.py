@@ -68,7 +68,7 @@ class CanonicalChain(Chain):
 
     Args:
         anatomy: where the knee is in the user's model.
-        left: the knee is a left one.
+        is_left: whether the knee is a left one.
         with_patella: the chain has a patella.
         component: axes of the femoral component, fixed to the femur's joint.
         insert: the insert frame, fixed to the tibia's joint.
@@ -160,7 +160,7 @@ class Bridge:
 
     Args:
         anatomy: where the knee is in the user's model.
-        left: the knee is a left one.
+        is_left: whether the knee is a left one.
         chain: the canonical chain.
         component: axes of the femoral component, fixed to the femur's joint.
         insert: the insert frame, fixed to the tibia's joint.

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.probe import CondyleWrench, ProbedContact
-from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.result import ContactStatus
+from tkamb.contact.warm_start import Guess
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, cross, pose
 from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
@@ -75,17 +76,17 @@ class KneeContact:
         stiffer = replace(own, young_modulus=own.young_modulus * modulus_factor)
         return KneeContact(self.model, self.pair.of_material(stiffer), friction)
 
-    def probe(self, guess: ContactResult | None = None) -> Any:
+    def probe(self, start: Guess | None = None) -> Any:
         """Return a new probe (`tkamb.contact.probe.Probe`), which a caller keeps as warm start."""
-        return self.model.probe(self.state, guess)
+        return self.model.probe(self.state, start)
 
-    def precise_probe(self, guess: ContactResult | None = None) -> Any:
+    def precise_probe(self, start: Guess | None = None) -> Any:
         """Return a new probe whose answers are precise enough for differences."""
         names = {field.name for field in fields(self.model)}  # type: ignore[arg-type]
         if "tolerance" not in names:
-            return self.probe(guess)
+            return self.probe(start)
         model = replace(self.model, tolerance=self._settings.tolerance)  # type: ignore[type-var]
-        return model.probe(self.state, guess)
+        return model.probe(self.state, start)
 
     def at(self, probe: Any, place: Array) -> ProbedContact:
         """Return the contact at a pose (4, 4).
@@ -169,7 +170,7 @@ class KneeContact:
                     pressed = -load.normal @ load.stiffness[:3]
                     total += np.outer(self._rubbing(load, twist), pressed)
             return total
-        precise = self.precise_probe(getattr(probe, "_guess", None))
+        precise = self.precise_probe(getattr(probe, "start", None))
         self.at(precise, place)
         settings = self._settings
         if contact.tangent and contact.exact and not hasattr(self.model, "tolerance"):

@@ -38,13 +38,13 @@ LOST = "what is finished is kept: go on with --resume"
 
 
 def answers_of_cluster(
-    task: "Task", wanted: Sequence["Numbered"], address: str, workers: int
+    task: "Task", tasks: Sequence["Numbered"], address: str, workers: int
 ) -> Iterator["Numbered"]:
     """Yield answers with their numbers as they are finished, in any order.
 
     Args:
         task: what each process of the cluster prepares.
-        wanted: numbers and contents of the jobs.
+        tasks: numbers and contents of the jobs.
         address: of the scheduler, "tcp://host:8786"; "local": one on this machine.
         workers: processes of a local one.
 
@@ -67,7 +67,7 @@ def answers_of_cluster(
                 )
             )
         client = stack.enter_context(_connected(distributed, place, address))
-        yield from _answers(distributed, client, task, wanted)
+        yield from _answers(distributed, client, task, tasks)
 
 
 def _own_security(distributed: Any) -> Any:
@@ -116,12 +116,12 @@ def _connected(distributed: Any, place: Any, address: str) -> Any:
 
 
 def _answers(
-    distributed: Any, client: Any, task: "Task", wanted: Sequence["Numbered"]
+    distributed: Any, client: Any, task: "Task", tasks: Sequence["Numbered"]
 ) -> Iterator["Numbered"]:
     packed = pickle.dumps((task.make, task.arguments))
     try:
         futures = {
-            client.submit(answer, packed, number, job, pure=False): number for number, job in wanted
+            client.submit(answer, packed, number, job, pure=False): number for number, job in tasks
         }
         for future in distributed.as_completed(futures):
             if future.cancelled():

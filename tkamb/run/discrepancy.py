@@ -170,22 +170,25 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
         force: total, medial or lateral.
         activity: of the scene; None or one without a trial has no bias of its own.
     """
-    known = [one for one in errors if one.force == force]
-    if not known:
+    chosen = [one for one in errors if one.force == force]
+    if not chosen:
         return None
-    own = [one.bias_BW for one in known if one.activity == activity]
+    own = [one.bias_BW for one in chosen if one.activity == activity]
     published = float(getattr(DISCREPANCY, f"published_{force}_BW"))
-    offset = float(np.mean([published**2, *(one.bias_BW**2 for one in known)]))
-    scatter = float(np.mean([one.scatter_BW**2 for one in known]))
-    inputs = float(np.mean([one.inputs_BW**2 for one in known]))
+    offset = float(np.mean([published**2, *(one.bias_BW**2 for one in chosen)]))
+    scatter = float(np.mean([one.scatter_BW**2 for one in chosen]))
+    inputs = float(np.mean([one.inputs_BW**2 for one in chosen]))
     mean = sum(own) / (len(own) + 1)
     variance = offset / 2 * (1 + 1 / (len(own) + 1)) + scatter - inputs
     deviation = float(np.sqrt(max(0.0, variance)))
-    return Discrepancy(mean, deviation, len(known) + 1, len(own), len(known))
+    return Discrepancy(mean, deviation, len(chosen) + 1, len(own), len(chosen))
 
 
 def band_with_discrepancy(
-    samples: Array, found: Discrepancy, body_weight: float, percents: Sequence[float] = (5.0, 95.0)
+    samples: Array,
+    discrepancy: Discrepancy,
+    body_weight: float,
+    percents: Sequence[float] = (5.0, 95.0),
 ) -> Array:
     """Return the band of inputs and discrepancy together, (percents, f), of the samples' unit.
 
@@ -193,18 +196,20 @@ def band_with_discrepancy(
 
     Args:
         samples: (n, f) NaN where a sample has no number.
-        found: the discrepancy.
+        discrepancy: root mean square error of the method against measured knees.
         body_weight: in the samples' unit; 1 for body weights.
         percents: of the distribution below the ends of the band.
     """
     steps = (np.arange(DISCREPANCY.quantiles) + 0.5) / DISCREPANCY.quantiles
-    added = (found.mean + found.deviation * stdtrit(found.freedom, steps)) * body_weight
+    added = (
+        discrepancy.mean + discrepancy.deviation * stdtrit(discrepancy.freedom, steps)
+    ) * body_weight
     spread = samples[:, None, :] + added[:, None]
     every = np.maximum(spread.reshape(-1, samples.shape[1]), 0.0)
     every[np.isnan(spread.reshape(-1, samples.shape[1]))] = np.nan
     ends = np.full((len(percents), samples.shape[1]), np.nan)
-    there = np.isfinite(every).any(axis=0)
-    ends[:, there] = np.nanpercentile(every[:, there], list(percents), axis=0)
+    finite = np.isfinite(every).any(axis=0)
+    ends[:, finite] = np.nanpercentile(every[:, finite], list(percents), axis=0)
     return ends
 
 
@@ -243,9 +248,9 @@ def discrepancy_of(summary: Mapping[str, Any]) -> dict[str, Discrepancy]:
 
 def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Return the summary's key `discrepancy`: numbers per force, and all that in words."""
-    found = discrepancy_of(summary)
+    discrepancy = discrepancy_of(summary)
     return {
-        "forces": {force: asdict(one) for force, one in found.items()},
+        "forces": {force: asdict(one) for force, one in discrepancy.items()},
         "trials": [one.trial for one in known_errors() if one.force == FORCES[0]],
         "rmse_BW": rms_error(known_errors(), FORCES[0], summary.get("activity")),
         "subjects": len({one.subject for one in known_errors()}),
@@ -253,26 +258,26 @@ def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _of_activity(known: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
+def _of_activity(errors: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
     """Return the trials of an activity; of one that was not compared, all."""
-    return [one for one in known if one.activity == activity] or known
+    return [one for one in errors if one.activity == activity] or errors
 
 
-def rms_error(known: Sequence[TrialError], force: str, activity: str | None) -> float:
+def rms_error(errors: Sequence[TrialError], force: str, activity: str | None) -> float:
     """Return the root mean square over trials of the nominal runs' errors (body weights)."""
-    rms = [one.nominal_rmse_BW for one in _of_activity(known, activity) if one.force == force]
+    rms = [one.nominal_rmse_BW for one in _of_activity(errors, activity) if one.force == force]
     return float(np.sqrt(np.mean(np.square(rms))))
 
 
 def discrepancy_words(summary: Mapping[str, Any]) -> str:
     """Return in a sentence how far the method was off when it was compared with measured knees."""
-    known, activity = known_errors(), summary.get("activity")
-    own = _of_activity(known, activity)
-    of_what = f"in {activity}" if any(one.activity == activity for one in known) else "in all"
+    errors, activity = known_errors(), summary.get("activity")
+    own = _of_activity(errors, activity)
+    of_what = f"in {activity}" if any(one.activity == activity for one in errors) else "in all"
     parts = []
     for force in FORCES:
         if any(one.force == force for one in own):
-            parts.append(f"{rms_error(known, force, activity):.2f} BW ({force})")
+            parts.append(f"{rms_error(errors, force, activity):.2f} BW ({force})")
     trials = len({one.trial for one in own})
     subjects = len({one.subject for one in own})
     words = (

@@ -89,9 +89,9 @@ class FrameSolver:
         return k, frame_row(self._case, k, body, contact, self.slips, status), arrays
 
     def _keep(self, contact: "FrameContact") -> None:
-        """Keep a contact as a guess; only the last that was found says where a solver begins."""
+        """Keep a contact; only the last that was found keeps its warm start, which is large."""
         if contact.result is not None:
-            self.before = [_without_warm_start(earlier) for earlier in self.before]
+            self.before = [replace(each, start=None, turned=None) for each in self.before]
         self.before.append(contact)
         del self.before[: -FRAME_LOOP.kept_contacts]
 
@@ -101,13 +101,6 @@ class FrameSolver:
         if self._case.scene.contact is None:
             return None
         return contact_side(self._case, self.mechanics)
-
-
-def _without_warm_start(contact: "FrameContact") -> "FrameContact":
-    result = contact.result
-    if result is None or (result.warm_start is None and contact.turned is None):
-        return contact
-    return replace(contact, result=replace(result, warm_start=None), turned=None)
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
@@ -146,7 +139,7 @@ class ChunkSolver:
 
 
 def finished_in_order(
-    team: WorkerPool, slips: "dict[str, CondyleSlip]", indices: range, left: Sequence[int]
+    team: WorkerPool, slips: "dict[str, CondyleSlip]", indices: range, remaining: Sequence[int]
 ) -> Iterator[Finished]:
     """Yield frames over worker processes, in order.
 
@@ -154,13 +147,13 @@ def finished_in_order(
         team: of workers whose task is a `ChunkSolver`.
         slips: of the recorded motion, see `FrameSolver`.
         indices: all frames of the run, which make its chunks.
-        left: those that are still to do.
+        remaining: frames that are not computed yet.
 
     Raises:
         ComputationError: a worker was killed.
     """
     chunks: dict[int, Chunk] = {}
-    for k in left:
+    for k in remaining:
         chunks.setdefault(indices.index(k) // FRAME_LOOP.frames_per_chunk, ([], slips))[0].append(k)
     early: dict[int, list[Finished]] = {}
     turn = iter(chunks)

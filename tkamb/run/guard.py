@@ -136,9 +136,9 @@ def _watch(stream: TextIO) -> None:
     for name in ("write", "flush"):
         inner = getattr(stream, name)
 
-        def call(*given: str, inner: Callable[..., object] = inner) -> object:
+        def call(*arguments: str, inner: Callable[..., object] = inner) -> object:
             try:
-                return inner(*given)
+                return inner(*arguments)
             except BrokenPipeError:
                 raise
             except OSError as error:

@@ -233,8 +233,8 @@ class Mechanics:
             return None
         from tkamb.knee.adjustment_effect import adjustment_effect
 
-        there = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
-        before = solve_knee(there, self.friction)
+        recorded_geometry = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
+        before = solve_knee(recorded_geometry, self.friction)
         if before.problems:
             return None
         return adjustment_effect(loads, before, geometry.condyles, recorded.condyles)

@@ -93,9 +93,9 @@ def moved_per_half_degree(results: "Results") -> Array:
     holds only until the other touches.
     """
     share = medial_share(results, "deformation")
-    moved = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
-    moved = np.minimum(moved, np.abs(results["force_si_N"]))
-    return np.where(np.abs(share - 0.5) < 0.5 - AGREEMENT.unloaded_share, moved, np.nan)
+    shift = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
+    shift = np.minimum(shift, np.abs(results["force_si_N"]))
+    return np.where(np.abs(share - 0.5) < 0.5 - AGREEMENT.unloaded_share, shift, np.nan)
 
 
 def shares_apart(results: "Results") -> Array:
@@ -159,8 +159,10 @@ def map_rows(results: "Results") -> dict[int, int]:
 def stretches(points: Array) -> list[slice]:
     """Return the parts, of two points or more, of a path (n, k) m that neither lacks nor jumps."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    known = steps[np.isfinite(steps)]
-    longest = max(METRICS.jump, METRICS.jump_steps * float(np.median(known))) if len(known) else 0.0
+    finite = steps[np.isfinite(steps)]
+    longest = (
+        max(METRICS.jump, METRICS.jump_steps * float(np.median(finite))) if len(finite) else 0.0
+    )
     near = np.concatenate([[False], steps <= longest, [False]])
     ends = np.flatnonzero(np.diff(near.astype(int))).reshape(-1, 2)
     return [slice(int(first), int(last) + 1) for first, last in ends]

@@ -168,8 +168,10 @@ def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> d
     if extensor is not None:
         places = [sagittal_pose(extensor.joints(k)[0]) for k in range(len(poses))]
         known["patella"] = poses @ chain.patella_joint_in_femur @ np.array(places)
-    lines = [*case.ligaments, *([] if ligament is None else [ligament])]
-    for link in {end.link for line in lines for end in (line.proximal, line.distal)} - set(known):
+    ends = [end for line in case.ligaments for end in (line.proximal, line.distal)]
+    if ligament is not None:
+        ends += [ligament.proximal, ligament.distal]
+    for link in {end.link for end in ends} - set(known):
         carrier = chain.carrier(link)
         known[link] = known[carrier] @ chain.link_in(link, carrier)
     return known

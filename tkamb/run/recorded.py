@@ -76,11 +76,11 @@ def measured_column(name: str) -> str:
 
 def predicted_columns(columns: Mapping[str, Any]) -> dict[str, str]:
     """Return force -> the column that predicts it: the first that holds a number."""
-    found = {}
+    labels = {}
     for name, candidates in PREDICTED.items():
-        known = [one for one in candidates if one in columns and np.isfinite(columns[one]).any()]
-        found[name] = next(iter(known or candidates))
-    return found
+        present = [one for one in candidates if one in columns and np.isfinite(columns[one]).any()]
+        labels[name] = next(iter(present or candidates))
+    return labels
 
 
 def compare_measured(
@@ -200,8 +200,10 @@ def fitted_normalisation(
     time, result = np.asarray(columns["time_s"]), {}
     for channel, value in envelopes.normalised_by.items():
         own = [name for name, one in envelopes.channel_of.items() if one == channel]
-        lost = np.full_like(time, np.nan)
-        a = np.array([columns.get(family_column(ACTIVATION, name), lost) for name in own])
+        nothing_measured = np.full_like(time, np.nan)
+        a = np.array(
+            [columns.get(family_column(ACTIVATION, name), nothing_measured) for name in own]
+        )
         e = np.array([envelopes.at(name, time) for name in own])
         both = np.isfinite(a) & np.isfinite(e)
         along = float(a[both] @ e[both])
@@ -227,8 +229,8 @@ def _correlations(a: Array, rows: Array) -> Array:
 def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
     """Return the lag (s) of the largest correlation; NaN where it has no maximum inside."""
     shifted = envelopes.at(muscle, time - LAGS[:, None])
-    known = np.isfinite(shifted).all(axis=0)
-    r = _correlations(activation[known], shifted[:, known])
+    finite = np.isfinite(shifted).all(axis=0)
+    r = _correlations(activation[finite], shifted[:, finite])
     if not r.max() > max(r[0], r[-1]) + COMPARISON.least_correlation_rise:  # NaN too
         return np.nan
     return float(LAGS[r.argmax()])

@@ -135,8 +135,8 @@ def _patella_flags(case: Case, body: FrameLoads) -> list[str]:
 def _motion_flags(case: Case, k: int) -> list[str]:
     motion = case.motion
     far = motion.deviation_translation[k] > STATUS.filter_translation
-    turned = motion.deviation_rotation[k] > STATUS.filter_rotation
-    result = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or turned else []
+    rotated = motion.deviation_rotation[k] > STATUS.filter_rotation
+    result = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or rotated else []
     if motion.markers is not None:
         time = motion.time[k : k + 1]
         if motion.markers.at(motion.markers.missing.astype(float), time)[0] > 0:

@@ -87,21 +87,21 @@ def _designs(cohort: Cohort, groups: Sequence[Group]) -> dict[str, str] | None:
 
 def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
     """Return by how much the cohort's contact models are known to err; None without contact."""
-    found: dict[str, str] = {}
+    words: dict[str, str] = {}
     large = False
     for n in outcomes:
         table = cohort.runs[n].scene.contact
         if table is None:
             continue
-        said = as_json(run_error(cohort.runs[n]))
+        error = as_json(run_error(cohort.runs[n]))
         material = material_as_json(given_material(cohort.runs[n].scene.insert_material))["name"]
         setting = f"{table.model} at {table.resolution_mm:g} mm, {material}"
-        found[setting] = f"{setting}: {known_error_words(said, PRESSURE_AND_AREA)}"
-        large = large or is_large(said, PRESSURE_AND_AREA)
-    if not found:
+        words[setting] = f"{setting}: {known_error_words(error, PRESSURE_AND_AREA)}"
+        large = large or is_large(error, PRESSURE_AND_AREA)
+    if not words:
         return None
-    detail = "; ".join(found.values()) + OTHER_ERRORS
-    number = f"{len(found)} setting{'s' * (len(found) > 1)}"
+    detail = "; ".join(words.values()) + OTHER_ERRORS
+    number = f"{len(words)} setting{'s' * (len(words) > 1)}"
     return Card("Known error of the contact model", number, detail, large)
 
 
@@ -122,15 +122,15 @@ def _subtitle(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> str:
 def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> list[Card]:
     failed = sum(bool(one.reason) for one in outcomes.values())
     frames = sum(len(one.status) for one in outcomes.values())
-    lost = sum(one.failed_frames for one in outcomes.values())
+    failures = sum(one.failed_frames for one in outcomes.values())
     detail = f"{failed} failed: listed at the end" if failed else "none failed"
     result = [
         Card("Runs computed", f"{len(outcomes) - failed} of {len(outcomes)}", detail, failed > 0)
     ]
-    words = "no numbers in those that failed" if lost else "none failed"
+    words = "no numbers in those that failed" if failures else "none failed"
     if flagged := sum(one.flagged_frames for one in outcomes.values()):
         words += f"; {flagged} to be read with care, see their status in cohort.parquet"
-    result.append(Card("Frames computed", f"{frames - lost} of {frames}", words, lost > 0))
+    result.append(Card("Frames computed", f"{frames - failures} of {frames}", words, failures > 0))
     name = "force_total_BW"
     means = {
         group.name: float(np.nanmean(group.peaks[name])) for group in groups if name in group.peaks
@@ -151,7 +151,7 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
 
 def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:
     """Return each group's worn volume, its range by the wear factor, and what other laws say."""
-    lost = sum(bool(one.wear_problem) for one in outcomes.values())
+    failures = sum(bool(one.wear_problem) for one in outcomes.values())
     parts = []
     for group in groups:
         if "volume_mm3_per_Mc" not in group.wear:
@@ -171,9 +171,11 @@ def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card
         ". By archard and cross-shear the contact area cancels: the volume hardly follows the "
         "design's conformity. A difference that only one law shows is that law's"
     )
-    if lost:
-        text += f". {lost} runs have none, see wear_failed in runs.csv"
-    return Card("Worn volume", f"{len(outcomes) - lost} of {len(outcomes)} runs", text, lost > 0)
+    if failures:
+        text += f". {failures} runs have none, see wear_failed in runs.csv"
+    return Card(
+        "Worn volume", f"{len(outcomes) - failures} of {len(outcomes)} runs", text, failures > 0
+    )
 
 
 def _row(group: Group, names: Sequence[str]) -> list[str]:
@@ -255,8 +257,8 @@ def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figur
 
 def _draw_group(axes: Axes, group: Group, label: str, name: str, colour: str) -> None:
     over, middle = spread(group.bins[name]), 0.5 * (group.edges[:-1] + group.edges[1:])
-    there = over.runs > 0  # lines run on over bins that no frame falls into
-    middle, mean, sd = middle[there], over.mean[there], over.sd[there]
+    filled = over.runs > 0  # lines run on over bins that no frame falls into
+    middle, mean, sd = middle[filled], over.mean[filled], over.sd[filled]
     axes.plot(middle, mean, "o-", color=colour, markersize=3, label=label)
     axes.fill_between(middle, mean - sd, mean + sd, color=colour, alpha=0.13, linewidth=0)
 
@@ -265,8 +267,8 @@ def _maps(
     cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
 ) -> dict[str, Any] | None:
     """Return one map of each group side by side on one scale; None without contact."""
-    shown = [(group, _typical(group, outcomes)) for group in groups]
-    with_map = [(group, n) for group, n in shown if n is not None][: COHORT_REPORT.most_maps]
+    rows = [(group, _typical(group, outcomes)) for group in groups]
+    with_map = [(group, n) for group, n in rows if n is not None][: COHORT_REPORT.most_maps]
     if not with_map:
         return None
     flexion = cohort.table.map_flexion_deg
@@ -290,19 +292,19 @@ def _typical(group: Group, outcomes: Mapping[int, Outcome]) -> int | None:
 
 
 def draw_group_maps(
-    cohort: Cohort, outcomes: Mapping[int, Outcome], shown: Sequence[tuple[Group, int]]
+    cohort: Cohort, outcomes: Mapping[int, Outcome], rows: Sequence[tuple[Group, int]]
 ) -> Figure:
     """Return the chosen pressure maps on one colour scale."""
-    largest = max(_pressure(outcomes[n]).max() for _, n in shown)
+    largest = max(_pressure(outcomes[n]).max() for _, n in rows)
     scale = Normalize(0.0, float(largest) or 1.0)
-    across = min(4, len(shown))
-    down = -(-len(shown) // across)
+    across = min(4, len(rows))
+    down = -(-len(rows) // across)
     with settings():
         figure = new_figure(11.0, down * 2.6)
         grid = figure.subplots(down, across, squeeze=False).ravel()
         for axes in grid:
             axes.set_axis_off()
-        for axes, (group, n) in zip(grid, shown, strict=False):
+        for axes, (group, n) in zip(grid, rows, strict=False):
             chosen = outcomes[n].chosen
             assert chosen is not None
             maps = ContactMaps({"points_m": chosen.points, "triangles": chosen.triangles})

@@ -141,23 +141,23 @@ def peaks_of(summary: Mapping[str, Any]) -> Mapping[str, Any]:
     return varied or summary.get("peaks_BW") or {}
 
 
-def peak_legend(found: Mapping[str, Any]) -> str:
+def peak_legend(peaks: Mapping[str, Any]) -> str:
     """Return in words what stands in the brackets of `peak_words`."""
-    if not any(one.get("p05") is not None for one in found.values()):
+    if not any(one.get("p05") is not None for one in peaks.values()):
         return "as the inputs stand; tkamb uncertainty says how sure that is"
     words = "median of the samples (5 to 95 % by the inputs"
-    if any(one.get("discrepancy_p05") is not None for one in found.values()):
+    if any(one.get("discrepancy_p05") is not None for one in peaks.values()):
         words += "; 5 to 95 % by the inputs and by what the model leaves out"
     return words + ")"
 
 
 def _peaks(results: "Results") -> Card | None:
     """Return the peak total, medial and lateral force with their bands."""
-    found = peaks_of(results.summary)
-    if not found:
+    peaks = peaks_of(results.summary)
+    if not peaks:
         return None
-    value = ", ".join(f"{name} {peak_words(one)}" for name, one in found.items()) + " BW"
-    detail = peak_legend(found) + "; each at the frame where it is largest as the inputs stand"
+    value = ", ".join(f"{name} {peak_words(one)}" for name, one in peaks.items()) + " BW"
+    detail = peak_legend(peaks) + "; each at the frame where it is largest as the inputs stand"
     return Card("Peak total, medial and lateral force", value, detail)
 
 
@@ -236,15 +236,15 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
     sampled = table.get("peak_force_total_BW")
     if sampled and sampled["median"] is None:
         parts.append(sampled["words"])
-    worst, held = table["largest_failed_share"], table["not_varied"]
+    worst, not_varied = table["largest_failed_share"], table["not_varied"]
     if worst > HEADLINE.notable_failed_share:
         why = "".join(f", most often: {text}" for text in [*table.get("causes_of_failure", ())][:1])
         parts.append(f"in up to {worst:.0%} of the samples a frame failed{why}")
-    if held:
-        names = ", ".join(name.replace("_", " ") for name in held)
+    if not_varied:
+        names = ", ".join(name.replace("_", " ") for name in not_varied)
         parts.append(f"not varied, and so not in the band: {names}")
     value = f"{low:.2f}–{high:.2f} BW" if np.isfinite(low) else "–"
-    return Card("How sure the peak is", value, "; ".join(parts), bool(held))
+    return Card("How sure the peak is", value, "; ".join(parts), bool(not_varied))
 
 
 def _largest(table: Mapping[str, Any], result: str) -> str:
@@ -293,13 +293,13 @@ def _shares(results: "Results") -> Card | None:
 
 def _adduction(results: "Results", unknown: int) -> list[str]:
     """Return what an error of the adduction does to the split by deformation, in words."""
-    moved = metrics.moved_per_half_degree(results)
+    shift = metrics.moved_per_half_degree(results)
     words = []
     if unknown:
         where = "in every frame" if unknown == len(results) else f"in {unknown} frames"
         words.append(f"the split by deformation is not determined {where}")
-    if np.isfinite(moved).any():
-        text = _range(moved, " N")
+    if np.isfinite(shift).any():
+        text = _range(shift, " N")
         words.append(f"± 0.5 deg of adduction moves {text} between condyles that both carry")
     return [": ".join(words)] if words else []
 

@@ -104,10 +104,10 @@ class PageGrid:
         order = np.argsort(
             height, kind="stable"
         )  # of triangles over each other the highest is seen
-        seen = np.full(len(self.up) * len(self.across), -1)
-        seen[place[order]] = order
-        over = seen >= 0
-        chosen = seen[over]
+        ids = np.full(len(self.up) * len(self.across), -1)
+        ids[place[order]] = order
+        over = ids >= 0
+        chosen = ids[over]
         shape = len(self.up), len(self.across)
         return over.reshape(shape), self._triangles[face[chosen]], weights[chosen]
 
@@ -127,8 +127,8 @@ class PageGrid:
         corners, weights = corners[chosen[over]], weights[chosen[over]]
         over = over[::every, ::every]
         result = np.full((*values.shape[:-1], *over.shape), -1.0)
-        for here in np.ndindex(values.shape[:-1]):
-            result[here][over] = np.einsum("ij,ij->i", weights, values[here][corners])
+        for place in np.ndindex(values.shape[:-1]):
+            result[place][over] = np.einsum("ij,ij->i", weights, values[place][corners])
         return result
 
 
@@ -138,12 +138,12 @@ def touched_part(touched: Mask) -> tuple[slice, slice]:
     Args:
         touched: (rows, columns); the first points where nothing is.
     """
-    rows, columns = (_range(there) for there in np.nonzero(touched))
+    rows, columns = (_range(indices) for indices in np.nonzero(touched))
     return rows, columns
 
 
-def _range(there: NDArray[np.int64]) -> slice:
-    low, high = (int(there.min()), int(there.max())) if len(there) else (0, 1)
+def _range(indices: NDArray[np.int64]) -> slice:
+    low, high = (int(indices.min()), int(indices.max())) if len(indices) else (0, 1)
     return slice(max(low - LEVELS.margin_points, 0), high + LEVELS.margin_points + 1)
 
 

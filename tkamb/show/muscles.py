@@ -81,11 +81,11 @@ class Cell:
 
 def muscle_panels(results: "Results") -> tuple[Panel, ...]:
     """Return the plots of what makes either condyle's force, and of the forces by group."""
-    made = (
+    panels = (
         *(_contributions(results, side) for side in CONTRIBUTIONS),
         _forces(results),
     )
-    return tuple(panel for panel in made if panel.lines)
+    return tuple(panel for panel in panels if panel.lines)
 
 
 def _groups(results: "Results") -> dict[str, tuple[str, ...]]:
@@ -128,8 +128,8 @@ def _contributions(results: "Results", side: str) -> Panel:
 def _sum(results: "Results", family: str, names: tuple[str, ...]) -> Array:
     """Return the sum (f,) of a family's columns, of those that are there; NaN without any."""
     columns = [family_column(family, name) for name in names]
-    there = [results[name] for name in columns if name in results.columns]
-    return np.sum(there, axis=0) if there else np.full(len(results), np.nan)
+    present = [results[name] for name in columns if name in results.columns]
+    return np.sum(present, axis=0) if present else np.full(len(results), np.nan)
 
 
 def activation_cells(results: "Results") -> list[Cell]:
@@ -180,21 +180,21 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
 def _place_cells(cells: Sequence[Axes], rows: int) -> None:
     """Put small plots beside and below each other, with room for what stands around them."""
     width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
-    left = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
-    beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - left)
-    left, right = (
-        max(left, LABEL_PLACE.edge_points + beyond[0]),
+    margin = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
+    beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - margin)
+    margin, right = (
+        max(margin, LABEL_PLACE.edge_points + beyond[0]),
         LABEL_PLACE.edge_points + beyond[1],
     )
     gap = max(BETWEEN[0], sum(beyond) + 2 * LABEL_PLACE.edge_points)
     labels_within = LABELS if len(cells) % CELLS_ACROSS and rows > 1 else 0.0
-    wide = (width - left - right + gap) / CELLS_ACROSS - gap
+    wide = (width - margin - right + gap) / CELLS_ACROSS - gap
     tall = (height - FOOT - TITLE - labels_within + BETWEEN[1]) / rows - BETWEEN[1]
     for k, axes in enumerate(cells):
         row, column = divmod(k, CELLS_ACROSS)
         raised = labels_within if row < rows - 1 else 0.0
         bottom = FOOT + (rows - 1 - row) * (tall + BETWEEN[1]) + raised
-        set_place(axes, left + column * (wide + gap), bottom, wide, tall)
+        set_place(axes, margin + column * (wide + gap), bottom, wide, tall)
     for axes in cells:
         leave_unmeasured(axes.xaxis)
         leave_unmeasured(axes.yaxis)
@@ -225,11 +225,11 @@ def _beyond(results: "Results", cell: Cell) -> str:
 def _agreement(results: "Results", cell: Cell) -> str:
     """Return Pearson's r of activation and envelope in words, the range over several muscles."""
     emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
-    known = [emg[name]["pearson_r"] for name in cell.muscles if name in emg]
-    known = [r for r in known if r is not None and np.isfinite(r)]
-    if not known:
+    correlations = [emg[name]["pearson_r"] for name in cell.muscles if name in emg]
+    correlations = [r for r in correlations if r is not None and np.isfinite(r)]
+    if not correlations:
         return ""
-    low, high = f"{min(known):.2f}", f"{max(known):.2f}"
+    low, high = f"{min(correlations):.2f}", f"{max(correlations):.2f}"
     return (f"r {low}" if low == high else f"r {low} to {high}").replace("-", "−")
 
 

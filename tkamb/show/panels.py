@@ -115,8 +115,8 @@ def panels(results: "Results") -> tuple[Panel, ...]:
         _post, _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
         _hip_moment, _motion, _slip, _adjustment, _adjustment_effect, _condition,
     )  # fmt: skip
-    made = (_without_empty_lines(make(results)) for make in makers)
-    return tuple(panel for panel in made if panel.lines)
+    panels_made = (_without_empty_lines(make(results)) for make in makers)
+    return tuple(panel for panel in panels_made if panel.lines)
 
 
 def _without_empty_lines(panel: Panel) -> Panel:

@@ -23,13 +23,13 @@ class LabelPlaceSettings:
 LABEL_PLACE = LabelPlaceSettings()
 
 
-def set_place(axes: Axes, left: float, bottom: float, wide: float, tall: float) -> None:
+def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> None:
     """Put axes at a place in their figure (points), whose layout engine then rests."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     figure.set_layout_engine("none")
     width, height = 72 * figure.get_size_inches()
-    axes.set_position((left / width, bottom / height, wide / width, tall / height))
+    axes.set_position((x / width, bottom / height, wide / width, tall / height))
 
 
 def leave_unmeasured(axis: Axis) -> None:
@@ -59,7 +59,7 @@ def label_width(axis: Axis) -> float:
 
 def overhang(axis: Axis, length: float) -> tuple[float, float]:
     """Return how far labels of a horizontal axis reach beyond its left and right end, points."""
-    shown = shown_labels(axis)
-    left = max((0.5 * width - place * length for place, width in shown), default=0.0)
-    right = max((0.5 * width - (1.0 - place) * length for place, width in shown), default=0.0)
-    return max(left, 0.0), max(right, 0.0)
+    labels = shown_labels(axis)
+    margin = max((0.5 * width - place * length for place, width in labels), default=0.0)
+    right = max((0.5 * width - (1.0 - place) * length for place, width in labels), default=0.0)
+    return max(margin, 0.0), max(right, 0.0)

@@ -130,13 +130,13 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
     Raises:
         InputError: a plot or an axis that does not exist.
     """
-    known = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
-    unknown = [name for name in names if name not in known]
+    by_name = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
+    unknown = [name for name in names if name not in by_name]
     if unknown:
         raise InputError(
-            f"the run has no plot '{unknown[0]}'", "plot", f"it has {', '.join(known)}"
+            f"the run has no plot '{unknown[0]}'", "plot", f"it has {', '.join(by_name)}"
         )
-    chosen = [known[name] for name in names or DEFAULT if name in known]
+    chosen = [by_name[name] for name in names or DEFAULT if name in by_name]
     horizontal = horizontal_axis(results, axis)
     with settings():
         rows = max(1, -(-len(chosen) // 2))
@@ -166,7 +166,7 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     widths = [label_width(side) for side in sides]
     if any(side.get_major_formatter().get_offset() for side in sides):
         return False
-    left, *others = (
+    first, *others = (
         LABEL_PLACE.edge_points
         + LABEL_PLACE.tick_points
         + width
@@ -181,17 +181,17 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     width, height = 72 * figure.get_size_inches()
     right = max(LABEL_PLACE.edge_points + outside + PLOT.side_gap * width, OVERHANG, *others)
     columns = _legend_columns(panel)
-    if _legend_width(panel, columns) > width - left - LABEL_PLACE.edge_points:
+    if _legend_width(panel, columns) > width - first - LABEL_PLACE.edge_points:
         return False
     rows = -(-len(panel.lines) // columns)
     top = LABEL_PLACE.edge_points + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
-    wide, tall = width - left - right, height - FOOT - top
-    set_place(axes, left, FOOT, wide, tall)
+    wide, tall = width - first - right, height - FOOT - top
+    set_place(axes, first, FOOT, wide, tall)
     axes.xaxis.set_label_coords(0.5, (PLOT.label_offset_points - FOOT) / tall)
     for side, place in zip(
         sides, (PLOT.label_offset_points, width - PLOT.label_offset_points), strict=False
     ):
-        side.set_label_coords((place - left) / wide, 0.5, axes.transAxes)
+        side.set_label_coords((place - first) / wide, 0.5, axes.transAxes)
     for axis in (axes.xaxis, *sides):
         leave_unmeasured(axis)
     return True

@@ -349,10 +349,10 @@ def _label_stops(
     axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
 ) -> None:
     """Write beside a path where the motion is at its dots, its first and its last place."""
-    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
-    if not len(known):
+    finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if not len(finite):
         return
-    first, last = int(known[0]), int(known[-1])
+    first, last = int(finite[0]), int(finite[-1])
     chosen = sorted({first, last, *(k for k in frames if np.isfinite(x[k] + y[k]))})
     outward = 1.0 if np.nanmean(x) > 0 else -1.0
     column = outward * (np.nanmax(outward * x) + LABEL_GAP_MM)

@@ -20,9 +20,9 @@ ALWAYS_NOT = (
 
 def conclusions(results: "Results") -> tuple[list[str], list[str]]:
     """Return what the run's numbers bear and what they do not, a sentence each."""
-    made = (_force(results), _split(results), _pressure(results), _certainty(results))
-    bears = [words for good, _ in made for words in good]
-    bears_not = [words for _, bad in made for words in bad]
+    sentences = (_force(results), _split(results), _pressure(results), _certainty(results))
+    bears = [words for good, _ in sentences for words in good]
+    bears_not = [words for _, bad in sentences for words in bad]
     questions = len(results.summary.get("questions") or [])
     if questions:
         many = "questions above are" if questions > 1 else "question above is"
@@ -33,8 +33,8 @@ def conclusions(results: "Results") -> tuple[list[str], list[str]]:
 def _force(results: "Results") -> tuple[list[str], list[str]]:
     if not np.isfinite(results["force_total_N"]).any():
         return [], ["The contact force: it is not modelled here, or every frame failed."]
-    lost = metrics.failed(results)
-    bad = [f"What happened in {_frames(lost)}: no numbers there."] if lost.any() else []
+    failures = metrics.failed(results)
+    bad = [f"What happened in {_frames(failures)}: no numbers there."] if failures.any() else []
     measured = _compared(results)
     if measured:
         parts = [f"{name} {one['rmse_BW']:.2f} BW" for name, one in measured.items()]

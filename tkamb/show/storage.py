@@ -75,12 +75,12 @@ def write_results_storage(results: "Results", path: Path) -> str:
     time = numbers.pop("time_s")
     if not (np.diff(time) > 0).all():
         raise InputError("holds times that do not rise, as OpenSim wants them", results.directory)
-    lost, doubtful = failed(results), flagged(results)
-    status = np.where(lost, 2.0, np.where(doubtful, 1.0, 0.0))
+    failures, doubtful = failed(results), flagged(results)
+    status = np.where(failures, 2.0, np.where(doubtful, 1.0, 0.0))
     write_storage(path, {"time": time, **numbers, "status": status}, in_degrees=True)
     return (
-        f"{len(status)} frames ({doubtful.sum()} to be read with care, {lost.sum()} failed: nan), "
-        f"{len(numbers) + 2} columns"
+        f"{len(status)} frames ({doubtful.sum()} to be read with care, "
+        f"{failures.sum()} failed: nan), {len(numbers) + 2} columns"
     )
 
 

@@ -58,8 +58,8 @@ def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
     lines = []
     for case in dict.fromkeys(row.job.case for row in rows):
         some = [row for row in rows if row.job.case == case]
-        known = _uncertainty(references[case])
-        lines += [f"{case} (reference known to: {known})", head]
+        uncertainty = _uncertainty(references[case])
+        lines += [f"{case} (reference known to: {uncertainty})", head]
         lines += [_line(row) for row in some]
         lines.append("")
     names = ", ".join(name.replace("_", " ") for name in FRONT_ERRORS)
@@ -76,8 +76,8 @@ def _line(row: Row) -> str:
     times = (
         f"{measure.prepare_seconds:9.3f} {measure.cold_seconds:8.4f} {measure.warm_seconds:8.4f}"
     )
-    known = [row.errors[key] for key in KEYS]
-    shares = [f"{100 * error:6.2f}%" if error == error else f"{'–':>7s}" for error in known]
+    errors = [row.errors[key] for key in KEYS]
+    shares = [f"{100 * error:6.2f}%" if error == error else f"{'–':>7s}" for error in errors]
     return f"{start} {times} {measure.peak_rss_MB:6.0f} {shares[0]:>9s} {' '.join(shares[1:])}"
 
 
@@ -214,9 +214,9 @@ def _fastest(settings: dict[Setting, list[Row]], key: str, limit: float) -> str:
         for setting, some in settings.items()
     }
     times = {setting: median(warm_by_bodies(some)) for setting, some in settings.items()}
-    kept = [setting for setting, error in worst.items() if error <= limit]
-    if kept:
-        best = min(kept, key=lambda setting: times[setting])
+    within = [setting for setting, error in worst.items() if error <= limit]
+    if within:
+        best = min(within, key=lambda setting: times[setting])
         return f"the fastest is {_named(best)} ({milliseconds(times[best])} ms warm)"
     if not worst:
         return "nothing can be said: no setting was tried on all bodies"

@@ -66,30 +66,30 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
     sides = [side for side in (result.medial, result.lateral) if side is not None]
     peak, highest = max((s.peak_pressure for s in sides), default=0.0), result.pressure.max()
     by_sides = sum(side.force for side in sides)
-    found = [
+    problems = [
         _off("the nodal forces sum to", float(along_y.sum()), load),
         _off("the pressures integrate to", by_pressure, load),
         _off("mean pressure times area is", sum(s.mean_pressure * s.area for s in sides), by_sides),
     ]
     if result.pressure.min() < 0:
-        found.append("a pressure is negative")
+        problems.append("a pressure is negative")
     if (
         by_sides < (1 - AUDIT.force_tolerance) * load
         or by_sides > (1 + AUDIT.force_tolerance) * force.sum()
     ):
-        found.append(f"the condyles carry {by_sides:.4g} N of {load:.4g} N")
+        problems.append(f"the condyles carry {by_sides:.4g} N of {load:.4g} N")
     if solved and abs(peak - highest) > AUDIT.force_tolerance * highest:
-        found.append(f"the condyles' peak is {peak / highest:.4g} of the map's")
+        problems.append(f"the condyles' peak is {peak / highest:.4g} of the map's")
     deepest = -float(np.nanmin(result.gap))
     if solved and deepest > AUDIT.penetration_tolerance * result.approach:
-        found.append(f"a node is {1e6 * deepest:.3g} µm inside the femoral component")
-    return [words for words in found if words]
+        problems.append(f"a node is {1e6 * deepest:.3g} µm inside the femoral component")
+    return [words for words in problems if words]
 
 
-def _off(what: str, found: float, wanted: float) -> str:
-    if math.isclose(found, wanted, rel_tol=AUDIT.force_tolerance):
+def _off(what: str, value: float, expected: float) -> str:
+    if math.isclose(value, expected, rel_tol=AUDIT.force_tolerance):
         return ""
-    return f"{what} {found / wanted:.4f} of what they must"
+    return f"{what} {value / expected:.4f} of what they must"
 
 
 def body_hash(extreme: Extreme) -> str:
@@ -113,12 +113,12 @@ def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
     """
     if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
         return {}
-    known, answer = stored_answers()[extreme.label]
-    if known != body_hash(extreme):
+    stored, answer = stored_answers()[extreme.label]
+    if stored != body_hash(extreme):
         raise InputError(
             "CalculiX's answer is to an earlier version of the case",
             f"case '{extreme.label}'",
             "run scripts/make_stability_answers",
         )
-    found = errors(quantities(result), answer)
-    return {name: found[name] for name in PEER_BOUNDS}
+    misses = errors(quantities(result), answer)
+    return {name: misses[name] for name in PEER_BOUNDS}

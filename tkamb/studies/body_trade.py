@@ -102,21 +102,21 @@ class BodyRow:
     changed: dict[str, float] | None = None
 
 
-def run_body_trade(kept: KeptRows | None = None) -> Iterator[BodyRow]:
+def run_body_trade(rows: KeptRows | None = None) -> Iterator[BodyRow]:
     """Run the shipped knee bend with one thing changed at a time; yield the rows.
 
     Args:
-        kept: rows of an earlier study that are taken as they are; new ones are added.
+        rows: rows of an earlier study, which are not computed again; new ones are added.
     """
     base: _Run | None = None
     for name, change in CHANGES.items():
         key = row_key("body", name, asdict(change))
-        result = kept.get(key) if kept else None
+        result = rows.get(key) if rows else None
         if result is None:
             base = base or _run(CHANGES["as shipped"])
             result = asdict(_row(name, change, base))
-            if kept:
-                kept.put(key, result)
+            if rows:
+                rows.put(key, result)
         yield BodyRow(**result)
 
 
@@ -165,11 +165,11 @@ def _changed(run: _Run, base: _Run) -> dict[str, float]:
     return changed
 
 
-def _change(found: Array, base: Array) -> float:
-    known = np.isfinite(found) & np.isfinite(base)
-    if not known.any():
+def _change(values: Array, base: Array) -> float:
+    finite = np.isfinite(values) & np.isfinite(base)
+    if not finite.any():
         return float("nan")
-    return float(np.abs(found - base)[known].max() / np.abs(base[known]).max())
+    return float(np.abs(values - base)[finite].max() / np.abs(base[finite]).max())
 
 
 def body_json(rows: Sequence[BodyRow]) -> str:

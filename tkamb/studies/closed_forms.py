@@ -109,10 +109,10 @@ class ClosedForm:
     @property
     def material(self) -> Material:
         """What the block is made of."""
-        given = {"young_modulus": self.modulus_MPa * MEGAPASCAL, "poisson_ratio": self.nu}
+        properties = {"young_modulus": self.modulus_MPa * MEGAPASCAL, "poisson_ratio": self.nu}
         if self.linear:
-            return material("polyethylene-linear", **given)
-        return material("polyethylene", **given, **CURVE)
+            return material("polyethylene-linear", **properties)
+        return material("polyethylene", **properties, **CURVE)
 
     @property
     def pair(self) -> ContactPair:
@@ -162,17 +162,17 @@ def apart(case: ClosedForm, result: ContactResult) -> dict[str, float]:
     """Return relative distances from the closed form: approach and pressure."""
     approach, pressure = solution(case)
     if case.model == "lattice-source":
-        found = result.pressure.mean()  # its rule gives every node the same area
+        mean_pressure = result.pressure.mean()  # its rule gives every node the same area
     elif case.plate:
-        found = np.median(result.pressure[_inner(result)])
+        mean_pressure = np.median(result.pressure[_inner(result)])
     else:
-        found = max(side.peak_pressure for side in (result.medial, result.lateral) if side)
+        mean_pressure = max(side.peak_pressure for side in (result.medial, result.lateral) if side)
     if case.kind == "hertz" and result.medial is not None:
         mean = 1.5 * result.medial.mean_pressure  # two thirds of the peak
-        found = max(found, mean, key=lambda value: abs(value / pressure - 1.0))
+        mean_pressure = max(mean_pressure, mean, key=lambda value: abs(value / pressure - 1.0))
     return {
         "approach": abs(result.approach / approach - 1.0),
-        "pressure": abs(float(found) / pressure - 1.0),
+        "pressure": abs(float(mean_pressure) / pressure - 1.0),
     }
 
 
@@ -219,10 +219,10 @@ def closed_forms(quick: bool) -> Iterator[ClosedForm]:
 
 
 def _wide(
-    kind: str, model: str, load_N: float = 3000.0, nu: float = 0.3, **given: bool
+    kind: str, model: str, load_N: float = 3000.0, nu: float = 0.3, **options: bool
 ) -> ClosedForm:
     """Return a sphere that presses as wide as the layer is thick: several cells of 3 mm."""
-    return ClosedForm(kind, model, load_N, 12.0, nu=nu, radius_mm=300.0, **given)
+    return ClosedForm(kind, model, load_N, 12.0, nu=nu, radius_mm=300.0, **options)
 
 
 def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
@@ -265,9 +265,9 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
         return lambda strain: young * confined * strain
 
     def pressure(strain: float) -> float:
-        wanted = -confined * np.log1p(-strain)
-        highest = young * wanted + 1.0
-        return float(brentq(lambda s: _strain(case, s) - wanted, 0.0, highest))
+        stress = -confined * np.log1p(-strain)
+        highest = young * stress + 1.0
+        return float(brentq(lambda s: _strain(case, s) - stress, 0.0, highest))
 
     return pressure
 

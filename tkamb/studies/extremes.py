@@ -141,8 +141,8 @@ def _roughened(surface: Surface, noise_mm: float) -> Surface:
     if noise_mm == 0:
         return surface
     rng = np.random.default_rng(2008)
-    moved = surface.vertices + rng.normal(0.0, noise_mm * MILLIMETRE, surface.vertices.shape)
-    return Surface(moved, surface.faces, surface.name)
+    vertices = surface.vertices + rng.normal(0.0, noise_mm * MILLIMETRE, surface.vertices.shape)
+    return Surface(vertices, surface.faces, surface.name)
 
 
 ALONE: dict[str, tuple[object, ...]] = {
@@ -238,10 +238,10 @@ BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
 
 def extremes() -> Iterator[Extreme]:
     """Return all of them, each once."""
-    seen = set()
+    labels = set()
     for extreme in _all():
-        if extreme not in seen:
-            seen.add(extreme)
+        if extreme not in labels:
+            labels.add(extreme)
             yield extreme
 
 

@@ -153,9 +153,9 @@ def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, flo
 
 def _bent(problem: PressProblem, run: PeerRun) -> ContactMap:
     """Return the deformed contact surface."""
-    moved = run.blocks["NINSERT"]
-    moved = moved[np.argsort(moved[:, 0]), 1:] * MILLIMETRE
-    deformed = replace(problem.lattice, nodes=problem.lattice.nodes + moved)
+    displacement = run.blocks["NINSERT"]
+    displacement = displacement[np.argsort(displacement[:, 0]), 1:] * MILLIMETRE
+    deformed = replace(problem.lattice, nodes=problem.lattice.nodes + displacement)
     return contact_map(deformed, problem.pair.insert)[1]
 
 

@@ -118,10 +118,10 @@ def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
     for name in next(iter(solved.values())):
         series = np.array([row[name] for row in solved.values()])
         finest = series[h <= np.unique(h)[:2].max()]
-        limit, left = common_limit(h, series, family)
+        limit, residual = common_limit(h, series, family)
         middle = float(finest.mean())
         if name == "approach" or name.endswith("force"):
-            values[name], uncertainty[name] = limit, max(left, abs(limit - middle))
+            values[name], uncertainty[name] = limit, max(residual, abs(limit - middle))
         else:
             spread = float(np.ptp(finest) / 2)
             values[name], uncertainty[name] = middle, max(spread, abs(limit - middle) / 2)
@@ -144,13 +144,13 @@ def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
     slopes = np.where(family[:, None] == kinds, h[:, None] ** 2, 0.0)
     matrix = np.column_stack([np.ones(len(h)), slopes])
     solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
-    left = np.abs(matrix @ solution - values).max()
+    residual = np.abs(matrix @ solution - values).max()
     own = []
     for kind in kinds:
         some = family == kind
         line = np.column_stack([np.ones(some.sum()), h[some] ** 2])
         own.append(np.linalg.lstsq(line, values[some], rcond=None)[0][0])
-    return float(solution[0]), float(max(left, 0.5 * (max(own) - min(own))))
+    return float(solution[0]), float(max(residual, 0.5 * (max(own) - min(own))))
 
 
 def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:

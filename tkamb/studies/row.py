@@ -89,13 +89,13 @@ def row_of(content: dict[str, Any]) -> Row:
     return Row(job, measure, errors, content["reference_known"], content["on_front"])
 
 
-def compared(job: Job, found: Measure, reference: Reference) -> Row:
+def compared(job: Job, measure: Measure, reference: Reference) -> Row:
     """Return the row of what was measured, with its errors."""
     floor = floor_of(reference)
-    if found.status != "ok":
-        return Row(job, found, {}, floor)
-    apart = map_error(raster_of(found.map), reference.raster) if found.map else math.nan
-    return Row(job, found, errors(found.values, reference.values) | {"map": apart}, floor)
+    if measure.status != "ok":
+        return Row(job, measure, {}, floor)
+    apart = map_error(raster_of(measure.map), reference.raster) if measure.map else math.nan
+    return Row(job, measure, errors(measure.values, reference.values) | {"map": apart}, floor)
 
 
 def floor_of(reference: Reference) -> float:

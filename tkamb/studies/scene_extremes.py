@@ -105,8 +105,8 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     right = math.isfinite(apart) and apart <= VERDICT.max_error
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
     reason = flags if right or flags else f"{100 * apart:.3g} % from what it must be"
-    known = apart if math.isfinite(apart) else None
-    return Verdict(extreme.label, "run", kind, reason, known, seconds)
+    distance = apart if math.isfinite(apart) else None
+    return Verdict(extreme.label, "run", kind, reason, distance, seconds)
 
 
 def _run(scene: Path, overrides: dict[str, Any]) -> "Results":
@@ -127,8 +127,8 @@ def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
     elif extreme.kind == "arm":
         content = tomllib.loads(SHIPPED_SCENE.read_text(encoding="utf-8"))
         x, y, z = content["patellar_ligament"]["distal"]["point_mm"]
-        moved = {"link": "tibia", "point_mm": [x + extreme.value, y, z]}
-        return {"patellar_ligament.distal": moved, "patellar_ligament.wrap": False}
+        attachment = {"link": "tibia", "point_mm": [x + extreme.value, y, z]}
+        return {"patellar_ligament.distal": attachment, "patellar_ligament.wrap": False}
     else:
         name = "femoral_component" if extreme.kind == "femoral" else "insert"
         _damage(folder / f"{name}.stl", extreme.value)
@@ -139,8 +139,8 @@ def _apart(extreme: SceneExtreme, results: "Results", folder: Path) -> float:
     """Return how far (relative) the results are from what they must be."""
     assert results.maps is not None
     demanded = results["force_si_N"]
-    carried = -results.maps.nodal_force_N[:, :, 1].sum(axis=1)
-    apart = float(np.max(np.abs(carried - demanded) / np.abs(demanded)))
+    force = -results.maps.nodal_force_N[:, :, 1].sum(axis=1)
+    apart = float(np.max(np.abs(force - demanded) / np.abs(demanded)))
     if extreme.kind == "time":
         once = _run(SHIPPED_SCENE, {})["force_si_N"]
         stretch_time(folder, INERTIA_STUDY.slow_factor / extreme.value)

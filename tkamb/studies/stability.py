@@ -84,7 +84,7 @@ def run_stability(
     Args:
         cases: the cases.
         longest: s, after which a case counts as hanging.
-        kept: rows of an earlier study that are taken as they are; new ones are added.
+        kept: rows of an earlier study, which are not computed again; new ones are added.
         workers: cases at a time.
     """
     judges, stored = _Judges(longest, kept), stored_verdicts()
@@ -118,8 +118,8 @@ class _Judges:
     so that a new one costs milliseconds. Each computes with one thread.
     """
 
-    def __init__(self, longest: float, kept: KeptRows | None) -> None:
-        self._longest, self._kept = longest, kept
+    def __init__(self, longest: float, rows: KeptRows | None) -> None:
+        self._longest, self._kept = longest, rows
         self._running: set[BaseProcess] = set()
         self._stopped = False
         self._context = multiprocessing.get_context("forkserver")

@@ -23,6 +23,7 @@ from tkamb.contact.model import ContactModel
 from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import Guess
 from tkamb.errors import ComputationError, TkambError
 from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form
@@ -127,16 +128,16 @@ def judge_closed_form(case: ClosedForm, pressed: Callable[[], None] = lambda: No
     pressed()
     if result.status is not ContactStatus.OK:
         return _verdict(case, "flagged", _words(result), None, seconds, result)
-    found = apart(case, result)
-    bounds = dict(zip(found, TOLERANCES[case.kind], strict=True))
+    distances = apart(case, result)
+    bounds = dict(zip(distances, TOLERANCES[case.kind], strict=True))
     wrong = [
         f"{name} {100 * value:.3g} % from the closed form"
-        for name, value in found.items()
+        for name, value in distances.items()
         if not value <= bounds[name]
     ]
     wrong += _audited(case.model, result, case.load_N)
     kind, reason = _judged(result, wrong)
-    return _verdict(case, kind, reason, max(found.values()), seconds, result)
+    return _verdict(case, kind, reason, max(distances.values()), seconds, result)
 
 
 def _judged(result: ContactResult, wrong: list[str]) -> tuple[str, str]:
@@ -169,8 +170,8 @@ def compared(
     extreme: Extreme, result: ContactResult, reference: ContactResult, seconds: float
 ) -> Verdict:
     """Return the verdict on a result that calls itself ok."""
-    found = errors(quantities(result), quantities(reference))
-    distance = max(found[key] for key in JUDGED)
+    misses = errors(quantities(result), quantities(reference))
+    distance = max(misses[key] for key in JUDGED)
     right = math.isfinite(distance) and distance <= VERDICT.max_error
     flags = "; ".join(result.flags)
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
@@ -186,8 +187,8 @@ def _verdict(
     seconds: float,
     result: ContactResult,
 ) -> Verdict:
-    known = distance if distance is not None and math.isfinite(distance) else None
-    return Verdict(case.label, case.model, kind, reason, known, seconds, int(result.iterations))
+    finite = distance if distance is not None and math.isfinite(distance) else None
+    return Verdict(case.label, case.model, kind, reason, finite, seconds, int(result.iterations))
 
 
 def _model(extreme: Extreme, **options: Any) -> ContactModel:
@@ -208,9 +209,9 @@ def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactRe
     for tolerance in NEWTON_TOLERANCES:
         newton = _model(extreme, newton=True, tolerance=tolerance)
         for shares, start in (((1.0,), None), (LOAD_STEPS, None), ((1.0,), result)):
-            found = _by_steps(newton, extreme, state, shares, start)
-            if found is not None:
-                return found
+            press = _by_steps(newton, extreme, state, shares, start)
+            if press is not None:
+                return press
     raise ComputationError("Newton's method does not get there, at once or in steps", "reference")
 
 
@@ -219,14 +220,15 @@ def _by_steps(
     extreme: Extreme,
     state: Any,
     shares: tuple[float, ...],
-    guess: ContactResult | None,
+    start: Guess | None,
 ) -> ContactResult | None:
     """Return Newton's answer after shares of the load; None where it finds none."""
     for share in shares:
         try:
-            guess = newton.press(state, share * extreme.load_N, extreme.pose, guess)
+            load = share * extreme.load_N
+            result, start = newton.press_from(state, load, extreme.pose, start)
         except ComputationError:
             return None
-        if guess.status is not ContactStatus.OK:
+        if result.status is not ContactStatus.OK:
             return None
-    return guess
+    return result

@@ -1,8 +1,8 @@
 """What a reader must know of a lattice's answer: strains, edges and contacts it cannot resolve.
 
-At a rounded edge narrower than the cells the pressure is that of a punch: it rises for as long
-as the cells shrink (docs/lattice.md, "Convergence on real implants"). Of a contact too narrow
-for the cells the peak is an average over more than the contact.
+At a rounded edge that is narrower than the cells the pressure is that of a punch: it rises as
+long as the cells shrink (docs/lattice.md, "Convergence on real implants"). If a contact is too
+narrow for the cells, the peak is an average over an area larger than the contact.
 """
 
 from collections.abc import Iterator, Mapping
@@ -131,7 +131,7 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
 
 
 def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
-    """Yield a flag where much of the approach is seen by no node.
+    """Yield a flag where the meshes overlap much before any node is touched.
 
     Args:
         state: prepared contact.
@@ -144,14 +144,15 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
     ):
         yield (
             f"the meshes first touch {unseen / MILLIMETRE:.2g} mm before any node does (cells of "
-            f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from there: "
-            "is there a spike or a ridge in a mesh?"
+            f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from first "
+            "touch: check the meshes for a spike or a ridge"
         )
 
 
 def unsettled_flag(solution: Solution) -> str:
-    """Return in words how far a solution that has not converged is from rest."""
+    """Return in words how large the residual of a solution is that has not converged."""
     return (
-        f"the solver has not converged: {100 * solution.residual:.2g} % of the force or of the way "
-        f"to the femoral surface is left after {solution.passes} passes; is the femoral mesh rough?"
+        f"the solver has not converged: after {solution.passes} passes the residual is "
+        f"{100 * solution.residual:.2g} % of the force or of the distance to the femoral surface; "
+        "check whether the femoral mesh is rough"
     )

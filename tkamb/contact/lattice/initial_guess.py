@@ -5,14 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, ContactResponse
-from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes
+from tkamb.contact.lattice.problem import ContactProblem, LatticeState, Region, TangentPlanes
 from tkamb.contact.lattice.settings import LatticeSolverSettings
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index, Mask
 
 FORCES_ONLY_DISTANCE = 0.1
 """Of a cell: how far a search that needs forces alone may go from the pose at which the whole solid
-was measured last. The residual there is measured in `tests/test_lattice_sketch.py`."""
+was measured last. The residual there is measured in `tests/test_lattice_forces_only.py`."""
 FORCES_ONLY_GROWTH = 1.1
 """How much the contact forces may have grown there."""
 LEVER_ARM = 0.03
@@ -24,11 +25,8 @@ SPARE_DEPTH = 1.6
 
 
 @dataclass(frozen=True, eq=False)
-class WarmStart:
-    """Where a solution ended: what its result carries for the next solution of the problem.
-
-    Handed back as `guess.warm_start`; it shortens the way and changes no answer beyond the
-    tolerance.
+class LatticeStart(WarmStart):
+    """Where a solution ended, and the next one of the same problem may begin.
 
     Args:
         problem: whose solution it was; it serves no other.
@@ -36,7 +34,6 @@ class WarmStart:
         moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
         depth: m, how far the femoral component went below the lowest contact node.
         region: outside of which h is zero, or None.
-        pose: (4, 4) pose_femoral_in_insert where it was.
         looked: norm of the contact forces, N, and pose when the whole solid was measured last.
         before: where the solution ended that this one began from, or None.
     """
@@ -46,16 +43,15 @@ class WarmStart:
     moved: Array
     depth: float
     region: Region | None
-    pose: Array
     looked: tuple[float, Array]
-    before: "WarmStart | None" = None
+    before: "LatticeStart | None" = None
 
     def near(self, pose: Array) -> bool:
         """Return whether the whole solid was measured within `FORCES_ONLY_DISTANCE` of a pose."""
         reach = FORCES_ONLY_DISTANCE * float(self.problem.solid.spacing.min())
         return bool(np.linalg.norm(_way(self.looked[1], pose)) <= reach)
 
-    def extrapolated(self, pose: Array) -> "WarmStart":
+    def extrapolated(self, pose: Array) -> "LatticeStart":
         """Return what is to be expected at a pose: this, or this and its last change once more.
 
         The change counts as far as the way to the pose goes on along the last one.
@@ -75,7 +71,7 @@ class WarmStart:
             moved=self.moved + along * np.where(both, self.moved - last.moved, 0.0),
         )
 
-    def going_as(self, start: "WarmStart", end: "WarmStart", pose: Array) -> "WarmStart":
+    def going_as(self, start: "LatticeStart", end: "LatticeStart", pose: Array) -> "LatticeStart":
         """Return this as if the change from another solution to the one after it had led here.
 
         `extrapolated` at the pose then expects that change once more.
@@ -96,6 +92,12 @@ class WarmStart:
             pose=2 * self.pose - pose,
         )
         return replace(self, before=replace(came, before=None))
+
+
+def lattice_start(state: LatticeState, start: Guess | None) -> LatticeStart | None:
+    """Return the start if it is one of this prepared state; an answer alone is none."""
+    own = isinstance(start, LatticeStart) and start.problem is state.problem
+    return start if own else None  # type: ignore[return-value]
 
 
 def _gone_on(
@@ -169,7 +171,7 @@ def initial_guess(
     depth: float,
     at_pose: bool,
     touched: Mask | None,
-    warm: WarmStart | None,
+    warm: LatticeStart | None,
     unmeasured: float = 0.0,
     margin: float = LatticeSolverSettings.candidate_margin,
 ) -> InitialGuess:

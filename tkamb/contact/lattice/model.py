@@ -10,9 +10,10 @@ from tkamb.contact.lattice.flags import unseen_flags
 from tkamb.contact.lattice.initial_guess import (
     FORCES_ONLY_GROWTH,
     InitialGuess,
-    WarmStart,
+    LatticeStart,
     guessed_depth,
     initial_guess,
+    lattice_start,
 )
 from tkamb.contact.lattice.linear.cache import cached_operator
 from tkamb.contact.lattice.linear.compliance import ComplianceCache
@@ -44,6 +45,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load, within_insert
 from tkamb.contact.probe import Probe
 from tkamb.contact.result import ContactResult
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
@@ -152,65 +154,76 @@ class CellContact(ContactModel):
         return cached_operator(solid, held, nodes, make, coarse)
 
     def evaluate(
+        self, state: LatticeState, pose: Array, guess: Guess | None = None
+    ) -> ContactResult:
+        """Return the contact at a pose; see `ContactModel`."""
+        return self.evaluate_from(state, pose, guess)[0]
+
+    def press(
+        self, state: LatticeState, load: float, pose: Array, guess: Guess | None = None
+    ) -> ContactResult:
+        """Find the approach that carries `load` (N); see `ContactModel`."""
+        return self.press_from(state, load, pose, guess)[0]
+
+    def evaluate_from(
         self,
         state: LatticeState,
         pose: Array,
-        guess: ContactResult | None = None,
-        sketch: bool = False,
-    ) -> ContactResult:
-        """Return the contact at a pose; see `ContactModel`.
+        start: Guess | None = None,
+        forces_only: bool = False,
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact at a pose, and the start of the next; see `ContactModel`.
 
         Args:
             state: what `prepare` returned.
             pose: (4, 4) pose_femoral_in_insert.
-            guess: an earlier result.
-            sketch: forces alone count: areas are whole nodes', nothing is flagged, and close to
-                the guess the elements that did not count there are not looked at.
+            start: an earlier result, or the start that came with it.
+            forces_only: areas are whole nodes', nothing is flagged, and close to the start the
+                elements that did not count there are not looked at.
         """
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return ContactResult.failed(state, pose, "the pose is not finite")
+            return _alone(ContactResult.failed(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
         deepest = -float(gaps.min())
         if deepest <= TOUCHING:
-            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
-        return self._solved(state, pose, None, (gaps, planes), deepest, guess, sketch)
+            return _alone(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
+        return self._solved(state, pose, None, (gaps, planes), deepest, start, forces_only)
 
-    def press(
+    def press_from(
         self,
         state: LatticeState,
         load: float,
         pose: Array,
-        guess: ContactResult | None = None,
-        sketch: bool = False,
-    ) -> ContactResult:
-        """Find the approach that carries `load` (N); see `ContactModel` and `evaluate`."""
+        start: Guess | None = None,
+        forces_only: bool = False,
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact under a load (N), and the start of the next; see `evaluate_from`."""
         check_load(load)
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return ContactResult.failed(state, pose, "the pose is not finite")
+            return _alone(ContactResult.failed(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
         lowest = float(gaps.min())
         if not np.isfinite(lowest):
-            return ContactResult.failed(
-                state, pose, "the femoral component does not lie over the insert"
-            )
+            missed = "the femoral component does not lie over the insert"
+            return _alone(ContactResult.failed(state, pose, missed))
         if load == 0:
             pose = state.pair.pose_at_approach(pose, 0.0)
             gaps, _ = undeformed(state.problem, pose)
-            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
+            return _alone(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
         pose[1, 3] -= lowest
         gaps, planes = gaps - lowest, planes.raised(-lowest)
-        warm = warm_start_of(state, guess)
-        if warm is not None:
-            depth = warm.depth
-        elif guess is not None and guess.approach > 0:
-            depth = guess.approach
+        own = lattice_start(state, start)
+        if own is not None:
+            depth = own.depth
+        elif start is not None and start.approach > 0:
+            depth = start.approach
         else:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load)
-        return self._solved(state, pose, load, (gaps, planes), depth, guess, sketch)
+        return self._solved(state, pose, load, (gaps, planes), depth, start, forces_only)
 
-    def probe(self, state: LatticeState, guess: ContactResult | None = None) -> Probe:
+    def probe(self, state: LatticeState, guess: Guess | None = None) -> Probe:
         """Return the probe with stiffness; see `ContactModel`."""
         if self.direction == "vertical":
             return Probe(self, state, guess)
@@ -224,20 +237,20 @@ class CellContact(ContactModel):
         load: float | None,
         rest: tuple[Array, TangentPlanes],
         depth: float,
-        guess: ContactResult | None,
-        sketch: bool,
-    ) -> ContactResult:
+        begin: Guess | None,
+        forces_only: bool,
+    ) -> tuple[ContactResult, WarmStart]:
         """Solve with growing candidate sets until they cover the approach.
 
         `rest` is what `undeformed` says at the pose.
         """
         gaps, planes = rest
         settings = self.settings
-        last = warm_start_of(state, guess)
+        last = lattice_start(state, begin)
         warm = None if last is None else last.extrapolated(pose)
-        near = sketch and last is not None and last.near(pose)
+        near = forces_only and last is not None and last.near(pose)
         unmeasured = FORCES_ONLY_GROWTH * last.looked[0] if last is not None and near else 0.0
-        touched = guess.pressure > 0 if guess and len(guess.pressure) == len(gaps) else None
+        touched = begin.pressure > 0 if begin and len(begin.pressure) == len(gaps) else None
         for _ in range(settings.max_expansions):
             start = initial_guess(
                 state.compliance,
@@ -255,27 +268,24 @@ class CellContact(ContactModel):
             within = np.inf if covered else (start.reach - below) / REACH
             solution = self._solution(state.problem, pose, load, start, settings, within)
             outgrown = solution.forces.approach > within
-            if solution.converged:
-                moved = np.zeros_like(state.surface.points)
-                moved[solution.candidates] = solution.displacement
+            if solution.converged:  # a repetition with more candidates begins here
                 below += solution.forces.approach
-                looked = float(np.linalg.norm(solution.forces.force)), pose
-                if last is not None and not solution.seen:
-                    looked = last.looked
-                warm = WarmStart(
-                    state.problem, solution.loads, moved, below, solution.region,
-                    pose, looked, None if last is None else replace(last, before=None),
-                )  # fmt: skip
+                warm = _start_after(state, pose, gaps, solution, below, last)
             others = gaps <= solution.forces.approach * REACH + below
             if not outgrown or _others_clear(state, pose, others, solution):
                 rule = self.pressure_rule
-                result = result_of(state, pose, load, gaps, solution, rule, sketch)
-                if load is not None and not sketch:
+                result = result_of(state, pose, load, gaps, solution, rule, forces_only)
+                if load is not None and not forces_only:
                     sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
                     result = within_insert(state, result, *unseen_flags(state, result, sunk))
-                return replace(result, warm_start=warm) if solution.converged else result
+                if not solution.converged or warm is None:
+                    return _alone(result)
+                return result, replace(
+                    warm, pose=result.pose, pressure=result.pressure, gap=result.gap
+                )
             depth, touched = 1.1 * solution.forces.approach, None
-        return ContactResult.failed(state, pose, "the set of candidate nodes is saturated")
+        saturated = "the set of candidate nodes is saturated"
+        return _alone(ContactResult.failed(state, pose, saturated))
 
     def _solution(
         self,
@@ -359,11 +369,48 @@ class FiniteElements(CellContact):
         return BbarHexahedra(lattice.nodes, lattice.cells, lattice.spacing, material)
 
 
-def warm_start_of(state: LatticeState, guess: ContactResult | None) -> WarmStart | None:
-    """Return where the solver may begin; None unless the guess is a result of this state."""
-    warm = None if guess is None else guess.warm_start
-    mine = isinstance(warm, WarmStart) and warm.problem is state.problem
-    return warm if mine else None
+def _alone(result: ContactResult) -> tuple[ContactResult, WarmStart]:
+    """Return an answer that leaves no solution behind, and the start that it gives by itself."""
+    return result, WarmStart.after(result)
+
+
+def _start_after(
+    state: LatticeState,
+    pose: Array,
+    gaps: Array,
+    solution: Solution,
+    depth: float,
+    last: LatticeStart | None,
+) -> LatticeStart:
+    """Return where the next solution may begin after one that has converged.
+
+    Args:
+        state: prepared contact.
+        pose: (4, 4) at approach 0 of the solution.
+        gaps: (c,) m, vertical, there.
+        solution: what the solver found.
+        depth: m, how far the femoral component is below the lowest contact node.
+        last: where it began, or None.
+    """
+    moved = np.zeros_like(state.surface.points)
+    moved[solution.candidates] = solution.displacement
+    looked = float(np.linalg.norm(solution.forces.force)), pose
+    if last is not None and not solution.seen:
+        looked = last.looked
+    return LatticeStart(
+        pair=state.pair,
+        pose=pose,
+        points=state.points,
+        pressure=np.zeros(len(gaps)),
+        gap=gaps,
+        problem=state.problem,
+        loads=solution.loads,
+        moved=moved,
+        depth=depth,
+        region=solution.region,
+        looked=looked,
+        before=None if last is None else replace(last, before=None),
+    )
 
 
 def _others_clear(state: LatticeState, pose: Array, near: Mask, solution: Solution) -> bool:

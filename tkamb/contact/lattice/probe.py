@@ -17,9 +17,12 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tkamb.contact.lattice.initial_guess import lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
+from tkamb.contact.pressing import Presses
 from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, medial_points
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.frames import Array, Index
 from tkamb.units import DEGREE
 
@@ -30,22 +33,22 @@ LARGEST_EXTRAPOLATION = 2.0 * DEGREE
 extrapolated step leaves open (1 %) grows to some per cent of what the step changes."""
 
 
-class Sketches(Protocol):
-    """A model whose `evaluate` and `press` can leave out all but the forces."""
+class FindsForces(Presses, Protocol):
+    """A model that can leave out all but the forces."""
 
-    def evaluate(
-        self, state: Any, pose: Array, guess: ContactResult | None = None, sketch: bool = False
-    ) -> ContactResult:
+    def evaluate_from(
+        self, state: Any, pose: Array, start: Guess | None = None, forces_only: bool = False
+    ) -> tuple[ContactResult, WarmStart]:
         """See `tkamb.contact.lattice.model.CellContact`."""
 
-    def press(
+    def press_from(
         self,
         state: Any,
         load: float,
         pose: Array,
-        guess: ContactResult | None = None,
-        sketch: bool = False,
-    ) -> ContactResult:
+        start: Guess | None = None,
+        forces_only: bool = False,
+    ) -> tuple[ContactResult, WarmStart]:
         """See `tkamb.contact.lattice.model.CellContact`."""
 
 
@@ -55,53 +58,53 @@ class LatticeProbe(Probe):
     Args:
         model: of the lattice family, nodes pressed along the femoral normal.
         state: what its `prepare` returned.
-        guess: an earlier result.
+        start: an earlier result or warm start.
         accuracy: the model's tolerance, share of the contact force.
         rough: the model with a wider tolerance, for steps that are extrapolated.
     """
 
     def __init__(
         self,
-        model: Sketches,
+        model: FindsForces,
         state: LatticeState,
-        guess: ContactResult | None,
+        start: Guess | None,
         accuracy: float,
-        rough: Sketches,
+        rough: FindsForces,
     ) -> None:
-        super().__init__(model, state, guess)
-        self._sketches, self._accuracy, self._rough = model, accuracy, rough
+        super().__init__(model, state, start)
+        self._exact_model, self._accuracy, self._rough = model, accuracy, rough
 
-    def evaluated(self, pose: Array) -> ContactResult:
+    def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
         """Return the forces at a pose; see `Probe`."""
-        return self._sketches.evaluate(self._state, pose, self._guess, sketch=True)
+        return self._exact_model.evaluate_from(self._state, pose, self.start, forces_only=True)
 
     def pressed(
         self,
         load: float,
         pose: Array,
-        guess: ContactResult,
-        like: tuple[ContactResult, ContactResult] | None = None,
-    ) -> ContactResult:
+        start: Guess | None,
+        like: tuple[WarmStart, WarmStart] | None = None,
+    ) -> tuple[ContactResult, WarmStart]:
         """Return the forces under a load; see `Probe`."""
-        here, *step = (result.warm_start for result in (guess, *(like or ())))
-        if (
-            here is None
-            or None in step
-            or not like
-            or _turn(like[0].pose, pose) > LARGEST_EXTRAPOLATION
-        ):
-            return self._sketches.press(self._state, load, pose, guess, sketch=True)
-        guess = replace(guess, warm_start=here.going_as(*step, pose))
-        return self._rough.press(self._state, load, pose, guess, sketch=True)
+        here, model = lattice_start(self._state, start), self._exact_model
+        step = [lattice_start(self._state, each) for each in like or ()]
+        if here is not None and like and _turn(like[0].pose, pose) <= LARGEST_EXTRAPOLATION:
+            first, last = step
+            if first is not None and last is not None:
+                start, model = here.going_as(first, last, pose), self._rough
+        return model.press_from(self._state, load, pose, start, forces_only=True)
 
-    def seen(self, result: ContactResult) -> ProbedContact:
+    def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return what a result says of the condyles, with their stiffness."""
         condyles = condyle_wrenches(result, self._state.pair.split)
         exact = self._state.problem.solid.material.is_linear
         nodes = np.flatnonzero(result.nodal_force.any(axis=1))
+        solution = lattice_start(self._state, start)
         if not len(nodes):
             return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
-        change = force_changes(self._state, result, nodes)
+        if solution is None:
+            return ProbedContact(condyles, accuracy=self._accuracy)
+        change = force_changes(self._state, result, solution.moved, nodes)
         points = result.points[nodes]
         medial = medial_points(points, result.pose, self._state.pair.split)
         for side, own in (("medial", medial), ("lateral", ~medial)):
@@ -118,12 +121,13 @@ def _turn(first: Array, second: Array) -> float:
     return float(Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).magnitude())
 
 
-def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> Array:
+def force_changes(state: LatticeState, result: ContactResult, moved: Array, nodes: Index) -> Array:
     """Return the change (m, 3, 6) of nodal forces per small displacement of the femur.
 
     Args:
         state: prepared contact.
         result: a contact that converged.
+        moved: (c, 3) m, displacement of the contact nodes there.
         nodes: (m,) the contact nodes that carry.
 
     Returns:
@@ -133,7 +137,7 @@ def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> A
     force = result.nodal_force[nodes]
     size = np.linalg.norm(force, axis=1)
     normals = force / size[:, None]
-    where = problem.surface_points[nodes] + result.warm_start.moved[nodes]
+    where = problem.surface_points[nodes] + moved[nodes]
     response = state.compliance.among(nodes, nodes)
     femoral = np.zeros((len(nodes), 3, 6))
     femoral[:, :, :3] = np.eye(3)
@@ -144,9 +148,9 @@ def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> A
     sliding = femoral - normals[:, :, None] * towards[:, None, :]
     turned -= _normal_gradient(problem, where, result.pose) @ sliding
     swung = size[:, None, None] * turned
-    moved = np.einsum("aibj,jbk->iak", response.compliance, swung, optimize=True)
+    yielded = np.einsum("aibj,jbk->iak", response.compliance, swung, optimize=True)
     along, _ = response.along(normals)
-    right = towards - np.einsum("ij,ijk->ik", normals, moved)
+    right = towards - np.einsum("ij,ijk->ik", normals, yielded)
     return normals[:, :, None] * np.linalg.solve(along, right)[:, None, :] + swung
 
 

@@ -86,11 +86,13 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
     if not folder.is_dir():
         raise InputError("is not a folder", folder, "give the folder of what you downloaded")
 
-    found = {file.name: _found(file, folder) for file in dataset.files}  # all, before any is copied
-    if not any(found.values()):
+    sources = {
+        file.name: _found(file, folder) for file in dataset.files
+    }  # all, before any is copied
+    if not any(sources.values()):
         hint = f"download or clone {dataset.repository} first"
         raise InputError("holds none of the files of this data set", folder, hint)
-    return _get(dataset, to, lambda file, beside: found[file.name])
+    return _get(dataset, to, lambda file, beside: sources[file.name])
 
 
 def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | None]) -> Got:
@@ -119,10 +121,10 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
     from requests.exceptions import HTTPError, RequestException
 
     fetch = _LimitedDownload(LARGEST if file.size is None else file.size)
-    known = f"sha256:{file.sha256}"
+    digest = f"sha256:{file.sha256}"
     hint = "run it again: what is complete is kept; or --from DIR for what you downloaded by hand"
     try:
-        return Path(pooch.retrieve(address, known, "whole", folder, downloader=fetch))
+        return Path(pooch.retrieve(address, digest, "whole", folder, downloader=fetch))
     except HTTPError as error:
         status = error.response.status_code if error.response is not None else "unknown"
         raise InputError(f"cannot be downloaded (HTTP status {status})", address, hint) from None
@@ -170,12 +172,12 @@ class _LimitedDownload:
 
 def _found(file: DataFile, folder: Path) -> Path | None:
     """Return where a folder of downloads holds a file; None where it does not."""
-    there = [place for place in file.places(folder) if place.is_file()]
-    for place in there:
+    copies = [place for place in file.places(folder) if place.is_file()]
+    for place in copies:
         if sha256_of(place) == file.sha256:
             return place
-    if there:
-        raise _other_content(there[0], file)
+    if copies:
+        raise _other_content(copies[0], file)
     return None
 
 

@@ -156,10 +156,10 @@ def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError
         model: the model.
         bodies: of the joint; none: of any joint.
     """
-    there = {joint.name for joint in model.joints}
+    names = {joint.name for joint in model.joints}
     for one in model.unread:
         of_these = not bodies or one.concerns & {*bodies}
-        if one.kind.endswith("Joint") and one.name not in there and of_these:
+        if one.kind.endswith("Joint") and one.name not in names and of_these:
             return InputError(one.reason)
     return None
 
@@ -205,11 +205,11 @@ def _check_lengths(leg: Leg) -> None:
 
 
 def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
-    there = {j.name: j for j in model.joints}
+    joints = {j.name: j for j in model.joints}
     if name is not None:
-        if name not in there:
-            raise InputError(f"has no joint '{name}'", model.name, f"it has {', '.join(there)}")
-        return there[name]
+        if name not in joints:
+            raise InputError(f"has no joint '{name}'", model.name, f"it has {', '.join(joints)}")
+        return joints[name]
     named = [
         j for j in _moving(model) if "knee" in j.name.lower() or "femorotibial" in j.name.lower()
     ]
@@ -218,7 +218,7 @@ def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
         own = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
     if len(own) != 1:
         result = f"{len(own)} joints" if own else "no joint"
-        listed = ", ".join(j.name for j in named) or ", ".join(there)
+        listed = ", ".join(j.name for j in named) or ", ".join(joints)
         raise InputError(
             f"has {result} that could be the {side} knee", model.name, f"give --knee, of {listed}"
         )

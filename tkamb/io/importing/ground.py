@@ -139,8 +139,8 @@ def _from_table(
         ground = _table_file(path, axes, chosen, recorded)
         lines = [_columns_line(path, side, chosen, why), *notices]
         return FoundGround(ground, request.interval, span, lines)
-    placed = all(force.has("point") or force.has("moment") for force in forces)
-    if feet is None or not forces or not placed:
+    has_places = all(force.has("point") or force.has("moment") for force in forces)
+    if feet is None or not forces or not has_places:
         raise _which_foot(forces, side, table)
     recorded = [_recorded(table, one, axes) for one in forces]
     loads = feet_loads(recorded, feet)
@@ -165,27 +165,27 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     size = np.nansum(np.abs(np.array(columns)), axis=(0, 2))
     if int(np.argmax(size)) != 1:
         return axes
-    turned = {"x": "+x", "z": "+y", "y": "-z"}
+    forceplate_axes = {"x": "+x", "z": "+y", "y": "-z"}
     result = []
     for axis in axes.split(","):
-        own = turned[axis[-1]]
+        own = forceplate_axes[axis[-1]]
         result.append(("+" if own[0] == axis[0] else "-") + own[1])
     return ",".join(result)
 
 
 def _named(
-    forces: list[TableForce], side: str, given: str | None, table: Table
+    forces: list[TableForce], side: str, source_name: str | None, table: Table
 ) -> list[TableForce]:
     """Return the forces that are given, or the one that is named after the foot; else none."""
-    there = ", ".join(force.name for force in forces) or "none"
-    if given is not None:
+    names = ", ".join(force.name for force in forces) or "none"
+    if source_name is not None:
         chosen = []
-        for name in given.split(","):
+        for name in source_name.split(","):
             plain = name.strip().removesuffix("_v").rstrip("_")
             own = [force for force in forces if force.name == plain]
             if len(own) != 1:
                 raise InputError(
-                    f"has no force '{name.strip()}' (it has {there})", table.path, "--grf-force"
+                    f"has no force '{name.strip()}' (it has {names})", table.path, "--grf-force"
                 )
             chosen += own
         return chosen
@@ -194,9 +194,9 @@ def _named(
 
 
 def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError:
-    there = ", ".join(force.name for force in forces) or "none"
+    names = ", ".join(force.name for force in forces) or "none"
     return InputError(
-        f"does not say which force is the {side} foot's (it has {there})",
+        f"does not say which force is the {side} foot's (it has {names})",
         table.path,
         f"give --grf-force, or name its columns after the foot: ground_force_{side[0]}_vx",
     )

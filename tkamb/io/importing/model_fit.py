@@ -169,9 +169,9 @@ class ModelChain:
 
     def moved(self, state: Array, step: Array) -> Array:
         """Return the coordinates (f, n) after a step (f, free) of the free ones."""
-        moved = state.copy()
-        moved[:, self.free] += step
-        return self.kinematics.coupled(moved) if self._couplers else moved
+        shifted = state.copy()
+        shifted[:, self.free] += step
+        return self.kinematics.coupled(shifted) if self._couplers else shifted
 
     def chosen(self, state: Array, frames: Index) -> Array:
         """Return the coordinates of some frames."""

@@ -187,7 +187,7 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
     if patient.ground is not None:
         files[folder / GROUND_FILE] = patient.ground
     new = {path: text for path, text in files.items() if not _same_there(path, text)}
-    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    new_folders = [place for place in (folder, *folder.parents) if not place.exists()]
     written: list[Path] = []
     try:
         claim_directory(folder)
@@ -200,19 +200,19 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
         for path in written:
             path.unlink(missing_ok=True)
         with suppress(OSError):  # not empty, or never made
-            for place in made:
+            for place in new_folders:
                 place.rmdir()
         raise
 
 
-def _gait_lines(case: Case, wanted: bool) -> tuple[str, ...]:
+def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
     """Return what the force plates show of gait, in a line.
 
     Raises:
         InputError: a cycle is wanted from the plates, and they show none.
     """
     gait = None if case.ground is None else case.ground.gait
-    if wanted and case.gait_cycle_s is None:
+    if asks_gait and case.gait_cycle_s is None:
         raise InputError(
             "the force plates show no two strikes of this foot within the motion",
             "--cycle plates",
@@ -266,12 +266,12 @@ def marker_lines(case: Case) -> tuple[str, ...]:
             f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
         )
     apart = result.at(result.centre_distance, case.motion.time) / MILLIMETRE
-    turned = (
+    remark = (
         result.at(result.flexion["segments"] - result.flexion["chain"], case.motion.time) / DEGREE
     )
     lines.append(
         f"knee centres of shank and thigh markers: {np.nanmedian(apart):.1f} mm apart (at most "
-        f"{np.nanmax(apart):.1f}); flexions differ by at most {np.nanmax(np.abs(turned)):.1f} deg"
+        f"{np.nanmax(apart):.1f}); flexions differ by at most {np.nanmax(np.abs(remark)):.1f} deg"
     )
     return tuple(lines)
 
@@ -316,7 +316,7 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
         InputError: neither of the two.
     """
     subject = request.mass_kg
-    share, wanted = own / subject, MODEL_MASS.leg_mass_share * subject
+    share, target = own / subject, MODEL_MASS.leg_mass_share * subject
     low, high = LEG_SHARES
     whole_body = 0.5 < share < 2.0
     text = (
@@ -332,8 +332,8 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
             "is --mass-kg in kilograms? else give the model's bodies a leg's masses",
         )
     why = ", the whole body's" if whole_body else ""
-    return wanted / own, (
-        f"{text}{why}: scaled to {wanted:.2f} kg, "
+    return target / own, (
+        f"{text}{why}: scaled to {target:.2f} kg, "
         f"the {MODEL_MASS.leg_mass_share:.1%} of a leg (Winter 2009)"
     )
 
@@ -383,7 +383,7 @@ def _title(request: ImportRequest) -> tuple[str, ...]:
 
 
 def _notes(
-    request: ImportRequest, scale: float, found: Trial, own_ligaments: bool
+    request: ImportRequest, scale: float, trial: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
     alone = (
         "Without [muscles] only the quadriceps acts: where hamstrings and gastrocnemius act too, "
@@ -392,10 +392,10 @@ def _notes(
     )
     notes = [
         *(() if request.muscles else (alone,)),
-        *_motion_notes(request, found),
+        *_motion_notes(request, trial),
         "Foot and shank are one body with the ankle at its neutral angle.",
     ]
-    if request.meshes and not found.poses:
+    if request.meshes and not trial.poses:
         notes.append(
             "Adduction, axial rotation, AP and ML of the femur are where contact, ligaments and "
             "muscle line leave them; nobody recorded them."
@@ -404,29 +404,29 @@ def _notes(
         notes.append("The ligaments are a generic set scaled to the implant, nobody's own.")
     if scale != 1.0:
         notes.append(f"Segment masses are the model's times {scale:.4f}.")
-    if found.ground is None:
+    if trial.ground is None:
         notes.append("No ground reaction: the shank hangs in the air.")
     return tuple(notes)
 
 
-def _motion_notes(request: ImportRequest, found: Trial) -> list[str]:
-    if request.poses is None or found.shank is None:
+def _motion_notes(request: ImportRequest, trial: Trial) -> list[str]:
+    if request.poses is None or trial.shank is None:
         return [
             "Shank and flexion come from skin markers; the columns marker_rms_*, flexion_* and "
             "knee_centre_distance_mm say how far the skin has moved."
         ]
     notes = []
     if request.poses.turned:
-        turned = ", ".join(request.poses.turned)
-        notes.append(f"The poses are read with the other sign of {turned}.")
+        names = ", ".join(request.poses.turned)
+        notes.append(f"The poses are read with the other sign of {names}.")
     if request.poses.stride:
         notes.append(
             "The knee's motion is of another recording than ground reaction and shank, laid on "
             "one stride of theirs phase for phase: an assumption."
         )
-    if centres := [centre.name.replace("_", " ") for centre in found.shank.centres]:
+    if centres := [centre.name.replace("_", " ") for centre in trial.shank.centres]:
         notes.append(
-            f"The shank shows {len(found.shank.points)} markers; {' and '.join(centres)}, which "
+            f"The shank shows {len(trial.shank.points)} markers; {' and '.join(centres)}, which "
             "the neighbours' markers carry, complete it. Its lean is less certain for that."
         )
     return notes

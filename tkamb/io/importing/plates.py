@@ -172,8 +172,8 @@ def _load(
         surface[side] = (
             height - FOOT_CONTACT.marker_height if height > FOOT_CONTACT.min_step_height else 0.0
         )
-        there = point + force / force[:, 1:2] * surface[side]
-        distance = np.linalg.norm((there - middle)[:, [0, 2]], axis=1)
+        place = point + force / force[:, 1:2] * surface[side]
+        distance = np.linalg.norm((place - middle)[:, [0, 2]], axis=1)
         away[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
     nearest = min(away, key=lambda side: np.nan_to_num(away[side], nan=np.inf))
     rest = [distance for side, distance in away.items() if side != nearest]
@@ -199,13 +199,13 @@ def own_plates(
             what = f"{shared[0]} is also loaded by a foot without markers"
         raise InputError(what, path, f"{hint}, or take another trial")
     if not own:
-        lost = [load for load in loads if not load.side]
+        unassigned = [load for load in loads if not load.side]
         what = f"no force plate was under the {side} foot"
-        if lost:
+        if unassigned:
             what += (
-                f": {lost[0].title} is stood upon from {lost[0].start:.2f} to {lost[0].end:.2f} s, "
-                f"but no foot's markers are within {FOOT_CONTACT.max_foot_distance:g} m of its "
-                "centre of pressure"
+                f": {unassigned[0].title} is loaded from {unassigned[0].start:.2f} to "
+                f"{unassigned[0].end:.2f} s, but no foot's markers are within "
+                f"{FOOT_CONTACT.max_foot_distance:g} m of its centre of pressure"
             )
             hint = f"check --laboratory-axes and the foot's labels, or {hint}"
         raise InputError(what, path, f"{hint}, or take another trial")
@@ -262,9 +262,9 @@ def _middle(table: Table, labels: list[str]) -> Array:
     if not labels:
         return np.full((rows, 3), np.nan)
     points = marker_trajectories(table, labels, table.unit_scale(None, "length_unit"))
-    seen = np.asarray(np.isfinite(points).all(axis=2))
-    total = np.where(seen[:, :, None], points, 0.0).sum(axis=1)
-    count = seen.sum(axis=1).astype(float)
+    visible = np.asarray(np.isfinite(points).all(axis=2))
+    total = np.where(visible[:, :, None], points, 0.0).sum(axis=1)
+    count = visible.sum(axis=1).astype(float)
     count[count == 0] = np.nan
     return np.asarray(total / count[:, None])
 

@@ -124,28 +124,28 @@ def _replace(
             f"names a file that is not there ({other})", where, "put it beside the model"
         )
     root = _read(other, notices)
-    held = root
+    target = root
     if root.tag == "OpenSimDocument":
         of_tag = [child for child in root if child.tag == element.tag]
         if not of_tag:
             raise InputError(f"names a file that holds no <{element.tag}> ({other})", where)
-        held = of_tag[0]
-    if held.tag != element.tag:
-        raise InputError(f"names a file that holds no <{element.tag}> but <{held.tag}>", where)
-    for source in (held, root):
-        _apply_defaults(held, source.find("defaults"))
-    element[:] = [child for child in held if child.tag != "defaults"]
-    element.text = held.text
-    for key, value in held.attrib.items():
+        target = of_tag[0]
+    if target.tag != element.tag:
+        raise InputError(f"names a file that holds no <{element.tag}> but <{target.tag}>", where)
+    for source in (target, root):
+        _apply_defaults(target, source.find("defaults"))
+    element[:] = [child for child in target if child.tag != "defaults"]
+    element.text = target.text
+    for key, value in target.attrib.items():
         element.attrib.setdefault(key, value)
     notices.append(f"{element.tag} read from {name}")
     return other, (*opened, other.resolve())
 
 
-def _apply_defaults(held: Element, defaults: Element | None) -> None:
+def _apply_defaults(target: Element, defaults: Element | None) -> None:
     """Write a file's own defaults into its elements: they hold for no other file's."""
     by_tag = {} if defaults is None else {entry.tag: entry for entry in defaults}
     inside = set() if defaults is None else set(defaults.iter())
-    for element in [e for e in held.iter() if e.tag in by_tag and e not in inside]:
-        there = {child.tag for child in element}
-        element.extend(copy.deepcopy(c) for c in by_tag[element.tag] if c.tag not in there)
+    for element in [e for e in target.iter() if e.tag in by_tag and e not in inside]:
+        tags = {child.tag for child in element}
+        element.extend(copy.deepcopy(c) for c in by_tag[element.tag] if c.tag not in tags)

@@ -118,9 +118,9 @@ class Document:
         except ValueError:
             values = np.array([np.nan])
         if not np.isfinite(values).all() or count not in (None, len(values)):
-            wanted = "numbers" if count is None else f"{count} number{'s' * (count > 1)}"
+            needed = "numbers" if count is None else f"{count} number{'s' * (count > 1)}"
             raise InputError(
-                f"<{tags[0]}>{text[:60]}</{tags[0]}> is not {wanted}", self.where(element)
+                f"<{tags[0]}>{text[:60]}</{tags[0]}> is not {needed}", self.where(element)
             )
         return values
 

@@ -126,9 +126,9 @@ class Kinematics:
             return values
         values = np.asarray(q, float)
         if values.shape[-1:] != (len(self.coordinates),):
-            given = values.shape[-1] if values.ndim else 1
-            wanted = f"{len(self.coordinates)} coordinates, {given} are given"
-            raise InputError(f"has {wanted}", self.model.name)
+            count = values.shape[-1] if values.ndim else 1
+            problem = f"{len(self.coordinates)} coordinates, {count} are given"
+            raise InputError(f"has {problem}", self.model.name)
         return values
 
     def coupled(self, q: Mapping[str, float] | ArrayLike) -> Array:

@@ -62,8 +62,8 @@ class AppliedPreset:
         )
         result = [f"Run as {self.name} ({self.source}): {changed or 'the scene says so already'}."]
         if self.overridden:
-            kept = ", ".join(self.overridden)
-            result.append(f"Not as {self.name}, since the run was told otherwise: {kept}.")
+            names = ", ".join(self.overridden)
+            result.append(f"Not as {self.name}, since the run was told otherwise: {names}.")
         return result + [f"Not as {self.name}: {words}." for words in self.departures]
 
 

@@ -113,9 +113,11 @@ class Recording:
                 return plate
         if number in self.unread_plates:
             raise self.unread_plates[number]
-        there = ", ".join(str(plate.number) for plate in self.plates) or "none"
+        numbers = ", ".join(str(plate.number) for plate in self.plates) or "none"
         raise InputError(
-            f"has no force plate {number}", self.path, f"give [ground_reaction] plates, of {there}"
+            f"has no force plate {number}",
+            self.path,
+            f"give [ground_reaction] plates, of {numbers}",
         )
 
     def channel(self, name: str) -> Array:
@@ -235,16 +237,16 @@ class _Reader:
         """Return metres per unit of length; None where the file's word is not understood."""
         words = self._parameters.texts("POINT:UNITS")
         word = words[0] if words else ""
-        own, given = metres(word), self.units.length
-        if given is None:
+        own, unit = metres(word), self.units.length
+        if unit is None:
             return own
-        if own is not None and own != metres(given):
+        if own is not None and own != metres(unit):
             raise InputError(
-                f"is in {word} by its own header, but length_unit says {given}",
+                f"is in {word} by its own header, but length_unit says {unit}",
                 self.path,
                 "correct length_unit",
             )
-        return metres(given)
+        return metres(unit)
 
     def _analog(self, rate: float) -> tuple[float, list[str], Array, list[str]]:
         """Return rate (Hz), and names, samples (c, k) and units of the analog channels."""
@@ -311,16 +313,19 @@ class _Reader:
             self._per_plate(key, rows)
             for key, rows in (("CORNERS", (3, 4)), ("ORIGIN", (3,)), ("CHANNEL", None))
         )
-        there = (len(kinds), *(0 if v is None else v.shape[-1] for v in (corners, origin, channel)))
-        if min(there) < number:
+        counts = (
+            len(kinds),
+            *(0 if v is None else v.shape[-1] for v in (corners, origin, channel)),
+        )
+        if min(counts) < number:
             raise InputError("is not described in full", where, EXPORT)
         assert corners is not None and origin is not None and channel is not None
-        wanted = channel[: CHANNELS.get(kinds[k], 6), k]
-        if not np.isfinite(wanted).all() or len(set(wanted)) < len(wanted):
+        used = channel[: CHANNELS.get(kinds[k], 6), k]
+        if not np.isfinite(used).all() or len(set(used)) < len(used):
             raise InputError("names one channel twice", where, EXPORT)
-        if len(wanted) and (wanted.min() < 1 or wanted.max() > len(names)):
-            raise InputError(f"asks for channel {wanted.max():g} of {len(names)}", where, EXPORT)
-        rows = [int(one) - 1 for one in wanted]
+        if len(used) and (used.min() < 1 or used.max() > len(names)):
+            raise InputError(f"asks for channel {used.max():g} of {len(names)}", where, EXPORT)
+        rows = [int(one) - 1 for one in used]
         force = self._parameters.texts("FORCE_PLATFORM:UNITS")
         return PlateRecord(
             number,

@@ -225,8 +225,8 @@ def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bo
 
     unit = 1.0 / (2.0 * math.pi * cutoff_Hz)  # in this unit of time lambda is one
     start, end = time[0] / unit, time[-1] / unit
-    wanted = math.ceil((end - start) * SPLINE_FILTER.knots_per_period / math.tau)
-    spans = max(SPLINE_FILTER.degree + 1, min(2 * len(time), wanted))
+    pieces = math.ceil((end - start) * SPLINE_FILTER.knots_per_period / math.tau)
+    spans = max(SPLINE_FILTER.degree + 1, min(2 * len(time), pieces))
     step = (end - start) / spans
     knots = start + step * np.arange(-SPLINE_FILTER.degree, spans + SPLINE_FILTER.degree + 1)
     inside = np.clip(

@@ -278,12 +278,12 @@ def _scales(record: PlateRecord) -> Array:
     kinds = {1: "fffllm", 3: "ffffffff"}.get(record.kind, "fffmmm")
     readers = {"f": newtons, "m": newton_metres, "l": metres}
     keys = {"f": "force_unit", "m": "moment_unit", "l": "length_unit"}
-    given = {"f": record.given.force, "m": record.given.moment, "l": record.given.length}
+    units = {"f": record.given.force, "m": record.given.moment, "l": record.given.length}
     examples = {"f": "N", "m": "Nmm", "l": "mm"}
     scales = []
     for quantity, unit in zip(kinds, record.units, strict=False):
         scale = readers[quantity](unit)
-        text = given[quantity]
+        text = units[quantity]
         stated = None if text is None else readers[quantity](text)
         if text is not None and stated is None:
             raise InputError(f"'{text}' is no unit of it", keys[quantity], examples[quantity])

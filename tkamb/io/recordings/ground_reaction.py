@@ -246,8 +246,8 @@ def _read_table(source: ForceRecording) -> RecordedReaction:
             "[ground_reaction] surface_mm",
             "leave it out",
         )
-    for key, given in (("force_unit", source.force_unit), ("moment_unit", source.moment_unit)):
-        if given:
+    for key, unit in (("force_unit", source.force_unit), ("moment_unit", source.moment_unit)):
+        if unit:
             raise InputError(
                 "is for plates of a .c3d: a table is in N and N·m",
                 f"[ground_reaction] {key}",
@@ -310,19 +310,21 @@ def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
     check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
     rotation = laboratory_rotation(source.laboratory_axes, recorded.path)
-    there = {role for role in roles if role in source.columns or role in recorded.columns}
+    roles_present = {role for role in roles if role in source.columns or role in recorded.columns}
     columns = []
     # moments about the file's origin need no points: the force then is given there
-    pointless = not any(role.startswith("point") for role in there) and len(there) == 6
+    pointless = (
+        not any(role.startswith("point") for role in roles_present) and len(roles_present) == 6
+    )
     for role in roles:
         column = source.columns.get(role, role)
-        given = role in there
+        present = role in roles_present
         if role.startswith("point") and pointless:
             columns.append(np.zeros(recorded.rows))
             continue
-        if role.startswith("point") and (given or role != _upright_point(source)):
+        if role.startswith("point") and (present or role != _upright_point(source)):
             columns.append(recorded.column(column))  # undefined while unloaded
-        elif role.startswith("force") or given:
+        elif role.startswith("force") or present:
             columns.append(recorded.column(column))
             _check_size(recorded.path, role[:-2], column, columns[-1])
         else:
@@ -336,8 +338,8 @@ def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
     """Raise an InputError where a column (n,) of a kind holds more than a foot exerts."""
     largest, unit = LARGEST[kind]
     question = f"is a cell mistyped, or the {kind} not in {unit}?"
-    known = np.where(np.isfinite(values), values, 0.0)  # a gap is refused where it is needed
-    check_range(path, f"foot: column '{column}'", known, (-largest, largest), unit, question)
+    filled = np.where(np.isfinite(values), values, 0.0)  # a gap is refused where it is needed
+    check_range(path, f"foot: column '{column}'", filled, (-largest, largest), unit, question)
 
 
 def _read_plates(source: ForceRecording) -> RecordedReaction:
@@ -350,12 +352,12 @@ def _read_plates(source: ForceRecording) -> RecordedReaction:
     """
     recording = read_c3d(source.file, _units(source))
     check_roles(source.columns, (), source.file, "ground_reaction")
-    there = [plate.number for plate in recording.plates]
+    numbers = [plate.number for plate in recording.plates]
     if not source.plates:
         raise InputError(
-            "holds several force plates" if there else "holds no force plate",
+            "holds several force plates" if numbers else "holds no force plate",
             source.file,
-            f"give [ground_reaction] plates, of {', '.join(map(str, there)) or 'none'}",
+            f"give [ground_reaction] plates, of {', '.join(map(str, numbers)) or 'none'}",
         )
     plates = [recording.plate(number) for number in dict.fromkeys(source.plates)]
     rotation = laboratory_rotation(source.laboratory_axes, source.file)

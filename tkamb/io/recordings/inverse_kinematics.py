@@ -124,34 +124,38 @@ def fit_chain(
         weights: (m,) of the squared distances.
         start: where the iteration begins.
     """
-    seen = np.isfinite(measured).all(axis=2)
-    target, each = np.nan_to_num(measured), np.where(seen, weights, 0.0)
+    visible = np.isfinite(measured).all(axis=2)
+    target, each = np.nan_to_num(measured), np.where(visible, weights, 0.0)
     damping, last = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
-    left, steps = np.arange(len(measured)), 0
-    state, here = start, chain.normal(start, target, each)
+    active, steps = np.arange(len(measured)), 0
+    state, residual = start, chain.normal(start, target, each)
     while steps < INVERSE_KINEMATICS.max_iterations:
-        step = _step(here.of(left), damping[left], last[left] < INVERSE_KINEMATICS.newton_below)
-        trial = chain.moved(chain.chosen(state, left), step)
+        step = _step(
+            residual.of(active), damping[active], last[active] < INVERSE_KINEMATICS.newton_below
+        )
+        trial = chain.moved(chain.chosen(state, active), step)
         size = np.abs(step).max(axis=1)
-        done = size < INVERSE_KINEMATICS.step_tolerance
-        state = chain.replaced(state, left[done], chain.chosen(trial, np.flatnonzero(done)))
-        left, size, steps = left[~done], size[~done], steps + 1
-        if not len(left):
+        converged = size < INVERSE_KINEMATICS.step_tolerance
+        state = chain.replaced(
+            state, active[converged], chain.chosen(trial, np.flatnonzero(converged))
+        )
+        active, size, steps = active[~converged], size[~converged], steps + 1
+        if not len(active):
             break
-        trial = chain.chosen(trial, np.flatnonzero(~done))
-        there = chain.normal(trial, target[left], each[left])
+        trial = chain.chosen(trial, np.flatnonzero(~converged))
+        trial_residual = chain.normal(trial, target[active], each[active])
         # a frame that would get worse stays where it is
-        better = there.cost <= here.cost[left] * (1.0 + 1e-12) + 1e-24
-        taken, kept = left[better], np.flatnonzero(better)
-        state = chain.replaced(state, taken, chain.chosen(trial, kept))
-        here = here.replaced(taken, there.of(kept))
-        damping[left] = np.clip(damping[left] * np.where(better, 0.1, 10.0), 1e-12, 1e6)
-        last[left] = np.where(better, size, np.inf)
-    distance = np.where(seen, np.linalg.norm(chain.places(state) - target, axis=2), np.nan)
-    count = seen.sum(axis=1)
+        better = trial_residual.cost <= residual.cost[active] * (1.0 + 1e-12) + 1e-24
+        accepted, rows = active[better], np.flatnonzero(better)
+        state = chain.replaced(state, accepted, chain.chosen(trial, rows))
+        residual = residual.replaced(accepted, trial_residual.of(rows))
+        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), 1e-12, 1e6)
+        last[active] = np.where(better, size, np.inf)
+    distance = np.where(visible, np.linalg.norm(chain.places(state) - target, axis=2), np.nan)
+    count = visible.sum(axis=1)
     rms = np.sqrt(np.nansum(distance**2, axis=1) / np.maximum(count, 1))
     solved = np.ones(len(measured), np.bool_)
-    solved[left] = False
+    solved[active] = False
     return ChainFit(state, np.where(count > 0, rms, np.nan), distance, solved, steps)
 
 

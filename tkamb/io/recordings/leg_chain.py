@@ -81,8 +81,8 @@ class LegChain:
         for ball in self.balls:
             assert ball.joint is not None and ball.centre is not None
             turn = state.turns[ball.name]
-            there = ball.joint - np.einsum("fij,j->fi", turn, ball.centre)
-            poses[ball.name] = poses[ball.joined_to] @ pose(turn, there)
+            offset = ball.joint - np.einsum("fij,j->fi", turn, ball.centre)
+            poses[ball.name] = poses[ball.joined_to] @ pose(turn, offset)
         return poses
 
     def start(self, fitted: dict[str, Array], neutral: Array) -> LegState:
@@ -196,8 +196,8 @@ def _carry(poses: Array, step: Array) -> Array:
 
 def _fill_gaps(poses: Array) -> Array:
     """Return the poses with those that are missing taken from the frame before (or after)."""
-    known = np.flatnonzero(np.isfinite(poses[:, 0, 3]))
-    if not len(known):
+    finite = np.flatnonzero(np.isfinite(poses[:, 0, 3]))
+    if not len(finite):
         return np.tile(np.eye(4), (len(poses), 1, 1))
-    nearest = known[np.clip(np.searchsorted(known, np.arange(len(poses)), "right") - 1, 0, None)]
+    nearest = finite[np.clip(np.searchsorted(finite, np.arange(len(poses)), "right") - 1, 0, None)]
     return np.asarray(poses[nearest])

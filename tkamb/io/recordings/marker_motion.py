@@ -158,8 +158,8 @@ def leg_segments(
     segments, measured = [], {}
     for own in markers.segment:
         labels = tuple(own.markers)
-        seen = marker_trajectories(recorded, list(labels), scale) @ rotation.T
-        measured[own.name] = seen @ mirror
+        points = marker_trajectories(recorded, list(labels), scale) @ rotation.T
+        measured[own.name] = points @ mirror
         ends = [None if end is None else mirror @ end for end in (own.joint, own.centre)]
         segments.append(
             Segment(
@@ -183,16 +183,16 @@ def neutral_coordinates(markers: MarkerSet, side: str) -> Array:
 
 def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
     for name, values in rms.items():
-        known = values[np.isfinite(values)]
-        if not len(known) and name in ("shank", "thigh"):
+        finite = values[np.isfinite(values)]
+        if not len(finite) and name in ("shank", "thigh"):
             raise InputError(
                 f"fewer than three markers of the {name} are seen together",
                 recorded.path,
                 "check the labels in [motion.markers], or use another trial",
             )
-        if len(known) and np.median(known) > MARKER_FIT.max_median_residual:
+        if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
             raise InputError(
-                f"markers of the {name} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
+                f"markers of the {name} fit only to {np.median(finite) / MILLIMETRE:.0f} mm",
                 recorded.path,
                 "check names and positions in [motion.markers], and length_unit",
             )
@@ -228,7 +228,9 @@ def _compare_readings(
     assert source.markers is not None
     used = source.markers.method
     knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
-    gone = np.concatenate([np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1)
+    missing = np.concatenate(
+        [np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1
+    )
     run = _run(time, np.isnan(knees[used][:, 0]), source.interval, recorded)
     return MarkerKinematics(
         time[run],
@@ -238,7 +240,7 @@ def _compare_readings(
         {name: knee[run, FLEXION] for name, knee in knees.items()},
         {name: values[run] for name, values in rms.items()},
         np.linalg.norm(knees["segments"][run, :3] - neutral[:3], axis=1),
-        gone.sum(axis=1)[run],
+        missing.sum(axis=1)[run],
     )
 
 
@@ -251,15 +253,15 @@ def _joint_rms(fits: dict[str, tuple[Array, Array]], measured: dict[str, Array])
 
 def _knee(insert: Array, femur: Array) -> Array:
     """Return knee coordinates (n, 6) of frames that are known, NaN elsewhere."""
-    known = np.isfinite(insert[:, 0, 3]) & np.isfinite(femur[:, 0, 3])
+    finite = np.isfinite(insert[:, 0, 3]) & np.isfinite(femur[:, 0, 3])
     result = np.full((len(insert), 6), np.nan)
-    if known.any():
-        result[known] = knee_coordinates(inverse(insert[known]) @ femur[known])
+    if finite.any():
+        result[finite] = knee_coordinates(inverse(insert[finite]) @ femur[finite])
     return result
 
 
 def _run(
-    time: Array, lost: np.ndarray, interval: tuple[float, float] | None, recorded: Table
+    time: Array, missing: np.ndarray, interval: tuple[float, float] | None, recorded: Table
 ) -> slice:
     """Return the longest run of frames around the interval in which none is lost.
 
@@ -273,15 +275,15 @@ def _run(
             "choose [motion] interval_s inside the recording",
         )
     inside = (time >= start - 1e-9) & (time <= end + 1e-9)
-    if (inside & lost).any():
-        k = int(np.argmax(inside & lost))
+    if (inside & missing).any():
+        k = int(np.argmax(inside & missing))
         raise InputError(
             f"too few markers of shank and thigh are seen at {time[k]:.4f} s",
             recorded.path,
             "choose [motion] interval_s between the gaps, or method = 'chain'",
         )
     first, last = int(np.argmax(inside)), len(time) - int(np.argmax(inside[::-1]))
-    before, after = np.flatnonzero(lost[:first]), np.flatnonzero(lost[last:])
+    before, after = np.flatnonzero(missing[:first]), np.flatnonzero(missing[last:])
     return slice(
         int(before[-1]) + 1 if len(before) else 0, last + int(after[0]) if len(after) else None
     )

@@ -50,10 +50,10 @@ class MeasuredForce:
         """
         step = np.diff(self.time)
         right = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
-        known = (time >= self.time[0]) & (time <= self.time[-1])
-        known &= step[right - 1] <= FORCE_SAMPLES.max_gap * np.median(step)
+        inside = (time >= self.time[0]) & (time <= self.time[-1])
+        inside &= step[right - 1] <= FORCE_SAMPLES.max_gap * np.median(step)
         return {
-            name: np.where(known, np.interp(time, self.time, values), np.nan)
+            name: np.where(inside, np.interp(time, self.time, values), np.nan)
             for name, values in self.force.items()
         }
 

@@ -164,8 +164,8 @@ def _from_markers(
     from tkamb.io.recordings.marker_motion import load_marker_motion
 
     assert source.markers is not None
-    taken = source.markers.coordinates
-    unrecorded = tuple(name for name in KNEE_COORDINATES if name not in taken)
+    names = source.markers.coordinates
+    unrecorded = tuple(name for name in KNEE_COORDINATES if name not in names)
     if needed := [name for name in unrecorded if name not in released]:
         raise InputError(
             f"nothing gives {', '.join(needed)}",
@@ -239,8 +239,8 @@ def _check_roles(source: MotionRecording, recorded: Table) -> None:
 def _turn_signs(recorded: Table, source: MotionRecording) -> Table:
     """Return the recording with the columns of the roles in `signs_turned` negated."""
     names = {source.columns.get(role, role) for role in source.signs_turned}
-    turned = {name: -recorded.column(name) for name in names}
-    return replace(recorded, columns=recorded.columns | turned)
+    negated = {name: -recorded.column(name) for name in names}
+    return replace(recorded, columns=recorded.columns | negated)
 
 
 def _bending_role(recorded: Table, source: MotionRecording) -> str:

@@ -139,9 +139,9 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
             or place[1] < 0
             or np.hypot(*place[[0, 2]]) > PATELLA_LINK.max_lateral_share * away
         ):
-            shown = ", ".join(f"{value:.4g}" for value in place)
+            words = ", ".join(f"{value:.4g}" for value in place)
             raise InputError(
-                f"{name} is at ({shown}) m in '{link}', {away:.4g} m from its origin",
+                f"{name} is at ({words}) m in '{link}', {away:.4g} m from its origin",
                 path,
                 f"it must lie {low:g} to {high:g} m above it, along y, in metres",
             )

@@ -47,8 +47,8 @@ def around_load(force: Array, time: Array) -> np.ndarray:
         force: (k,) N, size of the force on the plate.
         time: (k,) s.
     """
-    known = np.sort(force[np.isfinite(force)])
-    quiet = known[: math.ceil(PLATE_LOAD.quiet_share * len(known))]
+    forces = np.sort(force[np.isfinite(force)])
+    quiet = forces[: math.ceil(PLATE_LOAD.quiet_share * len(forces))]
     steady = (
         len(quiet)
         and np.ptp(quiet) <= PLATE_LOAD.quiet_spread_N

@@ -83,12 +83,12 @@ def neighbours_curve(time: Array, values: Array) -> Array:
     first = np.clip(np.arange(n) - 2, 0, n - 5)
     others = first[:, None] + np.arange(5)
     others = others[others != np.arange(n)[:, None]].reshape(n, 4)
-    t, here = time[others], time[:, None]
+    t, now = time[others], time[:, None]
     weights = np.ones((n, 4))
     for i in range(4):
         for j in range(4):
             if i != j:
-                weights[:, i] *= (here[:, 0] - t[:, j]) / (t[:, i] - t[:, j])
+                weights[:, i] *= (now[:, 0] - t[:, j]) / (t[:, i] - t[:, j])
     return np.asarray((weights * values[others]).sum(axis=1))
 
 

@@ -74,13 +74,13 @@ def _goes_on(content: bytes, place: int) -> bool:
 def _refuse_cut_short(content: bytes, path: Path) -> None:
     """Refuse a file that announces more triangles than it has, where the others are plausible."""
     count = int.from_bytes(content[80:_HEADER], "little")
-    there = (len(content) - _HEADER) // _TRIANGLE.itemsize
-    if not 0 < there < count:
+    stored = (len(content) - _HEADER) // _TRIANGLE.itemsize
+    if not 0 < stored < count:
         return
-    corners = np.frombuffer(content, _TRIANGLE, there, _HEADER)["corners"]
+    corners = np.frombuffer(content, _TRIANGLE, stored, _HEADER)["corners"]
     if np.isfinite(corners).all() and 0.0 < np.abs(corners).max() < 1e7:
         raise InputError(
-            f"cannot be read as a mesh (cut short: {there} of {count} triangles)",
+            f"cannot be read as a mesh (cut short: {stored} of {count} triangles)",
             path,
             "copy or export it again",
         )

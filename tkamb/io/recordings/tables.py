@@ -251,8 +251,8 @@ def read_trc(path: Path) -> Table:
         padded = cells[: len(columns)] + [""] * (len(columns) - len(cells))
         rows.append((number, padded if _filled(cells) <= len(columns) else cells))
     table, equal = _columns(path, columns, rows)
-    known = [m for m in labels if f"{m}_x" in table]
-    for marker in known:
+    complete = [m for m in labels if f"{m}_x" in table]
+    for marker in complete:
         absent = np.all([table[f"{marker}_{axis}"] == 0.0 for axis in "xyz"], axis=0)
         for axis in "xyz":
             table[f"{marker}_{axis}"][absent] = np.nan

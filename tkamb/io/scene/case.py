@@ -3,6 +3,7 @@
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -230,6 +231,27 @@ def load_case(scene: Scene) -> Case:
     return scaled_case(case)
 
 
+def with_insert(case: Case, mesh: Path) -> Case:
+    """Return a case with the insert of another mesh file of the same unit and axes.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    implant = case.scene.implant
+    assert implant.insert is not None
+    insert = implant.insert.model_copy(update={"mesh": mesh})
+    implant = implant.model_copy(update={"insert": insert})
+    scene = case.scene.model_copy(update={"implant": implant})
+    parts = _Parts(scene, insert_alone=True)
+    return replace(
+        case,
+        scene=scene,
+        insert=parts.insert,
+        post=parts.post,
+        insert_placement=parts.insert_placement,
+    )
+
+
 def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
     """Return the motion with what follows from the surfaces: a seat, a roll with slip."""
     table = scene.motion
@@ -279,15 +301,15 @@ def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, 
         from tkamb.knee.generic_ligaments import generic_ligaments
 
         assert parts.femoral is not None and parts.insert is not None
-        wanted = scene.generic_ligaments.ligaments
-        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, wanted)
+        names = scene.generic_ligaments.ligaments
+        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, names)
     return bundles
 
 
 class _Parts:
     """The implant's surfaces in their own frames, and where their meshes' axes lie."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, insert_alone: bool = False) -> None:
         implant, self._left = scene.implant, scene.patient.side == "left"
         wants_insert = (
             scene.contact is not None
@@ -316,6 +338,8 @@ class _Parts:
                 self.insert, self.post = divide_insert(self.insert)
         elif implant.insert and scene.muscles is not None:  # where the model's insert lies
             self._place_insert(scene)
+        if insert_alone:
+            return
         if wants_femoral:
             if not implant.femoral:
                 raise InputError("is missing", "[implant.femoral]", "the patella rides on it")

@@ -44,10 +44,10 @@ def seated_motion(
                 place[index] -= np.mean(points, axis=0)[axis]
         if "si" in motion.unrecorded:
             place[KNEE_COORDINATES.index("si")] -= touch.travel(knee_pose(place))
-    lost = _first_lost(places, motion.time)
-    if lost is not None:
+    gap = _first_lost(places, motion.time)
+    if gap is not None:
         raise InputError(
-            f"the femur does not lie over the insert at {lost:.3g} s",
+            f"the femur does not lie over the insert at {gap:.3g} s",
             "[motion]",
             "record ap and ml, or check the meshes' units, axes and origins",
         )
@@ -79,10 +79,10 @@ def rolling_motion(
     recorded = condyle_slip(femoral, insert, split, motion.coordinates)
     slip = np.mean([side.slip for side in recorded if side is not None], axis=0)
     rolled = roll_slip_motion(femoral, insert, split, motion.coordinates, slip_share * slip)
-    lost = _first_lost(rolled, motion.time)
-    if lost is not None:
+    gap = _first_lost(rolled, motion.time)
+    if gap is not None:
         raise InputError(
-            f"the femur rolls off the insert at {lost:.3g} s",
+            f"the femur rolls off the insert at {gap:.3g} s",
             "[motion] motion = 'roll-slip'",
             "give it more of the recorded slip (slip_share) or take motion = 'recorded'",
         )
@@ -91,8 +91,8 @@ def rolling_motion(
 
 def _first_lost(places: Array, time: Array) -> float | None:
     """Return the first time (s) at which coordinates (f, 6) are not known."""
-    lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
-    return float(time[lost[0]]) if len(lost) else None
+    missing = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    return float(time[missing[0]]) if len(missing) else None
 
 
 def _with_coordinates(

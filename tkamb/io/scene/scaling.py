@@ -33,12 +33,12 @@ def scaled_case(case: "Case") -> "Case":
             [measured], which is another subject's.
     """
     s = case.scene.patient.scale
-    for there, table in (
+    for place, table in (
         (case.scene.muscles, "[muscles]"),
         (case.motion.markers, "[motion.markers]"),
         (case.scene.measured, "[measured]"),
     ):
-        if there is not None:
+        if place is not None:
             what, hint = f"cannot scale a scene with {table}", "scale its models, or leave it out"
             raise InputError(what, "[patient] scale", hint)
     return replace(

@@ -138,8 +138,8 @@ class Scene(SceneTable):
             "[generic_ligaments]": bool(generic),
             "[motion] motion = 'roll-slip'": self.motion.motion == "roll-slip",
         }
-        for name, asked in needs_implant.items():
-            if asked and not (self.implant.femoral and self.implant.insert):
+        for name, wish in needs_implant.items():
+            if wish and not (self.implant.femoral and self.implant.insert):
                 raise ValueError(f"{name} needs [implant.femoral] and [implant.insert]")
         contact = self.contact
         if self.material and contact and "material" in contact.model_fields_set:
@@ -316,11 +316,11 @@ def _as_list(key: str, value: Any, from_command_line: bool) -> str:
     """Return how to write a list where a single value was given."""
     if isinstance(value, dict):
         return f"is one table; write [[{key}]], with two brackets, above each"
-    shown = json.dumps(value, default=str)
+    words = json.dumps(value, default=str)
     written = (
-        f"--set '{key}=[{shown}]'" if from_command_line else f"{key.split('.')[-1]} = [{shown}]"
+        f"--set '{key}=[{words}]'" if from_command_line else f"{key.split('.')[-1]} = [{words}]"
     )
-    return f"{shown} is no list; in brackets it is one: {written}"
+    return f"{words} is no list; in brackets it is one: {written}"
 
 
 def _shown(value: Any) -> str:

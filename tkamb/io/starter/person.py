@@ -114,15 +114,15 @@ def write_person(folder: Path, person: Person) -> None:
     urdf.write_text(patient_urdf(urdf.read_text(encoding="utf-8"), person), encoding="utf-8")
     scene.write_text(scene_text(scene.read_text(encoding="utf-8"), person), encoding="utf-8")
     weight, size = person.mass / Person().mass, person.height / Person().height
-    left = -1.0 if person.side == "left" else 1.0
+    mirror = -1.0 if person.side == "left" else 1.0
     _scale(
         folder / "ground_reaction.csv",
         {
             "force_x_N": weight,
             "force_y_N": weight,
-            "force_z_N": left * weight,
+            "force_z_N": mirror * weight,
             "point_x_mm": size,
-            "point_z_mm": left * size,
+            "point_z_mm": mirror * size,
         },
     )
     if person.side == "left":
@@ -169,7 +169,7 @@ def scene_text(text: str, person: Person) -> str:
     text = re.sub(r"(?m)^ankle_mm = \[.*?\]", f"ankle_mm = [0.0, {ankle:.2f}, 0.0]", text)
     knee_up = (person.knee_height - usual.knee_height) * 1e3
     thigh = person.hip_height / usual.hip_height
-    left = -1.0 if person.side == "left" else 1.0
+    mirror = -1.0 if person.side == "left" else 1.0
 
     def point(match: re.Match[str]) -> str:
         x, y, z = (float(value) for value in match["point"].split(","))
@@ -177,7 +177,7 @@ def scene_text(text: str, person: Person) -> str:
             y += knee_up  # every attachment on the tibia is near the knee
         elif match["link"] == "femur" and y > LEG_PROPORTIONS.insert_below_knee * 1e3:
             y *= thigh  # on the shaft; nearer the joint it belongs to the implant's place
-        z = left * z + 0.0
+        z = mirror * z + 0.0
         return f'link = "{match["link"]}", point_mm = [{x:g}, {round(y, 3):g}, {z:g}]'
 
     pattern = r'link = "(?P<link>\w+)", point_mm = \[(?P<point>[^\]]+)\]'

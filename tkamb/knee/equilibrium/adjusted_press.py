@@ -20,6 +20,7 @@ from typing import Any
 
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, touches
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.units import MILLIMETRE
@@ -31,8 +32,8 @@ def press_adjusted(
     load: float,
     adjustment: Adjustment,
     query: ClosestPointQuery,
-    guess: ContactResult | None = None,
-) -> tuple[ContactResult, Adjustment]:
+    start: Guess | None = None,
+) -> tuple[ContactResult, Adjustment, WarmStart]:
     """Press the adjusted femur in, check the adjustment, undo its rotation if it must be.
 
     Args:
@@ -41,28 +42,28 @@ def press_adjusted(
         load: N, superior-inferior.
         adjustment: of the recorded pose, by `tkamb.geometry.adjustment.adjust`.
         query: closest points of the same pair.
-        guess: an earlier result, to save time.
+        start: an earlier result or warm start, to save time.
 
     Returns:
-        The contact, whose flags hold those of the adjustment, and the adjustment as it
-        was checked.
+        The contact, whose flags hold those of the adjustment, the adjustment as it was checked,
+        and the start of the next press.
 
     Raises:
         ComputationError: the femoral component does not lie over the insert.
     """
-    result = model.press(state, load, adjustment.pose, guess)
+    result, start = model.press_from(state, load, adjustment.pose, start)
     final = adjustment.coronal_angle == 0.0 or adjustment.restored
     if result.status is not ContactStatus.OK or final:
         adjustment = replace(adjustment, penetration=float(result.approach))
-        return _flagged(result, adjustment), adjustment
+        return _flagged(result, adjustment), adjustment, start
     checked, restore, doubts = _check(query, adjustment, result)
     if restore:
         # At the recorded rotation the limit of the turn decides nothing any more.
         pose, translation, flags = moved_to_touch(query, checked.recorded, checked.settings)
         checked = replace(checked, pose=pose, translation=translation, restored=True, flags=flags)
-        result = model.press(state, load, pose, result)
+        result, start = model.press_from(state, load, pose, start)
     checked = replace(checked, flags=(*checked.flags, *doubts))
-    return _flagged(result, checked), checked
+    return _flagged(result, checked), checked, start
 
 
 def _flagged(result: ContactResult, adjustment: Adjustment) -> ContactResult:

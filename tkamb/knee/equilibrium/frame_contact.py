@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tkamb.contact.area import area_above
 from tkamb.contact.result import ContactResult
+from tkamb.contact.warm_start import WarmStart
 from tkamb.geometry.adjustment import Adjustment
 
 if TYPE_CHECKING:
@@ -34,7 +35,9 @@ class FrameContact:
         equilibrium: the search for the released coordinates, if there are any.
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
-        turned: the contact with a little more adduction from which that was found, if one was.
+        start: where a contact of the next frame may begin; None where there is no result.
+        turned: the start that came with the contact at a little more adduction, from which the
+            sensitivity was found; None if it was not.
         triangles: (k, 3) of the map.
         post: cam and post, where the scene asks for their contact.
     """
@@ -50,7 +53,8 @@ class FrameContact:
     point_change: float = NAN
     equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
-    turned: ContactResult | None = None
+    start: WarmStart | None = None
+    turned: WarmStart | None = None
     triangles: NDArray[np.int64] | None = None
     post: "PostContact | None" = None
 

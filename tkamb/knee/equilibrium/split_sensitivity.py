@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import WarmStart
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_axes, knee_coordinates, knee_pose
 from tkamb.units import DEGREE
 
@@ -32,8 +33,9 @@ ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "s
 def split_sensitivity(
     probe: "Probe",
     result: ContactResult,
-    like: tuple[ContactResult, ContactResult] | None = None,
-) -> tuple[float, ContactResult | None]:
+    start: WarmStart | None = None,
+    like: tuple[WarmStart, WarmStart] | None = None,
+) -> tuple[float, tuple[ContactResult, WarmStart] | None]:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
     Zero where one condyle carries everything: it then holds only until the other touches. NaN
@@ -42,18 +44,21 @@ def split_sensitivity(
     Args:
         probe: of the contact model.
         result: a contact; the load is what it carries along -y.
-        like: another contact and what this returned of it, which may save time.
+        start: that came with it.
+        like: the starts of another contact and of its turned one, which may save time.
 
     Returns:
-        The change, and the contact with the adduction turned; None where that does not succeed.
+        The change, and the contact with the adduction turned, and its start; None where that
+        does not succeed.
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
     place[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
-    rotated = probe.pressed(load, knee_pose(place), result, like)
+    begin = WarmStart.after(result) if start is None else start
+    rotated, end = probe.pressed(load, knee_pose(place), begin, like)
     if rotated.status is not ContactStatus.OK:
         return float("nan"), None
-    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step, rotated
+    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step, (rotated, end)
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:

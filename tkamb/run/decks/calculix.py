@@ -67,8 +67,10 @@ class Deck:
         Raises:
             InputError: the material's law or the bearing is not one of CalculiX's here.
         """
-        said = [f"** {line}" for line in self.comments]
-        return "\n".join([*said, *self._mesh(), *self._sets(), *self._solids(), *self._step(), ""])
+        comments = [f"** {line}" for line in self.comments]
+        return "\n".join(
+            [*comments, *self._mesh(), *self._sets(), *self._solids(), *self._step(), ""]
+        )
 
     @property
     def _centre(self) -> int:

@@ -192,10 +192,10 @@ def _course_and_output(root: Element) -> None:
 
 def _filled(parent: Element, tag: str, **values: object) -> Element:
     """Return a new child with one leaf per value."""
-    made = SubElement(parent, tag)
+    element = SubElement(parent, tag)
     for name, value in values.items():
-        SubElement(made, name).text = str(value)
-    return made
+        SubElement(element, name).text = str(value)
+    return element
 
 
 def _members(parent: Element, tag: str, first: int, members: Index) -> None:

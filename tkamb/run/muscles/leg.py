@@ -57,8 +57,8 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
     followers = {coupler.dependent for coupler in leg.model.couplers}
 
     def own(joint: Joint) -> list[str]:
-        there = leg.model.coordinates.values()
-        result = [c for c in there if c.joint == joint.name]
+        coordinates = leg.model.coordinates.values()
+        result = [c for c in coordinates if c.joint == joint.name]
         return [c.name for c in result if not c.locked and c.name not in followers]
 
     below = [joint for joint in leg.model.joints if joint.inboard == leg.ankle.outboard]

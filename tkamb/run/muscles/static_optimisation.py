@@ -100,9 +100,9 @@ class LoadSharing:
     def _quadratic(self) -> tuple[Array, Array, float]:
         """Return reserves and EMG as 1/2 a.H a + g.a + constant."""
         scaled = self.gain / self.reserve[:, None]
-        there = self.offset / self.reserve
-        hessian, gradient = 2 * scaled.T @ scaled, 2 * scaled.T @ there
-        constant = float(there @ there)
+        target = self.offset / self.reserve
+        hessian, gradient = 2 * scaled.T @ scaled, 2 * scaled.T @ target
+        constant = float(target @ target)
         if len(self.spread):
             stiff = 1.0 / self.spread**2
             hessian = hessian + 2 * np.diag(stiff)

@@ -108,8 +108,8 @@ def marker_questions(case: Case) -> Iterator[Question]:
         whose, rms = "the shank's markers", case.tibia.residual
     else:
         return
-    known = rms[np.isfinite(rms)]
-    if len(known) and (middle := float(np.median(known))) > MOVEMENT_LIMITS.max_marker_residual:
+    finite = rms[np.isfinite(rms)]
+    if len(finite) and (middle := float(np.median(finite))) > MOVEMENT_LIMITS.max_marker_residual:
         yield Question(
             f"{whose} lie {middle / MILLIMETRE:.0f} mm (rms) from their places: is markers_mm "
             "another subject's or trial's, or are two of them exchanged?",

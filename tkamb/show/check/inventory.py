@@ -129,8 +129,8 @@ def _ground(case: Case) -> Entry:
     vertical = ground.force[:, 1] / case.body_weight
     loaded = f"foot loaded in {int(np.sum(ground.loaded))} of {len(vertical)} frames"
     place = "at the ankle" if table.applied == "ankle" else "at the centre of pressure"
-    turned = ", signs turned: force on the plate" if table.force == "on the plate" else ""
-    text = f"{_range('vertical', vertical, 'BW', 2)}, {loaded}; applied {place}{turned}"
+    remark = ", signs turned: force on the plate" if table.force == "on the plate" else ""
+    text = f"{_range('vertical', vertical, 'BW', 2)}, {loaded}; applied {place}{remark}"
     return Entry("ground reaction", table.file, text)
 
 
@@ -166,9 +166,9 @@ def _ligaments(mechanics: Mechanics) -> Entry:
         if value > INVENTORY.high_strain
     ]
     text = f"{len(mechanics.ligaments)} bundles: {_listed([b.name for b in mechanics.ligaments])}"
-    known = np.array([v for values in strains.values() for v in values if np.isfinite(v)])
-    if len(known):
-        text += f"; {_range('strain', 100 * known, '%', 1)} at the recorded pose"
+    finite = np.array([v for values in strains.values() for v in values if np.isfinite(v)])
+    if len(finite):
+        text += f"; {_range('strain', 100 * finite, '%', 1)} at the recorded pose"
     return Entry("ligaments", None, text + (f"; over 10 %: {', '.join(torn)}" if torn else ""))
 
 

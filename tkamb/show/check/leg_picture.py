@@ -88,11 +88,11 @@ def shown_frames(case: Case) -> list[int]:
     where one lies near another, the last or the middle one instead.
     """
     count = len(case.motion.time)
-    wanted = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
+    frames = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
     if case.ground is not None:
-        wanted.insert(1, int(np.argmax(np.linalg.norm(case.ground.force, axis=1))))
+        frames.insert(1, int(np.argmax(np.linalg.norm(case.ground.force, axis=1))))
     result: list[int] = []
-    for k in wanted:
+    for k in frames:
         if len(result) < 3 and all(abs(k - other) >= max(count // 5, 1) for other in result):
             result.append(k)
     return sorted(result)
@@ -132,19 +132,19 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, st
 
     Only a ligament's first strand has its name.
     """
-    found: list[tuple[Array, str, str]] = []
+    segments: list[tuple[Array, str, str]] = []
     named: set[str] = set()
     for bundle in mechanics.ligaments:
         poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
         name = bundle.name.removeprefix("generic_").split("_")[0].rstrip("0123456789")
-        found.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
+        segments.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
         named.add(name)
     if mechanics.extensor is not None:
         with suppress(ComputationError):  # a patella that is lost there: the run says so
             quadriceps, ligament = mechanics.extensor.lines.paths(state)
-            found.append((quadriceps.points, QUADRICEPS, ""))
-            found.append((ligament.points, PATELLAR_LIGAMENT, ""))
-    return found
+            segments.append((quadriceps.points, QUADRICEPS, ""))
+            segments.append((ligament.points, PATELLAR_LIGAMENT, ""))
+    return segments
 
 
 @dataclass(frozen=True, eq=False)

@@ -256,8 +256,12 @@ def _shown(value: Any) -> str:
 
 
 def _frames_note(first: Run, run: Run) -> list[str]:
-    lost, count = int(failed(run.results).sum()), len(run.results)
-    notes = [f"{run.label}: {lost} of {count} frames failed and are not compared."] if lost else []
+    failures, count = int(failed(run.results).sum()), len(run.results)
+    notes = (
+        [f"{run.label}: {failures} of {count} frames failed and are not compared."]
+        if failures
+        else []
+    )
     if run is first:
         return notes
     if run.pairing is None:

@@ -111,10 +111,10 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
     colour, dashes = run_colour(number), DASHES[number % len(DASHES)]
     marker = "o" if len(values) == 1 else ""  # a line of one point would not be seen
     axes.plot(x, y, color=colour, linestyle=dashes, gid=f"run-{number}", marker=marker)
-    lost = failed(run.results)
-    height = np.full(int(lost.sum()), COMPARE_FIGURE.failed_row_height * (1 + number))
+    failures = failed(run.results)
+    height = np.full(int(failures.sum()), COMPARE_FIGURE.failed_row_height * (1 + number))
     axes.plot(
-        run.axis.values[lost], height, "x", color=colour, markersize=5,
+        run.axis.values[failures], height, "x", color=colour, markersize=5,
         transform=axes.get_xaxis_transform(), gid=f"failed-{number}",
     )  # fmt: skip
 
@@ -125,11 +125,11 @@ def shown_frame(comparison: Comparison) -> int:
     0 where no frame has a force.
     """
     force = comparison.runs[0].results["force_total_BW"]
-    known = np.isfinite(force)
-    if not known.any():
+    finite = np.isfinite(force)
+    if not finite.any():
         return 0
     maps = np.sum([_mapped(run, len(force)) for run in comparison.runs], axis=0)
-    return int(np.nanargmax(np.where(maps == maps[known].max(), force, np.nan)))
+    return int(np.nanargmax(np.where(maps == maps[finite].max(), force, np.nan)))
 
 
 def _mapped(run: Run, frames: int) -> Index:

@@ -103,7 +103,7 @@ def _plots(comparison: Comparison) -> list[dict[str, str]]:
     return result
 
 
-def _rows(comparison: Comparison, found: Sequence[Difference]) -> list[list[str]]:
+def _rows(comparison: Comparison, differences: Sequence[Difference]) -> list[list[str]]:
     unit = UNITS[comparison.kind]
     return [
         [
@@ -116,7 +116,7 @@ def _rows(comparison: Comparison, found: Sequence[Difference]) -> list[list[str]
             f"{one.mean:+.4g}" if one.mean else "0",
             str(one.frames),
         ]
-        for one in found
+        for one in differences
     ]
 
 
@@ -124,10 +124,10 @@ def peak_lines(comparison: Comparison) -> list[str]:
     """Return each run's peak total, medial and lateral force with its bands, a line per run."""
     lines = []
     for run in comparison.runs:
-        found = peaks_of(run.results.summary)
-        if found:
-            words = ", ".join(f"{name} {peak_words(one)}" for name, one in found.items())
-            lines.append(f"{run.label}: peak {words} BW, {peak_legend(found)}")
+        peaks = peaks_of(run.results.summary)
+        if peaks:
+            words = ", ".join(f"{name} {peak_words(one)}" for name, one in peaks.items())
+            lines.append(f"{run.label}: peak {words} BW, {peak_legend(peaks)}")
     return lines
 
 

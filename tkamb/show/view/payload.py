@@ -130,10 +130,10 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
     return max((one.map.peak for one in drawings if one.map), default=0.0)
 
 
-def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
+def packed_map(pressure_map: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
-    return block.compress({"map": _map(block, found, peak), "words": words})
+    return block.compress({"map": _map(block, pressure_map, peak), "words": words})
 
 
 def packed_lattice(lines: Array) -> bytes:
@@ -215,23 +215,23 @@ def _marker(block: Block, root: str, marker: Marker) -> dict[str, Any]:
     }
 
 
-def _map(block: Block, found: PressureMap, peak: float) -> dict[str, Any]:
+def _map(block: Block, pressure_map: PressureMap, peak: float) -> dict[str, Any]:
     return {
-        "count": len(found.points),
-        "points": block.put(found.points, "float32"),
-        "triangles": block.put(found.triangles, "uint32"),
-        "levels": block.put(map_levels(found, peak), "int16"),
+        "count": len(pressure_map.points),
+        "points": block.put(pressure_map.points, "float32"),
+        "triangles": block.put(pressure_map.triangles, "uint32"),
+        "levels": block.put(map_levels(pressure_map, peak), "int16"),
     }
 
 
-def map_levels(found: PressureMap, peak: float) -> NDArray[np.int16]:
+def map_levels(pressure_map: PressureMap, peak: float) -> NDArray[np.int16]:
     """Return `pressure_levels` (f, n) of the map as integers: a loaded point's is at least 1.
 
     Args:
-        found: the map.
+        pressure_map: the map.
         peak: MPa, top of the scale; a higher pressure has the top level.
     """
-    level = pressure_levels(found.pressure, found.gap, found.triangles, peak)
+    level = pressure_levels(pressure_map.pressure, pressure_map.gap, pressure_map.triangles, peak)
     whole = np.maximum(np.round(np.abs(level) * VIEW_PAYLOAD.pressure_levels), 1.0)
     return np.where(level > 0, whole, -whole).astype(np.int16)
 
@@ -256,10 +256,10 @@ def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[An
         side=FRONT,
         vertexColors=colours is not None,
     )
-    made = [SetObject(_Mesh(shape, colours), material, _node(path))]
+    commands = [SetObject(_Mesh(shape, colours), material, _node(path))]
     if len(solid.poses) == 1:
-        made.append(SetTransform(solid.poses[0], _node(path)))
-    return made
+        commands.append(SetTransform(solid.poses[0], _node(path)))
+    return commands
 
 
 def _node_name(root: str, layer: str, name: str) -> str:

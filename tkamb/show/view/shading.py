@@ -72,10 +72,10 @@ def decimate(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
         return surface, 0.0
     points, faces = surface.vertices / MILLIMETRE, surface.faces.astype(np.int32)
     for aggressiveness in AGGRESSIVENESS:
-        fewer, kept = simplify(points, faces, target_count=most_triangles, agg=aggressiveness)
-        if len(kept) <= most_triangles:
+        fewer, simplified = simplify(points, faces, target_count=most_triangles, agg=aggressiveness)
+        if len(simplified) <= most_triangles:
             break
-    result = Surface(fewer.astype(float) * MILLIMETRE, kept.astype(np.int64), surface.name)
+    result = Surface(fewer.astype(float) * MILLIMETRE, simplified.astype(np.int64), surface.name)
     return result, _distance(result, surface)
 
 

@@ -143,8 +143,8 @@ def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
     depth = read_vtp_values(path, "wear_depth_mm")
     if side == "left":
         points, faces = points @ MIRROR, faces[:, ::-1]
-    worn = Surface(points, faces, "worn insert")
-    return (Solid(worn.name, "worn insert", worn, INSERT, 1.0, np.eye(4)[None], depth),)
+    surface = Surface(points, faces, "worn insert")
+    return (Solid(surface.name, "worn insert", surface, INSERT, 1.0, np.eye(4)[None], depth),)
 
 
 def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
@@ -188,9 +188,9 @@ def _patella(case: Case) -> Surface:
     ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
     top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
     radii = np.array([PATELLA_DEPTH, 0.5 * float(np.linalg.norm(top - bottom)), PATELLA_WIDTH])
-    placed = _turned([0.0, 1.0, 0.0], top - bottom)
-    placed[:3, 3] = 0.5 * (top + bottom)
-    return hull(sphere_points() * radii, "patella").moved(placed)
+    rotation = _turned([0.0, 1.0, 0.0], top - bottom)
+    rotation[:3, 3] = 0.5 * (top + bottom)
+    return hull(sphere_points() * radii, "patella").moved(rotation)
 
 
 def _turned(axis: ArrayLike, towards: Array) -> Array:

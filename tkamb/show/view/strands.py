@@ -63,8 +63,8 @@ def ligament_strands(
         return (), 0.0
     links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
     poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
-    lost = failed(results)
-    strains = [np.where(lost, np.nan, one.strain(one.length(poses))) for one in bundles]
+    failures = failed(results)
+    strains = [np.where(failures, np.nan, one.strain(one.length(poses))) for one in bundles]
     limit = float(np.nanmax(strains, initial=0.01))
     radius = BUNDLE * (0.5 if len(bundles) > VIEW_STRAND.many_bundles else 1.0)
     strands = []
@@ -169,10 +169,10 @@ def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]
     for side in SIDE_COLOURS:
         x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))
         points = np.column_stack([x, np.full(len(x), top), z])
-        known = np.isfinite(points).all(axis=1)
-        points[~known] = np.nan
-        down, _ = rays.first(points[known], np.array([0.0, -1.0, 0.0]))
-        points[known, 1] -= np.where(np.isfinite(down), down, np.nan)
+        finite = np.isfinite(points).all(axis=1)
+        points[~finite] = np.nan
+        down, _ = rays.first(points[finite], np.array([0.0, -1.0, 0.0]))
+        points[finite, 1] -= np.where(np.isfinite(down), down, np.nan)
         result[side] = points
     return result
 

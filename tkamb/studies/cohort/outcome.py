@@ -147,7 +147,7 @@ class CohortWorker:
         return result if self._wear is None else self._worn(run, results, result, self._wear)
 
     def _worn(
-        self, run: CohortRun, results: Results, found: Outcome, wear: CohortWearTable
+        self, run: CohortRun, results: Results, outcome: Outcome, wear: CohortWearTable
     ) -> Outcome:
         """Return an outcome with the wear of its insert, or why there is none."""
         from tkamb.studies.wear.run import wear_of_results
@@ -162,7 +162,7 @@ class CohortWorker:
                 frames=wear.frames_per_cycle,
             ).as_dict()
         except TkambError as error:
-            return replace(found, wear_problem=str(error))
+            return replace(outcome, wear_problem=str(error))
         low, high = report["volume_mm3_per_Mc_range"]
         values = {
             "volume_mm3_per_Mc": report["volume_mm3_per_Mc"],
@@ -173,7 +173,7 @@ class CohortWorker:
         }
         for one in report["laws_side_by_side"]:
             values[f"first_{one['law']}_mm3_per_Mc"] = one["first_volume_mm3_per_Mc"]
-        return replace(found, wear={k: v for k, v in values.items() if v is not None})
+        return replace(outcome, wear={k: v for k, v in values.items() if v is not None})
 
 
 def chosen_map(results: Results, flexion: float | None) -> PressureMap | None:

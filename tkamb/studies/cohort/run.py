@@ -99,25 +99,25 @@ def run_cohort(
     with claimed_directory(folder, force, "cohort"), _parts(directory, part, resume) as parts:
         shards = Shards(folder, identity, resume)
         others = [Shards(one, identity, True) for one in parts]
-        wanted = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
-        done = _kept([shards, *others], wanted)
-        left = [(n, cohort.runs[n]) for n in wanted if n not in done]
+        numbers = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
+        outcomes = _kept([shards, *others], numbers)
+        remaining = [(n, cohort.runs[n]) for n in numbers if n not in outcomes]
         task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg, cohort.table.wear))
-        answers = crew.answers(task, left)
+        answers = crew.answers(task, remaining)
         try:
             with interrupt_as_such():
-                for number, outcome in progress(answers, len(left)):
+                for number, outcome in progress(answers, len(remaining)):
                     shards.put(number, outcome.shard())
-                    done[number] = outcome
+                    outcomes[number] = outcome
         except KeyboardInterrupt:
-            kept = f"{len(done)} of {len(wanted)} runs are kept; go on with --resume"
-            raise KeyboardInterrupt(kept) from None
-        done = {number: done[number] for number in wanted}
+            words = f"{len(outcomes)} of {len(numbers)} runs are kept; go on with --resume"
+            raise KeyboardInterrupt(words) from None
+        outcomes = {number: outcomes[number] for number in numbers}
         if part is None:
-            write_cohort(cohort, done, identity, folder)
+            write_cohort(cohort, outcomes, identity, folder)
             for one in (folder, *parts):
                 remove_shards(one)
-    return done
+    return outcomes
 
 
 def _identity(cohort: Cohort) -> dict[str, Any]:
@@ -146,11 +146,11 @@ def _holds_parts_alone(directory: Path) -> bool:
     return bool(entries) and named and all(is_ours(entry) for entry in entries)
 
 
-def _kept(places: list[Shards], wanted: list[int]) -> dict[int, Outcome]:
+def _kept(places: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
     """Return the runs that are finished already."""
     result: dict[int, Outcome] = {}
     for shards in places:
-        for number in wanted if shards.resumed else ():
+        for number in numbers if shards.resumed else ():
             shard = shards.get(number)
             if shard is not None:
                 result[number] = Outcome.of(shard)

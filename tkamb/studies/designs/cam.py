@@ -118,11 +118,11 @@ def _between(vertices: Array, first: Ids, second: Ids) -> Ids:
     triangles = []
     while i < len(first) or j < len(second):
         if i < len(first) and (j == len(second) or ahead[0][i] <= ahead[1][j]):
-            here, after = first[i], first[(i + 1) % len(first)]
-            triangles.append((here, after, second[j % len(second)]))
+            point, after = first[i], first[(i + 1) % len(first)]
+            triangles.append((point, after, second[j % len(second)]))
             i += 1
         else:
-            here, after = second[j], second[(j + 1) % len(second)]
-            triangles.append((first[i % len(first)], after, here))
+            point, after = second[j], second[(j + 1) % len(second)]
+            triangles.append((first[i % len(first)], after, point))
             j += 1
     return np.array(triangles, np.int64)

@@ -40,12 +40,12 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN, hidden below
-        found = np.nanpercentile(values, list(PERCENTILES.values()), axis=0)
+        limits = np.nanpercentile(values, list(PERCENTILES.values()), axis=0)
     hidden = np.isfinite(values).sum(axis=0) < STATISTICS_LIMITS.min_samples
     if failed is not None:
         hidden = hidden | (failed.mean(axis=0) > STATISTICS_LIMITS.max_failed_share)
-    found[:, hidden] = np.nan
-    return dict(zip(PERCENTILES, found, strict=True))
+    limits[:, hidden] = np.nan
+    return dict(zip(PERCENTILES, limits, strict=True))
 
 
 def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, Any] | None:
@@ -65,11 +65,11 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
         return None
     frame = int(np.nanargmax(nominal))
     there, level = values[:, frame], float(nominal[frame])
-    known = there[np.isfinite(there)]
+    finite = there[np.isfinite(there)]
     bands = percentiles(values[:, frame : frame + 1], failed[:, frame : frame + 1])
     low, middle, high = (float(bands[name][0]) for name in ("p05", "p50", "p95"))
-    below = (known < level).sum() + 0.5 * (known == level).sum()
-    found = {
+    below = (finite < level).sum() + 0.5 * (finite == level).sum()
+    limits = {
         "frame": frame,
         "nominal": level,
         "samples": len(there),
@@ -77,9 +77,9 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
         "median": middle if np.isfinite(middle) else None,
         "p05": low if np.isfinite(low) else None,
         "p95": high if np.isfinite(high) else None,
-        "nominal_percentile": 100.0 * float(below) / len(known) if len(known) else None,
+        "nominal_percentile": 100.0 * float(below) / len(finite) if len(finite) else None,
     }
-    return found | {"words": _peak_words(found)}
+    return limits | {"words": _peak_words(limits)}
 
 
 def _peak_words(peak: Mapping[str, Any]) -> str:
@@ -113,8 +113,8 @@ def band_columns(
             force = values[:, list(names).index(f"{side}_force_N")]
             columns[f"{side}_unloaded_share"] = (force == 0.0).sum(axis=0) / solved
     for index, name in enumerate(names):
-        for ending, found in percentiles(values[:, index], failed).items():
-            columns[f"{name}_{ending}"] = found
+        for ending, limits in percentiles(values[:, index], failed).items():
+            columns[f"{name}_{ending}"] = limits
     return columns
 
 
@@ -131,14 +131,14 @@ def discrepancy_columns(
         summary: of the run.
         body_weight: N.
     """
-    known = discrepancy_of(summary)
+    discrepancy = discrepancy_of(summary)
     columns: dict[str, Array] = {}
     for index, name in enumerate(names):
-        found = known.get(COLUMNS.get(name, ""))
-        if found is None:
+        spread = discrepancy.get(COLUMNS.get(name, ""))
+        if spread is None:
             continue
         unit = 1.0 if name.endswith("_BW") else body_weight
-        ends = band_with_discrepancy(values[:, index], found, unit)
+        ends = band_with_discrepancy(values[:, index], spread, unit)
         ends[:, np.isnan(percentiles(values[:, index])["p50"])] = np.nan
         columns |= {f"{name}_discrepancy_{end}": one for end, one in zip(ENDS, ends, strict=True)}
     return columns
@@ -162,7 +162,7 @@ def peak_bands(
         Force -> frame, nominal, median, p05, p95, discrepancy_p05, discrepancy_p95, of which
         those are None that have no band.
     """
-    found: dict[str, dict[str, Any]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for force, name in compared.items():
         if not np.isfinite(columns[name]).any():
             continue
@@ -172,10 +172,10 @@ def peak_bands(
         ends |= {f"discrepancy_{end}": f"discrepancy_{end}" for end in ENDS}
         for key, ending in ends.items():
             band = bands.get(f"{name}_{ending}")
-            known = band is not None and np.isfinite(band[frame])
-            row[key] = float(band[frame]) / body_weight if known and band is not None else None
-        found[force] = row
-    return found
+            has_band = band is not None and np.isfinite(band[frame])
+            row[key] = float(band[frame]) / body_weight if has_band and band is not None else None
+        rows[force] = row
+    return rows
 
 
 def causes(problems: np.ndarray) -> dict[str, float]:
@@ -204,18 +204,18 @@ def measured_inside(
         Force -> frames that have both, and the share of them inside, NaN of none: in the band of
         inputs, and, where there is one, in that of inputs and discrepancy.
     """
-    found: dict[str, dict[str, Any]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for name, one in compared.items():
         measured, column = columns[f"measured_{name}_N"], one["predicted"]
         missing = np.full(len(measured), np.nan)
         low, high = (bands.get(f"{column}_{end}", missing) for end in ENDS)
         frames, share = coverage(low, high, measured)
-        found[name] = {"frames": frames, "share": share}
+        rows[name] = {"frames": frames, "share": share}
         low, high = (bands.get(f"{column}_discrepancy_{end}", missing) for end in ENDS)
         frames, share = coverage(low, high, measured)
         if frames:
-            found[name]["share_with_discrepancy"] = share
-    return found
+            rows[name]["share_with_discrepancy"] = share
+    return rows
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def influences(
 
     Reference: Li et al., J Phys Chem A 114:6022 (2010), doi:10.1021/jp9096919.
     """
-    found: list[Influence] = []
+    influences: list[Influence] = []
     for index, result in enumerate(results):
         of_frames = [_regression(values[:, index, k], errors[:, k]) for k in range(errors.shape[1])]
         frames = [(k, *one) for k, one in enumerate(of_frames) if one is not None]
@@ -275,16 +275,16 @@ def influences(
             for name, share, slope in zip(inputs, explained, slopes, strict=True)
         ]
         rows.sort(key=lambda one: -one.share)
-        found += [*rows, Influence(result, "rest", float(1.0 - explained.sum()), float("nan"))]
-    return found
+        influences += [*rows, Influence(result, "rest", float(1.0 - explained.sum()), float("nan"))]
+    return influences
 
 
 def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
     """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
-    there, count = np.isfinite(y), errors.shape[1]
-    if there.sum() < STATISTICS_LIMITS.min_samples:
+    finite, count = np.isfinite(y), errors.shape[1]
+    if finite.sum() < STATISTICS_LIMITS.min_samples:
         return None
-    y, x = y[there], errors[there]
+    y, x = y[finite], errors[finite]
     variance = float(y.var())
     if len(y) < SAMPLES_PER_INPUT * count:
         return _one_by_one(y, x)

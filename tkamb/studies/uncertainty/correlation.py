@@ -61,8 +61,8 @@ def _cholesky(matrix: Array) -> Array:
     """Return L of a positive semi-definite matrix; a column of zeros where nothing is left."""
     root = np.zeros_like(matrix)
     for k in range(len(matrix)):
-        left = matrix[k, k] - root[k, :k] @ root[k, :k]
-        if left > ROUNDING:
-            root[k, k] = np.sqrt(left)
+        rest = matrix[k, k] - root[k, :k] @ root[k, :k]
+        if rest > ROUNDING:
+            root[k, k] = np.sqrt(rest)
             root[k + 1 :, k] = (matrix[k + 1 :, k] - root[k + 1 :, :k] @ root[k, :k]) / root[k, k]
     return root

@@ -198,31 +198,31 @@ class _Job:
         """Compute the samples that are not there yet and return all with their bands."""
         names = banded_names(self.nominal)
         count = len(self.points)
-        done = _kept(shards, count)
-        left = [n for n in range(count) if n not in done]
-        new = self.team.answers([(n, (self.points[n], names)) for n in left])
+        samples = _kept(shards, count)
+        remaining = [n for n in range(count) if n not in samples]
+        new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
         try:
             with interrupt_as_such():
-                for number, sample in self.progress(new, len(left)):
-                    done[number] = sample
+                for number, sample in self.progress(new, len(remaining)):
+                    samples[number] = sample
                     if shards is not None:
                         shards.put(number, Shard({}, dict(vars(sample))))
         except KeyboardInterrupt:
-            if shards is None or not done:
+            if shards is None or not samples:
                 raise
-            kept = f"{len(done)} of {count} samples are kept; go on with --resume"
-            raise KeyboardInterrupt(kept) from None
-        return self._found(names, [done[n] for n in range(count)])
+            words = f"{len(samples)} of {count} samples are kept; go on with --resume"
+            raise KeyboardInterrupt(words) from None
+        return self._found(names, [samples[n] for n in range(count)])
 
     def _found(self, names: list[str], samples: list[Sample]) -> Uncertainty:
         wanted = [name for name in TORNADO_RESULTS if name in names]
         rows = [names.index(name) for name in wanted]
         input_names = [one.name for one in self.inputs]
-        found: list[SobolIndex] = []
+        indices: list[SobolIndex] = []
         if self.crossed:
             every = np.array([one.values[rows] for one in samples])
             seed = uncertainty_of(self.case).seed
-            found = sobol_indices(wanted, input_names, every, self.crossed, seed)
+            indices = sobol_indices(wanted, input_names, every, self.crossed, seed)
         plain = samples[: 2 * self.crossed or len(samples)]  # those that are independent
         values = np.array([one.values for one in plain])
         problems = np.array([one.problems for one in plain])
@@ -243,7 +243,7 @@ class _Job:
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside
         results = replace(self.nominal, bands=bands)
-        return Uncertainty(results, bands, tornado, names, self.inputs, samples, found)
+        return Uncertainty(results, bands, tornado, names, self.inputs, samples, indices)
 
     def _summary(self, problems: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
         failed = problems != ""
@@ -262,10 +262,10 @@ class _Job:
 
 def shares_of_variance(tornado: Sequence[Influence]) -> dict[str, dict[str, float]]:
     """Return result -> input -> its share of the result's variance, largest first."""
-    found: dict[str, dict[str, float]] = {}
+    rows: dict[str, dict[str, float]] = {}
     for one in tornado:
-        found.setdefault(one.result, {})[one.name] = one.share
-    return found
+        rows.setdefault(one.result, {})[one.name] = one.share
+    return rows
 
 
 def banded_names(results: Results) -> list[str]:
@@ -282,9 +282,9 @@ def banded_names(results: Results) -> list[str]:
 
 def _kept(shards: Shards | None, count: int) -> dict[int, Sample]:
     """Return the samples that an earlier run left."""
-    found: dict[int, Sample] = {}
+    samples: dict[int, Sample] = {}
     for number in range(count) if shards is not None and shards.resumed else ():
         shard = shards.get(number) if shards is not None else None
         if shard is not None and shard.contact is not None:
-            found[number] = Sample(**shard.contact)
-    return found
+            samples[number] = Sample(**shard.contact)
+    return samples

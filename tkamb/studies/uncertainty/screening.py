@@ -82,12 +82,12 @@ def screen(
     answers = crew.answers(task, points)
     samples: dict[int, Sample] = dict(progress(answers, len(points)))
     values = np.array([samples[n].values for n in range(len(points))])
-    found: list[Screened] = []
+    screened: list[Screened] = []
     for m, result in enumerate(SCREENED, start=1):
         if np.isfinite(values[0, m]).any():
             frame = int(np.nanargmax(values[0, m]))
-            found += _of_result(result, values[:, m, frame], values[0, 0, frame], inputs)
-    return found
+            screened += _of_result(result, values[:, m, frame], values[0, 0, frame], inputs)
+    return screened
 
 
 def _of_result(

@@ -94,15 +94,15 @@ class WearBands:
 
     def questions(self) -> list[str]:
         """Return what a reader must know before using the bands."""
-        asked = []
+        questions = []
         if self.failed:
-            asked.append(f"{self.failed} of {self.samples} samples have no contact: in no band")
+            questions.append(f"{self.failed} of {self.samples} samples have no contact: in no band")
         if self.ended:
-            asked.append(
+            questions.append(
                 f"{self.ended} of {self.samples} samples wore through or lost their contact: from "
                 "there on the bands are those of the others"
             )
-        return asked
+        return questions
 
 
 @dataclass(frozen=True)
@@ -160,14 +160,14 @@ class Sampling:
         """
         count = self.samples
         normal = normal_samples("lhs", count, len(self.inputs), self.seed) @ self.root.T
-        kept = {n: shards.get(n) for n in range(count)} if shards and shards.resumed else {}
-        done: dict[int, Rows] = {n: shard.contact or {} for n, shard in kept.items() if shard}
-        left = [(n, normal[n]) for n in range(count) if n not in done]
+        shard_of = {n: shards.get(n) for n in range(count)} if shards and shards.resumed else {}
+        done: dict[int, Rows] = {n: shard.contact or {} for n, shard in shard_of.items() if shard}
+        remaining = [(n, normal[n]) for n in range(count) if n not in done]
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
         try:
             with interrupt_as_such():
                 for number, sample in progress(
-                    (crew or PoolOptions()).answers(task, left), len(left)
+                    (crew or PoolOptions()).answers(task, remaining), len(remaining)
                 ):
                     done[number] = sample
                     if shards is not None:

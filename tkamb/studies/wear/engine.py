@@ -80,22 +80,22 @@ class ContactEngine:
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
         state = self.model.prepare(pair)
         pressure = np.zeros((len(motion), len(state.points)))
-        poses, failed, guess = motion.poses.copy(), {}, None
+        poses, failed, start = motion.poses.copy(), {}, None
         drive = motion.drive
         resting = None if drive is None else RestingPoses(self.model, state, drive)
         for k, (pose, load) in enumerate(zip(motion.poses, motion.load, strict=True)):
             if load <= 0:
                 continue
             if resting is not None:
-                pose, why = resting.at(k, float(load), guess)
+                pose, why = resting.at(k, float(load), start)
                 if why:
                     failed[k] = why
                     continue
-            result = self.model.press(state, float(load), pose, guess)
+            result, end = self.model.press_from(state, float(load), pose, start)
             if result.status is not ContactStatus.OK:
                 failed[k] = "; ".join(result.flags) or result.status.value
                 continue
-            pressure[k], poses[k], guess = result.pressure, result.pose, result
+            pressure[k], poses[k], start = result.pressure, result.pose, end
         return CycleMaps(state.points, state.triangles, pressure, poses, failed)
 
     def dwell(self, insert: Surface, rotation: Array) -> tuple[float, float]:

@@ -165,8 +165,8 @@ class PressureCrossShear(WearLaw):
             [np.clip(v, a[0], a[-1]) for v, a in zip((shear, history.pressure), axes, strict=True)],
             axis=-1,
         )
-        worn = (table(places) * history.work).sum(axis=0)
-        return np.asarray(history.passes * PER_NEWTON_METRE * worn)
+        depth = (table(places) * history.work).sum(axis=0)
+        return np.asarray(history.passes * PER_NEWTON_METRE * depth)
 
 
 @dataclass(frozen=True)

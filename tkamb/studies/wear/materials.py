@@ -98,11 +98,11 @@ def wear_material(name: str | Path) -> WearMaterial:
     Raises:
         InputError: no such name or file, an unknown key, or a bad value.
     """
-    known = _built_in()
-    if str(name) in known:
-        return _material(str(name), known[str(name)], f"wear material '{name}'")
+    built_in = _built_in()
+    if str(name) in built_in:
+        return _material(str(name), built_in[str(name)], f"wear material '{name}'")
     if Path(name).suffix != ".toml":
-        hint = f"{names_near(str(name), known)}; or give a material file (.toml)"
+        hint = f"{names_near(str(name), built_in)}; or give a material file (.toml)"
         raise InputError(f"no wear material '{name}'", hint=hint)
     content = read_toml(name, what="wear material")
     return _material(str(content.pop("name", Path(name).stem)), content, name)
@@ -150,27 +150,27 @@ def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial
 
 
 def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]:
-    given = content.get("factor_range")
-    if given is None:
+    limits = content.get("factor_range")
+    if limits is None:
         return TWO_EITHER_WAY
     sound = (
-        isinstance(given, list)
-        and len(given) == 2
-        and all(isinstance(one, int | float) and math.isfinite(one) for one in given)
-        and 0 < given[0] <= 1 <= given[1]
+        isinstance(limits, list)
+        and len(limits) == 2
+        and all(isinstance(one, int | float) and math.isfinite(one) for one in limits)
+        and 0 < limits[0] <= 1 <= limits[1]
     )
     if not sound:
         hint = "give two factors, at most 1 and at least 1, e.g. [0.5, 2.0]"
-        raise InputError(f"cannot be {given}", f"{where}: factor_range", hint)
+        raise InputError(f"cannot be {limits}", f"{where}: factor_range", hint)
     if "range_source" not in content:
         raise InputError("'range_source' is missing", where, "say where the range comes from")
-    return float(given[0]), float(given[1])
+    return float(limits[0]), float(limits[1])
 
 
-def _sources(given: Any, where: object) -> tuple[str, ...]:
-    if not (isinstance(given, list) and given and all(isinstance(line, str) for line in given)):
+def _sources(value: Any, where: object) -> tuple[str, ...]:
+    if not (isinstance(value, list) and value and all(isinstance(line, str) for line in value)):
         raise InputError("sources is no list of texts", where, "say where each number comes from")
-    return tuple(given)
+    return tuple(value)
 
 
 def _creep(table: Any, where: object) -> LogarithmicCreep | None:

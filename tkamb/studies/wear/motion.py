@@ -121,11 +121,11 @@ class CycleMotion:
             InputError: fewer than two frames are left, or there is no such closing.
         """
         check_closing(closing)
-        known = np.isfinite(load) & np.isfinite(poses).all(axis=(1, 2))
+        finite = np.isfinite(load) & np.isfinite(poses).all(axis=(1, 2))
         notes, questions = [], []
-        if lost := int((~known).sum()):
-            notes.append(f"{lost} of {len(known)} frames failed and are left out of the cycle")
-        time, poses, load = time[known], poses[known], load[known]
+        if missing := int((~finite).sum()):
+            notes.append(f"{missing} of {len(finite)} frames failed and are left out of the cycle")
+        time, poses, load = time[finite], poses[finite], load[finite]
         if len(time) < 2:
             raise InputError("fewer than two frames have a contact", "wear", "see the run's status")
         steps, span = np.diff(time), float(time[-1] - time[0])
@@ -159,7 +159,7 @@ class CycleMotion:
         longest = max(distance(a, b) for a, b in pairwise(poses))
         pieces = 1 if longest == 0 else max(1, int(np.ceil(gap / longest - 1e-9)))
         way = _way(poses[-1], poses[0], pieces)
-        carried = np.linspace(load[-1], load[0], pieces + 1)
+        loads = np.linspace(load[-1], load[0], pieces + 1)
         interval = span / (len(time) - 1) if interval is None else interval
         if path is not None:
             places = len(time) - 1 + np.arange(1, pieces + 1)
@@ -170,7 +170,7 @@ class CycleMotion:
         )
         return cls(
             np.concatenate([poses, way[1:]]),
-            np.concatenate([load, carried[1:]]),
+            np.concatenate([load, loads[1:]]),
             span + interval,
             1,
             tuple(notes),

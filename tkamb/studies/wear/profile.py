@@ -136,15 +136,15 @@ def read_profile(path: str | Path, frames: int) -> Profile:
             does not close, or force control without axial force.
     """
     table = read_table(Path(path), "csv")
-    known = (PERCENT, LOAD, *COORDINATES, *FORCES)
+    names = (PERCENT, LOAD, *COORDINATES, *FORCES)
     for name in table.columns:
-        if name not in known:
-            raise InputError(f"unknown column '{name}'", path, f"there are: {', '.join(known)}")
+        if name not in names:
+            raise InputError(f"unknown column '{name}'", path, f"there are: {', '.join(names)}")
     free = _free(table)
     percent = _percent(table)
     columns = {
         name: table.complete_column(name)
-        for name in known[1:]
+        for name in names[1:]
         if name in table.columns or name in (LOAD, "flexion_deg")
     }
     for name, values in columns.items():
@@ -182,12 +182,12 @@ def _divided(rows: Array, longest: float) -> Array:
 
 def _free(table: Table) -> tuple[int, ...]:
     """Return the indices of the coordinates that a force or torque is given for."""
-    given = [name for name in FORCES if name in table.columns]
-    for name in given:
+    forces = [name for name in FORCES if name in table.columns]
+    for name in forces:
         if FORCES[name] in table.columns:
             what = f"both '{name}' and '{FORCES[name]}' are given"
             raise InputError(what, table.path, "prescribe the position or apply the force")
-    return tuple(COORDINATES[FORCES[name]][1] for name in given)
+    return tuple(COORDINATES[FORCES[name]][1] for name in forces)
 
 
 def _percent(table: Table) -> Array:

@@ -184,20 +184,20 @@ class WearReport:
 
     def questions(self) -> list[str]:
         """Return what a reader must know before using the numbers."""
-        asked = [] if not self.material.caution else [self.material.caution]
-        asked += self.case.motion.questions
+        questions = [] if not self.material.caution else [self.material.caution]
+        questions += self.case.motion.questions
         if self.first.frames_change > WEAR_REPORT.max_frame_change:
-            asked.append(
+            questions.append(
                 f"half as many frames per cycle move its volume by {self.first.frames_change:.1%}: "
                 "take more with --frames-per-cycle"
             )
         if self.state.map_error > WEAR_REPORT.max_map_correction:
-            asked.append(
+            questions.append(
                 f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
                 "take a finer resolution"
             )
         if self.state.unsettled:
-            asked.append(
+            questions.append(
                 f"in {self.state.unsettled} blocks the pressure moved away from what it wore, "
                 "however short they were: take more --updates"
             )
@@ -207,24 +207,24 @@ class WearReport:
             <= self.rate
             <= high * WEAR_REPORT.max_published_ratio
         ):
-            asked.append(
+            questions.append(
                 f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
                 f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"
             )
         most = max(row.get("failed_rows", 0.0) for row in self.state.rows)
         if most:
             why = next(iter(self.last.failed.values()), "in blocks before the last")
-            asked.append(
+            questions.append(
                 f"up to {most:.0f} of {len(self.case.motion)} rows of the profile failed and are "
                 f"left out of the cycle: {why}"
             )
         if self.setup.engine.bearing == "mobile":
-            asked.append("the backside of a mobile bearing wears too and is not modelled")
+            questions.append("the backside of a mobile bearing wears too and is not modelled")
         if self.bands is not None:
-            asked += self.bands.questions()
+            questions += self.bands.questions()
         if self.case.creep is None:
-            asked.append("creep is not modelled: the material gives no [creep]")
-        return asked
+            questions.append("creep is not modelled: the material gives no [creep]")
+        return questions
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""

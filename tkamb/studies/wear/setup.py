@@ -130,17 +130,17 @@ def wear_setup(
             preset = preset_of_run(summary)
             path, of_run = _scene_of(summary, path), overrides_of_run(summary)
         scene_path = path
-        given = load_scene(path, of_run | given_keys, preset)
-        case = load_case(_with_contact(given, contact, resolution_mm, path))
-        hashes = _hashes(case, given)
+        scene = load_scene(path, of_run | given_keys, preset)
+        case = load_case(_with_contact(scene, contact, resolution_mm, path))
+        hashes = _hashes(case, scene)
     check(_wear_table(case.scene), scene_path)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
     assert table is not None and case.femoral is not None and case.insert is not None
     _refuse_post(case)
     engine = _engine(case, table)
     if simulator is not None:
-        held = None if springs is None else read_springs(springs)
-        motion = _of_profile(read_profile(simulator, frames), held, engine, case, period)
+        spring_table = None if springs is None else read_springs(springs)
+        motion = _of_profile(read_profile(simulator, frames), spring_table, engine, case, period)
     elif motion is None:
         motion = _of_scene(case.scene, path, frames, progress)
     return WearSetup(
@@ -207,9 +207,9 @@ def _wear_table(scene: Scene) -> WearTable:
     return scene.wear or WearTable()
 
 
-def _hashes(case: Case, given: Scene) -> tuple[str, ...]:
+def _hashes(case: Case, scene: Scene) -> tuple[str, ...]:
     """Return the hashes that a run of the scene has: as given, and with the contact asked for."""
-    scenes = (given, case.scene)
+    scenes = (scene, case.scene)
     return tuple(dict.fromkeys(scene_hash(replace(case, scene=one)) for one in scenes))
 
 
@@ -243,8 +243,8 @@ def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleM
     track = _Track(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
     contact = scene.contact
     assert contact is not None
-    moved = contact.released or contact.adjust  # other poses than the recorded ones
-    whole = None if moved else (recorded, knee_pose(case.motion.coordinates))
+    changed = contact.released or contact.adjust  # other poses than the recorded ones
+    whole = None if changed else (recorded, knee_pose(case.motion.coordinates))
     return _cycle_of(track, range(len(track.time)), scene, recorded, whole)
 
 

@@ -201,11 +201,11 @@ def simulate_wear(
         step = min(state.step, cycles - state.cycles)
         tried = _worn(case, state, now, step)
         after = _cycle(case, tried)
-        lost = isinstance(after, str)
+        failed = isinstance(after, str)
         change = math.inf if isinstance(after, str) else now.change_to(after)
         shorter = step / 2 >= cycles / updates / WEAR_SIMULATION.max_block_division
         if shorter and (
-            lost
+            failed
             or (change > most_change and not before <= change * WEAR_SIMULATION.min_improvement)
         ):
             state, before = replace(state, step=step / 2), change
@@ -301,27 +301,27 @@ def _rows(maps: CycleMaps, motion: CycleMotion) -> list[int] | str:
     that is left. Frames of a prescribed motion have all to be there.
     """
     every = range(len(motion))
-    known = [k for k in every if k not in maps.failed]
+    good = [k for k in every if k not in maps.failed]
     if not maps.failed:
-        return known
-    if motion.drive is None or len(known) < WEAR_SIMULATION.min_row_share * len(motion):
+        return good
+    if motion.drive is None or len(good) < WEAR_SIMULATION.min_row_share * len(motion):
         frame, why = next(iter(maps.failed.items()))
-        lost = f"no contact in {len(maps.failed)} of {len(motion)} frames"
-        return f"{lost}, the first of them {frame}: {why}"
-    ends = known[0] == every[0] and known[-1] == every[-1]
-    return known if ends else [*known, known[0]]
+        words = f"no contact in {len(maps.failed)} of {len(motion)} frames"
+        return f"{words}, the first of them {frame}: {why}"
+    ends = good[0] == every[0] and good[-1] == every[-1]
+    return good if ends else [*good, good[0]]
 
 
 def _worn(case: WearCase, state: WearState, now: CycleWear, step: float) -> WearState:
     """Return the state after `step` more cycles, or fewer if the insert is worn through."""
     wear, creep = now.rate * step, np.zeros_like(now.rate)
-    left = case.articular.thickness - state.fall
+    thickness = case.articular.thickness - state.fall
     if case.creep is not None:
         begin = state.cycles * case.motion.duration
         end = begin + step * case.motion.duration
-        creep = case.creep.depth(now.history.mean_pressure, left, begin, end)
+        creep = case.creep.depth(now.history.mean_pressure, thickness, begin, end)
     fall = wear / now.normals[:, 1] + creep
-    share = _until_worn_through(left, fall)
+    share = _until_worn_through(thickness, fall)
     cycles = state.cycles + share * step
     return replace(
         state,
@@ -335,24 +335,24 @@ def _worn(case: WearCase, state: WearState, now: CycleWear, step: float) -> Wear
     )
 
 
-def _until_worn_through(left: Array, fall: Array) -> float:
+def _until_worn_through(thickness: Array, fall: Array) -> float:
     """Return the share of a block after which somewhere only `WEAR_SIMULATION.min_thickness` is
     left; 1: nowhere."""
     falls = fall > 0
     if not falls.any():
         return 1.0
-    share = (left[falls] - WEAR_SIMULATION.min_thickness) / fall[falls]
+    share = (thickness[falls] - WEAR_SIMULATION.min_thickness) / fall[falls]
     return float(np.clip(share.min(), 0.0, 1.0))
 
 
 def _row(case: WearCase, state: WearState, now: CycleWear) -> dict[str, float]:
     """Return one row of the table: the insert after the state's cycles."""
-    articular, worn = case.articular, state.wear > WEAR_SIMULATION.min_depth
-    area = float(now.area[worn].sum())
+    articular, worn_nodes = case.articular, state.wear > WEAR_SIMULATION.min_depth
+    area = float(now.area[worn_nodes].sum())
     medial = articular.surface.vertices[articular.vertices, 2] < 0
     each = state.wear * now.area
     crept, drive = case.creep is not None, case.motion.drive
-    lost = volume(articular.surface) - volume(articular.lowered(state.fall))
+    volume_lost = volume(articular.surface) - volume(articular.lowered(state.fall))
     return {
         "cycles": state.cycles,
         "volume_mm3": state.volume / MILLIMETRE**3,
@@ -363,7 +363,7 @@ def _row(case: WearCase, state: WearState, now: CycleWear) -> dict[str, float]:
         "medial_share": float(each[medial].sum() / each.sum()) if area else math.nan,
         "creep_depth_mm": float(state.creep.max()) / MILLIMETRE if crept else math.nan,
         "creep_volume_mm3": state.creep_volume / MILLIMETRE**3 if crept else math.nan,
-        "mesh_volume_lost_mm3": lost / MILLIMETRE**3,
+        "mesh_volume_lost_mm3": volume_lost / MILLIMETRE**3,
         "peak_pressure_MPa": float(now.peak_pressure.max()) / MEGAPASCAL,
         **({} if drive is None else drive.ranges(now.poses, now.failed)),
     }

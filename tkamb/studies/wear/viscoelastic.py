@@ -56,8 +56,8 @@ class PronySeries:
         """
         ratio = step / np.array(self.times)
         decay = np.exp(-ratio)
-        kept = np.array(self.fractions) * -np.expm1(-ratio) / ratio
-        return self.equilibrium + float(kept.sum()), decay, kept
+        weights = np.array(self.fractions) * -np.expm1(-ratio) / ratio
+        return self.equilibrium + float(weights.sum()), decay, weights
 
     def stress(self, time: Array, strain: Array) -> Array:
         """Return the stress relative to M_0 (f, ...) of strains (f, ...), linear between times.
@@ -72,7 +72,7 @@ class PronySeries:
         memory = np.multiply.outer(np.array(self.fractions), strain[0])
         result = [self.equilibrium * strain[0] + memory.sum(axis=0)]
         for step, before, after in zip(np.diff(time), strain[:-1], strain[1:], strict=True):
-            _, decay, kept = self.response(float(step))
-            memory = (memory.T * decay).T + np.multiply.outer(kept, after - before)
+            _, decay, weights = self.response(float(step))
+            memory = (memory.T * decay).T + np.multiply.outer(weights, after - before)
             result.append(self.equilibrium * after + memory.sum(axis=0))
         return np.array(result)

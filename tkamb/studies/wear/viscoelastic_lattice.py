@@ -85,19 +85,19 @@ class ViscoelasticLattice:
     def _step(self, load: float | None, pose: Array, step: float) -> ViscoelasticContact:
         if not step > 0:
             raise InputError(f"a step of {step:g} s", "viscoelastic", "give seconds above 0")
-        slope, decay, kept = self._series.response(step)
-        carried = np.tensordot(decay, self._memory, 1) - kept.sum() * self._moved
-        pose, force = self._contact(load, np.array(pose, float), slope, -carried / slope)
+        slope, decay, weights = self._series.response(step)
+        relaxed = np.tensordot(decay, self._memory, 1) - weights.sum() * self._moved
+        pose, force = self._contact(load, np.array(pose, float), slope, -relaxed / slope)
         problem = self._state.problem
         applied = np.zeros_like(problem.solid.nodes)
         applied[problem.contact_nodes] = force
         elastic = problem.operator.solve(applied)[problem.contact_nodes]
-        moved = (elastic - carried) / slope
-        change = np.multiply.outer(kept, moved - self._moved)
+        displacement = (elastic - relaxed) / slope
+        change = np.multiply.outer(weights, displacement - self._moved)
         self._memory = (self._memory.T * decay).T + change
-        self._moved = moved
+        self._moved = displacement
         pressure = np.linalg.norm(force, axis=1) / self._state.surface.area
-        return ViscoelasticContact(pose, pressure, force, moved)
+        return ViscoelasticContact(pose, pressure, force, displacement)
 
     def _contact(
         self, load: float | None, pose: Array, slope: float, offset: Array

@@ -83,10 +83,10 @@ class ArticularSurface:
         thickness = (
             WORN_SURFACE.ray_offset + caster.first(points + WORN_SURFACE.ray_offset * DOWN, DOWN)[0]
         )
-        seen = top & np.isfinite(thickness)
-        if not seen.any():
+        sampled = top & np.isfinite(thickness)
+        if not sampled.any():
             raise InputError("no part of it faces upwards", insert.name, "check the mesh's axes")
-        return cls(surface, up[seen], thickness[seen])
+        return cls(surface, up[sampled], thickness[sampled])
 
     def lowered(self, fall: Array) -> Surface:
         """Return the insert with its articular vertices moved down by `fall` (n,) m."""

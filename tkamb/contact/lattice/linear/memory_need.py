@@ -42,12 +42,12 @@ MEMORY_NEED = MemoryNeedSettings()
 
 
 class TooLittleMemoryError(ComputationError):
-    """What is to be computed does not fit into the memory that is left.
+    """What is to be computed does not fit into the available memory.
 
     Args:
-        need: bytes.
-        left: bytes.
-        likely: bytes that it will come to in the end, where more follows.
+        need: bytes that the next step needs.
+        available: bytes that are available.
+        likely: bytes that the whole computation is expected to need; 0: as many as `need`.
     """
 
     def __init__(self, need: float, available: float, likely: float) -> None:

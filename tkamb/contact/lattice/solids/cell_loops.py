@@ -6,7 +6,7 @@ from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
 NOTHING = 1e-300
-"""m², so that nothing is divided by zero."""
+"""m²: smallest divisor, which avoids a division by zero."""
 
 
 @compiled
@@ -57,10 +57,10 @@ def deviatoric_matrices(
 def _parted(
     x: Array, g: Array, nodes: Index, displacement: Array, u: Array, rest: Array
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Part a cell's displacement into G x, G = sum u_i g_iᵀ, and a rest; return G, row by row.
+    """Split a cell's displacement into G x, G = sum u_i g_iᵀ, and a rest; return G, row by row.
 
-    One axis after the other, each with its eight corners side by side: so they fill the
-    processor's vectors. G is held in nine registers. The arguments are those of `_shear_force`.
+    The eight corners of an axis lie side by side, so that they fill the processor's vector
+    registers. G is held in nine registers. The arguments are those of `_shear_force`.
     """
     first = nodes[0]
     for i in range(8):
@@ -82,7 +82,7 @@ def _parted(
 
 @compiled
 def _along(one: Array, other: Array) -> float:
-    """Return the product of eight numbers with eight others."""
+    """Return the scalar product of two vectors of eight numbers."""
     total = 0.0
     for i in range(8):
         total += one[i] * other[i]
@@ -130,9 +130,9 @@ def strained_cells(
     strain: float,
     dilatation: float,
 ) -> tuple[Index, Array]:
-    """Return the cells whose strain or dilatation may exceed its limit; of the others none does.
+    """Return the cells whose strain or dilatation may exceed its limit, and their mean strains.
 
-    And the norm of the mean strain sym G of each that is returned.
+    The other cells are certain to be below. The mean strain is the norm of sym G.
 
     With the parts G x and r of the displacement, uᵀ K_d u is 2 V |dev sym G|² and what the springs
     store of r. That is no more than `stiffest` |r|²: K_spr is no larger than the Laplacian of the
@@ -185,9 +185,9 @@ def _shear_force(
 ) -> float:
     """Put K_d u of a cell into force (3, 8); return uᵀ K_d u.
 
-    K_d is never made: from G = sum u_i g_iᵀ follow the rests u_i - G x_i, from these the springs'
-    forces t_i, and with D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces t_i + D g_i. D is held
-    in nine registers as G is.
+    The matrix K_d is never assembled. G = sum u_i g_iᵀ gives the rests u_i - G x_i, and these the
+    springs' forces t_i. With D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces are t_i + D g_i.
+    D is held in nine registers, as G is.
 
     Args:
         x: (3, 8) m, corners.
@@ -289,7 +289,7 @@ def softened_forces(
         shear_modulus: mu, Pa.
         knots: (q,) e between which 3 mu_s e is cubic.
         cubic: (4, q - 1) its coefficients, the highest power first.
-        least: the smallest e that is told from none.
+        least: smallest e that is distinguished from zero.
         nodes: (c, 8) of the cells.
         chosen: (k,) cells.
         displacement: (n, 3) m.
@@ -332,8 +332,8 @@ def cell_forces(
     """Add mu_s K_d u + K V g (g · u), N, of cells to the nodes' `internal` (n, 3).
 
     Return uᵀ K_T u, N·m, K_T the tangent stiffness: V q'(e) e² + K V (g · u)² of each cell,
-    q = 3 mu_s e. And put (mu - mu_s) K_d u of each cell, N, into `residuals` (c, 24). One pass over
-    the cells gives the true force of the solid and what the linear solid carries beyond it.
+    q = 3 mu_s e. Also write (mu - mu_s) K_d u of each cell, N, into `residuals` (c, 24). One pass
+    over the cells gives the true force of the solid and how much more the linear solid carries.
 
     Args:
         corners: (c, 3, 8) m.
@@ -344,7 +344,7 @@ def cell_forces(
         bulk_modulus: K, Pa.
         knots: (q,) equivalent strains between which 3 mu_s e is cubic.
         cubic: (4, q - 1) its coefficients, the highest power first.
-        least: the smallest equivalent strain that is told from none.
+        least: smallest equivalent strain that is distinguished from zero.
         nodes: (c, 8) of the cells.
         displacement: (n, 3) m.
         residuals: (c, 24), written.

@@ -83,7 +83,7 @@ class ShearCurve:
         return self.shear_modulus * self.spline.x - self.spline(self.spline.x) / 3
 
     def lost(self, equivalent: Array) -> Array:
-        """Return 1 - (dq/de)/(3 mu) at equivalent strains e >= 0: of the tangent, what is lost."""
+        """Return the lost share of the tangent, 1 - (dq/de)/(3 mu), at strains e >= 0."""
         if self.spline is None:
             return np.zeros_like(equivalent)
         slope = self.spline(np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1]), 1)

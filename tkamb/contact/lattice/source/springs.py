@@ -183,7 +183,7 @@ def _add_tangent_forces(
         direction: (s, 3) n, unit, from a to b.
         stiffness: (s,) k, N/m.
         displacement: (n, 3) u, m.
-        total: (n, 3) N, to be added to: what holds the displacement.
+        total: (n, 3) N, sum of forces that hold the displacement; added to.
     """
     for s in range(len(springs)):
         a, b = springs[s]

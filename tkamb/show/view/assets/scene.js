@@ -127,7 +127,12 @@ function seeThrough(view) {
       if (object.material && object.material.transparent) found.push(object);
     });
     for (const object of found) {
-      const depth = new THREE.MeshBasicMaterial({colorWrite: false, transparent: true});
+      // The recorded pose lies a little behind: where both are one, the component is seen.
+      const behind = layer === "recorded pose";
+      const depth = new THREE.MeshBasicMaterial({colorWrite: false, transparent: true,
+        polygonOffset: behind, polygonOffsetFactor: 1, polygonOffsetUnits: 40});
+      Object.assign(object.material, {
+        polygonOffset: behind, polygonOffsetFactor: 1, polygonOffsetUnits: 40});
       const before = new THREE.Mesh(object.geometry, depth);
       before.renderOrder = 2 + 0.1 * order;
       object.renderOrder = before.renderOrder + 0.05;

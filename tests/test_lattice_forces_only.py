@@ -23,56 +23,57 @@ def place(x, adduction=0.3):
     return knee_pose([x, 0.0, 0.3e-3, 0.0, np.radians(adduction), 0.0])
 
 
-def imbalance(state, result):
+def imbalance(state, result, start):
     """Return what is out of balance anywhere in the solid, relative to the contact forces."""
-    problem, warm = state.problem, result.warm_start
+    problem = state.problem
     applied = np.zeros_like(problem.solid.nodes)
     applied[problem.contact_nodes] = result.nodal_force
-    field = problem.operator.solve(applied + warm.loads)
+    field = problem.operator.solve(applied + start.loads)
     outside = applied - problem.solid.internal_force(field)
     missing = np.linalg.norm(outside.ravel()[~problem.held])
     return missing / np.linalg.norm(applied)
 
 
-def test_a_sketch_has_the_forces_of_the_whole_answer(state):
+def test_forces_alone_are_those_of_the_whole_answer(state):
     """Small steps as of a search: every look at all elements is left out but the first."""
-    last = MODEL.press(state, LOAD, place(0.0))
-    looked = last.warm_start.looked[1]
+    _, start = MODEL.press_from(state, LOAD, place(0.0))
+    looked = start.looked[1]
     for step in range(1, 6):
         pose = place(2e-5 * step, 0.3 + 0.02 * step)
-        last = MODEL.press(state, LOAD, pose, last, sketch=True)
-        whole = MODEL.press(state, LOAD, pose)
-        assert last.warm_start.looked[1] is looked
-        assert last.warm_start.region is not whole.warm_start.region
+        last, start = MODEL.press_from(state, LOAD, pose, start, forces_only=True)
+        whole, whole_start = MODEL.press_from(state, LOAD, pose)
+        assert start.looked[1] is looked
+        assert start.region is not whole_start.region
         size = np.linalg.norm(whole.nodal_force)
         assert np.linalg.norm(last.nodal_force - whole.nodal_force) < 2e-3 * size
         assert last.medial.force == pytest.approx(whole.medial.force, rel=1e-3)
-        assert imbalance(state, last) < 1.2 * MODEL.tolerance
+        assert imbalance(state, last, start) < 1.2 * MODEL.tolerance
 
 
 def test_beyond_the_bound_all_is_looked_at(state, monkeypatch):
     """Without the bound the same step leaves elements out that count, and nobody knows."""
-    first = MODEL.press(state, LOAD, place(0.0))
+    _, first = MODEL.press_from(state, LOAD, place(0.0))
     far = place(3e-3)
-    sound = MODEL.press(state, LOAD, far, first, sketch=True)
-    assert np.array_equal(sound.warm_start.looked[1], sound.warm_start.pose)
-    assert imbalance(state, sound) < 1.2 * MODEL.tolerance
+    sound, start = MODEL.press_from(state, LOAD, far, first, forces_only=True)
+    assert np.array_equal(start.looked[1][:, 0::2], far[:, 0::2])
+    assert start.looked[1][0, 3] == far[0, 3]
+    assert imbalance(state, sound, start) < 1.2 * MODEL.tolerance
     monkeypatch.setattr(initial_guess, "FORCES_ONLY_DISTANCE", np.inf)
-    blind = MODEL.press(state, LOAD, far, first, sketch=True)
-    assert blind.warm_start.looked[1] is first.warm_start.looked[1]
-    assert imbalance(state, blind) > 2 * MODEL.tolerance
+    blind, start = MODEL.press_from(state, LOAD, far, first, forces_only=True)
+    assert start.looked[1] is first.looked[1]
+    assert imbalance(state, blind, start) > 2 * MODEL.tolerance
 
 
 def test_forces_that_grow_are_looked_at(state):
-    first = MODEL.press(state, LOAD, place(0.0))
-    heavier = MODEL.press(state, 1.2 * LOAD, place(0.0), first, sketch=True)
-    assert heavier.warm_start.looked[0] > 1.1 * first.warm_start.looked[0]
-    lighter = MODEL.press(state, 0.9 * LOAD, place(0.0), first, sketch=True)
-    assert lighter.warm_start.looked[0] == first.warm_start.looked[0]
+    _, first = MODEL.press_from(state, LOAD, place(0.0))
+    _, heavier = MODEL.press_from(state, 1.2 * LOAD, place(0.0), first, forces_only=True)
+    assert heavier.looked[0] > 1.1 * first.looked[0]
+    _, lighter = MODEL.press_from(state, 0.9 * LOAD, place(0.0), first, forces_only=True)
+    assert lighter.looked[0] == first.looked[0]
 
 
-def test_a_sketch_flags_nothing_and_without_a_guess_looks_at_all(state):
-    result = MODEL.press(state, LOAD, place(0.0), sketch=True)
+def test_forces_alone_flag_nothing_and_without_a_start_look_at_all(state):
+    result, _ = MODEL.press_from(state, LOAD, place(0.0), forces_only=True)
     whole = MODEL.press(state, LOAD, place(0.0))
     assert result.flags == ()
     assert np.array_equal(result.nodal_force, whole.nodal_force)
@@ -80,12 +81,12 @@ def test_a_sketch_flags_nothing_and_without_a_guess_looks_at_all(state):
 
 
 @pytest.mark.slow
-def test_a_sketch_that_compresses_cells_to_nothing_is_out_of_range(state):
+def test_forces_alone_of_cells_compressed_to_nothing_are_out_of_range(state):
     """A step of a search that went far too deep: it must not come back with forces."""
-    touching = MODEL.press(state, LOAD, place(0.0))
+    touching, start = MODEL.press_from(state, LOAD, place(0.0))
     deep = touching.pose.copy()
     deep[1, 3] -= 6e-3
     whole = MODEL.evaluate(state, deep)
-    sketch = MODEL.evaluate(state, deep, touching, sketch=True)
+    forces, _ = MODEL.evaluate_from(state, deep, start, forces_only=True)
     assert any("compressed to nothing" in flag for flag in whole.flags)
-    assert sketch.status is whole.status is not touching.status
+    assert forces.status is whole.status is not touching.status
