@@ -26,7 +26,8 @@ class AssemblySettings:
     """How parts are put together."""
 
     frame_tolerance: float = 1e-9
-    """m and rad: an insert frame this near to that of its flat bottom is the same frame."""
+    """m and rad: an insert frame this near to that of its flat bottom is the same frame. Chosen:
+    above rounding."""
 
 
 ASSEMBLY = AssemblySettings()
