@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from tkamb.studies.error_cases import SITUATIONS
-from tkamb.studies.error_rows import COMPARED, ErrorRow
+from error_cases import SITUATIONS
+from error_rows import COMPARED, ErrorRow
 
 HEADS = {
     "approach": "approach",

@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
+from error_cases import SITUATIONS
+from error_rows import ErrorRow
 from tkamb.errors import InputError
 from tkamb.run.known_errors import KnownError
 from tkamb.show.tradeoff_report import (
@@ -18,8 +20,6 @@ from tkamb.show.tradeoff_report import (
 )
 from tkamb.studies.body_trade import HEADS as BODY_HEADS
 from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.error_cases import SITUATIONS
-from tkamb.studies.error_rows import ErrorRow
 from tkamb.studies.row import KEYS, TIMING, Row, beats, on_front
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
@@ -87,7 +87,7 @@ def known_errors_json(rows: Sequence[Row], cases: Sequence[ErrorRow] = ()) -> st
 
     Args:
         rows: of the trade-off study; its material is polyethylene.
-        cases: errors on the pairs of bodies of `tkamb.studies.error_cases`.
+        cases: errors on the pairs of bodies of `error_cases`.
     """
     found: dict[tuple[str, float, str], list[dict[str, float]]] = {}
     for (label, resolution), some in _settings(rows).items():

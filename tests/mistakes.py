@@ -20,8 +20,8 @@ from tkamb.contact.registry import contact_model
 from tkamb.errors import TkambError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.plausibility.plausibility import Plausibility
+from tkamb.run.read_scene import mechanics_of
 from tkamb.run.status import frame_status
 
 DM = MODEL.parent / "dm"
@@ -114,8 +114,8 @@ class Bench:
         if contact is not None:  # what the contact side, which is not run, would refuse
             contact_model(contact.model, contact.resolution_mm, **contact.options)
             material(contact.material)
-        mechanics = Mechanics(case)
-        plausibility = Plausibility(mechanics)
+        mechanics = mechanics_of(case)
+        plausibility = Plausibility(case, mechanics)
         words = {NUMBER.sub("#", question.text) for question in plausibility.questions}
         forces = []
         for k in self.frames:

@@ -6,8 +6,7 @@ import pytest
 from scenes import write_scene
 from tkamb import load_scene, simulate
 from tkamb.io.scene.case import load_case
-from tkamb.run.contact_side import ContactSide
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import contact_side, mechanics_of
 
 FRAMES = slice(3, 26, 10)
 
@@ -80,7 +79,7 @@ def test_a_restored_frame_is_the_recorded_rotation_for_the_body_too(tmp_path):
     path = wrong_scene(tmp_path, 0.3, 0.0)
     changes = {"contact.adjust": True, "contact.adjust_restore_when": "either"}
     case = load_case(load_scene(path, changes | {"motion.frames": 26}))
-    side = ContactSide(case, Mechanics(case))
+    side = contact_side(case, mechanics_of(case))
     restored = 0
     for k in (12, 23):
         body, contact = side.frame(k)

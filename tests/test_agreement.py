@@ -18,8 +18,7 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.equilibrium.split_sensitivity import split_sensitivity, split_tangent
 from tkamb.run.agreement import contradictions
-from tkamb.run.contact_side import ContactSide
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards
 from tkamb.studies.cases import change_recording
@@ -43,7 +42,7 @@ def shipped(tmp_path_factory):
 def test_the_tangent_and_a_turned_press_tell_the_same_of_the_shipped_knee(tmp_path):
     """Within the roughness of its facets."""
     case = load_case(load_scene(write_scene(tmp_path)))
-    side = ContactSide(case, Mechanics(case))
+    side = contact_side(case, mechanics_of(case))
     for k in (10, 60, 95):
         _, contact = side.frame(k)
         turned = split_sensitivity(Probe(side.model, side.state), contact.result)
@@ -102,7 +101,7 @@ def test_a_probe_looks_at_the_whole_bed_where_a_result_failed():
 def test_sensitivity_is_the_slope_of_presses_farther_apart(tmp_path):
     """Of the run's own column: 0.05 deg to either side, at the load of the equations."""
     case = load_case(load_scene(write_scene(tmp_path)))
-    side = ContactSide(case, Mechanics(case))
+    side = contact_side(case, mechanics_of(case))
     body, contact = side.frame(60)
     medial = []
     for angle in np.radians([-0.05, 0.05]):
@@ -166,7 +165,7 @@ def test_an_axial_rotation_of_the_wrong_sign_is_flagged(tmp_path, shipped):
 def dm_side():
     changes = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
     case = load_case(load_scene(DM, changes))
-    return case, ContactSide(case, Mechanics(case))
+    return case, contact_side(case, mechanics_of(case))
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")

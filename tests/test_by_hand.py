@@ -17,7 +17,7 @@ from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import EQUATION, solve_knee
 from tkamb.knee.ligaments import quadratic_toe_force, two_line_force
 from tkamb.knee.unknowns import residuals
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import mechanics_of
 
 FRICTION = 0.05
 ROWS = slice(30, 91, 30)
@@ -25,7 +25,7 @@ ROWS = slice(30, 91, 30)
 
 @pytest.fixture(scope="module")
 def mechanics():
-    return Mechanics(load_case(load_scene(MODEL / "scene.toml")))
+    return mechanics_of(load_case(load_scene(MODEL / "scene.toml")))
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_friction_opposes_the_sliding_of_the_femur():
 
 def test_sliding_is_the_femur_s_velocity_at_the_contact(mechanics, frame):
     """By central differences of the recorded poses; the shank's insert is at rest in its frame."""
-    time, poses = mechanics.case.motion.time, mechanics.poses
+    time, poses = mechanics.motion.time, mechanics.poses
     for condyle in frame.geometry.condyles.values():
         on_femur = np.linalg.inv(poses[60]) @ np.append(condyle.point, 1.0)
         moved = [(poses[k] @ on_femur)[:3] for k in (59, 61)]

@@ -25,8 +25,7 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.joint_equilibrium import external_wrench
 from tkamb.knee.load import total_wrench, wrench_of
-from tkamb.run.contact_side import ContactSide
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.run.tabulate import frame_row
 from tkamb.studies.designs.design import CAM_MESH, INSERT_MESH, load_design
 from tkamb.units import MILLIMETRE
@@ -247,13 +246,14 @@ def knee(tmp_path_factory):
     }
     drop = ("quadriceps", "patellar_ligament", "patella")
     case = load_case(load_scene(write_scene(folder / "knee", drop, **changes)))
-    side = ContactSide(case, Mechanics(case))
+    side = contact_side(case, mechanics_of(case))
 
     def released(*names):
         contact = case.scene.contact.model_copy(update={"released": names})
         other = replace(case, scene=case.scene.model_copy(update={"contact": contact}))
-        return ContactSide(other, side.mechanics, side.state, post=side.post)
+        return contact_side(other, side.mechanics, post=side.post)
 
+    released.case = case
     return released
 
 
@@ -291,9 +291,8 @@ def test_condyles_and_post_together_balance_the_shank(knee, released, frame):
 def test_without_friction_the_equations_get_the_pairs_own_wrench(knee):
     side = knee()
     load = side.post.at(place(95.0, -6.2, 2.0)).load
-    friction, side.mechanics.friction = side.mechanics.friction, 0.0
-    push, _ = side.mechanics.post_loads(58, side.case.motion.coordinates[58], load)
-    side.mechanics.friction = friction
+    smooth = replace(side.mechanics.instant(58), friction=0.0)
+    push, _ = smooth.post_loads(smooth.coordinates, load)
     assert total_wrench([push], np.zeros(3)) == pytest.approx(load.wrench, abs=1e-9)
 
 
@@ -305,7 +304,7 @@ def test_a_recorded_overlap_is_asked_about_and_a_deep_one_fails(knee):
     assert contact.result is None
     assert "cam-post contact out of range" in contact.problem
     assert np.isnan(body.loads.contact_force).all()
-    row = frame_row(knee().case, 70, body, contact, {}, "failed")
+    row = frame_row(knee.case, 70, body, contact, {}, "failed")
     assert np.isnan([row["post_force_N"], row["post_area_mm2"], row["force_si_N"]]).all()
 
 

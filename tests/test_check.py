@@ -83,8 +83,8 @@ def test_a_ground_reaction_in_the_wrong_unit_is_asked_about(scene, checked):
 
 def test_the_leg_is_drawn_where_the_chain_and_the_plate_are(checked):
     """Segments keep their lengths, the hip is above the ankle, the force acts on the plate."""
-    case = checked.mechanics.case
-    frames = [leg_frame(checked.mechanics, k) for k in shown_frames(checked.mechanics)]
+    case = checked.case
+    frames = [leg_frame(case, checked.mechanics, k) for k in shown_frames(case)]
     assert len(frames) == 3
     shank = [np.linalg.norm(one.joints[1] - one.joints[2]) for one in frames]
     np.testing.assert_allclose(shank, shank[0], rtol=1e-12)
@@ -124,7 +124,8 @@ def test_the_page_holds_questions_picture_and_files(checked):
 def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp_path):
     """The MCL stands on the page where "medial" is written, of a right and of a left knee."""
     scene = MODEL / "scene.toml" if side == "right" else write_mirrored_patient(tmp_path)
-    figure = draw_leg(check_scene(scene).mechanics)
+    checked = check_scene(scene)
+    figure = draw_leg(checked.case, checked.mechanics)
     knee = figure.axes[-1]
     words = {text.get_gid(): text for text in knee.texts}
     medial = words["side-left"].get_text() == "medial"
@@ -136,7 +137,7 @@ def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp
 def test_a_solver_that_is_not_installed_is_named_before_a_run(checked, monkeypatch):
     """The muscles' solver is an extra: the check names it first, and still shows the leg."""
     monkeypatch.setattr(static_optimisation, "find_spec", lambda name: None)
-    plain = checked.mechanics.case
+    plain = checked.case
     assert _missing(plain) == ()
     scene = plain.scene.model_copy(update={"muscles": object()})
     (words,) = _missing(replace(plain, scene=scene))

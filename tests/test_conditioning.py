@@ -15,6 +15,7 @@ from tkamb.knee.equations import solve_knee
 from tkamb.knee.load import PointForces
 from tkamb.knee.unknowns import UNKNOWNS
 from tkamb.run.mechanics import FrameLoads, Mechanics
+from tkamb.run.read_scene import mechanics_of
 from tkamb.run.status import FAILED, frame_status
 
 MIDDLE = 60
@@ -22,7 +23,7 @@ MIDDLE = 60
 
 @cache
 def mechanics(friction: float = 0.05) -> Mechanics:
-    return Mechanics(load_case(load_scene(MODEL / "scene.toml", {"contact.friction": friction})))
+    return mechanics_of(load_case(load_scene(MODEL / "scene.toml", {"contact.friction": friction})))
 
 
 @cache
@@ -76,7 +77,7 @@ def test_a_scene_that_comes_near_the_singularity_says_so(tmp_path):
     frame = shipped_frame()
     proximal = frame.geometry.extensor.patellar_ligament[0].points[0]
     distal = proximal + 1.3 * (contact_axis(frame) - proximal)
-    chain = mechanics().case.chain
+    chain = mechanics().knee.chain
     in_tibia = transform(chain.insert_in_tibia, distal) * 1e3
     path = write_scene(
         tmp_path,
@@ -138,18 +139,19 @@ def noisy_scene(folder):
 
 def test_noise_of_fluoroscopy_is_flagged_and_never_silent(tmp_path):
     path = noisy_scene(tmp_path)
-    noisy = Mechanics(load_case(load_scene(path, {"contact.adjust": True})))
+    case = load_case(load_scene(path, {"contact.adjust": True}))
+    noisy = mechanics_of(case)
     changes, flagged = [], 0
     for k in range(5, 101, 15):
         frame = noisy.frame(k)
-        status, force = frame_status(noisy.case, k, frame, None), frame.loads.contact_force
+        status, force = frame_status(case, k, frame, None), frame.loads.contact_force
         assert status.startswith(FAILED) == bool(np.isnan(force).any())
         if status.startswith(FAILED):
             continue
         assert frame.loads.condition < UNKNOWNS.max_condition
         flagged += "filter moves the recorded pose" in status
         clean = mechanics().frame(k).loads.contact_force
-        changes.append((np.linalg.norm(force) - np.linalg.norm(clean)) / noisy.case.body_weight)
+        changes.append((np.linalg.norm(force) - np.linalg.norm(clean)) / case.body_weight)
     assert len(changes) >= 6
     assert flagged >= 4
     assert np.sqrt(np.mean(np.square(changes))) < 0.15

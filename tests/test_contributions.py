@@ -31,7 +31,7 @@ def solved(where, least=0.05):
         PointForces("femur", strap[0][None], -strap[1][None]),
     )
     knee = replace(bent_knee(), ground=ground, ligaments=pull)
-    return SharedMuscles(two_flexors(1, reserve=2.0, least=least)).solve(0, knee, FRICTION)
+    return SharedMuscles(two_flexors(1, reserve=2.0, least=least)).frame(0).solve(knee, FRICTION)
 
 
 @pytest.mark.parametrize("where", PLACES)
@@ -82,8 +82,10 @@ def test_a_cam_on_the_post_is_a_cause_of_its_own():
         PointForces("femur", place[None], -push[None]),
     )
     geometry, _ = solved("taut")
-    geometry, loads = SharedMuscles(two_flexors(1, reserve=2.0, least=0.05)).solve(
-        0, replace(geometry, post=post), FRICTION
+    geometry, loads = (
+        SharedMuscles(two_flexors(1, reserve=2.0, least=0.05))
+        .frame(0)
+        .solve(replace(geometry, post=post), FRICTION)
     )
     parts = condyle_contributions(geometry, loads, FRICTION)
     for side, force in shank_alone(geometry, wrench_of(place, push)).items():

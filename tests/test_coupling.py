@@ -7,8 +7,8 @@ from scenes import fast_scene
 from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.contact_side import COUPLING, ContactSide
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.contact_side import COUPLING
+from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.run.simulation import simulate
 
 SCENE = fast_scene()
@@ -44,8 +44,8 @@ def shares(results):
 def test_uncoupled_is_the_body_and_then_a_press():
     """Bit for bit: the load of the equations, pressed in at the recorded pose."""
     case = load_case(load_scene(SCENE, COARSE))
-    mechanics = Mechanics(case)
-    side = ContactSide(case, mechanics)
+    mechanics = mechanics_of(case)
+    side = contact_side(case, mechanics)
     body, contact = side.frame(60)
     alone = mechanics.frame(60)
     load = alone.loads.contact_force[1]

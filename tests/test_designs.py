@@ -15,9 +15,9 @@ from tkamb.io.recordings.meshes import load_surface
 from tkamb.studies.designs.design import load_design
 from tkamb.studies.designs.radii import circle_radius, measured_radii
 from tkamb.studies.designs.sagittal import SagittalProfile
-from tkamb.studies.validation.design_cells import Assumption, PressedDesign, nominal, table_force
-from tkamb.studies.validation.design_tables import FOLDERS, pairs_in_order
-from tkamb.studies.validation.dissertation import designs
+from validation.design_cells import Assumption, PressedDesign, nominal, table_force
+from validation.design_tables import FOLDERS, pairs_in_order
+from validation.dissertation import designs
 
 ROOT = Path(__file__).parents[1] / "models" / "designs"
 

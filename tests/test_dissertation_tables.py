@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tkamb.errors import InputError
-from tkamb.studies.validation import dissertation as d
+from validation import dissertation as d
 
 FINDINGS = {row["check"]: row for row in d.findings()}
 

@@ -12,8 +12,7 @@ from tkamb.geometry.frames import knee_pose
 from tkamb.io.recordings.tables import read_table
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.contact_side import ContactSide
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import contact_side, mechanics_of
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 ALL = ["ap", "ml", "axial_rotation", "adduction"]
@@ -41,7 +40,7 @@ def test_flexion_alone_finds_the_state_of_the_whole_recording(tmp_path):
     alone = load_case(scene_of(tmp_path, list(ROLES.values()), ALL))
     whole = load_case(load_scene(BEND / "scene.toml", {"contact.released": ALL} | COARSE))
     assert set(alone.motion.unrecorded) == {*ALL, "si"}
-    sides = [ContactSide(case, Mechanics(case)) for case in (alone, whole)]
+    sides = [contact_side(case, mechanics_of(case)) for case in (alone, whole)]
     for k in (30, 75):
         contacts = [side.frame(k)[1] for side in sides]
         assert not any(contact.problem for contact in contacts)

@@ -27,8 +27,8 @@ from tkamb.geometry.frames import pose
 from tkamb.io.recordings.meshes import axes_rotation, load_surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.muscles.shared_muscles import SharedMuscles
+from tkamb.run.read_scene import mechanics_of
 
 MODELS = Path(__file__).parents[1] / "models"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"
@@ -48,7 +48,7 @@ needs_dm = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def shipped():
     case = load_case(load_scene(SHIPPED))
-    return Leg(SHIPPED), Mechanics(case), case.motion.time
+    return Leg(SHIPPED), mechanics_of(case), case.motion.time
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def dm():
     scene = load_scene(DM)
     scene = scene.model_copy(update={"motion": scene.motion.model_copy(update={"frames": 21})})
     case = load_case(scene)
-    mechanics, time = Mechanics(case), case.motion.time
+    mechanics, time = mechanics_of(case), case.motion.time
     patella = np.array([state.coordinates for state in mechanics.extensor.states])
     table = scene.implant.insert
     surface = load_surface(table.mesh, table.unit, table.axes, name="insert")

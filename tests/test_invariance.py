@@ -22,7 +22,8 @@ from tkamb.io.scene.si import in_si
 from tkamb.knee import contact_points, patellofemoral
 from tkamb.knee import equations as knee
 from tkamb.knee.chain import Chain
-from tkamb.run.mechanics import FrameLoads, Mechanics
+from tkamb.run.mechanics import FrameLoads
+from tkamb.run.read_scene import mechanics_of
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)
@@ -43,7 +44,7 @@ def shipped() -> Case:
 
 @cache
 def shipped_loads() -> list[FrameLoads]:
-    mechanics = Mechanics(shipped())
+    mechanics = mechanics_of(shipped())
     return [mechanics.frame(k) for k in FRAMES]
 
 
@@ -80,7 +81,7 @@ def turned(case: Case, rotation: np.ndarray, shift: np.ndarray) -> Case:
 @pytest.mark.parametrize("angle_deg", [17.0, 201.0])
 def test_turning_the_laboratory_about_the_vertical_changes_nothing(angle_deg):
     rotation = Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
-    mechanics = Mechanics(turned(shipped(), rotation, np.array([0.4, -0.1, 1.3])))
+    mechanics = mechanics_of(turned(shipped(), rotation, np.array([0.4, -0.1, 1.3])))
     for k, before in zip(FRAMES, shipped_loads(), strict=True):
         expected = numbers(before)
         scale = np.abs(expected).max()
@@ -92,7 +93,7 @@ def test_turning_it_anyhow_changes_nothing_if_gravity_is_turned_too():
     case = turned(shipped.__wrapped__(), rotation, np.zeros(3))
     gravity = rotation @ case.chain.model.gravity.linear
     case.chain.model.gravity = pin.Motion(gravity, np.zeros(3))
-    mechanics = Mechanics(case)
+    mechanics = mechanics_of(case)
     for k, before in zip(FRAMES, shipped_loads(), strict=True):
         expected = numbers(before)
         scale = np.abs(expected).max()
@@ -126,7 +127,7 @@ def test_a_laboratory_with_other_axes_gives_the_same(tmp_path, axes):
             f'length_unit = "m"\nlaboratory_axes = "{axes}"\n'
         )
     _turn_columns(tmp_path / "ground_reaction.csv", to_laboratory)
-    mechanics = Mechanics(load_case(load_scene(path)))
+    mechanics = mechanics_of(load_case(load_scene(path)))
     for k, before in zip(FRAMES, shipped_loads(), strict=True):
         expected = numbers(before)
         scale = np.abs(expected).max()
@@ -267,7 +268,7 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     ml, lateral_yield, tilt_yield = patella.__defaults__
     scaled = (ml, lateral_yield * LENGTH, tilt_yield / LENGTH)
     monkeypatch.setattr(patella, "__defaults__", scaled)
-    mechanics = Mechanics(scaled_case(shipped()))
+    mechanics = mechanics_of(scaled_case(shipped()))
     for k, before in zip(FRAMES, unscaled, strict=True):
         after = mechanics.frame(k)
         assert not after.loads.problems
@@ -313,7 +314,7 @@ def test_slow_and_fast_recordings_of_the_same_motion_agree(tmp_path):
     found = {}
     for rate in (20, 1000):
         case = load_case(load_scene(resampled_scene(tmp_path / str(rate), rate, 6.0)))
-        mechanics = Mechanics(case)
+        mechanics = mechanics_of(case)
         chosen = [int(np.argmin(np.abs(case.motion.time - at))) for at in (1.3, 1.5, 1.7)]
         frames = [mechanics.frame(k) for k in chosen]
         assert not any(frame.loads.problems for frame in frames)

@@ -9,7 +9,7 @@ from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.muscles import muscle_line
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import mechanics_of
 
 ORIGIN = {"link": "femur", "point_mm": [32.0, 205.0, 0.0]}
 INSERTION = {"link": "patella", "point_mm": [8.0, 20.0, 0.0]}
@@ -21,9 +21,8 @@ def muscle(name="quadriceps", path=(ORIGIN, INSERTION), wraps=True, **more):
     return {"name": name, "path": list(path), **({"wrap": {}} if wraps else {}), **more}
 
 
-def mechanics_of(folder, *muscles, drop=BARE):
-    scene = load_scene(write_scene(folder, drop, muscle=list(muscles)), FEW)
-    return Mechanics(load_case(scene))
+def case_of(folder, *muscles, drop=BARE):
+    return load_case(load_scene(write_scene(folder, drop, muscle=list(muscles)), FEW))
 
 
 def test_the_long_form_of_the_quadriceps_gives_the_same_numbers(tmp_path):
@@ -39,13 +38,13 @@ def test_the_long_form_of_the_quadriceps_gives_the_same_numbers(tmp_path):
 def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_path):
     """Generalised force of a newton of it = -dL/dq for all nine joint coordinates."""
     moved = {"link": "femur", "point_mm": [25.0, 180.0, 9.0]}
-    mechanics = mechanics_of(tmp_path, muscle("vastus_lateralis", (moved, INSERTION)))
-    frame = mechanics.frame(2)
+    case = case_of(tmp_path, muscle("vastus_lateralis", (moved, INSERTION)))
+    mechanics = mechanics_of(case)
+    frame, chain = mechanics.frame(2), mechanics.knee.chain
     assert frame.loads.values["muscle_vastus_lateralis"] > 100.0
     assert "muscle_quadriceps" not in frame.loads.values
-    case, chain = mechanics.case, mechanics.case.chain
     line = muscle_line(case.muscles[0], chain, case.femoral)
-    motion, step = mechanics.chain_motion(2, case.motion.coordinates[2]), 1e-6
+    motion, step = mechanics.instant(2).motion, 1e-6
 
     def length(joint, change):
         joints = motion.joints.copy()
@@ -63,13 +62,14 @@ def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_pa
 def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_path):
     """Straight from the last point on the femur: what lies before it pulls nothing."""
     via = {"link": "femur", "point_mm": [45.0, 90.0, 0.0]}
-    bent = mechanics_of(tmp_path / "a", muscle(path=(ORIGIN, via, INSERTION), wraps=False))
-    direct = mechanics_of(tmp_path / "b", muscle(path=(via, INSERTION), wraps=False))
+    bent = case_of(tmp_path / "a", muscle(path=(ORIGIN, via, INSERTION), wraps=False))
+    direct = case_of(tmp_path / "b", muscle(path=(via, INSERTION), wraps=False))
+    bent, direct = mechanics_of(bent), mechanics_of(direct)
     far, near = (one.frame(0) for one in (bent, direct))
     assert not far.loads.problems
     for name, value in near.loads.values.items():
         assert far.loads.values[name] == pytest.approx(value, rel=1e-9, abs=1e-7)
-    paths = [one.extensor.paths(one.geometry(0).state)[0] for one in (bent, direct)]
+    paths = [one.extensor.lines.paths(one.geometry(0).state)[0] for one in (bent, direct)]
     apart = np.subtract(ORIGIN["point_mm"], via["point_mm"]) * 1e-3
     assert paths[0].length - paths[1].length == pytest.approx(np.linalg.norm(apart))
 
@@ -89,11 +89,11 @@ def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_pa
 )
 def test_what_cannot_be_balanced_or_read_is_one_clear_line(tmp_path, muscles, words):
     with pytest.raises(InputError) as error:
-        mechanics_of(tmp_path, *muscles)
+        case_of(tmp_path, *muscles)
     assert words in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_the_short_form_beside_a_second_muscle_is_refused(tmp_path):
     with pytest.raises(InputError, match="static optimisation"):
-        mechanics_of(tmp_path, muscle("vasti"), drop=BARE[:-1])
+        case_of(tmp_path, muscle("vasti"), drop=BARE[:-1])

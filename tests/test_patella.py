@@ -21,8 +21,7 @@ from tkamb.knee.patella import (
 )
 from tkamb.knee.patella_search import solve_patella
 from tkamb.knee.patellofemoral import PatellofemoralContact
-from tkamb.run.known import extensor_frames
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import mechanics_of
 
 TROCHLEA, DOME = 0.025, 0.02
 CENTRE = np.array([0.004, 0.0, 0.0])
@@ -320,7 +319,7 @@ def shipped() -> tuple[Array, list[PatellaState]]:
     """Flexion (deg) and patella of every frame of the shipped deep knee bend."""
     path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
     case = load_case(load_scene(path, {"patella.motion": "solved"}))
-    frames = extensor_frames(case, knee_pose(case.motion.coordinates))
+    frames = mechanics_of(case, near=True).extensor
     return np.rad2deg(case.motion.coordinates[:, 5]), frames.states
 
 
@@ -357,10 +356,10 @@ def test_shipped_patella_moves_smoothly(shipped: tuple[Array, list[PatellaState]
 def test_a_patella_that_is_lost_from_a_frame_far_off_is_found_from_its_own():
     """A coarse choice of frames must not lose what the frames between would have found."""
     starter = Path(starter_package.__file__).parent / "files" / "scene.toml"
-    mechanics = Mechanics(load_case(load_scene(starter)))
+    mechanics = mechanics_of(load_case(load_scene(starter)))
     extensor, pose = mechanics.extensor, mechanics.poses[0]
     own, far = extensor.states[0], extensor.states[-1]
-    lost = solve_patella(extensor._mechanism, pose, far.coordinates, far.slopes)
+    lost = solve_patella(extensor.lines.mechanism, pose, far.coordinates, far.slopes)
     assert not lost.status.found
     found = extensor.patella(0, pose, far)
     assert found.status.found

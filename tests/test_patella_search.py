@@ -16,19 +16,18 @@ from tkamb.io.scene.case import load_case
 from tkamb.knee import extensor
 from tkamb.knee.patella import ExtensorMechanism, PatellaStatus
 from tkamb.knee.patella_search import solve_patella
-from tkamb.run.known import SharedState, extensor_frames
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import SharedState, _extensor_frames, mechanics_of
 
 FEW = {"motion.frames": 11, "patella.motion": "solved", "contact.resolution_mm": 3.0}
 
 
 @pytest.fixture(scope="module")
 def plain():
-    return mechanics_of(MODEL / "scene.toml")
+    return read(MODEL / "scene.toml")
 
 
-def mechanics_of(path):
-    return Mechanics(load_case(load_scene(path, FEW)))
+def read(path):
+    return mechanics_of(load_case(load_scene(path, FEW)))
 
 
 def turned_about_y(point):
@@ -55,7 +54,7 @@ def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are
         f'<origin xyz="0 0 0" rpy="0 {np.pi!r} 0"/></joint></robot>'
     )
     urdf.write_text(urdf.read_text(encoding="utf-8").replace("</robot>", link), encoding="utf-8")
-    turned = mechanics_of(path)
+    turned = read(path)
     for k in (2, 5, 8):
         one, other = plain.frame(k).loads, turned.frame(k).loads
         assert not one.problems
@@ -145,14 +144,14 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
 
 def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain):
     """At the same poses the same; a little elsewhere what a search of all rotations finds."""
-    case, frames = plain.case, plain.extensor
-    same = frames.moved(frames._parts, plain.poses, range(2, 5))
+    frames = plain.extensor
+    same = frames.moved(frames.lines, plain.poses, range(2, 5))
     for k in range(11):
         np.testing.assert_allclose(same.joints(k), frames.joints(k), rtol=0, atol=1e-6)
-    bent = case.motion.coordinates + np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.02])
-    moved = frames.moved(frames._parts, knee_pose(bent), range(2, 5))
+    bent = plain.motion.coordinates + np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.02])
+    moved = frames.moved(frames.lines, knee_pose(bent), range(2, 5))
     for k in (2, 4):
-        alone = solve_patella(frames._mechanism, knee_pose(bent)[k])
+        alone = solve_patella(frames.lines.mechanism, knee_pose(bent)[k])
         np.testing.assert_allclose(moved.states[k].coordinates, alone.coordinates, atol=1e-6)
         change = alone.coordinates - frames.states[k].coordinates
         assert np.abs(change).max() > 1e-4
@@ -164,20 +163,20 @@ def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain)
 def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
     """A recorded one stays as recorded."""
     known = SharedState(None, None, SimpleNamespace(moved=lambda *_: "moved"), range(1))
-    poses = knee_pose(plain.case.motion.coordinates)
-    assert extensor_frames(plain.case, poses, known) == "moved"
-    patella = plain.case.scene.patella.model_copy(update={"motion": "recorded"})
-    scene = plain.case.scene.model_copy(update={"patella": patella})
-    recorded = extensor_frames(replace(plain.case, scene=scene), poses, known)
+    case = load_case(load_scene(MODEL / "scene.toml", FEW))
+    assert _extensor_frames(case, plain.knee, plain.poses, known) == "moved"
+    patella = case.scene.patella.model_copy(update={"motion": "recorded"})
+    scene = case.scene.model_copy(update={"patella": patella})
+    recorded = _extensor_frames(replace(case, scene=scene), plain.knee, plain.poses, known)
     for k in (0, 10):
-        np.testing.assert_array_equal(recorded.joints(k)[0], plain.case.motion.patella[k])
+        np.testing.assert_array_equal(recorded.joints(k)[0], case.motion.patella[k])
 
 
 def test_the_moments_of_three_lines_on_the_patella_add_up_to_nothing(plain):
     """About the femur's z, per unit tension: quadriceps, patellar ligament, contact."""
     for k in (3, 9):
         state, patella = plain.geometry(k).state, plain.extensor.states[k]
-        muscle, ligament = plain.extensor.paths(state)
+        muscle, ligament = plain.extensor.lines.paths(state)
         hold = patella.ligament_ratio * ligament.start_direction
         press = patella.patellofemoral_ratio * patella.contact_normal
         points = np.stack([muscle.points[-1], ligament.points[0], patella.contact_point])

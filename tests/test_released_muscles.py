@@ -19,9 +19,8 @@ from tkamb.knee.equilibrium.relaxation import Relaxation
 from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.knee.joint_equilibrium import external_wrench
 from tkamb.knee.load import total_wrench
-from tkamb.run.contact_side import ContactSide
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.muscles.shared_muscles import SharedMuscles
+from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.run.simulation import simulate
 
 OG3 = MODEL.parent / "jw" / "ngait_og3.toml"
@@ -36,12 +35,12 @@ FRAMES = (40, 41, 42)
 def side_with_flexors(scene, left=False):
     """Return the shipped knee with quadriceps, hamstring and gastrocnemius."""
     case = load_case(load_scene(scene, CONTACT))
-    mechanics = Mechanics(case)
+    mechanics = mechanics_of(case)
     trial = two_flexors(len(case.motion.time), least=0.02)
     if left:
         trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
     mechanics.muscles = SharedMuscles(trial, is_left=left)
-    return ContactSide(case, mechanics)
+    return contact_side(case, mechanics)
 
 
 def computed(side):

@@ -22,7 +22,6 @@ def test_the_hint_of_an_error_is_accepted_under_its_former_name():
     [
         ("tkamb.run.workers", "Crew", "PoolOptions"),
         ("tkamb.run.workers", "Team", "WorkerPool"),
-        ("tkamb.run.known", "Known", "SharedState"),
     ],
 )
 def test_a_renamed_class_is_found_under_its_former_name(module, former, name):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tkamb.io.presets.registry import find_preset
-from tkamb.studies.validation import dissertation, reproduction
-from tkamb.studies.validation.reproduction_page import facts, names_in, page
+from validation import dissertation, reproduction
+from validation.reproduction_page import facts, names_in, page
 
 ROOT = Path(__file__).parents[1]
 MODEL = ROOT / "models" / "deep_knee_bend"

@@ -2,6 +2,7 @@
 
 import json
 import runpy
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +16,9 @@ from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, transform
 from tkamb.io.recordings.meshes import load_surface
 from tkamb.io.scene import lines
 from tkamb.io.scene.case import load_case
+from tkamb.io.scene.recording_tables import TibiaTable
 from tkamb.io.scene.scene import load_scene
+from tkamb.io.scene.si import CLASSES, in_si, si_names
 
 ROOT = Path(__file__).parents[1]
 
@@ -142,3 +145,22 @@ def test_the_case_leaves_the_scene_as_its_file_has_it(tmp_path):
     assert other.tolist() == (MIRROR @ one).tolist()
     assert one[2] == pytest.approx(0.003)
     assert left.patellar_ligament == scene.patellar_ligament
+
+
+@pytest.mark.parametrize("table", CLASSES)
+def test_every_key_of_a_recording_has_a_field_that_its_reader_sees(table):
+    assert {name for name, _ in si_names(table).values()} == {
+        one.name for one in fields(CLASSES[table])
+    }
+
+
+def test_a_key_that_no_reader_would_see_is_an_error(monkeypatch):
+    """A key that is declared in the table alone used to be read and passed over."""
+
+    class MoreTable(TibiaTable):
+        tilt_deg: float = 0.0
+
+    monkeypatch.setitem(CLASSES, MoreTable, CLASSES[TibiaTable])
+    table = MoreTable(kind="sagittal", file="lean.csv", tilt_deg=3.0)
+    with pytest.raises(TypeError, match=r"MoreTable.tilt_deg: no field ShankRecording.tilt"):
+        in_si(table)

@@ -43,7 +43,7 @@ def stood_upon(place):
 @pytest.mark.parametrize("where", PLACES)
 def test_the_quadriceps_of_the_sharing_is_the_quadriceps_of_the_knee(where):
     muscles = SharedMuscles(two_flexors(1))
-    geometry, loads = muscles.solve(0, stood_upon(PLACES[where]), FRICTION)
+    geometry, loads = muscles.frame(0).solve(stood_upon(PLACES[where]), FRICTION)
     assert loads.problems == ()
     assert geometry.share.force.min() > 50.0
     quadriceps = geometry.extensor.tension(loads.values)
@@ -54,7 +54,9 @@ def test_flexors_carry_what_a_slack_quadriceps_leaves():
     """Ground ahead of the knee: without them a residual, with them a reserve of 1 % of it."""
     knee = stood_upon([0.06, -0.45, 0.0])
     alone = solve_knee(knee, FRICTION)
-    geometry, loads = SharedMuscles(two_flexors(1, reserve=0.5, least=0.0)).solve(0, knee, FRICTION)
+    geometry, loads = (
+        SharedMuscles(two_flexors(1, reserve=0.5, least=0.0)).frame(0).solve(knee, FRICTION)
+    )
     assert alone.slack
     assert alone.values["residual_flexion"] < -10.0
     assert geometry.share.force[0] < 1e-6
@@ -66,7 +68,7 @@ def test_flexors_carry_what_a_slack_quadriceps_leaves():
 def test_without_strength_of_the_others_nothing_changes():
     knee = stood_upon(PLACES["behind"])
     trial = two_flexors(1, strengths=(6000.0, 1e-9, 1e-9), reserve=1e-3, least=0.0)
-    geometry, loads = SharedMuscles(trial).solve(0, knee, FRICTION)
+    geometry, loads = SharedMuscles(trial).frame(0).solve(knee, FRICTION)
     alone = solve_knee(knee, FRICTION)
     assert loads.values == pytest.approx(alone.values, rel=1e-6, abs=1e-4)
     assert geometry.share.reserve[0] == pytest.approx(0.0, abs=1e-6)
@@ -76,7 +78,7 @@ def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
     """The optimum of one row without reserve: a_i as R_i F_i."""
     knee = stood_upon(PLACES["ahead"])
     trial = two_flexors(1, reserve=1e-3, least=0.0)
-    share = SharedMuscles(trial).share(0, knee, FRICTION, frozenset())
+    share = SharedMuscles(trial).frame(0).share(knee, FRICTION, frozenset())
     force, step = share.force, 1.0
     pulled = []
     for i in (1, 2):  # the arms by differences of the whole knee's equations
@@ -121,7 +123,7 @@ def test_the_work_of_a_line_is_that_of_its_shortening():
 
 def test_the_wrench_of_the_released_knee_is_that_of_the_equations():
     trial, knee = two_flexors(1), stood_upon(PLACES["behind"])
-    share = SharedMuscles(trial).share(0, knee, FRICTION, frozenset())
+    share = SharedMuscles(trial).frame(0).share(knee, FRICTION, frozenset())
     state = knee.state
     on_tibia = [load for load in share.loads(state) if load.link == "tibia"]
     wrench = share.wrench(state.pose("tibia"), state.pose("femur"))
@@ -131,7 +133,7 @@ def test_the_wrench_of_the_released_knee_is_that_of_the_equations():
 def test_a_muscle_without_a_path_fails_its_frame_by_name():
     trial = two_flexors(1)
     trial.problems.arms[0, 1] = np.nan
-    geometry, loads = SharedMuscles(trial).solve(0, stood_upon(PLACES["behind"]), FRICTION)
+    geometry, loads = SharedMuscles(trial).frame(0).solve(stood_upon(PLACES["behind"]), FRICTION)
     assert "no taut path of hamstring" in loads.problems[0]
     assert np.isnan(loads.contact_force).all()
     assert np.isnan(geometry.share.force).all()
@@ -139,7 +141,7 @@ def test_a_muscle_without_a_path_fails_its_frame_by_name():
 
 def test_a_frame_without_its_patella_fails_by_name():
     lost = replace(stood_upon(PLACES["behind"]), extensor=None, problems=("patella lost",))
-    geometry, loads = SharedMuscles(two_flexors(1)).solve(0, lost, FRICTION)
+    geometry, loads = SharedMuscles(two_flexors(1)).frame(0).solve(lost, FRICTION)
     assert "patella lost" in loads.problems[0]
     assert np.isnan(geometry.share.force).all()
 
@@ -166,8 +168,8 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
     code = (
         "import sys; from tkamb.io.scene import load_scene; "
         "from tkamb.io.scene.case import load_case; "
-        "from tkamb.run.mechanics import Mechanics; "
-        f"m = Mechanics(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
+        "from tkamb.run.read_scene import mechanics_of; "
+        f"m = mechanics_of(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
         f"print([n for n in sys.modules if n.startswith({own})])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

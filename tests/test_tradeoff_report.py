@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from error_cases import SITUATIONS
+from error_rows import read_error_rows
 from known_error_tables import tables
 from tkamb.errors import InputError
 from tkamb.run.known_errors import (
@@ -20,8 +22,6 @@ from tkamb.run.known_errors import (
 )
 from tkamb.show.tradeoff_report import comparison, picture, recommendations, table
 from tkamb.studies.body_trade import read_body_rows
-from tkamb.studies.error_cases import SITUATIONS
-from tkamb.studies.error_rows import read_error_rows
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.references import read_references
 from tkamb.studies.row import KEYS, TIMES, Row, as_json, read_rows, with_fronts

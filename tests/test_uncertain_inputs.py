@@ -16,8 +16,8 @@ from tkamb.io.scene.case import load_case
 from tkamb.io.scene.recording_tables import MarkersTable
 from tkamb.io.scene.uncertainty import CorrelationTable
 from tkamb.knee.load import PointForces
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.muscles.shared_muscles import SharedMuscles
+from tkamb.run.read_scene import mechanics_of
 from tkamb.studies.uncertainty.bands import influences
 from tkamb.studies.uncertainty.correlation import correlation_root
 from tkamb.studies.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
@@ -128,9 +128,11 @@ def test_a_knee_centre_that_is_off_is_a_ground_reaction_that_is_off_the_other_wa
     away = case.tibia.pose[:, :3, :3] @ (1e-3 * np.array(list(off.values())))
     other = replace(case, ground=replace(case.ground, point=case.ground.point - away))
     for k in (10, 60):
-        found, expected = (Mechanics(one).frame(k).loads for one in (moved, other))
+        found, expected = (mechanics_of(one).frame(k).loads for one in (moved, other))
         assert found.values == pytest.approx(expected.values, rel=1e-9, abs=1e-8)
-        assert abs(found.external_flexion - Mechanics(case).frame(k).loads.external_flexion) > 5.0
+        assert (
+            abs(found.external_flexion - mechanics_of(case).frame(k).loads.external_flexion) > 5.0
+        )
 
 
 def test_an_insert_that_is_turned_turns_the_femur_with_it():
@@ -198,13 +200,13 @@ def test_muscles_of_another_strength_and_place_are_those_of_a_trial_made_so():
     )
     draw = Draw(inputs, np.array([1.0, 4.0]), np.zeros((1, 0)), 1.0)
     factor = draw.factor("muscle_strength.flexors")
-    found = varied_muscles(SharedMuscles(trial), draw).share(0, knee_now, 0.05, frozenset())
+    found = varied_muscles(SharedMuscles(trial), draw).frame(0).share(knee_now, 0.05, frozenset())
     strengths = (STRENGTHS[0], factor * STRENGTHS[1], factor * STRENGTHS[2])
     by_hand = two_flexors(1, strengths=strengths)
     by_hand = replace(by_hand, shank=by_hand.shank + np.array([away, 0.0, 0.0]))
-    expected = SharedMuscles(by_hand).share(0, knee_now, 0.05, frozenset())
+    expected = SharedMuscles(by_hand).frame(0).share(knee_now, 0.05, frozenset())
     np.testing.assert_allclose(found.force, expected.force, rtol=1e-9)
-    before = SharedMuscles(trial).share(0, knee_now, 0.05, frozenset())
+    before = SharedMuscles(trial).frame(0).share(knee_now, 0.05, frozenset())
     assert np.abs(found.force - before.force).max() > 1.0
     assert varied_muscles(None, draw) is None
 

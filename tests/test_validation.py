@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from tkamb.studies.designs.design import load_design
-from tkamb.studies.validation import benchmarks, dissertation
-from tkamb.studies.validation.design_cells import (
+from validation import benchmarks, dissertation
+from validation.design_cells import (
     PressedDesign,
     in_public_units,
     nominal,
     table_force,
 )
-from tkamb.studies.validation.design_tables import FOLDERS, QUANTITIES, pressed_row
-from tkamb.studies.validation.film import PressureFilm, hertz_field, worst_errors
-from tkamb.studies.validation.page import badge, hit, page, published
+from validation.design_tables import FOLDERS, QUANTITIES, pressed_row
+from validation.film import PressureFilm, hertz_field, worst_errors
+from validation.page import badge, hit, page, published
 
 ROOT = Path(__file__).parents[1]
 STORED = json.loads((ROOT / "scripts" / "data" / "validation.json").read_text(encoding="utf-8"))

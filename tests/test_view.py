@@ -104,7 +104,7 @@ def test_strands_are_as_long_as_their_lines(show):
     run, drawing = show.runs[0], show.drawings[0]
     for row, frame in enumerate(run.frames):
         state = run.mechanics.frame(frame).geometry.state
-        for path in run.mechanics.extensor.paths(state):
+        for path in run.mechanics.extensor.lines.paths(state):
             found = [
                 np.linalg.norm(np.diff(one.points[row], axis=0), axis=1).sum()
                 for one in drawing.strands

@@ -17,7 +17,7 @@ def frames():
     """Return the bent knee with active flexors, with slack ones, and without a solution."""
     ground = PointForces("tibia", np.array([[0.06, -0.45, 0.0]]), 700 * UP[None])
     knee = replace(bent_knee(), ground=ground)
-    active, _ = SharedMuscles(two_flexors(1, least=0.0)).solve(0, knee, 0.05)
+    active, _ = SharedMuscles(two_flexors(1, least=0.0)).frame(0).solve(knee, 0.05)
     nothing = 0.0 * active.share.force
     slack = replace(active, share=replace(active.share, force=nothing, activation=nothing))
     return [

@@ -12,8 +12,8 @@ from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.surface import Surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.metrics import METRICS
+from tkamb.run.read_scene import mechanics_of
 from tkamb.show.style import PRESSURE_MAP
 from tkamb.show.view import colours
 from tkamb.show.view.draw import draw
@@ -152,9 +152,10 @@ def test_the_bone_that_the_scene_names_is_drawn():
     data = Path(__file__).parents[2] / "shared" / "data" / "dm"
     if not data.is_dir():
         pytest.skip("subject DM's data are not beside the project")
-    mechanics = Mechanics(load_case(load_scene(DM, {"motion.frames": 26})))
+    case = load_case(load_scene(DM, {"motion.frames": 26}))
+    mechanics = mechanics_of(case)
     states = [mechanics.geometry(k).state for k in range(2)]
-    made = solids(mechanics.case, mechanics.poses[:2], states, None, [-1] * 2)
+    made = solids(case, mechanics.poses[:2], states, None, [-1] * 2)
     femur = next(one for one in made if one.name == "femur")
     given = trimesh.load(data / "geometry" / "bone_femur.stl")
     assert len(femur.surface.faces) == len(given.faces)

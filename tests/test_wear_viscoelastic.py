@@ -4,16 +4,67 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import shapes
+from tkamb.contact.foundation import FOUNDATION
 from tkamb.contact.lattice.model import LinearLattice
 from tkamb.contact.materials import Material
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.samples import sample_surface
+from tkamb.contact.samples import gaps_along_normals, sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import pose
-from tkamb.studies.wear.viscoelastic import PronySeries, ViscoelasticBed
+from tkamb.studies.wear.viscoelastic import PronySeries
 from tkamb.studies.wear.viscoelastic_lattice import ViscoelasticLattice
+
+
+class ViscoelasticBed:
+    """Columns of springs and dampers under a rigid femoral component, step by step.
+
+    Each column of the bed (`tkamb.contact.samples`) has the linear foundation's pressure p = M d/h
+    with M relaxing as a Prony series. A column that the femur leaves carries nothing and creeps
+    back: its strain is then what makes its stress zero. The load acts along -y.
+
+    Limits: as the linear elastic foundation; one modulus, relaxing in volume and shape alike.
+
+    Args:
+        bed: the sampled articular surface.
+        femoral: the femoral component, in its own frame.
+        modulus: M_0, Pa, instantaneous and confined.
+        series: its relaxation.
+    """
+
+    def __init__(self, bed, femoral, modulus, series):
+        self._bed, self._femoral, self._modulus, self._series = bed, femoral, modulus, series
+        self._strain = np.zeros(len(bed.points))
+        self._memory = np.zeros((len(series.times), len(bed.points)))
+
+    def press(self, load, pose, step):
+        """Go on by `step` s to a load (N) at a pose whose y is free; pressure (n,) Pa."""
+
+        def missing(fall):
+            result = self._pressed(pose, fall, step)[1]
+            return float((result * self._bed.area) @ self._bed.normals[:, 1]) - load
+
+        fall = brentq(missing, -5e-3, 5e-3, xtol=1e-9)
+        strain, pressure = self._pressed(pose, fall, step)
+        _, decay, kept = self._series.response(step)
+        self._memory = decay[:, None] * self._memory + kept[:, None] * (strain - self._strain)
+        self._strain = strain
+        return pressure
+
+    def _pressed(self, pose, fall, step):
+        """Return strains and pressures (n,) with the femur `fall` below its pose."""
+        moved = np.array(pose, float)
+        moved[1, 3] -= fall
+        gap = gaps_along_normals(self._bed, self._femoral, moved)
+        asked = -gap / np.maximum(self._bed.thickness, FOUNDATION.least_thickness)
+        slope, decay, kept = self._series.response(step)
+        carried = decay @ self._memory - kept.sum() * self._strain
+        free = -carried / slope  # strain at which the stress is zero
+        strain = np.maximum(asked, free)
+        return strain, self._modulus * np.maximum(slope * strain + carried, 0.0)
+
 
 SERIES = PronySeries((0.4, 0.3), (0.5, 20.0))
 

@@ -58,7 +58,7 @@ def _write_picture(check: "SceneCheck", path: Path) -> None:
     from tkamb.atomic import replaced_file, write_text
     from tkamb.show.check.leg_picture import draw_leg
 
-    figure = draw_leg(check.mechanics)
+    figure = draw_leg(check.case, check.mechanics)
     if path.suffix.lower() == ".html":
         write_text(path, check_html(check, figure))
         return

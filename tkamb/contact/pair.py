@@ -1,9 +1,10 @@
 """The two bodies of a contact, and what a model prepares of them."""
 
+import copy
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
+
+if TYPE_CHECKING:
+    from tkamb.geometry.closest import ClosestPointQuery
 
 Bearing = Literal["fixed", "mobile"]
 
@@ -47,6 +51,19 @@ class ContactPair:
     def articular_edge(self) -> ArticularEdge:
         """Where the insert's articular surface ends."""
         return ArticularEdge.of(self.insert)
+
+    @cached_property
+    def closest_points(self) -> "ClosestPointQuery":
+        """Closest points of the two undeformed bodies, at any pose."""
+        from tkamb.geometry.closest import ClosestPointQuery
+
+        return ClosestPointQuery(self.femoral, self.insert, self.split)
+
+    def of_material(self, material: Material) -> "ContactPair":
+        """Return the bodies with an insert of another material; what is known of them stays."""
+        other = copy.copy(self)
+        object.__setattr__(other, "material", material)
+        return other
 
     def touch_at(self, pose: Array) -> Touch | None:
         """Return the first touch of either condyle, whatever the pose's y; travel from y = 0.

@@ -185,3 +185,12 @@ def _axes_of_knees(c: Array) -> Array:
     axes[..., 5, 5] = np.cos(turn) * np.cos(tilt)
     axes[..., 3:, :3] = cross(c[..., None, :3], axes[..., 3:, 3:])
     return axes
+
+
+def sagittal_pose(coordinates: Array) -> Array:
+    """Return the pose (4, 4) at ap, si (m) and a rotation about z (rad) in the sagittal plane."""
+    ap, si, rotation = coordinates
+    c, s = np.cos(rotation), np.sin(rotation)
+    result = np.eye(4)
+    result[:2, :2], result[:2, 3] = [[c, -s], [s, c]], [ap, si]
+    return result

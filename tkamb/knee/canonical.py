@@ -15,6 +15,7 @@ spatial velocities v and accelerations a of the two frames,
 give the rates of the knee coordinates, whatever joints the model has there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,9 +31,26 @@ from tkamb.geometry.frames import (
     knee_coordinates,
     mirrored_pose,
 )
-from tkamb.knee.anatomy import Anatomy, Place
+from tkamb.knee.anatomy import Anatomy, Place, knee_size
 from tkamb.knee.chain import Chain, ChainMotion, ChainState
 from tkamb.knee.load import LinkPoint, PointForces, wrenches
+
+
+@dataclass(frozen=True)
+class KneeSettings:
+    """How joint coordinates that make a given pose of the knee are found."""
+
+    pose_tolerance: float = 1e-12
+    """m and rad: residual of the joint coordinates that make a given pose of the knee. Chosen: near
+    the rounding of double precision."""
+    accepted_pose_error: float = 1e-8
+    """m and rad: at most what is left after the last Newton step of a pose that is reached. Chosen:
+    far below what changes a force."""
+    max_pose_steps: int = 30
+    """Newton steps at most to find these coordinates. Chosen: poses that converge need fewer."""
+
+
+KNEE = KneeSettings()
 
 _TWIST_MIRROR = np.array([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
 """Signs of a twist or wrench (linear or force first) in the mirror image (z to -z)."""
@@ -158,6 +176,9 @@ class Bridge:
         self.component, self.insert = component, insert
         self._chain_data = chain.model.createData()
         self._last = chain.model.getJointId(KNEE_JOINT_NAMES[-1])
+        self._shank: Sequence[int] = anatomy.shank
+        if anatomy.fixed:
+            self._shank = tuple(anatomy.model.subtrees[anatomy.knee_joints[0]])
 
     def link_point(self, point: LinkPoint) -> LinkPoint:
         """Return a point on a frame of the user's model as a point on a link of the chain.
@@ -284,33 +305,94 @@ class Bridge:
             return pair
         return mirrored_spatial(pair[0]), mirrored_spatial(pair[1])
 
-    def shank_needs(self, data: Any, external: Any) -> Array:
-        """Return the wrench (6,) that the knee must exert on the shank, insert frame.
+    def relative_jacobian(self, data: Any, q: Array) -> Array:
+        """Return J (6, nv), see `tkamb.Knee.relative_jacobian`; `data` is brought up to date."""
+        model = self.anatomy.model
+        pin.computeJointJacobians(model, data, q)
+        insert = data.oMi[self.insert.joint] * self.insert.placement
+        total = np.zeros((6, model.nv))
+        for place, sign in ((self.component, 1.0), (self.insert, -1.0)):
+            if place.joint:
+                local = pin.getJointJacobian(model, data, place.joint, pin.ReferenceFrame.LOCAL)
+                to_insert = insert.actInv(data.oMi[place.joint]).toActionMatrix()
+                total += sign * to_insert @ local.reshape(6, -1)
+        return total
 
-        The sum over the shank's bodies of what their motion and weight need, less the external
-        loads on them: the equations of motion of the shank. Where the tibia is fixed to the
-        universe, the negative of the same sum over everything above the knee.
+    def configuration(self, q: Array, target: Array) -> Array:
+        """Return q with the knee's joints moved so that the femur has a pose (4, 4).
+
+        Newton's method on the joints between tibia and femur.
+
+        Args:
+            q: (nq,) of the user's model.
+            target: pose_femoral_in_insert of a right knee.
+
+        Raises:
+            InputError: these joints cannot make that pose.
+        """
+        model = self.anatomy.model
+        data, placement = model.createData(), self._placed(target)
+        columns = [
+            model.joints[joint].idx_v + k
+            for joint in self.anatomy.knee_joints
+            for k in range(model.joints[joint].nv)
+        ]
+        q = np.array(q, float)
+        for _ in range(KNEE.max_pose_steps):
+            pin.forwardKinematics(model, data, q)
+            insert = data.oMi[self.insert.joint] * self.insert.placement
+            femur = data.oMi[self.component.joint] * self.component.placement
+            error = pin.log6(placement * insert.actInv(femur).inverse()).vector
+            if np.abs(error).max() < KNEE.pose_tolerance:
+                return q
+            jacobian = self.relative_jacobian(data, q)[:, columns]
+            step = np.zeros(model.nv)
+            step[columns] = np.linalg.lstsq(jacobian, error, rcond=None)[0]
+            q = pin.integrate(model, q, step)
+        if np.abs(error).max() < KNEE.accepted_pose_error:
+            return q
+        raise InputError(
+            f"the {knee_size(self.anatomy)} degrees of freedom between tibia and femur do not "
+            "reach the pose of equilibrium",
+            "Knee",
+            "give the knee of the model six (a pin.JointModelFreeFlyer, or six single joints)",
+        )
+
+    def shank_needs(self, data: Any) -> Array:
+        """Return the wrench (6,) that motion and weight of the shank need, insert frame.
+
+        The sum over the shank's bodies. Where the tibia is fixed to the universe, the negative of
+        the same sum over everything above the knee.
 
         Args:
             data: of the user's model, after `pin.forwardKinematics(model, data, q, v, a)`.
-            external: forces on the joints, each in its joint's frame; None: none.
         """
-        anatomy = self.anatomy
+        needs = []
+        for joint in self._shank:
+            inertia, velocity = self.anatomy.model.inertias[joint], data.v[joint]
+            falling = data.a[joint] - data.oMi[joint].actInv(self.anatomy.model.gravity)
+            needs.append(inertia * falling + velocity.cross(inertia * velocity))
+        return self._sum(data, self._shank, needs)
+
+    def on_shank(self, data: Any, external: Any) -> PointForces:
+        """Return the external forces on the shank as one at the insert's origin, insert frame.
+
+        Where the tibia is fixed to the universe: the negative of those above the knee.
+
+        Args:
+            data: of the user's model, with joint placements up to date.
+            external: forces on the joints, each in its joint's frame.
+        """
+        wrench = self._sum(data, self._shank, [external[joint] for joint in self._shank])
+        return PointForces("tibia", np.zeros((1, 3)), wrench[None, :3], wrench[3:])
+
+    def _sum(self, data: Any, joints: Sequence[int], forces: Sequence[pin.Force]) -> Array:
+        """Return the sum (6,) of forces on joints, each in its joint's frame, on the insert."""
         insert = data.oMi[self.insert.joint] * self.insert.placement
-        bodies, sign = anatomy.shank, 1.0
-        if anatomy.fixed:
-            model = anatomy.model
-            first_joint = anatomy.knee_joints[0]
-            bodies, sign = tuple(model.subtrees[first_joint]), -1.0
         total = np.zeros(6)
-        gravity = anatomy.model.gravity
-        for joint in bodies:
-            inertia, velocity = anatomy.model.inertias[joint], data.v[joint]
-            falling = data.a[joint] - data.oMi[joint].actInv(gravity)
-            needs = inertia * falling + velocity.cross(inertia * velocity)
-            if external is not None:
-                needs = needs - external[joint]
-            total += sign * insert.actInv(data.oMi[joint]).act(needs).vector
+        for joint, force in zip(joints, forces, strict=True):
+            total += insert.actInv(data.oMi[joint]).act(force).vector
+        total *= -1.0 if self.anatomy.fixed else 1.0
         return mirrored_spatial(total) if self.left else total
 
     def external_on(self, place: Place | None, data: Any, external: Any) -> Array:
@@ -346,6 +428,9 @@ class Bridge:
             forces[joint] += data.oMi[joint].actInv(insert).act(pin.Force(own))
         return pin.StdVec_Force(forces)
 
+    def _placed(self, pose: Array) -> pin.SE3:
+        return se3(mirrored_pose(pose) if self.left else pose)
+
     def _right(self, placement: pin.SE3) -> Array:
         pose = placement.homogeneous
         return mirrored_pose(pose) if self.left else pose
@@ -363,7 +448,12 @@ def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
 
 
 def _solved(jacobian: Array, twist: Array) -> Array:
-    """Return the rates that make a twist, the nearest to it where there are fewer than six."""
+    """Return the rates that make a twist, the nearest to it where there are fewer than six.
+
+    NaN where a place or a rate is not known.
+    """
+    if not (np.isfinite(jacobian).all() and np.isfinite(twist).all()):
+        return np.full(jacobian.shape[1], np.nan)
     if jacobian.shape[1] == 6:
         return np.asarray(np.linalg.solve(jacobian, twist))
     return np.asarray(np.linalg.lstsq(jacobian, twist, rcond=None)[0])
@@ -377,7 +467,7 @@ def canonical_state(
     Args:
         chain: the canonical chain.
         motion: how it moves.
-        shank: (6,) wrench that the knee must exert on the shank, insert frame.
+        shank: (6,) wrench that motion and weight of the shank need, insert frame.
         thigh: (6,) external wrench on the thigh, insert frame.
         patella: (6,) external wrench on the patella, insert frame.
     """

@@ -44,25 +44,40 @@ CONTACT_DIFFERENCE = DifferenceSettings()
 
 
 class KneeContact:
-    """A prepared contact model with friction.
+    """A contact model of one pair of bodies, with friction.
 
     Args:
         model: the contact model.
         pair: femoral component and insert.
         friction: Coulomb coefficient.
-        settings: of the differences.
+        state: what the model's `prepare` returned for the pair; None: it is prepared when it is
+            first asked for.
     """
 
     def __init__(
-        self,
-        model: ContactModel,
-        pair: ContactPair,
-        friction: float,
-        settings: DifferenceSettings | None = None,
+        self, model: ContactModel, pair: ContactPair, friction: float, state: Any = None
     ) -> None:
         self.model, self.pair, self.friction = model, pair, friction
-        self.state: Any = model.prepare(pair)
-        self._settings = settings or CONTACT_DIFFERENCE
+        self._state = state
+        self._settings = CONTACT_DIFFERENCE
+
+    @property
+    def state(self) -> Any:
+        """What the model has prepared."""
+        if self._state is None:
+            self._state = self.model.prepare(self.pair)
+        return self._state
+
+    def changed(self, friction: float, modulus_factor: float = 1.0) -> "KneeContact":
+        """Return the same contact with another friction, and an insert of another modulus.
+
+        What is prepared is shared, unless the modulus differs.
+        """
+        if modulus_factor == 1.0:
+            return KneeContact(self.model, self.pair, friction, self._state)
+        own = self.pair.material
+        stiffer = replace(own, young_modulus=own.young_modulus * modulus_factor)
+        return KneeContact(self.model, self.pair.of_material(stiffer), friction)
 
     def probe(self, start: Guess | None = None) -> Any:
         """Return a new probe (`tkamb.contact.probe.Probe`), which a caller keeps as warm start."""

@@ -1,7 +1,7 @@
 """The extensor mechanism over all frames: place of the patella, and lines of action."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Protocol, overload
@@ -13,9 +13,9 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_coordinates, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.geometry.surface import Surface
-from tkamb.knee.chain import Chain, ChainState
+from tkamb.knee.chain import Chain
 from tkamb.knee.equations import Extensor
-from tkamb.knee.load import PointForces
+from tkamb.knee.load import PointForces, scaled
 from tkamb.knee.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
 from tkamb.knee.patella import ExtensorMechanism, PatellaState, patella_at
 from tkamb.knee.patella_search import solve_patella
@@ -64,27 +64,24 @@ class ExtensorLines:
     Attributes:
         muscle: its line of action.
         ligament: the patellar ligament's.
+        mechanism: what the place of the patella is found with.
+        prepared: the patellofemoral contact, shared by all lines of the same surfaces.
 
     Raises:
         InputError: a line starts inside what it wraps.
     """
 
     def __init__(self, parts: ExtensorParts) -> None:
-        self._take(parts)
-
-    def _take(self, parts: ExtensorParts) -> PatellofemoralContact:
-        """Build the lines and the mechanism of parts; return its contact as it was prepared."""
         self._parts, self._chain = parts, parts.chain
         self.muscle = muscle_line(parts.muscle, parts.chain, parts.femoral)
         self.ligament = self._ligament_line()
         self._check_fixed_ends()
-        self._mechanism, prepared = self._build_mechanism()
-        return prepared
+        self.mechanism, self.prepared = self._build_mechanism()
 
     def given(self, pose: Array, coordinates: Array) -> PatellaState:
         """Return the patella at given coordinates (3,), the femur at a pose (4, 4)."""
-        contact = self._mechanism.contact.at(coordinates)
-        return patella_at(self._mechanism, pose, coordinates, contact)
+        contact = self.mechanism.contact.at(coordinates)
+        return patella_at(self.mechanism, pose, coordinates, contact)
 
     def solved(
         self, pose: Array, guess: PatellaState | None = None, near: Array | None = None
@@ -97,8 +94,8 @@ class ExtensorLines:
             near: (3,) coordinates near by, without it; None searches all rotations.
         """
         if guess is None or not guess.status.found:
-            return solve_patella(self._mechanism, pose, near)
-        return solve_patella(self._mechanism, pose, guess.coordinates, guess.slopes)
+            return solve_patella(self.mechanism, pose, near)
+        return solve_patella(self.mechanism, pose, guess.coordinates, guess.slopes)
 
     def loads(
         self, flexion: float, state: Posed, patella: PatellaState
@@ -126,6 +123,53 @@ class ExtensorLines:
             muscle.wrap_angle,
         )
         return extensor, Unknown(muscle_load(self.muscle.name), self.muscle.loads(muscle))
+
+    def pull(
+        self,
+        poses: Mapping[str, Array],
+        patella: PatellaState,
+        flexion: float,
+        tension: float,
+        patellar_tension: float | None = None,
+    ) -> list[PointForces]:
+        """Return what a tension of the muscle does to femur, patella and tibia.
+
+        The patella is massless: the patellofemoral force is what the two tendons leave.
+
+        Args:
+            poses: link -> pose (4, 4) in the insert frame.
+            patella: where it is.
+            flexion: rad, for messages.
+            tension: N, of the muscle.
+            patellar_tension: N, of the patellar ligament; None: as the patella carries it on.
+
+        Raises:
+            ComputationError: the patella cannot carry it on.
+        """
+        extensor, muscle = self.loads(flexion, _Poses(poses), patella)
+        pulls = scaled(muscle.loads, tension)
+        if patellar_tension is None:
+            if not (patella.ligament_ratio > 0.0 and patella.patellofemoral_ratio > 0.0):
+                raise ComputationError(
+                    "the contact would have to pull, or the patellar ligament to push", "extensor"
+                )
+            pulls += scaled(extensor.patellar_ligament, tension * patella.ligament_ratio)
+            force = tension * patella.patellofemoral_ratio * patella.contact_normal
+        else:
+            pulls += scaled(extensor.patellar_ligament, patellar_tension)
+            pull = sum(load.forces.sum(axis=0) for load in pulls if load.link == "patella")
+            across = poses["femur"][:3, 2]
+            force = -(pull - (pull @ across) * across)
+        point = patella.contact_point[None]
+        return [
+            *pulls,
+            PointForces("patella", point, force[None]),
+            PointForces("femur", point, -force[None]),
+        ]
+
+    def paths_at(self, poses: Mapping[str, Array]) -> tuple[TautPath, TautPath]:
+        """Return what `paths` does, of link -> pose (4, 4) in the insert frame."""
+        return self.paths(_Poses(poses))
 
     def paths(self, state: Posed) -> tuple[TautPath, TautPath]:
         """Return muscle and patellar ligament as they run, in the insert frame.
@@ -193,59 +237,55 @@ class ExtensorLines:
         return mechanism, prepared
 
 
-class ExtensorFrames(ExtensorLines):
-    """Muscle, patella and patellar ligament over the frames of a motion.
+class ExtensorFrames:
+    """The patella over the frames of a motion.
 
     Args:
-        parts: the mechanism.
+        lines: the extensor mechanism.
         time: (f,) s.
         poses: (f, 4, 4) pose_femur_in_insert.
         recorded: (f, 3, 3) patella coordinates, rates and accelerations; None: to be found.
         rates: from time (n,) and coordinates (n, 3) to them filtered, and their derivatives.
 
     Attributes:
-        muscle: its line of action.
-        ligament: the patellar ligament's.
+        lines: as given.
         states: the patella at each frame; a recorded one is evaluated on first use.
 
     Raises:
-        InputError: a line starts inside what it wraps, or the patella is found nowhere.
+        InputError: the patella is found nowhere.
     """
 
     def __init__(
-        self, parts: ExtensorParts, time: Array, poses: Array, recorded: Array | None, rates: Rates
+        self, lines: ExtensorLines, time: Array, poses: Array, recorded: Array | None, rates: Rates
     ) -> None:
-        prepared = self._take(parts)
+        self.lines = lines
         self._contacts: _RecordedContacts | None = None
         self.states: Sequence[PatellaState]
         if recorded is not None:
             self._joints = recorded
-            self._contacts = _recorded_contacts(prepared, recorded[:, 0].tobytes())
-            self.states = _RecordedStates(self._mechanism, poses, self._contacts)
+            self._contacts = _recorded_contacts(lines.prepared, recorded[:, 0].tobytes())
+            self.states = _RecordedStates(lines.mechanism, poses, self._contacts)
         else:
-            self.states = _solve_all(self._mechanism, poses)
+            self.states = _solve_all(lines.mechanism, poses)
             self._joints = self._differentiate(time, poses, rates)
 
-    def moved(self, parts: ExtensorParts, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
-        """Return the mechanism of a solved patella with its parts or the femur a little elsewhere.
+    def moved(self, lines: ExtensorLines, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
+        """Return the frames of a solved patella with its lines or the femur a little elsewhere.
 
         In the given frames the patella is solved again, with its place here as initial guess; its
         joint moves by as much. Rates, and the patella in the other frames, are kept.
 
         Args:
-            parts: the mechanism.
+            lines: the mechanism.
             poses: (f, 4, 4) pose_femur_in_insert.
             frames: frames in which the patella is solved again.
-
-        Raises:
-            InputError: a line starts inside what it wraps.
         """
         other = copy.copy(self)
-        other._take(parts)
+        other.lines = lines
         states, other._joints = list(self.states), self._joints.copy()
         for k in frames:
             near = self.states[k]
-            solution = solve_patella(other._mechanism, poses[k], near.coordinates, near.slopes)
+            solution = solve_patella(lines.mechanism, poses[k], near.coordinates, near.slopes)
             states[k] = solution
             other._joints[k, 0] += solution.coordinates - near.coordinates
         other.states = states
@@ -255,41 +295,29 @@ class ExtensorFrames(ExtensorLines):
         """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
         return np.asarray(self._joints[k])
 
+    def at(self, k: int) -> "PatellaOfFrame":
+        """Return what finds the patella of frame k."""
+        return PatellaOfFrame(self, k)
+
     def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
         """Return the patella of frame k with the femur at another pose (4, 4).
 
         Recorded coordinates are kept; a solved patella is found anew, from `guess` or from
         where it was at the recorded pose.
         """
+        mechanism = self.lines.mechanism
         if self._contacts is not None:
-            recorded = self._contacts.places[k]
-            return patella_at(self._mechanism, pose, recorded, self._contacts[k])
+            return patella_at(mechanism, pose, self._contacts.places[k], self._contacts[k])
         own = self.states[k]
         if guess is not None and own.status.found:
             # An initial guess from a distant frame may fail where the frame's own one converges.
             near = guess.coordinates
-            solution = solve_patella(self._mechanism, pose, near, guess.slopes, anywhere=False)
+            solution = solve_patella(mechanism, pose, near, guess.slopes, anywhere=False)
             if solution.status.found:
                 return solution
             guess = None
         last = own if guess is None else guess
-        return solve_patella(self._mechanism, pose, last.coordinates, last.slopes)
-
-    def at(
-        self, k: int, flexion: float, state: ChainState, patella: PatellaState | None = None
-    ) -> tuple[Extensor, Unknown]:
-        """Return the mechanism and its muscle, both per unit tension.
-
-        Args:
-            k: frame.
-            flexion: rad, for messages.
-            state: the chain there.
-            patella: where it is, if not as at the recorded pose.
-
-        Raises:
-            ComputationError: no patella at this frame, or a line's end inside what it wraps.
-        """
-        return self.loads(flexion, state, self.states[k] if patella is None else patella)
+        return solve_patella(mechanism, pose, last.coordinates, last.slopes)
 
     def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
@@ -315,6 +343,30 @@ class ExtensorFrames(ExtensorLines):
         result[part] = np.stack(rates(time[part], bridged), axis=1)
         result[np.isnan(places).any(axis=1)] = np.nan
         return result
+
+
+@dataclass(frozen=True, eq=False)
+class PatellaOfFrame:
+    """Finds the patella of one frame of a motion.
+
+    Args:
+        frames: of the motion.
+        k: which.
+    """
+
+    frames: ExtensorFrames
+    k: int
+
+    @property
+    def lines(self) -> ExtensorLines:
+        """The extensor mechanism."""
+        return self.frames.lines
+
+    def patella(self, pose: Array | None = None, guess: PatellaState | None = None) -> PatellaState:
+        """Return the patella with the femur at a pose (4, 4); None: as recorded."""
+        if pose is None:
+            return self.frames.states[self.k]
+        return self.frames.patella(self.k, pose, guess)
 
 
 @lru_cache(maxsize=1)
@@ -392,6 +444,17 @@ def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]
         near = (states[-1].coordinates, states[-1].slopes) if states else ()
         states.append(solve_patella(mechanism, pose, *near))
     return states
+
+
+class _Poses:
+    """Poses of links in the insert frame, as `ExtensorLines` asks for them."""
+
+    def __init__(self, poses: Mapping[str, Array]) -> None:
+        self._poses = poses
+
+    def pose(self, link: str) -> Array:
+        """Return pose_link_in_insert (4, 4)."""
+        return self._poses[link]
 
 
 def _on_tibia(load: PointForces) -> PointForces:

@@ -1,12 +1,12 @@
-"""A knee at one instant, at the pose of q or near it: input of a search for equilibrium.
+"""A knee at one instant, at the pose of q or near it: its loads and lines of action.
 
-The shank moves as q, v and a say, whatever the knee coordinates of the search. The wrench that the
-knee must exert on it is therefore computed once.
+The shank moves as q, v and a say, whatever the knee coordinates of a search for equilibrium. The
+wrench that the knee must exert on it is therefore computed once.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -14,20 +14,63 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.frames import SIDES, Array, cross, knee_pose, knee_twist
 from tkamb.knee.canonical import canonical_state
 from tkamb.knee.chain import Chain, ChainMotion
-from tkamb.knee.contact_points import CondylePoint
-from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.contact_points import CondylePoint, ContactPoints, contact_points
+from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.knee.load import PointForces
 
 if TYPE_CHECKING:
     from tkamb.contact.probe import CondyleWrench
+    from tkamb.geometry.closest import ClosestPointQuery
+    from tkamb.knee.chain import ChainState
+    from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
 
 
+class PatellaFinder(Protocol):
+    """Where the patella is at one instant.
+
+    Attributes:
+        lines: the extensor mechanism.
+    """
+
+    @property
+    def lines(self) -> "ExtensorLines":
+        """The extensor mechanism."""
+
+    def patella(
+        self, pose: Array | None = None, guess: "PatellaState | None" = None
+    ) -> "PatellaState":
+        """Return the patella with the femur at a pose (4, 4); None: at the instant's own."""
+
+
+class SharingMuscles(Protocol):
+    """Muscles of a leg that share the load of one instant with the knee."""
+
+    def share(
+        self, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
+    ) -> "MuscleShare":
+        """Return what each muscle carries with the knee as it stands."""
+
+    def share_of_yielding_knee(
+        self, geometry: KneeGeometry, base: float, per_wrench: Array
+    ) -> "MuscleShare":
+        """Return what each muscle carries while released coordinates yield to it."""
+
+    def at(self, share: "MuscleShare") -> "MuscleShare":
+        """Return the forces of a share along the lines of this instant."""
+
+    def tension(self, share: "MuscleShare") -> float:
+        """Return what the extensor group pulls with, N."""
+
+    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, KneeLoads]:
+        """Return the geometry with the muscles' forces in it, and all loads."""
+
+
 @dataclass(frozen=True, eq=False)
 class PatellaAt:
-    """Finds the patella with the femur at a pose.
+    """Finds the patella of one instant by its place in q, or without one.
 
     Args:
         lines: the extensor mechanism.
@@ -41,8 +84,11 @@ class PatellaAt:
     coordinates: Array | None
     solved: bool
 
-    def patella(self, k: int, pose: Array, guess: "PatellaState | None" = None) -> "PatellaState":
-        """Return the patella with the femur at a pose (4, 4); `k` has no meaning."""
+    def patella(
+        self, pose: Array | None = None, guess: "PatellaState | None" = None
+    ) -> "PatellaState":
+        """Return the patella with the femur at a pose (4, 4); None: at that of q."""
+        pose = self.pose if pose is None else pose
         if self.coordinates is None:
             return self.lines.solved(pose, guess)
         if not self.solved or np.array_equal(pose, self.pose):
@@ -52,19 +98,20 @@ class PatellaAt:
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A knee at one instant; has what `tkamb.knee.equilibrium.released.ReleasedKnee` asks of a
-    body.
+    """A knee at one instant.
 
     Args:
         chain: the canonical chain.
         motion: how it moves.
-        shank: (6,) wrench that the knee must exert on the shank, insert frame.
+        shank: (6,) wrench that motion and weight of the shank need, insert frame.
         thigh: (6,) external wrench on the thigh, insert frame.
         on_patella: (6,) external wrench on the patella, insert frame.
         ligaments: the bundles, on links of the chain.
-        extensor: the extensor mechanism; None: not modelled.
+        extensor: finds the patella; None: not modelled.
         friction: Coulomb coefficient.
         two_condyles: whether there are two.
+        ground: what acts on the shank from outside; None: nothing.
+        muscles: those of the leg that share the load; None: the quadriceps alone acts.
     """
 
     chain: Chain
@@ -73,10 +120,11 @@ class Instant:
     thigh: Array
     on_patella: Array
     ligaments: "tuple[Ligament, ...]"
-    extensor: PatellaAt | None
+    extensor: PatellaFinder | None
     friction: float
     two_condyles: bool
-    muscles: None = None
+    ground: PointForces | None = None
+    muscles: SharingMuscles | None = None
 
     @property
     def sides(self) -> set[str]:
@@ -89,72 +137,131 @@ class Instant:
         return self.motion.joints[0, :6]
 
     def geometry(
-        self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
+        self, coordinates: Array | None = None, patella: "PatellaState | None" = None
     ) -> KneeGeometry:
         """Return the knee without its contact, perhaps at other coordinates than those of q.
 
         Args:
-            k: without meaning here.
             coordinates: (6,) m and rad; None: those of q.
-            patella: where the patella is; None: as the extensor mechanism finds it.
+            patella: where the patella is; None: as it is found there.
         """
         place = self.coordinates if coordinates is None else coordinates
         motion = self.motion
+        problems: tuple[str, ...] = ()
+        if self.extensor is not None and patella is None:
+            try:
+                patella = self.extensor.patella(None if coordinates is None else knee_pose(place))
+            except ComputationError as error:
+                problems = (str(error),)
         joints = motion.joints.copy()
         joints[0, :6] = place
-        failure = ""
-        if self.extensor is not None:
-            if patella is None:
-                patella = self.extensor.patella(k, knee_pose(place))
-            if patella.status.found:
-                joints[0, 6:] = patella.coordinates
-            else:
-                failure = f"patella lost: {patella.status.value}"
+        if patella is not None and patella.status.found:
+            joints[0, 6:] = patella.coordinates
         state = canonical_state(
             self.chain, replace(motion, joints=joints), self.shank, self.thigh, self.on_patella
         )
         tensions, pulls = self._pulls(state)
-        geometry = KneeGeometry(state, None, pulls, coordinates=place, tensions=tensions)
-        if failure:
-            return replace(geometry, problems=(failure,))
-        if self.extensor is None:
+        geometry = KneeGeometry(
+            state, self.ground, pulls, coordinates=place, tensions=tensions, problems=problems
+        )
+        if self.extensor is None or patella is None:
             return geometry
-        assert patella is not None
         try:
             extensor, muscle = self.extensor.lines.loads(place[5], state, patella)
         except ComputationError as error:
             return replace(geometry, problems=(str(error),))
         return replace(geometry, extensor=extensor, muscles=(muscle,))
 
-    def _pulls(self, state: object) -> tuple[dict[str, float], tuple[PointForces, ...]]:
+    def _pulls(self, state: "ChainState") -> tuple[dict[str, float], tuple[PointForces, ...]]:
+        """Return the ligaments' tensions (N) by name, and what they do to the links."""
         if not self.ligaments:
             return {}, ()
         from tkamb.knee.ligaments import ligament_loads
 
         links = {end.link for one in self.ligaments for end in (one.proximal, one.distal)}
-        poses = {link: state.pose(link) for link in links}  # type: ignore[attr-defined]
-        tensions, loads = ligament_loads(self.ligaments, poses)
+        tensions, loads = ligament_loads(self.ligaments, {link: state.pose(link) for link in links})
         names = [bundle.name for bundle in self.ligaments]
         return dict(zip(names, tensions.tolist(), strict=True)), loads
 
-    def sliding(self, k: int, coordinates: Array, point: Array) -> Array:
-        """Return the velocity (3,) m/s of the femur's point (3,) relative to the insert's."""
+    def contact_points(self, query: "ClosestPointQuery", pose: Array) -> ContactPoints:
+        """Return where the undeformed condyles meet the insert at a pose (4, 4), with its rates."""
+        return contact_points(query, pose, lambda point: self.sliding(self.coordinates, point))
+
+    def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, KneeLoads]:
+        """Return a geometry with the muscles' shares in it, and its loads.
+
+        Args:
+            geometry: of `geometry`, with its contact points.
+        """
+        if geometry.problems:
+            return geometry, unsolved(geometry.problems)
+        if self.muscles is None:
+            return geometry, solve_knee(geometry, self.friction)
+        return self.muscles.solve(geometry, self.friction)
+
+    def sliding(self, coordinates: Array, point: Array) -> Array:
+        """Return the velocity (3,) m/s of the femur's point (3,) relative to the insert's.
+
+        The rates are those of q and v, wherever the knee is.
+        """
         velocity, spin = knee_twist(coordinates, self.motion.joints[1, :6])
         return np.asarray(velocity + cross(spin, point - coordinates[:3]))
 
     def resultants(
-        self, k: int, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
+        self, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
     ) -> dict[str, CondylePoint]:
-        """Return the resultants of a contact as the contact points of the equations."""
+        """Return the resultants of a contact as the contact points of the equations.
+
+        Args:
+            coordinates: (6,) where the knee is.
+            condyles: side -> what it does to the insert there.
+        """
         return {
             side: CondylePoint(
-                condyle.point, condyle.normal, self.sliding(k, coordinates, condyle.point), 0.0
+                condyle.point, condyle.normal, self.sliding(coordinates, condyle.point), 0.0
             )
             for side, condyle in condyles.items()
         }
 
+    def touching(
+        self,
+        geometry: KneeGeometry,
+        coordinates: Array,
+        condyles: "Mapping[str, CondyleWrench]",
+        points: Mapping[str, Array],
+    ) -> KneeGeometry:
+        """Return a geometry with the resultants of a contact as its contact points.
+
+        Args:
+            geometry: of `geometry`.
+            coordinates: (6,) where the knee is.
+            condyles: side -> what it does to the insert there; the others carry nothing.
+            points: side -> (3,) m, where a condyle that carries nothing is nearest to the insert.
+        """
+        up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+        separated = {
+            side: CondylePoint(point, up, still, float("nan")) for side, point in points.items()
+        }
+        resultants = self.resultants(coordinates, condyles)
+        lifted = frozenset(self.sides - set(resultants))
+        return replace(geometry, condyles=separated | resultants, lifted=lifted)
+
     def post_loads(
-        self, k: int, coordinates: Array, post: "CondyleWrench | None"
-    ) -> Sequence[PointForces]:
-        """Return the loads of a cam on a post: none is modelled here."""
-        return ()
+        self, coordinates: Array, post: "CondyleWrench | None"
+    ) -> tuple[PointForces, ...]:
+        """Return what a cam on the post does to tibia and femur, with friction as a condyle's.
+
+        Args:
+            coordinates: (6,) where the knee is.
+            post: what the cam does to the insert there; None: nothing.
+        """
+        if post is None:
+            return ()
+        sliding = self.sliding(coordinates, post.point)
+        touch = CondylePoint(post.point, post.normal, sliding, 0.0)
+        force = -post.force * touch.direction(self.friction)
+        twist = post.wrench[3:] - cross(post.point, post.wrench[:3])
+        return (
+            PointForces("tibia", post.point[None], force[None], twist),
+            PointForces("femur", post.point[None], -force[None], -twist),
+        )

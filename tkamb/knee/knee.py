@@ -7,10 +7,11 @@ SI units; NumPy arrays and Pinocchio types in and out. No file is read, nothing 
 call changes the next: what may save time is a `KneeData` that the caller makes and hands over.
 """
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -19,27 +20,29 @@ from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
     Array,
-    cross,
     inverse,
     knee_pose,
     mirrored_pose,
-    transform,
+    sagittal_pose,
 )
-from tkamb.knee.anatomy import Place, find_anatomy, knee_size
+from tkamb.knee.anatomy import find_anatomy
+from tkamb.knee.assembly import (
+    bundle_on_chain,
+    crossing_and_others,
+    extensor_lines,
+    placed_insert,
+    prepared_contact,
+    surfaces_of,
+)
 from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, mirrored_spatial, se3, summed
-from tkamb.knee.contact_points import NO_CONTACT, CondylePoint, contact_points
-from tkamb.knee.equations import KneeGeometry, solve_knee, solved_unknowns, unsolved
-from tkamb.knee.instant import Instant, PatellaAt
+from tkamb.knee.contact_points import NO_CONTACT
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.instant import Instant, PatellaAt, PatellaFinder, SharingMuscles
 from tkamb.knee.load import PointForces
 from tkamb.knee.loads import KneeLoads, knee_loads
 from tkamb.knee.muscles import Muscle
-from tkamb.knee.parts import (
-    Extensor,
-    Implant,
-    as_surface,
-    link_point,
-    mirrored_surface,
-)
+from tkamb.knee.parts import Extensor, Implant
+from tkamb.knee.tension import checked_tensions, tension_lines
 
 if TYPE_CHECKING:
     from tkamb.contact.model import ContactModel
@@ -47,34 +50,14 @@ if TYPE_CHECKING:
     from tkamb.contact.result import ContactResult
     from tkamb.contact.warm_start import Guess, WarmStart
     from tkamb.geometry.closest import ClosestPointQuery
-    from tkamb.geometry.surface import Surface
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.equilibrium.released import KneeEquilibrium
-    from tkamb.knee.ligaments import BundleArrays, Ligament
+    from tkamb.knee.extensor import ExtensorLines
+    from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Its name among the tensions."""
-
-
-@dataclass(frozen=True)
-class KneeSettings:
-    """The knee object: frames and poses."""
-
-    frame_tolerance: float = 1e-9
-    """m and rad: an insert frame this near to that of its flat bottom is the same frame. Chosen:
-    above rounding."""
-    pose_tolerance: float = 1e-12
-    """m and rad: residual of the joint coordinates that make a given pose of the knee. Chosen: near
-    the rounding of double precision."""
-    accepted_pose_error: float = 1e-8
-    """m and rad: at most what is left after the last Newton step of a pose that is reached. Chosen:
-    far below what changes a force."""
-    max_pose_steps: int = 30
-    """Newton steps at most to find these coordinates. Chosen: poses that converge need fewer."""
-
-
-KNEE = KneeSettings()
 
 
 @dataclass(eq=False)
@@ -121,14 +104,6 @@ class Equilibrium:
     search: "KneeEquilibrium"
 
 
-@dataclass(frozen=True, eq=False)
-class _Line:
-    """A muscle of given tension, straight from point to point, on any frames of the model."""
-
-    places: tuple[Place, ...]
-    positions: tuple[Array, ...]
-
-
 class Knee:
     """A total knee replacement on a user's Pinocchio model.
 
@@ -150,7 +125,8 @@ class Knee:
         implant: meshes, see `Implant`.
         ligaments: bundles, with slack lengths.
         extensor: quadriceps, patella and patellar ligament.
-        contact: a contact model (`tkamb.contact_model`) or its name; None: no contact.
+        contact: a contact model (`tkamb.contact_model`), its name, or a model with what it has
+            prepared for this implant (`Knee.contact` of another knee); None: no contact.
         friction: Coulomb coefficient of the femorotibial contact.
         muscles: lines of given tension between any frames of the model, straight from point to
             point.
@@ -170,7 +146,7 @@ class Knee:
         implant: Implant | None = None,
         ligaments: "Iterable[Ligament]" = (),
         extensor: Extensor | None = None,
-        contact: "ContactModel | str | None" = None,
+        contact: "ContactModel | KneeContact | str | None" = None,
         friction: float = 0.0,
         muscles: Iterable[Muscle] = (),
         frames: Mapping[str, str] | None = None,
@@ -179,24 +155,62 @@ class Knee:
     ) -> None:
         if side not in ("right", "left"):
             raise InputError(f"side {side!r}", "Knee", "give 'right' or 'left'")
-        if not 0.0 <= friction < 1.0:
+        if not 0.0 <= friction <= 1.0:
             raise InputError(f"friction {friction}", "Knee", "give 0 to 1")
         self.model, self.side, self.friction = model, side, float(friction)
         self.implant, left = implant or Implant(), side == "left"
-        plane = extensor.plane if extensor else None
-        self.anatomy = find_anatomy(model, frames or {}, joints, plane)
-        self.femoral, self.insert, self.button = self._surfaces(left, contact, extensor)
-        component, insert = self.anatomy.femoral, self._insert_place(left)
+        self.anatomy = find_anatomy(
+            model, frames or {}, joints, extensor.plane if extensor else None
+        )
+        given = surfaces_of(self.implant, left, contact is not None, extensor is not None)
+        insert, placed = placed_insert(self.anatomy, self.implant, given.insert, left)
+        self._surfaces = replace(given, insert=placed)
+        component = self.anatomy.femoral
         self.chain = CanonicalChain(self.anatomy, left, extensor is not None, component, insert)
         self.bridge = Bridge(self.anatomy, left, self.chain, component, insert)
-        self.ligaments = tuple(self._bundle(bundle) for bundle in ligaments)
-        self._crossing, self._others = self._divided()
-        self._lines = {muscle.name: self._line(muscle) for muscle in muscles}
-        self.extensor, self._extensor_lines = extensor, cast(Any, None)
+        self._lines = tension_lines(muscles, self.anatomy)
+        self._take(ligaments)
+        self.extensor = extensor
+        self.extensor_lines: ExtensorLines | None = None
         if extensor is not None:
-            self._extensor_lines = self._build_extensor(extensor, left)
-        self._query: ClosestPointQuery | None = None
-        self.contact = None if contact is None else self._build_contact(contact, cache)
+            self.extensor_lines = extensor_lines(self.bridge, extensor, self._surfaces)
+        self.contact: KneeContact | None = None
+        if contact is not None:
+            given_contact = prepared_contact(contact, self.implant, self._surfaces, cache)
+            self.contact = given_contact.changed(self.friction)
+
+    def _take(self, bundles: "Iterable[Ligament]") -> None:
+        self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in bundles)
+        self._crossing, self._others = crossing_and_others(self.chain, self.ligaments)
+
+    def with_ligaments(self, ligaments: "Iterable[Ligament]") -> "Knee":
+        """Return the same knee with other ligaments, which shares all else."""
+        other = copy.copy(self)
+        other._take(ligaments)
+        return other
+
+    def with_contact(self, model: "ContactModel") -> "Knee":
+        """Return the same knee with another contact model, prepared when it is first needed."""
+        from tkamb.knee.contact import KneeContact
+
+        other = copy.copy(self)
+        other.contact = KneeContact(model, self._need_contact().pair, self.friction)
+        return other
+
+    @property
+    def femoral(self) -> Any:
+        """The femoral component in its own frame, a right knee's; None: not given."""
+        return self._surfaces.femoral
+
+    @property
+    def insert(self) -> Any:
+        """The insert in the insert frame, a right knee's; None: not given."""
+        return self._surfaces.insert
+
+    @property
+    def button(self) -> Any:
+        """The patellar button in the patella's frame, a right knee's; None: not given."""
+        return self._surfaces.button
 
     def create_data(self) -> KneeData:
         """Return an object that a caller hands from call to call to save time."""
@@ -263,23 +277,32 @@ class Knee:
         if self._crossing is not None:
             on_insert = on_insert + self._crossing.wrench(place.pose)
         pulled = self._tensions(tensions)
-        total: list[PointForces] = []
-        if self._others or self._pulls(pulled):
-            patella = None
-            if self.extensor is not None:
-                patella = self._find_patella(place, data)
-            poses = self._link_poses(place, patella)
-            if self._others:
-                from tkamb.knee.ligaments import ligament_loads
-
-                total += ligament_loads(self._others, poses)[1]
-            if patella is not None and self._pulls(pulled):
-                total += self._extensor_pull(poses, place, patella, pulled)
-        links = summed(total)
+        links = summed(self._beside_the_contact(data, place, pulled))
         for link, sign in (("tibia", 1.0), ("femur", -1.0)):
             links[link] = links.get(link, np.zeros(6)) + sign * on_insert
-        forces = self.bridge.joint_forces(data.data, links)
-        return self._with_lines(data, pulled, forces) if self._lines else forces
+        return self._with_lines(data, pulled, self.bridge.joint_forces(data.data, links))
+
+    def _beside_the_contact(
+        self, data: KneeData, place: KneePlace, pulled: Mapping[str, float]
+    ) -> list[PointForces]:
+        """Return what ligaments off the femorotibial gap and the extensor mechanism do."""
+        pulls, patella = self._pulls(pulled), None
+        if not self._others and not pulls:
+            return []
+        if self.extensor_lines is not None:
+            patella = self._find_patella(place, data)
+        poses, total = self._link_poses(place, patella), list[PointForces]()
+        if self._others:
+            from tkamb.knee.ligaments import ligament_loads
+
+            total += ligament_loads(self._others, poses)[1]
+        if pulls:
+            assert patella is not None and self.extensor_lines is not None
+            quadriceps = pulled[self._extensor_names[0]]
+            total += self.extensor_lines.pull(
+                poses, patella, place.coordinates[5], quadriceps, pulled.get(PATELLAR_LIGAMENT)
+            )
+        return total
 
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
@@ -333,20 +356,7 @@ class Knee:
         `pin.computeABADerivatives` is -J^T K J.
         """
         data = self.create_data_for_kinematics() if data is None else data
-        self._check(q, "q", self.model.nq)
-        model, cache = self.model, data.data
-        pin.computeJointJacobians(model, cache, q)
-        insert = cache.oMi[self.bridge.insert.joint] * self.bridge.insert.placement
-        total = np.zeros((6, model.nv))
-        for place, sign in ((self.bridge.component, 1.0), (self.bridge.insert, -1.0)):
-            if place.joint:
-                local = pin.getJointJacobian(model, cache, place.joint, pin.ReferenceFrame.LOCAL)
-                total += (
-                    sign
-                    * insert.actInv(cache.oMi[place.joint]).toActionMatrix()
-                    @ local.reshape(6, -1)
-                )
-        return total
+        return self.bridge.relative_jacobian(data.data, self._check(q, "q", self.model.nq))
 
     def inverse_dynamics(
         self,
@@ -382,27 +392,18 @@ class Knee:
                 knee without a contact model.
         """
         data = self.create_data_for_kinematics() if data is None else data
-        instant = self._instant(q, v, a, external, tensions, data)
-        geometry = instant.geometry(0)
-        points = NO_CONTACT
+        instant = self.instant(q, v, a, external, tensions, data)
+        geometry, points = instant.geometry(), NO_CONTACT
         if contact is not None:
             from tkamb.contact.probe import condyle_wrenches
 
             wrenches = condyle_wrenches(contact, self._need_contact().pair.split)
-            condyles = instant.resultants(0, instant.coordinates, wrenches)
-            off = frozenset(instant.sides - set(condyles))
-            points = replace(NO_CONTACT, condyles=condyles, lifted=off)
+            geometry = instant.touching(geometry, instant.coordinates, wrenches, {})
         elif self.contact is not None:
-            points = contact_points(
-                self.query,
-                knee_pose(instant.coordinates),
-                lambda point: instant.sliding(0, instant.coordinates, point),
-            )
-        problems = points.problems + geometry.problems
-        geometry = replace(
-            geometry, condyles=points.condyles, lifted=points.lifted, problems=problems
-        )
-        return self._solved(geometry, data)
+            points = instant.contact_points(self.query, knee_pose(instant.coordinates))
+            geometry = replace(geometry, condyles=points.condyles, lifted=points.lifted)
+        geometry = replace(geometry, problems=points.problems + geometry.problems)
+        return self._solved(instant, geometry, data)
 
     def press(
         self,
@@ -488,21 +489,21 @@ class Knee:
             if name not in allowed:
                 raise InputError(f"no coordinate '{name}'", "released", names_near(name, allowed))
         data = self.create_data() if data is None else data
-        instant = self._instant(q, v, a, external, tensions, data)
+        instant = self.instant(q, v, a, external, tensions, data)
         probe = data.probe if data.probe is not None else contact.probe()
-        search = ReleasedKnee(instant, probe, released)  # type: ignore[arg-type]
-        points = {} if len(search.released) == 5 else self._nearest_points(instant)
+        search = ReleasedKnee(probe, released)
+        points = {} if len(search.released) == 5 else self.nearest_points(instant.coordinates)
         knee = self._rest(search, instant, points)
-        loads, result, q_end = None, None, np.array(q, float)
+        result, q_end = None, np.array(q, float)
+        geometry = replace(knee.geometry, problems=(knee.problem,))
         if not knee.problem:
-            q_end = self._configuration(q, knee_pose(knee.coordinates))
+            q_end = self.bridge.configuration(q, knee_pose(knee.coordinates))
             pin.forwardKinematics(self.model, data.data, q_end)
             result = contact.model.evaluate(contact.state, knee_pose(knee.coordinates))
-            geometry = self._loaded(knee, instant, points)
-            loads = self._solved(geometry, data)
-        if loads is None:
-            unsolvable = replace(knee.geometry, problems=(knee.problem,))
-            loads = self._solved(unsolvable, data)
+            geometry = instant.touching(
+                knee.geometry, knee.coordinates, knee.contact.condyles, points
+            )
+        loads = self._solved(instant, geometry, data)
         left_over = knee.residual
         return Equilibrium(
             q_end,
@@ -572,147 +573,81 @@ class Knee:
 
         Empty without an extensor mechanism, or where the patella is found nowhere.
         """
-        if self._extensor_lines is None or "patella" not in poses:
+        if self.extensor_lines is None or "patella" not in poses:
             return {}
-        muscle, ligament = self._extensor_lines.paths(_Posed(poses))
-        return {self._extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
+        muscle, ligament = self.extensor_lines.paths_at(poses)
+        return {self.extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
 
     @property
     def query(self) -> "ClosestPointQuery":
         """Closest points of femoral component and insert, made when first asked for."""
-        if self._query is None:
-            from tkamb.geometry.closest import ClosestPointQuery
+        return self._need_contact().pair.closest_points
 
-            contact = self._need_contact()
-            pair = contact.pair
-            self._query = ClosestPointQuery(pair.femoral, pair.insert, pair.split)
-        return self._query
+    def nearest_points(self, coordinates: Array) -> dict[str, Array]:
+        """Return side -> (3,) m, where each undeformed condyle is nearest to the insert."""
+        gaps = self.query.at(knee_pose(coordinates))
+        centres = {"medial": gaps.medial.centre}
+        return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
-    # -- building --
+    def instant(
+        self,
+        q: Array,
+        v: Array,
+        a: Array,
+        external: Any = None,
+        tensions: Mapping[str, float] | None = None,
+        data: KneeData | None = None,
+        patella: PatellaFinder | None = None,
+        muscles: SharingMuscles | None = None,
+    ) -> Instant:
+        """Return the knee at one instant: what its equations and a search for equilibrium ask.
 
-    def _surfaces(
-        self, is_left: bool, contact: object, extensor: object
-    ) -> "tuple[Surface | None, Surface | None, Surface | None]":
-        """Return femoral component, insert and button, those of a right knee.
+        Args:
+            q: (nq,).
+            v: (nv,).
+            a: (nv,).
+            external: see `inverse_dynamics`.
+            tensions: see `inverse_dynamics`; among what is external.
+            data: from `create_data`, to save time.
+            patella: finds the patella; None: by its place in q, or where the model has none anew.
+            muscles: those of the leg that share the load; None: the quadriceps alone acts.
 
         Raises:
-            InputError: one that is needed is missing or cannot be used.
+            InputError: an argument of the wrong size, or an unknown muscle.
         """
-        implant = self.implant
-        needs = {"femoral": contact is not None or extensor is not None}
-        needs |= {"insert": contact is not None, "patella": extensor is not None}
-        surfaces: list[Surface | None] = []
-        for name, needed in needs.items():
-            mesh = getattr(implant, name)
-            if mesh is None and needed:
-                what = "[the contact]" if name == "insert" else "the contact or the extensor"
-                raise InputError(f"has no {name} mesh", "Implant", f"{what} needs it")
-            if mesh is None:
-                surfaces.append(None)
-                continue
-            surface = as_surface(mesh, f"{name} mesh", closed=name == "insert")
-            surfaces.append(mirrored_surface(surface) if is_left else surface)
-        return surfaces[0], surfaces[1], surfaces[2]
-
-    def _insert_place(self, is_left: bool) -> Place:
-        """Return the insert frame on the tibia, and move the insert into it."""
-        place = self.anatomy.insert
-        if self.insert is None or self.implant.placed:
-            return place
-        from tkamb.geometry.flat_bottom import insert_placement
-
-        placement = insert_placement(self.insert)
-        if np.abs(placement - np.eye(4)).max() < KNEE.frame_tolerance:
-            return place
-        self.insert = self.insert.moved(placement)
-        mesh_in_insert = mirrored_pose(placement) if is_left else placement
-        return Place(place.joint, place.placement * se3(inverse(mesh_in_insert)))
-
-    def _bundle(self, bundle: "Ligament") -> "Ligament":
-        ends = [self.bridge.link_point(link_point(end)) for end in (bundle.proximal, bundle.distal)]
-        if not bundle.slack_length > 0:
+        data = self.create_data_for_kinematics() if data is None else data
+        q = self._check(q, "q", self.model.nq)
+        v, a = self._check(v, "v", self.model.nv), self._check(a, "a", self.model.nv)
+        if external is not None and len(external) != self.model.njoints:
             raise InputError(
-                f"slack length {bundle.slack_length} m",
-                f"ligament {bundle.name}",
-                "give slack_length in metres",
+                f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
             )
-        return replace(bundle, proximal=ends[0], distal=ends[1])
-
-    def _divided(self) -> "tuple[BundleArrays | None, tuple[Ligament, ...]]":
-        """Return the bundles between femur and tibia, and the others.
-
-        The ends of the first are in the femoral and the insert frame.
-        """
-        across = [
-            bundle
-            for bundle in self.ligaments
-            if {bundle.proximal.link, bundle.distal.link} == {"femur", "tibia"}
-        ]
-        others = tuple(bundle for bundle in self.ligaments if bundle not in across)
-        if not across:
-            return None, others
-        from tkamb.knee.ligaments import BundleArrays
-
-        shank = inverse(self.chain.insert_in_tibia)
-        ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
-        for bundle in across:
-            for end in (bundle.proximal, bundle.distal):
-                at = transform(shank, end.position) if end.link == "tibia" else end.position
-                ends[end.link].append(at)
-        bundles = BundleArrays.of(across, np.array(ends["femur"]), np.array(ends["tibia"]))
-        return bundles, others
-
-    def _line(self, muscle: Muscle) -> _Line:
-        points = [link_point(point) for point in muscle.points]
-        if len(points) < 2 or muscle.wrap is not None:
+        pulled = self._tensions(tensions)
+        if self._pulls(pulled):
             raise InputError(
-                "is no straight line over two points or more",
-                f"muscle {muscle.name}",
-                "give its points; a quadriceps that wraps belongs to extensor=",
+                "the quadriceps is what is sought", "tensions", "give other muscles' alone"
             )
-        places = tuple(self.anatomy.frame(point.link) for point in points)
-        return _Line(places, tuple(point.position for point in points))
-
-    def _build_extensor(self, extensor: Extensor, is_left: bool) -> Any:
-        from tkamb.knee.extensor import ExtensorLines, ExtensorParts
-        from tkamb.knee.muscles import check_muscles
-
-        assert self.femoral is not None and self.button is not None
-        muscle, ligament = extensor.quadriceps, extensor.patellar_ligament
-        points = tuple(self.bridge.link_point(link_point(point)) for point in muscle.points)
-        wrap = muscle.wrap
-        if wrap is not None and wrap.bone is not None:
-            bone = as_surface(wrap.bone, "bone mesh")
-            to_component = self.bridge.component.placement.inverse() * self.anatomy.femur.placement
-            pose = to_component.homogeneous
-            if is_left:
-                bone, pose = mirrored_surface(bone), mirrored_pose(pose)
-            wrap = replace(wrap, bone=bone.moved(pose))
-        muscle = replace(muscle, points=points, wrap=wrap)
-        check_muscles([muscle], self.chain)
-        ends = [self.bridge.link_point(link_point(p)) for p in (ligament.proximal, ligament.distal)]
-        ligament = replace(ligament, proximal=ends[0], distal=ends[1])
-        if self._finds_patella and not ligament.length > 0:
-            raise InputError(
-                "has no length", "patellar ligament", "the place of the patella follows from it"
-            )
-        parts = ExtensorParts(muscle, ligament, self.chain, self.femoral, self.button, self.insert)
-        return ExtensorLines(parts)
-
-    def _build_contact(self, contact: "ContactModel | str", cache: bool) -> "KneeContact":
-        from tkamb.contact.pair import ContactPair
-        from tkamb.contact.registry import contact_model
-        from tkamb.knee.contact import KneeContact
-
-        model = contact_model(contact) if isinstance(contact, str) else contact
-        if hasattr(model, "cache") and not cache:
-            model = replace(model, cache=False)  # type: ignore[type-var]
-        assert self.femoral is not None and self.insert is not None
-        implant = self.implant
-        pair = ContactPair(self.femoral, self.insert, implant.insert_material, implant.bearing)
-        return KneeContact(model, pair, self.friction)
-
-    # -- one instant --
+        bridge, pin_data, lines = self.bridge, data.data, self.extensor_lines
+        pin.forwardKinematics(self.model, pin_data, q, v, a)
+        external = self._with_lines(data, pulled, external)
+        motion = bridge.motion(pin_data, lines is not None)
+        if lines is not None and patella is None:
+            own = None if self._finds_patella else motion.joints[0, 6:]
+            assert self.extensor is not None
+            patella = PatellaAt(lines, knee_pose(motion.joints[0, :6]), own, self.extensor.solved)
+        return Instant(
+            self.chain,
+            motion,
+            bridge.shank_needs(pin_data),
+            bridge.external_on(self.anatomy.femur, pin_data, external),
+            bridge.external_on(self.anatomy.patella, pin_data, external),
+            self.ligaments,
+            patella,
+            self.friction,
+            self.contact is not None and self.contact.pair.split is not None,
+            None if external is None else bridge.on_shank(pin_data, external),
+            muscles,
+        )
 
     def _check(self, values: Array, name: str, size: int) -> Array:
         array = np.asarray(values, float)
@@ -747,33 +682,19 @@ class Knee:
         """Whether the place of the patella is found, and not that of q."""
         return self.anatomy.patella is None
 
+    @property
+    def _extensor_names(self) -> tuple[str, ...]:
+        return (self.extensor.quadriceps.name, PATELLAR_LIGAMENT) if self.extensor else ()
+
     def _pulls(self, tensions: Mapping[str, float]) -> bool:
-        return self.extensor is not None and tensions.get(self.extensor.quadriceps.name, 0.0) != 0
+        return self.extensor is not None and tensions.get(self._extensor_names[0], 0.0) != 0
 
     def _tensions(self, tensions: Mapping[str, float] | float | None) -> dict[str, float]:
-        """Return muscle -> N.
-
-        Raises:
-            InputError: an unknown muscle, or a tension that is negative or not finite.
-        """
-        own = [self.extensor.quadriceps.name, PATELLAR_LIGAMENT] if self.extensor else []
-        if tensions is None:
-            return {}
-        if not isinstance(tensions, Mapping):
-            if not own:
-                raise InputError("has no quadriceps", "tensions", "give extensor=, or names")
-            tensions = {own[0]: tensions}
-        for name, tension in tensions.items():
-            if name not in (*own, *self._lines):
-                raise InputError(
-                    f"no muscle '{name}'", "tensions", names_near(name, [*own, *self._lines])
-                )
-            if not (np.isfinite(tension) and tension >= 0.0):
-                raise InputError(f"tension {tension} N", f"muscle {name}", "a muscle only pulls")
-        return {name: float(tension) for name, tension in tensions.items()}
+        return checked_tensions(tensions, self._extensor_names, self._lines)
 
     def _find_patella(self, place: KneePlace, data: KneeData) -> "PatellaState":
-        lines = self._extensor_lines
+        lines = self.extensor_lines
+        assert lines is not None
         if self._finds_patella:
             data.patella = solution = lines.solved(place.pose, data.patella)
         else:
@@ -792,75 +713,26 @@ class Knee:
         }
         if patella is not None:
             joint = self.chain.patella_joint_in_femur
-            poses["patella"] = place.pose @ joint @ _in_plane(patella.coordinates)
+            poses["patella"] = place.pose @ joint @ sagittal_pose(patella.coordinates)
         return poses
 
-    def _extensor_pull(
-        self,
-        poses: dict[str, Array],
-        place: KneePlace,
-        patella: "PatellaState",
-        tensions: Mapping[str, float],
-    ) -> list[PointForces]:
-        """Return what a tension of the quadriceps does, the patella massless.
+    def _with_lines(self, data: KneeData, tensions: Mapping[str, float], forces: Any) -> Any:
+        """Return forces on the joints with the pulls of the muscles' lines added.
 
-        Raises:
-            ComputationError: the patella cannot carry it on.
+        Args:
+            data: with joint placements up to date.
+            tensions: muscle -> N.
+            forces: one per joint; None: none.
         """
-        assert self.extensor is not None
-        tension = tensions.get(self.extensor.quadriceps.name, 0.0)
-        extensor, muscle = self._extensor_lines.loads(place.coordinates[5], _Posed(poses), patella)
-        point, normal = patella.contact_point[None], patella.contact_normal
-        patellar_tension = tensions.get(PATELLAR_LIGAMENT)
-        if patellar_tension is not None:
-            pulls = [
-                *_scaled(muscle.loads, tension),
-                *_scaled(extensor.patellar_ligament, patellar_tension),
-            ]
-            pull = sum(load.forces.sum(axis=0) for load in pulls if load.link == "patella")
-            across = poses["femur"][:3, 2]
-            force = -(pull - (pull @ across) * across)
-        else:
-            if not (patella.ligament_ratio > 0.0 and patella.patellofemoral_ratio > 0.0):
-                raise ComputationError(
-                    "the contact would have to pull, or the patellar ligament to push", "extensor"
-                )
-            pulls = [
-                *_scaled(muscle.loads, tension),
-                *_scaled(extensor.patellar_ligament, tension * patella.ligament_ratio),
-            ]
-            force = tension * patella.patellofemoral_ratio * normal
-        return [
-            *pulls,
-            PointForces("patella", point, force[None]),
-            PointForces("femur", point, -force[None]),
-        ]
-
-    def _with_lines(self, data: KneeData, tensions: Mapping[str, float], *parts: Any) -> Any:
-        """Return the sum of forces on the joints, and of the muscles' lines."""
-        forces = [pin.Force.Zero() for _ in range(self.model.njoints)]
-        for part in parts:
-            if part is not None:
-                forces = [one + other for one, other in zip(forces, part, strict=True)]
-        for name, line in self._lines.items():
-            tension = tensions.get(name, 0.0)
-            if tension == 0.0:
-                continue
-            placements = [data.data.oMi[place.joint] for place in line.places]
-            at = [
-                placement.act(place.placement.act(position))
-                for placement, place, position in zip(
-                    placements, line.places, line.positions, strict=True
-                )
-            ]
-            steps = np.diff(np.array(at), axis=0)
-            along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-            pulls = tension * np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
-            for placement, place, point, pull in zip(
-                placements, line.places, at, pulls, strict=True
-            ):
-                forces[place.joint] += placement.actInv(pin.Force(pull, cross(point, pull)))
-        return pin.StdVec_Force(forces)
+        pulls = [name for name in self._lines if tensions.get(name, 0.0)]
+        if not pulls:
+            return forces
+        given = [pin.Force.Zero()] * self.model.njoints if forces is None else forces
+        total = [pin.Force(force) for force in given]
+        for name in pulls:
+            for joint, force in self._lines[name].forces(data.data, tensions[name]):
+                total[joint] += force
+        return pin.StdVec_Force(total)
 
     def _ligament_stiffness(self, place: KneePlace) -> Array:
         """Return the derivative (6, 6) of the wrench of the bundles between femur and tibia."""
@@ -875,161 +747,16 @@ class Knee:
             return matrix
         return mirrored_spatial(mirrored_spatial(matrix).T).T
 
-    def _instant(
-        self,
-        q: Array,
-        v: Array,
-        a: Array,
-        external: Any,
-        tensions: Mapping[str, float] | None,
-        data: KneeData,
-    ) -> Instant:
-        """Return the knee at one instant, muscles of given tension among what is external."""
-        q, v, a = (
-            self._check(values, name, size)
-            for values, name, size in (
-                (q, "q", self.model.nq),
-                (v, "v", self.model.nv),
-                (a, "a", self.model.nv),
-            )
-        )
-        if external is not None and len(external) != self.model.njoints:
-            raise InputError(
-                f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
-            )
-        pulled = self._tensions(tensions)
-        if self._pulls(pulled):
-            raise InputError(
-                "the quadriceps is what is sought", "tensions", "give other muscles' alone"
-            )
-        pin.forwardKinematics(self.model, data.data, q, v, a)
-        if pulled:
-            external = self._with_lines(data, pulled, external)
-        bridge, pin_data = self.bridge, data.data
-        chain_motion = bridge.motion(pin_data, self.extensor is not None)
-        patella = None
-        if self.extensor is not None:
-            joints = None if self._finds_patella else chain_motion.joints[0, 6:]
-            place = knee_pose(chain_motion.joints[0, :6])
-            patella = PatellaAt(self._extensor_lines, place, joints, self.extensor.solved)
-        return Instant(
-            self.chain,
-            chain_motion,
-            bridge.shank_needs(pin_data, external),
-            bridge.external_on(self.anatomy.femur, pin_data, external),
-            bridge.external_on(self.anatomy.patella, pin_data, external),
-            self.ligaments,
-            patella,
-            self.friction,
-            self.contact is not None and self.contact.pair.split is not None,
-        )
-
-    def _solved(self, geometry: KneeGeometry, data: KneeData) -> KneeLoads:
+    def _solved(self, instant: Instant, geometry: KneeGeometry, data: KneeData) -> KneeLoads:
         """Return the loads of a geometry, and what they do to the user's joints."""
-        if geometry.problems:
-            loads, unknowns = unsolved(geometry.problems), []
-        else:
-            loads = solve_knee(geometry, self.friction)
-            unknowns = [] if loads.problems else solved_unknowns(geometry, loads, self.friction)
-        groups: dict[str, list[PointForces]] = {"external": [], "residual": [], "hip": []}
-        if unknowns:
-            groups["external"] += geometry.ligaments
-        for unknown in unknowns:
-            group = unknown.name.split("_")[0]
-            group = group if group in groups else "external"
-            groups[group] += _scaled(unknown.loads, loads.values[unknown.name])
-        forces = {
-            name: self.bridge.joint_forces(data.data, group) for name, group in groups.items()
-        }
-        return knee_loads(geometry, loads, self.left, forces)
-
-    # -- equilibrium --
-
-    def _nearest_points(self, instant: Instant) -> dict[str, Array]:
-        gaps = self.query.at(knee_pose(instant.coordinates))
-        centres = {"medial": gaps.medial.centre}
-        return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
+        geometry, loads = instant.solved(geometry)
+        return knee_loads(geometry, loads, self.friction, self.bridge, data.data)
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
         """Return the knee at rest, from first touch at the other coordinates of q."""
         from tkamb.knee.equilibrium.starts import InitialPoses
 
-        pair, recorded = self._need_contact().pair, instant.coordinates
-        if not np.isfinite(pair.first_touch_height(knee_pose(recorded))):
+        pair = self._need_contact().pair
+        if not np.isfinite(pair.first_touch_height(knee_pose(instant.coordinates))):
             raise ComputationError("the femoral component does not lie over the insert", "q")
-        return InitialPoses(recorded[None], search, pair, None).rest(0, (), points)
-
-    def _loaded(
-        self, knee: "KneeEquilibrium", instant: Instant, points: dict[str, Array]
-    ) -> KneeGeometry:
-        """Return the geometry at rest with the contact's resultants in it."""
-        up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
-        separated = {
-            side: CondylePoint(point, up, still, float("nan")) for side, point in points.items()
-        }
-        touching = instant.resultants(0, knee.coordinates, knee.contact.condyles)
-        lifted = frozenset(instant.sides - set(touching))
-        return replace(knee.geometry, condyles=separated | touching, lifted=lifted)
-
-    def _configuration(self, q: Array, target: Array) -> Array:
-        """Return q with the knee's joints moved so that the femur has a pose (4, 4).
-
-        Newton's method on the joints between tibia and femur.
-
-        Raises:
-            InputError: these joints cannot make that pose.
-        """
-        model, data = self.model, self.model.createData()
-        target_placement = se3(mirrored_pose(target) if self.left else target)
-        columns = [
-            model.joints[joint].idx_v + k
-            for joint in self.anatomy.knee_joints
-            for k in range(model.joints[joint].nv)
-        ]
-        q = np.array(q, float)
-        for _ in range(KNEE.max_pose_steps):
-            pin.forwardKinematics(model, data, q)
-            insert = data.oMi[self.bridge.insert.joint] * self.bridge.insert.placement
-            femur = data.oMi[self.bridge.component.joint] * self.bridge.component.placement
-            error = pin.log6(target_placement * insert.actInv(femur).inverse()).vector
-            if np.abs(error).max() < KNEE.pose_tolerance:
-                return q
-            jacobian = self.relative_jacobian(q)[:, columns]
-            step = np.zeros(model.nv)
-            step[columns] = np.linalg.lstsq(jacobian, error, rcond=None)[0]
-            q = pin.integrate(model, q, step)
-        if np.abs(error).max() < KNEE.accepted_pose_error:
-            return q
-        raise InputError(
-            f"the {knee_size(self.anatomy)} degrees of freedom between tibia and femur do not "
-            "reach the pose of equilibrium",
-            "Knee",
-            "give the knee of the model six (a pin.JointModelFreeFlyer, or six single joints)",
-        )
-
-
-class _Posed:
-    """Poses of links in the insert frame, as `ExtensorLines` asks for them."""
-
-    def __init__(self, poses: dict[str, Array]) -> None:
-        self._poses = poses
-
-    def pose(self, link: str) -> Array:
-        """Return pose_link_in_insert (4, 4)."""
-        return self._poses[link]
-
-
-def _scaled(loads: Iterable[PointForces], factor: float) -> list[PointForces]:
-    return [
-        PointForces(load.link, load.points, factor * load.forces, factor * load.moment)
-        for load in loads
-    ]
-
-
-def _in_plane(coordinates: Array) -> Array:
-    """Return the patella's pose (4, 4) in its plane's frame at (ap, si, rotation)."""
-    ap, si, rotation = coordinates
-    c, s = np.cos(rotation), np.sin(rotation)
-    result = np.eye(4)
-    result[:2, :2], result[:2, 3] = [[c, -s], [s, c]], [ap, si]
-    return result
+        return InitialPoses(search, pair, None).rest(instant, (), points)

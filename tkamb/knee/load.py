@@ -1,6 +1,6 @@
 """Points on links, point forces, and their wrenches about the insert's origin."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,6 +36,14 @@ class PointForces:
     points: Array
     forces: Array
     moment: Array = field(default_factory=lambda: np.zeros(3))
+
+
+def scaled(loads: Iterable[PointForces], factor: float) -> list[PointForces]:
+    """Return loads times a factor."""
+    return [
+        PointForces(load.link, load.points, factor * load.forces, factor * load.moment)
+        for load in loads
+    ]
 
 
 def wrench_of(points: Array, forces: Array) -> Array:

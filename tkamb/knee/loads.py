@@ -1,14 +1,15 @@
 """Loads of a knee at one instant, in the axes and signs of the user's knee."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.canonical import Bridge
+from tkamb.knee.equations import KneeGeometry, solved_unknowns
 from tkamb.knee.equations import KneeLoads as SolvedLoads
+from tkamb.knee.load import PointForces, scaled
 from tkamb.knee.unknowns import MUSCLE, muscle_load
 
 MIRRORED = ("ml", "axial", "coronal")
@@ -92,19 +93,27 @@ class KneeLoads:
 
 
 def knee_loads(
-    geometry: KneeGeometry,
-    solved: SolvedLoads,
-    is_left: bool,
-    forces: Mapping[str, Any],
+    geometry: KneeGeometry, solved: SolvedLoads, friction: float, bridge: Bridge, data: Any
 ) -> KneeLoads:
-    """Return solved loads as those of the user's knee.
+    """Return solved loads as those of the user's knee, and what they do to the model's joints.
 
     Args:
         geometry: the geometry of the equations.
         solved: their solution, of a right knee.
-        is_left: the user's knee is a left one.
-        forces: `external_forces`, `residual_forces` and `hip_forces`.
+        friction: Coulomb coefficient of the femorotibial contact.
+        bridge: to the user's model.
+        data: Pinocchio's, with joint placements up to date.
     """
+    unknowns = [] if solved.problems else solved_unknowns(geometry, solved, friction)
+    groups: dict[str, list[PointForces]] = {"external": [], "residual": [], "hip": []}
+    if unknowns:
+        groups["external"] += geometry.ligaments
+    for unknown in unknowns:
+        group = unknown.name.split("_")[0]
+        group = group if group in groups else "external"
+        groups[group] += scaled(unknown.loads, solved.values[unknown.name])
+    forces = {name: bridge.joint_forces(data, group) for name, group in groups.items()}
+    is_left = bridge.left
     values = {
         name: -value if is_left and _mirrored(name) else value
         for name, value in solved.values.items()

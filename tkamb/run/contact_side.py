@@ -12,34 +12,29 @@
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
-from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.contact.warm_start import WarmStart
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.geometry.threads import both
-from tkamb.io.given_material import given_material, material_as_json
-from tkamb.io.scene import Scene
-from tkamb.io.scene.case import Case
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import solve_knee, unsolved
 from tkamb.knee.equilibrium.adjusted_press import press_adjusted
 from tkamb.knee.equilibrium.frame_contact import FrameContact
-from tkamb.knee.equilibrium.post_side import cam_on_post, post_contact
+from tkamb.knee.equilibrium.post_side import post_contact
 from tkamb.knee.equilibrium.split_sensitivity import split_sensitivity, split_tangent
+from tkamb.knee.instant import Instant
 from tkamb.run.mechanics import FrameLoads, Mechanics
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
-    from tkamb.contact.model import ContactModel
     from tkamb.knee.equilibrium.released import KneeEquilibrium
 
 NAN = float("nan")
@@ -66,52 +61,46 @@ COUPLING = CouplingSettings()
 
 
 class ContactSide:
-    """The contact model of a case, prepared once, and the body side that it must agree with.
+    """The contact model of a knee, prepared once, and the body that it has to agree with.
 
     Args:
-        case: a case with [contact].
-        mechanics: its body side.
-        state: what the model's `prepare` returned for these surfaces, if there is one already.
+        mechanics: the body side of a knee with contact.
+        coupled: whether the contact's resultants take the place of the contact points.
+        released: the coordinates that find their own equilibrium.
+        post: cam and post, if they are modelled.
         sensitivity: whether each frame tells how its split changes with the adduction, which
             takes one more press of a model without a tangent.
-        post: cam and post, if they are prepared already.
-        model: what prepared `state`, if there is one already.
+        prepare_seconds: what preparing the contact took.
+
+    Attributes:
+        model: the contact model.
+        state: what it has prepared.
     """
 
     def __init__(
         self,
-        case: Case,
         mechanics: Mechanics,
-        state: Any = None,
-        sensitivity: bool = True,
+        coupled: bool = False,
+        released: Sequence[str] = (),
         post: "CamPost | None" = None,
-        model: "ContactModel | None" = None,
+        sensitivity: bool = True,
+        prepare_seconds: float = 0.0,
     ) -> None:
-        table = case.scene.contact
-        insert = case.scene.implant.insert
-        assert table is not None and insert is not None
-        assert case.femoral is not None and case.insert is not None
-        self.case, self.table, self.mechanics = case, table, mechanics
-        self.model = model or contact_model(table.model, table.resolution_mm, **table.options)
-        pair = ContactPair(
-            case.femoral, case.insert, given_material(case.scene.insert_material), insert.bearing
-        )
-        start = clock.perf_counter()
-        self.state = self.model.prepare(pair) if state is None else state
-        self.post = cam_on_post(case, self.model, self.state.pair.material, post)
-        self.prepare_seconds = clock.perf_counter() - start
-
-        self._sensitivity = sensitivity and "adduction" not in table.released
+        contact = mechanics.knee.contact
+        assert contact is not None
+        self.mechanics, self.post, self.prepare_seconds = mechanics, post, prepare_seconds
+        self.model, self.state, self._coupled = contact.model, contact.state, coupled
+        self._split, self._names = contact.pair.split, tuple(released)
+        self._sensitivity = sensitivity and "adduction" not in released
         self._probe = self.model.probe(self.state)
         self.released = None
-        if table.released:
+        if released:
             from tkamb.knee.equilibrium.released import ReleasedKnee
             from tkamb.knee.equilibrium.starts import InitialPoses
 
-            probe = self._probe if self.post is None else self.post.probe_with(self._probe)
-            self.released = ReleasedKnee(mechanics, probe, table.released)
-            recorded = case.motion.coordinates
-            self.starts = InitialPoses(recorded, self.released, self.state.pair, self.post)
+            probe = self._probe if post is None else post.probe_with(self._probe)
+            self.released = ReleasedKnee(probe, released)
+            self.starts = InitialPoses(self.released, self.state.pair, post)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact of frame k, coupled as the scene asks.
@@ -125,7 +114,7 @@ class ContactSide:
             body, contact = self._press_recorded(k, before)
         else:
             body, contact = self._release(k, before)
-        if contact.result is None or body.loads.problems or self.case.split is None:
+        if contact.result is None or body.loads.problems or self._split is None:
             return body, contact
         if not self._sensitivity:
             return body, contact
@@ -148,7 +137,7 @@ class ContactSide:
         if contact.adjustment and contact.adjustment.restored:
             body = self.mechanics.frame(k, contact.adjustment)
             contact = self.carry(body, self.mechanics.poses[k], contact.start)
-        if self.table.coupling == "none" and self.post is None:
+        if not self._coupled and self.post is None:
             return body, contact
         return self._couple(k, body, contact)
 
@@ -180,21 +169,21 @@ class ContactSide:
         self, k: int, body: FrameLoads, contact: FrameContact
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact after the contact's resultants and post force act on the body."""
-        seconds, place = contact.seconds, self.case.motion.coordinates[k]
+        seconds, instant = contact.seconds, self.mechanics.instant(k)
+        place, coupled = instant.coordinates, self._coupled
         for iteration in range(1, COUPLING.max_iterations + 1):
             if contact.result is None:
                 return body, contact
             load, points = body.loads.contact_force[1], _points(body)
-            coupled = self.table.coupling == "points"
-            result = self.resultants(k, place, contact.result) if coupled else {}
-            post = post_contact(self.post, contact.result.pose, self.table)
+            result = self._resultants(instant, contact.result) if coupled else {}
+            post = post_contact(self.post, contact.result.pose, self._names)
             if post is not None and post.problem:
                 return replace(body, loads=unsolved([post.problem])), replace(
                     contact, result=None, problem=post.problem, post=post
                 )
-            pushed = self.mechanics.post_loads(k, place, post.load if post else None)
+            pushed = instant.post_loads(place, post.load if post else None)
             geometry = replace(body.geometry, condyles=body.geometry.condyles | result, post=pushed)
-            geometry, loads = self.mechanics.solved(k, geometry)
+            geometry, loads = instant.solved(geometry)
             body = replace(body, geometry=geometry, loads=loads)
             contact = self.carry(body, self.mechanics.poses[k], contact.start)
             seconds += contact.seconds
@@ -223,16 +212,19 @@ class ContactSide:
             before: contacts of the earlier frames; the search begins where the last three that
                 were found extrapolate to.
         """
-        released, began = self.released, clock.perf_counter()
+        released, began, mechanics = self.released, clock.perf_counter(), self.mechanics
         assert released is not None
+        instant = mechanics.instant(k)
         good = [contact for contact in before if contact.equilibrium and not contact.problem][-3:]
         begin = good[-1].start if good else None
-        points = {} if len(released.released) == 5 else self._nearest_points(k)
+        points = {}
+        if len(released.released) < 5:
+            points = mechanics.knee.nearest_points(instant.coordinates)
         try:
-            knee = self.starts.rest(k, [c.equilibrium for c in good if c.equilibrium], points)
+            knee = self.starts.rest(instant, [c.equilibrium for c in good if c.equilibrium], points)
         except ComputationError as error:
             contact = self.nothing(error.what)
-            body = self.mechanics.frame(k)
+            body = mechanics.frame(k)
             return replace(body, loads=unsolved([contact.problem])), contact
         result, contact = None, self.nothing(knee.problem)
         if not knee.problem:
@@ -245,7 +237,7 @@ class ContactSide:
             result = within_insert(self.state, result)
             contact = self._contact(result, start, None, 0.0)
             flags = (*contact.flags, *_doubts(knee))
-            post = post_contact(self.post, result.pose, self.table)
+            post = post_contact(self.post, result.pose, self._names)
             contact = replace(contact, flags=flags, post=post)
         contact = replace(
             contact,
@@ -254,44 +246,35 @@ class ContactSide:
             load_change=knee.change,
             equilibrium=knee,
         )
-        body = self._equilibrium_loads(k, knee, contact, points)
+        body = self._equilibrium_loads(instant, knee, contact, points)
         if body.loads.problems:
             return body, replace(contact, result=None, problem=body.loads.problems[0])
         return body, contact
 
     def _equilibrium_loads(
-        self, k: int, knee: "KneeEquilibrium", contact: FrameContact, points: dict[str, Array]
+        self,
+        instant: Instant,
+        knee: "KneeEquilibrium",
+        contact: FrameContact,
+        points: dict[str, Array],
     ) -> FrameLoads:
         start, geometry = clock.perf_counter(), knee.geometry
         if contact.result is None:
             loads = unsolved([contact.problem])
         else:
-            up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
-            separated = {
-                side: CondylePoint(point, up, still, NAN) for side, point in points.items()
-            }
-            touching = self.resultants(k, knee.coordinates, contact.result)
-            lifted = frozenset(self.mechanics.sides - set(touching))
+            condyles, place = condyle_wrenches(contact.result, self._split), knee.coordinates
             geometry = replace(
-                geometry,
-                condyles=separated | touching,
-                lifted=lifted,
-                post=self.mechanics.post_loads(k, knee.coordinates, knee.contact.post),
+                instant.touching(geometry, place, condyles, points),
+                post=instant.post_loads(place, knee.contact.post),
             )
-            loads = solve_knee(geometry, self.mechanics.friction)
+            loads = solve_knee(geometry, instant.friction)
         seconds = clock.perf_counter() - start
         return FrameLoads(geometry, loads, None, 0.0, seconds)
 
-    def resultants(self, k: int, place: Array, result: ContactResult) -> dict[str, CondylePoint]:
+    def _resultants(self, instant: Instant, result: ContactResult) -> dict[str, CondylePoint]:
         """Return the contact's resultants as the contact points of the equations."""
-        return self.mechanics.resultants(k, place, condyle_wrenches(result, self.case.split))
-
-    def _nearest_points(self, k: int) -> dict[str, Array]:
-        query = self.mechanics.query
-        assert query is not None
-        gaps = query.at(self.mechanics.poses[k])
-        result = {"medial": gaps.medial.centre}
-        return result | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
+        condyles = condyle_wrenches(result, self._split)
+        return instant.resultants(instant.coordinates, condyles)
 
     def _contact(
         self,
@@ -300,7 +283,7 @@ class ContactSide:
         adjustment: Adjustment | None,
         seconds: float,
     ) -> FrameContact:
-        medial = medial_points(self.state.points, result.pose, self.case.split)
+        medial = medial_points(self.state.points, result.pose, self._split)
         if result.status is not ContactStatus.OK:
             reason = f"contact {result.status.value.replace('_', ' ')}"
             words = "; ".join((reason, *result.flags))
@@ -314,11 +297,6 @@ class ContactSide:
         """Return a contact that could not be computed, and why."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
-
-
-def insert_material_as_json(scene: Scene) -> dict[str, Any]:
-    """Return all numbers of the insert's material, MPa, and their sources."""
-    return material_as_json(given_material(scene.insert_material))
 
 
 def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from tkamb.geometry.frames import Array
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.plausibility.plausibility import Plausibility
+from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.run.shards import Row
 from tkamb.run.status import frame_status
 from tkamb.run.tabulate import frame_row
@@ -63,10 +63,13 @@ class FrameSolver:
         self, case: Case, frames: range | None = None, slips: "dict[str, CondyleSlip] | None" = None
     ) -> None:
         self._case = case
-        self.mechanics = Mechanics(case)
-        self.plausibility = Plausibility(self.mechanics)
+        self.mechanics = mechanics_of(case)
+        self.plausibility = Plausibility(case, self.mechanics)
         last = max(frames or range(len(case.motion.time)))
-        self.slips = self.mechanics.slips(last) if slips is None else slips
+        if slips is None:  # of the recorded motion: released coordinates make another one
+            released = case.scene.contact and case.scene.contact.released
+            slips = {} if released else self.mechanics.slips(last)
+        self.slips = slips
         self.before: list[FrameContact] = []
 
     def solve(self, k: int) -> Finished:
@@ -96,9 +99,7 @@ class FrameSolver:
         """The contact side, prepared when it is first asked for; None without [contact]."""
         if self._case.scene.contact is None:
             return None
-        from tkamb.run.contact_side import ContactSide
-
-        return ContactSide(self._case, self.mechanics)
+        return contact_side(self._case, self.mechanics)
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]

@@ -2,7 +2,7 @@
 
 The errors are relative, against converged references: the largest over the cases on which a
 setting was measured. They hold for these cases, and are no bound for others. The cases are
-those of the trade-off study and half of the pairs of bodies of `tkamb.studies.error_cases`; the
+those of the trade-off study and half of the pairs of bodies of `error_cases`; the
 other half is held out, and shows how many of its errors are within the stated ones
 (docs/known_errors.md). `run/known_errors.json` is written by `scripts/make_tradeoff_table`. What
 was not measured is said to be so, never interpolated.

@@ -1,56 +1,57 @@
-"""A scene as a knee, its motion and its ground reaction: `tkamb.read_scene`."""
+"""A scene as a knee, its motion and its ground reaction: `tkamb.read_scene`.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+What is computed of a knee needs these three alone. `mechanics_of` and `contact_side` put them
+together with what else a run asks of a scene: shared muscles, the patella over all frames, femoral
+adjustment, post and coupling.
+"""
+
+import time as clock
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from tkamb.geometry.frames import Array
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, inverse, knee_pose, sagittal_pose
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
+from tkamb.knee.chain import ChainMotion
+from tkamb.knee.contact_points import CONTACT_POINT, nearest_gap
 from tkamb.knee.knee import Knee
 from tkamb.knee.parts import Extensor, Implant
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.mechanics import Ground, Mechanics, Motion
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.contact.cam_post import CamPost
+    from tkamb.contact.pair import ContactPair
+    from tkamb.knee.contact import KneeContact
+    from tkamb.knee.extensor import ExtensorFrames
+    from tkamb.run.contact_side import ContactSide
+    from tkamb.run.muscles.shared_muscles import SharedMuscles
+
+STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
+"""deg: where the strains of the ligaments are shown."""
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """The motion of a model, frame by frame.
+class SharedState:
+    """State that a sample, a case with changed inputs, shares with the nominal case.
 
     Args:
-        time: (f,) s.
-        q: (f, nq) configuration.
-        v: (f, nv) velocity.
-        a: (f, nv) acceleration.
+        pair: femoral component and insert, which stay near each other in all samples.
+        muscles: those of [muscles]; their strengths may differ from the nominal ones.
+        extensor: extensor mechanism of the nominal case. Its patella is the initial guess of the
+            search for the patella of the sample.
+        frames: frames in which the patella is searched for. In the others it stays where it is.
     """
 
-    time: Array
-    q: Array
-    v: Array
-    a: Array
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-
-@dataclass(frozen=True, eq=False)
-class Ground(Sequence[Any]):
-    """The ground reaction, frame by frame, as external forces on the joints of a model.
-
-    Args:
-        forces: (f,) of `pin.StdVec_Force`, one force per joint in its joint's frame.
-    """
-
-    forces: tuple[Any, ...]
-
-    def __len__(self) -> int:
-        return len(self.forces)
-
-    def __getitem__(self, k: Any) -> Any:
-        return self.forces[k]
+    pair: "ContactPair | None"
+    muscles: "SharedMuscles | None"
+    extensor: "ExtensorFrames | None"
+    frames: range
 
 
 def read_scene(scene: Scene | Case | str | Path) -> tuple[Knee, Motion, Ground]:
@@ -69,52 +70,232 @@ def read_scene(scene: Scene | Case | str | Path) -> tuple[Knee, Motion, Ground]:
     if isinstance(scene, str | Path):
         scene = load_scene(scene)
     case = scene if isinstance(scene, Case) else load_case(scene)
-    mechanics = Mechanics(case)
-    count = len(case.motion.time)
-    states = [case.chain.configuration(mechanics.chain_motion(k)) for k in range(count)]
-    q, v, a = (np.array(values) for values in zip(*states, strict=True))
-    knee = _knee(case, mechanics)
-    ground = tuple(_external(case, mechanics, knee.model, q[k], k) for k in range(count))
-    return knee, Motion(case.motion.time, q, v, a), Ground(ground)
+    if case.scene.muscles is not None:  # they are no part of the knee
+        case = replace(case, scene=case.scene.model_copy(update={"muscles": None}))
+    mechanics = mechanics_of(case)
+    knee, motion, ground = mechanics.knee, mechanics.motion, mechanics.ground
+    if knee.contact is not None:
+        knee.contact.state  # noqa: B018  what cannot be prepared shows here
+    if ground is None:
+        none = pin.StdVec_Force([pin.Force.Zero()] * knee.model.njoints)
+        ground = Ground((none,) * len(motion), np.full((len(motion), 3), np.nan))
+    return knee, motion, ground
 
 
-def _knee(case: Case, mechanics: Mechanics) -> Knee:
-    scene, contact, extensor = case.scene, None, None
+def mechanics_of(
+    case: Case,
+    shared: SharedState | None = None,
+    near: bool = False,
+    contact: "KneeContact | None" = None,
+) -> Mechanics:
+    """Return the body side of a case.
+
+    Args:
+        case: the scene with its files read.
+        shared: what is known already of a case that this one is a sample of.
+        near: whether the condyles are known to be near the insert.
+        contact: the contact model with what it has prepared; None: the scene's.
+
+    Raises:
+        InputError: whatever does not fit together.
+    """
+    poses = knee_pose(case.motion.coordinates)
+    knee = _knee(case, shared, contact)
+    if shared is None and not near:
+        _check_near(case, knee, poses)
+    extensor = None
+    if knee.extensor_lines is not None:
+        extensor = _extensor_frames(case, knee, poses, shared)
+    strains = None
+    if case.ligaments:
+        from tkamb.knee.ligaments import build_ligaments, strain_table
+
+        flexion, links = case.motion.coordinates[:, 5], link_poses(case, poses, extensor)
+        bundles = build_ligaments(case.ligaments, links, flexion)
+        knee = knee.with_ligaments(bundles)
+        strains = strain_table(bundles, links, flexion, STRAIN_FLEXIONS)
+    motion = _motion(case, extensor)
+    table, adjust = case.scene.contact, None
+    if table is not None and table.adjust:
+        from tkamb.geometry.adjustment import AdjustmentSettings
+
+        adjust = AdjustmentSettings(restore_when=table.adjust_restore_when)
+    muscles = shared.muscles if shared else _muscles(case)
+    ground = _ground(case, motion)
+    return Mechanics(knee, motion, ground, extensor, muscles, adjust, strains)
+
+
+def contact_side(
+    case: Case,
+    mechanics: Mechanics,
+    sensitivity: bool = True,
+    post: "CamPost | None" = None,
+) -> "ContactSide":
+    """Return the contact side of a case with [contact], prepared.
+
+    Args:
+        case: the case.
+        mechanics: its body side.
+        sensitivity: see `ContactSide`.
+        post: cam and post, if they are prepared already.
+    """
+    from tkamb.knee.equilibrium.post_side import cam_on_post
+    from tkamb.run.contact_side import ContactSide
+
+    table, contact = case.scene.contact, mechanics.knee.contact
+    assert table is not None and contact is not None
+    start, cam = clock.perf_counter(), None
+    material = contact.state.pair.material
+    if case.post is not None:
+        cam = cam_on_post(contact.model, contact.pair, case.post, material, post)
+    seconds = clock.perf_counter() - start
+    return ContactSide(
+        mechanics, table.coupling == "points", table.released, cam, sensitivity, seconds
+    )
+
+
+def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> dict[str, Array]:
+    """Return link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments.
+
+    Args:
+        case: the case.
+        poses: (f, 4, 4) of the femur.
+        extensor: the patella over the frames.
+    """
+    chain, ligament = case.chain, case.patellar_ligament
+    shank = np.broadcast_to(inverse(chain.insert_in_tibia), poses.shape)
+    known: dict[str, Array] = {"femur": poses, "tibia": shank}
+    if extensor is not None:
+        places = [sagittal_pose(extensor.joints(k)[0]) for k in range(len(poses))]
+        known["patella"] = poses @ chain.patella_joint_in_femur @ np.array(places)
+    ends = [end for line in case.ligaments for end in (line.proximal, line.distal)]
+    if ligament is not None:
+        ends += [ligament.proximal, ligament.distal]
+    for link in {end.link for end in ends} - set(known):
+        carrier = chain.carrier(link)
+        known[link] = known[carrier] @ chain.link_in(link, carrier)
+    return known
+
+
+def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None") -> Knee:
+    """Return the knee of a case, without its ligaments."""
+    scene, extensor = case.scene, None
     table, insert = scene.contact, scene.implant.insert
     implant = Implant(case.femoral, case.insert, case.patella, placed=True)
-    if table is not None:
+    friction = 0.0 if table is None else table.friction
+    if table is not None and contact is None:
+        from tkamb.contact.pair import ContactPair
         from tkamb.contact.registry import contact_model
+        from tkamb.io.given_material import given_material
+        from tkamb.knee.contact import KneeContact
 
-        assert insert is not None
-        contact = contact_model(table.model, table.resolution_mm, **table.options)
-        implant = Implant(
-            case.femoral, case.insert, case.patella, table.material, insert.bearing, placed=True
-        )
+        assert insert is not None and case.femoral is not None and case.insert is not None
+        pair = shared.pair if shared else None
+        if pair is None:
+            material = given_material(scene.insert_material)
+            pair = ContactPair(case.femoral, case.insert, material, insert.bearing)
+            pair.__dict__["split"] = case.split  # found once
+        model = contact_model(table.model, table.resolution_mm, **table.options)
+        contact = KneeContact(model, pair, friction)
+    if contact is not None:
+        pair = contact.pair
+        implant = replace(implant, material=pair.material, bearing=pair.bearing)
     if scene.patella is not None:
         (muscle,) = case.muscles
         assert case.patellar_ligament is not None
         solved = scene.patella.motion == "solved"
         extensor = Extensor(muscle, case.patellar_ligament, solved=solved)
     return Knee(
-        case.chain.model,
-        implant=implant,
-        ligaments=mechanics.ligaments,
-        extensor=extensor,
-        contact=contact,
-        friction=mechanics.friction,
-        cache=True,
+        case.chain.model, implant=implant, extensor=extensor, contact=contact, friction=friction
     )
 
 
-def _external(case: Case, mechanics: Mechanics, model: pin.Model, q: Array, k: int) -> Any:
-    """Return the ground reaction of frame k as forces on the joints."""
-    forces = [pin.Force.Zero() for _ in range(model.njoints)]
-    load = mechanics.ground_in_laboratory(k)
-    if load is not None:
-        force, point, moment = load
-        data = model.createData()
+def _check_near(case: Case, knee: Knee, poses: Array) -> None:
+    """Raise where the condyles are nowhere near the insert, whatever the frame."""
+    table = case.scene.contact
+    if table is None or table.released:
+        return
+    nearest: list[float] = []
+    for k in (len(poses) // 2, 0, len(poses) - 1):
+        nearest.append(nearest_gap(knee.query.at(poses[k])))
+        if abs(nearest[-1]) <= CONTACT_POINT.max_gap:
+            return
+    gap = min(nearest, key=abs)
+    raise InputError(
+        f"neither condyle is near the insert (nearest {abs(gap) / MILLIMETRE:.0f} mm "
+        f"{'apart' if gap > 0 else 'inside'})",
+        "[motion] with [implant.femoral] and [implant.insert]",
+        "check which mesh is which, their units, axes and places, and the motion's",
+    )
+
+
+def _extensor_frames(
+    case: Case, knee: Knee, poses: Array, shared: SharedState | None
+) -> "ExtensorFrames":
+    """Return the patella of a case with [patella], over all frames.
+
+    Raises:
+        InputError: no patella was recorded, or see `ExtensorFrames`.
+    """
+    from tkamb.knee.extensor import ExtensorFrames
+
+    motion, recorded = case.motion, None
+    assert case.scene.patella is not None and knee.extensor_lines is not None
+    if shared is not None and case.scene.patella.motion == "solved":
+        assert shared.extensor is not None
+        return shared.extensor.moved(knee.extensor_lines, poses, shared.frames)
+    if case.scene.patella.motion == "recorded":
+        if motion.patella is None:
+            raise InputError(
+                "has no patella columns",
+                case.scene.motion.file,
+                "record patella_ap, patella_si, patella_rotation or set [patella] motion = "
+                "'solved'",
+            )
+        assert motion.patella_velocity is not None and motion.patella_acceleration is not None
+        rates = (motion.patella_velocity, motion.patella_acceleration)
+        recorded = np.stack([motion.patella, *rates], axis=1)
+    return ExtensorFrames(knee.extensor_lines, motion.time, poses, recorded, case.rates)
+
+
+def _motion(case: Case, extensor: "ExtensorFrames | None") -> Motion:
+    """Return the motion of the case's model."""
+    motion, tibia, states = case.motion, case.tibia, []
+    still = (np.eye(4), np.zeros(6), np.zeros(6))
+    for k, rows in enumerate(
+        np.stack([motion.coordinates, motion.velocity, motion.acceleration], axis=1)
+    ):
+        joints = rows if extensor is None else np.hstack([rows, extensor.joints(k)])
+        shank = still
+        if tibia is not None:
+            shank = (tibia.pose[k], tibia.velocity[k], tibia.acceleration[k])
+        states.append(case.chain.configuration(ChainMotion(*shank, joints)))
+    q, v, a = (np.array(values) for values in zip(*states, strict=True))
+    return Motion(motion.time, q, v, a, motion.coordinates)
+
+
+def _ground(case: Case, motion: Motion) -> Ground | None:
+    """Return the ground reaction as forces on the joints; None if it is not measured."""
+    ground, table, model = case.ground, case.scene.ground_reaction, case.chain.model
+    if ground is None or table is None:
+        return None
+    points, moments = ground.point, ground.moment
+    if table.applied == "ankle":
+        assert case.tibia is not None
+        points, moments = case.tibia.pose[:, :3, 3], np.zeros_like(ground.force)
+    joint = model.frames[case.chain.frame_id("tibia")].parentJoint
+    data, result = model.createData(), []
+    for q, force, point, moment in zip(motion.q, ground.force, points, moments, strict=True):
         pin.forwardKinematics(model, data, q)
-        joint = model.frames[case.chain.frame_id("tibia")].parentJoint
-        wrench = pin.Force(force, moment + np.cross(point, force))
-        forces[joint] = data.oMi[joint].actInv(wrench)
-    return pin.StdVec_Force(forces)
+        forces = [pin.Force.Zero()] * model.njoints
+        forces[joint] = data.oMi[joint].actInv(pin.Force(force, moment + np.cross(point, force)))
+        result.append(pin.StdVec_Force(forces))
+    return Ground(tuple(result), points)
+
+
+def _muscles(case: Case) -> "SharedMuscles | None":
+    if case.scene.muscles is None:
+        return None
+    from tkamb.run.muscles.shared_muscles import load_muscles
+
+    return load_muscles(case)

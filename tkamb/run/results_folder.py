@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-import os
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -197,7 +197,7 @@ class _Run:
     def _begin_maps(self, side: "ContactSide") -> None:
         labels = {
             "frame": "insert: x anterior, y superior, z lateral",
-            "model": side.table.model,
+            "model": side.model.name,
             "version": str(self.identity["version of tkamb"]),
             "scene_sha256": scene_hash(self.case),
         }

@@ -22,8 +22,8 @@ from tkamb.io.scene.tables import ContactTable, MusclesTable
 from tkamb.run.columns import ACTIVATION, JOINT_MOMENT, RESERVE, belongs, family_column, name_in
 from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.known_errors import as_json, known_error, left_out
-from tkamb.run.mechanics import STRAIN_FLEXIONS
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
+from tkamb.run.read_scene import STRAIN_FLEXIONS
 from tkamb.run.recorded import predicted_columns
 from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
@@ -105,9 +105,9 @@ def summary_of(
         summary |= compare_recorded(case, columns)
     if scene.contact:
         table = scene.contact
-        from tkamb.run.contact_side import insert_material_as_json
+        from tkamb.io.given_material import given_material, material_as_json
 
-        chosen = insert_material_as_json(scene)
+        chosen = material_as_json(given_material(scene.insert_material))
         error = known_error(table.model, table.resolution_mm, chosen["name"], table.options)
         summary["contact"] = table.model_dump(mode="json")
         if scene.material is not None:

@@ -11,7 +11,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from tkamb.geometry.frames import Array
-from tkamb.run.contact_side import insert_material_as_json
+from tkamb.io.given_material import given_material, material_as_json
 from tkamb.run.known_errors import as_json, is_large, known_error_words
 from tkamb.run.maps import ContactMaps
 from tkamb.show.design_figure import BANDS, design_bars, draw_designs, run_error
@@ -95,7 +95,7 @@ def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
         if table is None:
             continue
         error = as_json(run_error(cohort.runs[n]))
-        material = insert_material_as_json(cohort.runs[n].scene)["name"]
+        material = material_as_json(given_material(cohort.runs[n].scene.insert_material))["name"]
         setting = f"{table.model} at {table.resolution_mm:g} mm, {material}"
         words[setting] = f"{setting}: {known_error_words(error, PRESSURE_AND_AREA)}"
         large = large or is_large(error, PRESSURE_AND_AREA)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.run.contact_side import insert_material_as_json
+from tkamb.io.given_material import given_material, material_as_json
 from tkamb.run.known_errors import KnownError, known_error
 from tkamb.show.style import CYCLE as COLOURS
 from tkamb.show.style import legend_above, new_figure, settings
@@ -64,7 +64,7 @@ def run_error(run: CohortRun) -> KnownError | None:
     table = run.scene.contact
     if table is None:
         return None
-    material = insert_material_as_json(run.scene)["name"]
+    material = material_as_json(given_material(run.scene.insert_material))["name"]
     return known_error(table.model, table.resolution_mm, material, table.options)
 
 

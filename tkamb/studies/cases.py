@@ -158,13 +158,13 @@ def _shipped(name: str) -> StudyCase:
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
     from tkamb.io.scene import load_scene
     from tkamb.io.scene.case import load_case
-    from tkamb.run.mechanics import Mechanics
+    from tkamb.run.read_scene import mechanics_of
 
     case = load_case(load_scene(path))
     table, insert = case.scene.contact, case.scene.implant.insert
     if table is None or insert is None or case.femoral is None or case.insert is None:
         raise InputError("has no [contact]", path, "the trade-off needs two bodies")
-    mechanics = Mechanics(case)
+    mechanics = mechanics_of(case)
     k = int(np.argmin(np.abs(case.motion.coordinates[:, 5] - flexion * DEGREE)))
     load = float(mechanics.frame(k).loads.contact_force[1])
     if not load > 0:

@@ -29,21 +29,42 @@ CLASSES: dict[type[SceneTable], type] = {
 NAMES = {"neutral_mm": "neutral_translation", "neutral_deg": "neutral_rotation"}
 """Two keys that differ by their unit alone."""
 
+SCENE_ONLY: dict[type[SceneTable], frozenset[str]] = {
+    tables.PatientTable: frozenset({"scale"}),
+    recording_tables.MotionTable: frozenset({"motion", "slip_share"}),
+    recording_tables.GroundReactionTable: frozenset({"applied"}),
+    measured.EmgTable: frozenset({"use", "weight", "width"}),
+}
+"""Keys that no reader of a file needs."""
+
+
+def si_names(table: type[SceneTable]) -> dict[str, tuple[str, float]]:
+    """Return key -> field of the class below the scene, and what one of its unit is in SI.
+
+    Raises:
+        TypeError: a key without a field that is not of the scene alone, or a field without a key.
+    """
+    names = {}
+    for key in table.model_fields.keys() - SCENE_ONLY.get(table, frozenset()):
+        unit = next((unit for unit in SCALES if key.endswith(unit)), "")
+        names[key] = NAMES.get(key, key.removesuffix(unit)), SCALES.get(unit, 1.0)
+    known = {one.name for one in fields(CLASSES[table])}
+    for key, (name, _) in names.items():
+        if name not in known:
+            raise TypeError(f"{table.__name__}.{key}: no field {CLASSES[table].__name__}.{name}")
+    if apart := known - {name for name, _ in names.values()}:
+        raise TypeError(f"{CLASSES[table].__name__}.{min(apart)}: no key in {table.__name__}")
+    return names
+
 
 def in_si(table: SceneTable) -> Any:
-    """Return the SI object of a table, see `CLASSES`.
-
-    Keys that the class does not have are left out.
-    """
-    kind = CLASSES[type(table)]
-    names = {one.name for one in fields(kind)}
-    values = {}
-    for key, value in table:
-        unit = next((unit for unit in SCALES if key.endswith(unit)), "")
-        name = NAMES.get(key, key.removesuffix(unit))
-        if name in names:
-            values[name] = _value(value, SCALES.get(unit, 1.0))
-    return kind(**values)
+    """Return the SI object of a table, see `CLASSES`."""
+    return CLASSES[type(table)](
+        **{
+            name: _value(getattr(table, key), scale)
+            for key, (name, scale) in si_names(type(table)).items()
+        }
+    )
 
 
 def _value(value: Any, scale: float) -> Any:

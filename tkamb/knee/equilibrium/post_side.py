@@ -1,5 +1,6 @@
-"""Cam and post of a case: prepared if the scene asks for them, and evaluated at a pose."""
+"""Cam and post of a knee: prepared once, and evaluated at a pose."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,9 +12,9 @@ if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost, PostContact
     from tkamb.contact.materials import Material
     from tkamb.contact.model import ContactModel
+    from tkamb.contact.pair import ContactPair
     from tkamb.geometry.frames import Array
-    from tkamb.io.scene.case import Case
-    from tkamb.io.scene.tables import ContactTable
+    from tkamb.geometry.surface import Surface
 
 
 @dataclass(frozen=True)
@@ -29,40 +30,42 @@ POST_SIDE = PostSideSettings()
 
 
 def cam_on_post(
-    case: "Case", model: "ContactModel", material: "Material", ready: "CamPost | None" = None
-) -> "CamPost | None":
-    """Return cam and post, prepared; None where the scene does not ask for them.
+    model: "ContactModel",
+    pair: "ContactPair",
+    post: "Surface",
+    material: "Material",
+    ready: "CamPost | None" = None,
+) -> "CamPost":
+    """Return cam and post, prepared.
 
     Args:
-        case: the case.
         model: the contact model.
+        pair: femoral component and insert.
+        post: of the insert, insert frame.
         material: of the insert.
         ready: the same prepared already, perhaps of another material.
 
     Raises:
         InputError: see `CamPost`.
     """
-    if case.post is None:
-        return None
     if ready is not None:
         return ready if ready.material == material else ready.of_material(material)
     from tkamb.contact.cam_post import CamPost
 
-    assert case.femoral is not None
-    return CamPost(model, case.femoral, case.post, case.split, material)
+    return CamPost(model, pair.femoral, post, pair.split, material)
 
 
 def post_contact(
-    cam_post: "CamPost | None", pose: "Array", table: "ContactTable"
+    cam_post: "CamPost | None", pose: "Array", released: Sequence[str]
 ) -> "PostContact | None":
     """Return cam and post at a pose (4, 4), with a question if a recorded AP makes them overlap.
 
-    None where the scene does not ask for them.
+    None where they are not modelled.
     """
     if cam_post is None:
         return None
     post = cam_post.at(pose)
-    if "ap" in table.released or post.problem or not post.gap < -POST_SIDE.pose_error:
+    if "ap" in released or post.problem or not post.gap < -POST_SIDE.pose_error:
         return post
     question = (
         f"cam and post overlap by {-post.gap / MILLIMETRE:.1f} mm as recorded, which makes "

@@ -17,10 +17,9 @@ except for follower loads.
 The contact comes as a probe; this file does not know the models.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,16 +29,13 @@ from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.equilibrium.balance import Balance, BalanceStatus
 from tkamb.knee.equilibrium.relaxation import Relaxation
 from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
+from tkamb.knee.instant import Instant
 from tkamb.knee.joint_equilibrium import JointEquilibrium, external_wrench, joint_equilibrium
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import CondyleWrench, Probe, ProbedContact
-    from tkamb.knee.contact_points import CondylePoint
+    from tkamb.contact.probe import Probe, ProbedContact
     from tkamb.knee.crossing import MuscleShare
-    from tkamb.knee.ligaments import Ligament
-    from tkamb.knee.load import PointForces
     from tkamb.knee.patella import PatellaState
-    from tkamb.run.muscles.shared_muscles import SharedMuscles
 
 
 @dataclass(frozen=True)
@@ -129,74 +125,34 @@ def released_indices(names: Sequence[str]) -> tuple[int, ...]:
     return tuple(i for i, name in enumerate(KNEE_COORDINATES) if name == "si" or name in names)
 
 
-class Body(Protocol):
-    """What the search needs from the body, frame by frame: of a whole motion, or of one instant."""
-
-    friction: float
-    extensor: Any
-
-    @property
-    def ligaments(self) -> "Sequence[Ligament]":
-        """The bundles, with slack lengths."""
-
-    @property
-    def muscles(self) -> "SharedMuscles | None":
-        """Muscles that share the load; None if the quadriceps alone acts."""
-
-    @property
-    def sides(self) -> set[str]:
-        """Names of the condyles that may carry load."""
-
-    def geometry(
-        self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
-    ) -> KneeGeometry:
-        """Return frame k without its contact, perhaps at other coordinates (6,)."""
-
-    def sliding(self, k: int, coordinates: Array, point: Array) -> Array:
-        """Return the velocity (3,) m/s of the femur's point relative to the insert's."""
-
-    def resultants(
-        self, k: int, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
-    ) -> "dict[str, CondylePoint]":
-        """Return the resultants of a contact as the contact points of the equations."""
-
-    def post_loads(
-        self, k: int, coordinates: Array, post: "CondyleWrench | None"
-    ) -> "tuple[PointForces, ...]":
-        """Return what a cam on the post does to tibia and femur."""
-
-
 class ReleasedKnee:
-    """Finds the released coordinates of a body, frame by frame.
+    """Finds the released coordinates of a knee, instant by instant.
 
     Args:
-        mechanics: the body side.
         probe: of the contact model.
         names: the released coordinates, "si" understood.
 
     Attributes:
         released: their indices.
-        muscles: the load is shared among muscles.
     """
 
-    def __init__(self, mechanics: Body, probe: "Probe", names: Sequence[str]) -> None:
-        self._mechanics, self._probe = mechanics, probe
-        self.muscles = mechanics.muscles is not None
+    def __init__(self, probe: "Probe", names: Sequence[str]) -> None:
+        self._probe = probe
         self.released = released_indices(names)
-        self._external: tuple[int, Array] | None = None
-        """Index and external wrench of the last frame."""
+        self._external: tuple[Instant, Array] | None = None
+        """The last instant and its external wrench."""
 
     def find(
         self,
-        k: int,
+        instant: Instant,
         start: Array,
         points: dict[str, Array] | None = None,
         before: KneeEquilibrium | None = None,
     ) -> KneeEquilibrium:
-        """Return frame k in equilibrium.
+        """Return the knee in equilibrium.
 
         Args:
-            k: frame.
+            instant: the knee.
             start: (6,) coordinates; the released ones are where the search begins.
             points: side -> (3,) m, where a condyle that carries nothing is nearest to the
                 insert: residual forces act in the middle of both condyles' points.
@@ -208,11 +164,11 @@ class ReleasedKnee:
         place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
         knee, slack, trials, passes = before, False, 0, 0
         touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
-        if self._mechanics.muscles and before:
+        if instant.muscles and before:
             place, touch = self._carrying(place, before.contact)
         reach = RELEASED_KNEE.muscle_force_range if touch else np.inf
         while passes < RELEASED_KNEE.max_passes:
-            knee, pushes = self._pass(k, place, middle, slack, knee, touch, mixing, reach)
+            knee, pushes = self._pass(instant, place, middle, slack, knee, touch, mixing, reach)
             touch = knee.contact
             passes, trials = passes + 1, trials + knee.balance.trials
             change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
@@ -237,7 +193,7 @@ class ReleasedKnee:
                     RELEASED_KNEE.contact_force_share * float(np.linalg.norm(force)),
                 )
             ):
-                knee = self._measured(k, replace(knee, doubt=mixing.doubt), middle, slack)
+                knee = self._measured(instant, replace(knee, doubt=mixing.doubt), middle, slack)
                 if knee.problem or knee.residual <= self._allowed(knee.contact):
                     return knee
         assert knee is not None
@@ -250,18 +206,20 @@ class ReleasedKnee:
         return max(RELEASED_KNEE.residual_tolerance, share * force)
 
     def _measured(
-        self, k: int, knee: KneeEquilibrium, middle: Array, slack: bool
+        self, instant: Instant, knee: KneeEquilibrium, middle: Array, slack: bool
     ) -> KneeEquilibrium:
         """Return the knee with patella, lines and residual as they are at its own pose."""
         if knee.problem:
             return knee
-        patella = self._patella(k, knee.coordinates, knee.patella)
-        geometry = self._mechanics.geometry(k, knee.coordinates, patella)
-        joint = self._joint(k, geometry, middle, slack)
+        patella = None
+        if instant.extensor is not None:
+            patella = instant.extensor.patella(knee_pose(knee.coordinates), knee.patella)
+        geometry = instant.geometry(knee.coordinates, patella)
+        joint = self._joint(instant, geometry, middle, slack)
         if knee.geometry.share is not None:
             geometry = replace(geometry, share=knee.geometry.share)
             joint = replace(joint, share=knee.geometry.share)
-        left = self._forces(k, joint, knee.coordinates, knee.contact).left()
+        left = self._forces(instant, joint, knee.coordinates, knee.contact).left()
         problem = "; ".join(geometry.problems)
         return replace(knee, geometry=geometry, patella=patella, residual=left, problem=problem)
 
@@ -298,7 +256,7 @@ class ReleasedKnee:
 
     def _pass(
         self,
-        k: int,
+        instant: Instant,
         place: Array,
         middle: Array,
         slack: bool,
@@ -308,18 +266,20 @@ class ReleasedKnee:
         reach: float,
     ) -> tuple[KneeEquilibrium, bool]:
         """Return the equilibrium with the patella at `place`; say if its ligament would push."""
-        patella = self._patella(k, place, before.patella if before else None)
-        geometry = self._mechanics.geometry(k, place, patella)
-        joint = self._joint(k, geometry, middle, slack)
-        muscles = self._mechanics.muscles
+        patella, guess = None, before.patella if before else None
+        if instant.extensor is not None:
+            patella = instant.extensor.patella(knee_pose(place), guess)
+        geometry = instant.geometry(place, patella)
+        joint = self._joint(instant, geometry, middle, slack)
+        muscles = instant.muscles
         if muscles is not None and not geometry.problems:
             applied = None if touch is None or before is None else before.geometry.share
-            applied = None if applied is None else muscles.at(k, applied)
-            share = mixing.mixed(self._share(k, geometry, joint, touch, applied, mixing))
+            applied = None if applied is None else muscles.at(applied)
+            share = mixing.mixed(self._share(instant, geometry, joint, touch, applied, mixing))
             geometry, joint = replace(geometry, share=share), replace(joint, share=share)
             if slack := muscles.tension(share) < RELEASED_KNEE.slack_force:
-                joint = self._joint(k, geometry, middle, slack)
-        forces = self._forces(k, joint, place, touch)
+                joint = self._joint(instant, geometry, middle, slack)
+        forces = self._forces(instant, joint, place, touch)
         stiffness = before.balance.stiffness if before else None
         balance = forces.balance(
             stiffness, *((RELEASED_KNEE.inner_tolerance_share, reach) if muscles else ())
@@ -346,7 +306,7 @@ class ReleasedKnee:
 
     def _share(
         self,
-        k: int,
+        instant: Instant,
         geometry: KneeGeometry,
         joint: JointEquilibrium,
         touch: "ProbedContact | None",
@@ -359,7 +319,7 @@ class ReleasedKnee:
         If they make the equations singular, the knee's forces pass through the femoral origin.
 
         Args:
-            k: frame.
+            instant: the knee.
             geometry: the frame without its contact.
             joint: its equations, the extensor mechanism taut.
             touch: the contact there; None where the search begins without a contact like that of
@@ -370,26 +330,25 @@ class ReleasedKnee:
         Raises:
             ComputationError: no muscle forces carry the frame.
         """
-        mechanics, place = self._mechanics, geometry.coordinates
-        muscles, friction = mechanics.muscles, mechanics.friction
+        place, muscles, friction = geometry.coordinates, instant.muscles, instant.friction
         assert muscles is not None
         contact = self._probe.at(knee_pose(place)) if touch is None else touch
         gain = None
         if applied is not None:
-            forces = self._forces(k, replace(joint, share=applied), place)
+            forces = self._forces(instant, replace(joint, share=applied), place)
             smooth = self._probe.smoothed(knee_pose(place), contact)
             gain = mixing.yielding(forces.tension_per_wrench(smooth))
         if applied is not None and gain is not None:
             pull = applied.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
             base = forces.tension_at_rest(contact, gain) - float(gain @ pull)
-            share = muscles.share_of_yielding_knee(k, geometry, base, gain)
+            share = muscles.share_of_yielding_knee(geometry, base, gain)
         else:
-            points = mechanics.resultants(k, place, contact.condyles)
-            geometry = replace(geometry, post=mechanics.post_loads(k, place, contact.post))
-            off = frozenset(mechanics.sides - set(points)) if points else frozenset[str]()
-            share = muscles.share(k, replace(geometry, condyles=points), friction, off)
+            points = instant.resultants(place, contact.condyles)
+            geometry = replace(geometry, post=instant.post_loads(place, contact.post))
+            off = frozenset(instant.sides - set(points)) if points else frozenset[str]()
+            share = muscles.share(replace(geometry, condyles=points), friction, off)
             if touch is None and share.status != "ok":
-                share = muscles.share(k, geometry, friction, frozenset())
+                share = muscles.share(geometry, friction, frozenset())
         if share.status != "ok":
             raise ComputationError(f"muscles: {share.status.removeprefix('failed: ')}")
         return share
@@ -399,18 +358,12 @@ class ReleasedKnee:
         """Whether residual forces act: a translation or rotation is kept as recorded."""
         return len(self.released) < 5
 
-    def _patella(self, k: int, place: Array, guess: "PatellaState | None") -> "PatellaState | None":
-        extensor = self._mechanics.extensor
-        if extensor is None:
-            return None
-        return extensor.patella(k, knee_pose(place), guess)
-
     def _joint(
-        self, k: int, geometry: KneeGeometry, middle: Array, slack: bool
+        self, instant: Instant, geometry: KneeGeometry, middle: Array, slack: bool
     ) -> JointEquilibrium:
-        ligaments, place = self._mechanics.ligaments, geometry.coordinates
-        if self._external is None or self._external[0] != k:
-            self._external = k, external_wrench(geometry, place)
+        ligaments, place = instant.ligaments, geometry.coordinates
+        if self._external is None or self._external[0] is not instant:
+            self._external = instant, external_wrench(geometry, place)
         external = self._external[1]
         if not np.isfinite(external).all():  # of a patella that was lost: the next may not be
             self._external = None
@@ -418,14 +371,13 @@ class ReleasedKnee:
 
     def _forces(
         self,
-        k: int,
+        instant: Instant,
         joint: JointEquilibrium,
         place: Array,
         touch: "ProbedContact | None" = None,
     ) -> "ReleasedForces":
-        sliding = partial(self._mechanics.sliding, k)
-        friction = self._mechanics.friction
-        return ReleasedForces(joint, self._probe, place, friction, sliding, touch)
+        friction = instant.friction
+        return ReleasedForces(joint, self._probe, place, friction, instant.sliding, touch)
 
 
 def ahead(ways: Sequence[float]) -> float:

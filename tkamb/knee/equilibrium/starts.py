@@ -13,6 +13,7 @@ from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
 from tkamb.knee.equilibrium.balance import BalanceStatus
 from tkamb.knee.equilibrium.released import KneeEquilibrium, ReleasedKnee
 from tkamb.knee.equilibrium.released_forces import SCALE
+from tkamb.knee.instant import Instant
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -54,22 +55,19 @@ AP = KNEE_COORDINATES.index("ap")
 
 
 class InitialPoses:
-    """The initial guesses of the frames of a motion, the likeliest first.
+    """The initial guesses of a search, the likeliest first.
 
     Args:
-        recorded: (f, 6) knee coordinates of the motion, m and rad.
         knee: it searches from an initial guess.
         pair: femoral component and insert.
         post: cam and post, if they are modelled.
     """
 
-    def __init__(
-        self, recorded: Array, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None"
-    ) -> None:
-        self._recorded, self._knee, self._pair, self._post = recorded, knee, pair, post
+    def __init__(self, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None") -> None:
+        self._knee, self._pair, self._post = knee, pair, post
 
     def rest(
-        self, k: int, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
+        self, instant: Instant, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
     ) -> KneeEquilibrium:
         """Return the equilibrium from the first initial guess that converges.
 
@@ -77,7 +75,7 @@ class InitialPoses:
         repeated from the other starts; one that ends elsewhere is told in `second`.
 
         Args:
-            k: frame.
+            instant: the knee.
             previous: the last three frames that were found.
             points: side -> where a condyle that carries nothing is nearest to the insert.
 
@@ -85,40 +83,45 @@ class InitialPoses:
             ComputationError: no start lies over the insert, or no muscle forces carry the frame.
         """
         knee, failure = None, "the femoral component does not lie over the insert"
-        starts = list(self._starts(k, [knee.coordinates for knee in previous]))
+        recorded = instant.coordinates
+        starts = list(self._starts(recorded, [knee.coordinates for knee in previous]))
         for place in starts:
             if not np.isfinite(place).all():
                 continue
             try:
-                knee = self._knee.find(k, place, points, previous[-1] if previous else None)
+                knee = self._knee.find(instant, place, points, previous[-1] if previous else None)
             except ComputationError as error:
                 failure = error.what
                 continue
-            if knee.balance.status not in ASTRAY and not (knee.problem and self._knee.muscles):
+            if knee.balance.status not in ASTRAY and not (knee.problem and instant.muscles):
                 break
         if knee is None:
             raise ComputationError(failure)
         if knee.problem or _apart(place, knee.coordinates) <= INITIAL_POSE.max_continuation:
             return knee
-        others = [one for one in starts[1:] if one is not place] or self._beside(k)
-        return replace(knee, second=self._second(k, knee, others, points))
+        others = [one for one in starts[1:] if one is not place] or self._beside(instant)
+        return replace(knee, second=self._second(instant, knee, others, points))
 
-    def _beside(self, k: int) -> list[Array]:
+    def _beside(self, instant: Instant) -> list[Array]:
         """Return the recorded pose moved forwards and backwards, just touching."""
-        places = [self._recorded[k].copy(), self._recorded[k].copy()]
+        places = [instant.coordinates.copy(), instant.coordinates.copy()]
         for place, sign in zip(places, (1.0, -1.0), strict=True):
             place[AP] += sign * INITIAL_POSE.other_shift * (AP in self._knee.released)
         return [self.on_the_insert(place) for place in places]
 
     def _second(
-        self, k: int, knee: KneeEquilibrium, starts: list[Array], points: dict[str, Array]
+        self,
+        instant: Instant,
+        knee: KneeEquilibrium,
+        starts: list[Array],
+        points: dict[str, Array],
     ) -> str:
         """Return in words where other starts lead that do not lead to an equilibrium; or empty."""
         for place in starts:
             if not np.isfinite(place).all():
                 continue
             try:
-                other = self._knee.find(k, place, points)
+                other = self._knee.find(instant, place, points)
             except ComputationError:
                 continue
             apart = _apart(other.coordinates, knee.coordinates)
@@ -133,12 +136,12 @@ class InitialPoses:
             )
         return ""
 
-    def _starts(self, k: int, previous: list[Array]) -> Iterator[Array]:
+    def _starts(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
         """Yield initial guesses: extrapolated from the last frames, the last frame, as recorded.
 
         The first keeps its height; the others are moved to first touch.
         """
-        recorded, rows = self._recorded[k], list(self._knee.released)
+        rows = list(self._knee.released)
         for number, place in enumerate([carried_on(previous), previous[-1]] if previous else []):
             start = recorded.copy()
             start[rows] = place[rows]

@@ -52,7 +52,7 @@ class SharedMuscles:
 
     def __init__(self, trial: KneeTrial, is_left: bool = False) -> None:
         flip = MIRROR if is_left else np.eye(3)
-        self.trial, self._left, self._names = trial, is_left, trial.muscles
+        self.trial, self._left = trial, is_left
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
         self._knee = trial.knee
         if is_left and trial.knee is not None:
@@ -75,83 +75,72 @@ class SharedMuscles:
         trial = self.trial.changed(strength, shank @ flip, thigh @ flip)
         return SharedMuscles(trial, self._left)
 
-    def share(
-        self, k: int, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
-    ) -> MuscleShare:
-        """Return the force of each muscle in frame k with the knee where it is.
+    def frame(self, k: int) -> "FrameMuscles":
+        """Return the muscles at frame k."""
+        knee = None if self._knee is None else self._knee[k]
+        return FrameMuscles(self.trial, k, CrossingLines(self._shank[k], self._thigh[k], knee))
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMuscles:
+    """Shares the load of one frame among the muscles of a leg.
+
+    Args:
+        trial: the muscles over the frames.
+        k: frame.
+        lines: theirs across the knee.
+    """
+
+    trial: KneeTrial
+    k: int
+    lines: CrossingLines
+
+    def share(self, geometry: KneeGeometry, friction: float, lifted: frozenset[str]) -> MuscleShare:
+        """Return what each muscle carries with the knee as it stands.
 
         Args:
-            k: frame.
             geometry: the knee, with contact points where contact is modelled.
             friction: Coulomb coefficient.
             lifted: sides that carry nothing.
         """
-        lines = self._lines(k)
         try:
-            return self._shared(k, lines, flexion_row(geometry, lines, friction, lifted))
+            return self._shared(flexion_row(geometry, self.lines, friction, lifted))
         except ComputationError as error:
-            return self._failed(lines, f"failed: {error.what}")
+            return self._failed(f"failed: {error.what}")
 
     def share_of_yielding_knee(
-        self, k: int, geometry: KneeGeometry, base: float, per_wrench: Array
+        self, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> MuscleShare:
-        """Return the force of each muscle in frame k while released coordinates yield to it.
+        """Return what each muscle carries while released coordinates yield to it.
 
         Args:
-            k: frame.
             geometry: the knee; its contact is not looked at.
             base: N, see `yielding_flexion_row`.
             per_wrench: (6,), likewise.
         """
-        lines = self._lines(k)
         try:
-            row = yielding_flexion_row(geometry, lines, base, per_wrench)
+            row = yielding_flexion_row(geometry, self.lines, base, per_wrench)
         except ComputationError as error:
-            return self._failed(lines, f"failed: {error.what}")
-        return self._shared(k, lines, row)
+            return self._failed(f"failed: {error.what}")
+        return self._shared(row)
 
-    def at(self, k: int, share: MuscleShare) -> MuscleShare:
-        """Return the forces of a share along the lines of frame k."""
-        return replace(share, lines=self._lines(k))
-
-    def _lines(self, k: int) -> CrossingLines:
-        knee = None if self._knee is None else self._knee[k]
-        return CrossingLines(self._shank[k], self._thigh[k], knee)
-
-    def _shared(self, k: int, lines: CrossingLines, row: FlexionRow) -> MuscleShare:
-        trial = self.trial
-        problem, (activation, reserve, _, status) = trial.solved(
-            k, row.moment, row.extensor_arm, row.arms
-        )
-        if status != "ok":
-            return self._failed(lines, status)
-        return MuscleShare(
-            self._names,
-            activation,
-            trial.force(k, activation),
-            trial.problems.coordinates,
-            problem.moment[0],
-            reserve,
-            trial.flexion,
-            trial.crossing,
-            lines,
-        )
+    def at(self, share: MuscleShare) -> MuscleShare:
+        """Return the forces of a share along the lines of this frame."""
+        return replace(share, lines=self.lines)
 
     def tension(self, share: MuscleShare) -> float:
         """Return the tension of the extensor group, N."""
         return float(share.force[self.trial.extensor].sum())
 
-    def solve(
-        self, k: int, geometry: KneeGeometry, friction: float
-    ) -> tuple[KneeGeometry, KneeLoads]:
-        """Return frame k with the muscles' forces, and all loads.
+    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, KneeLoads]:
+        """Return the geometry with the muscles' forces in it, and all loads.
 
         Contact points and lines stay, so the sharing is exact at once; again where a condyle
         turns out to carry nothing.
         """
         lifted = geometry.lifted
         for _ in range(SHARED_MUSCLES.max_iterations):
-            share = self.share(k, geometry, friction, lifted)
+            share = self.share(geometry, friction, lifted)
             geometry = replace(geometry, share=share)
             if share.status != "ok":
                 return geometry, unsolved([f"muscles: {share.status.removeprefix('failed: ')}"])
@@ -161,20 +150,35 @@ class SharedMuscles:
             lifted = loads.lifted
         return geometry, unsolved(["the iteration of muscles and load state does not converge"])
 
-    def _failed(self, lines: CrossingLines, status: str) -> MuscleShare:
-        nothing = np.full(len(self._names), np.nan)
-        names = self.trial.problems.coordinates
-        rest = np.full(len(names), np.nan)
+    def _shared(self, row: FlexionRow) -> MuscleShare:
+        trial, k = self.trial, self.k
+        problem, (activation, reserve, _, status) = trial.solved(
+            k, row.moment, row.extensor_arm, row.arms
+        )
+        if status != "ok":
+            return self._failed(status)
+        force = trial.force(k, activation)
+        return self._share(activation, force, problem.moment[0], reserve, "ok")
+
+    def _failed(self, status: str) -> MuscleShare:
+        nothing = np.full(len(self.trial.muscles), np.nan)
+        rest = np.full(len(self.trial.problems.coordinates), np.nan)
+        return self._share(nothing, nothing, rest, rest, status)
+
+    def _share(
+        self, activation: Array, force: Array, moment: Array, reserve: Array, status: str
+    ) -> MuscleShare:
+        trial = self.trial
         return MuscleShare(
-            self._names,
-            nothing,
-            nothing,
-            names,
-            rest,
-            rest,
-            self.trial.flexion,
-            self.trial.crossing,
-            lines,
+            trial.muscles,
+            activation,
+            force,
+            trial.problems.coordinates,
+            moment,
+            reserve,
+            trial.flexion,
+            trial.crossing,
+            self.lines,
             status,
         )
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.errors import InputError
+from tkamb.io.scene.case import Case
 from tkamb.run.plausibility.ground import (
     direction_questions,
     foot_questions,
@@ -46,6 +47,7 @@ class Plausibility:
     """The questions of a case.
 
     Args:
+        case: the case.
         mechanics: its body side, prepared.
 
     Attributes:
@@ -56,9 +58,8 @@ class Plausibility:
         InputError: an answer is empty, or to a question that nobody asks.
     """
 
-    def __init__(self, mechanics: "Mechanics") -> None:
-        self._mechanics = mechanics
-        case = mechanics.case
+    def __init__(self, case: Case, mechanics: "Mechanics") -> None:
+        self._case, self._mechanics = case, mechanics
         result = [
             *segment_questions(case),
             *motion_questions(case),
@@ -74,7 +75,7 @@ class Plausibility:
             *sign_questions(case),
         ]
         if case.ligaments or case.muscles:
-            result += _line_questions(mechanics)
+            result += _line_questions(case, mechanics)
         self.questions, self.answered = _answered(result, case.scene.output.answers)
 
     def flags(self, k: int, body: "FrameLoads") -> list[str]:
@@ -89,7 +90,7 @@ class Plausibility:
                 words.append(
                     f"ligament strain above {100 * LINE_LIMITS.max_strain:.0f} %: {some(torn)}"
                 )
-        force = float(np.linalg.norm(body.loads.contact_force)) / self._mechanics.case.body_weight
+        force = float(np.linalg.norm(body.loads.contact_force)) / self._case.body_weight
         if force > FORCE_LIMITS.max_force_BW:
             words.append(
                 f"contact force of {force:.1f} BW, more than any knee was measured to bear"
@@ -122,12 +123,12 @@ def _answered(
     return tuple(unanswered), tuple(text)
 
 
-def _line_questions(mechanics: "Mechanics") -> list[Question]:
+def _line_questions(case: Case, mechanics: "Mechanics") -> list[Question]:
     from tkamb.run.plausibility import lines
+    from tkamb.run.read_scene import link_poses
 
-    case = mechanics.case
     result = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
-    poses = mechanics.recorded_poses
+    poses = link_poses(case, mechanics.poses, mechanics.extensor)
     result += lines.extensor_questions(case, poses)
     if not (case.scene.contact and case.scene.contact.released):
         strains = {b.name: b.strain(b.length(poses)) for b in mechanics.ligaments}

@@ -16,7 +16,8 @@ from tkamb.io.given_material import (
     material_in_words,
 )
 from tkamb.io.scene.case import Case
-from tkamb.run.mechanics import STRAIN_FLEXIONS, Mechanics
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import STRAIN_FLEXIONS
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -57,9 +58,8 @@ class Entry:
         return f"{self.part}{where}: {self.found}"
 
 
-def inventory(mechanics: Mechanics) -> tuple[Entry, ...]:
+def inventory(case: Case, mechanics: Mechanics) -> tuple[Entry, ...]:
     """Return the content of every file and table of a case."""
-    case = mechanics.case
     result = [_patient(case), _motion(case)]
     if case.scene.tibia or case.motion.markers:
         result.append(_shank(case))

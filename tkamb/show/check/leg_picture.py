@@ -20,6 +20,7 @@ from matplotlib.ticker import MultipleLocator
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.surface import Surface
+from tkamb.io.scene.case import Case
 from tkamb.knee.chain import ChainState
 from tkamb.run.mechanics import Mechanics
 from tkamb.show.style import (
@@ -80,13 +81,12 @@ class LegFrame:
     loaded: bool
 
 
-def shown_frames(mechanics: Mechanics) -> list[int]:
+def shown_frames(case: Case) -> list[int]:
     """Return three frames (fewer of a short motion), apart from each other, in time order.
 
     They are the first, the one of the largest ground reaction and the one of the most flexion;
     where one lies near another, the last or the middle one instead.
     """
-    case = mechanics.case
     count = len(case.motion.time)
     frames = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
     if case.ground is not None:
@@ -98,10 +98,9 @@ def shown_frames(mechanics: Mechanics) -> list[int]:
     return sorted(result)
 
 
-def leg_frame(mechanics: Mechanics, k: int) -> LegFrame:
+def leg_frame(case: Case, mechanics: Mechanics, k: int) -> LegFrame:
     """Return the leg at frame k."""
-    case, geometry = mechanics.case, mechanics.geometry(k)
-    state = geometry.state
+    state = mechanics.geometry(k).state
     to_laboratory = state.insert_in_laboratory
     in_insert = [state.point("hip", np.zeros(3)), np.zeros(3), state.point("tibia", np.zeros(3))]
     parts = (
@@ -142,7 +141,7 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, st
         named.add(name)
     if mechanics.extensor is not None:
         with suppress(ComputationError):  # no patella at this frame: the run reports it
-            quadriceps, ligament = mechanics.extensor.paths(state)
+            quadriceps, ligament = mechanics.extensor.lines.paths(state)
             segments.append((quadriceps.points, QUADRICEPS, ""))
             segments.append((ligament.points, PATELLAR_LIGAMENT, ""))
     return segments
@@ -170,19 +169,19 @@ class View:
         return np.stack([points @ self.across, points[..., 1]], axis=-1)
 
 
-def draw_leg(mechanics: Mechanics) -> Figure:
+def draw_leg(case: Case, mechanics: Mechanics) -> Figure:
     """Return the picture of a case: three frames across; leg from two sides, and the knee."""
-    frames = [leg_frame(mechanics, k) for k in shown_frames(mechanics)]
+    frames = [leg_frame(case, mechanics, k) for k in shown_frames(case)]
     ahead = np.mean([_ahead(mechanics, one.frame) for one in frames], axis=0)
     ahead /= np.linalg.norm(ahead)
     lateral = np.cross(ahead, [0.0, 1.0, 0.0])
-    mirror = -1.0 if mechanics.case.scene.patient.side == "left" else 1.0
+    mirror = -1.0 if case.scene.patient.side == "left" else 1.0
     side, front = ("posterior", "anterior"), ("lateral", "medial")
     if mirror < 0:
         side, front = side[::-1], front[::-1]
     from_side = View(mirror * ahead, lateral, *side)
     from_front = View(-mirror * lateral, ahead, *front)
-    weight = mechanics.case.body_weight
+    weight = case.body_weight
     with settings():
         figure = new_figure(3.2 * len(frames), 14.7)
         grid = figure.subplots(4, len(frames), squeeze=False, height_ratios=(1.3, 1.3, 1.0, 1.0))
@@ -194,7 +193,7 @@ def draw_leg(mechanics: Mechanics) -> Figure:
             for axes, view in zip(column[2:], views[2:], strict=True):
                 _close_up(axes, one, view)
             _name_ligaments(column[3], one, from_front)
-            column[0].set_title(_caption(mechanics, one), fontsize=9)
+            column[0].set_title(_caption(case, one), fontsize=9)
         _same_limits(grid[0])
         _same_limits(grid[1])
         places = ("from its lateral side", "from the front")
@@ -211,15 +210,15 @@ def _ahead(mechanics: Mechanics, k: int) -> Array:
     return state.insert_in_laboratory[:3, 0] * np.array([1.0, 0.0, 1.0])
 
 
-def _caption(mechanics: Mechanics, one: LegFrame) -> str:
-    motion = mechanics.case.motion
+def _caption(case: Case, one: LegFrame) -> str:
+    motion = case.motion
     flexion = motion.coordinates[one.frame, 5] / DEGREE
     words = f"frame {one.frame}, {motion.time[one.frame]:.2f} s\nflexion {flexion:.0f} deg"
     if one.force is None:
         return f"{words}, no force plate"
     if not one.loaded:
         return f"{words}, plate not loaded"
-    return f"{words}, plate {np.linalg.norm(one.force) / mechanics.case.body_weight:.2f} BW"
+    return f"{words}, plate {np.linalg.norm(one.force) / case.body_weight:.2f} BW"
 
 
 def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:

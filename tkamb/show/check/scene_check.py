@@ -11,6 +11,7 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.mechanics import Mechanics
 from tkamb.run.plausibility.plausibility import Plausibility
+from tkamb.run.read_scene import mechanics_of
 from tkamb.run.summary import assumptions, not_modelled
 from tkamb.show.check.inventory import Entry, inventory
 
@@ -21,7 +22,8 @@ class SceneCheck:
 
     Args:
         scene: its file.
-        mechanics: the case, prepared.
+        case: the scene with its files read.
+        mechanics: its body side, prepared.
         entries: content of each file and table.
         not_modelled: parts that the scene leaves out.
         assumptions: assumptions of the results.
@@ -32,6 +34,7 @@ class SceneCheck:
     """
 
     scene: Path
+    case: Case
     mechanics: Mechanics
     entries: tuple[Entry, ...]
     not_modelled: tuple[str, ...]
@@ -55,7 +58,7 @@ class SceneCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `tkamb check --json` prints."""
-        motion = self.mechanics.case.motion
+        motion = self.case.motion
         return {
             "scene": str(self.scene),
             "frames": len(motion.time),
@@ -96,13 +99,14 @@ def check_scene(
         given_material(scene.insert_material)
     case = load_case(scene)
     begin("placing leg, patella and muscles")
-    mechanics = Mechanics(case)
+    mechanics = mechanics_of(case)
     begin("checking for unlikely values")
-    plausibility = Plausibility(mechanics)
+    plausibility = Plausibility(case, mechanics)
     return SceneCheck(
         Path(path),
+        case,
         mechanics,
-        inventory(mechanics),
+        inventory(case, mechanics),
         (*not_modelled(case), *_beyond(case)),
         tuple(assumptions(case)),
         tuple(question.text for question in plausibility.questions),

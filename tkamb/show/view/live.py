@@ -21,9 +21,9 @@ from tkamb.knee.chain import Chain
 from tkamb.knee.equilibrium.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
 from tkamb.run.guard import unforeseen_words
-from tkamb.run.known import SharedState
 from tkamb.run.known_errors import as_json, known_error
 from tkamb.run.mechanics import FrameLoads, Mechanics
+from tkamb.run.read_scene import SharedState, contact_side, mechanics_of
 from tkamb.show.view.bench import BENCH_LIMIT, ROWS, Bench, BenchRequest
 from tkamb.show.view.bench_scene import write_bench
 from tkamb.show.view.parametric_insert import parametric_insert, with_thickness
@@ -94,7 +94,7 @@ class LiveKnee:
         if case.scene.patient.scale != 1.0:
             raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
         self.case = _without_muscles(case)
-        self.bench = Bench(self.case, Mechanics(self.case, near=True).ligaments)
+        self.bench = Bench(self.case, mechanics_of(self.case, near=True).ligaments)
         self._own = own or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
         weakref.finalize(self, shutil.rmtree, self._own, True)
         self.design = parametric_insert(case, self._own)
@@ -246,9 +246,10 @@ class LiveKnee:
             side = self._sides.get(key)
         if side is None:
             case = self.bench.case_of(request, like=self._case_with(insert))
-            mechanics = Mechanics(case, self._known.get(insert), near=True)
-            side = ContactSide(case, mechanics)
-            self._known[insert] = SharedState(mechanics.query, None, None, range(ROWS))
+            mechanics = mechanics_of(case, self._known.get(insert), near=True)
+            side = contact_side(case, mechanics)
+            assert mechanics.knee.contact is not None
+            self._known[insert] = SharedState(mechanics.knee.contact.pair, None, None, range(ROWS))
         with self._counting:
             self._sides.pop(key, None)
             self._sides[key] = side  # the latest is last
@@ -271,8 +272,9 @@ class LiveKnee:
             return replace(empty, status=words)
         key = setting(request)
         try:
-            mechanics = Mechanics(case, self._known[request.thickness_mm], near=True)
-            side = ContactSide(case, mechanics, state, sensitivity=False, model=prepared.model)
+            ready, known = prepared.mechanics.knee.contact, self._known[request.thickness_mm]
+            mechanics = mechanics_of(case, known, near=True, contact=ready)
+            side = contact_side(case, mechanics, sensitivity=False)
             before = [self._before[key]] if key in self._before and not request.released else []
             body, contact = side.frame(0, before)
         except TkambError as error:

@@ -16,6 +16,7 @@ from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.patella import touching_patella
 from tkamb.run.mechanics import Mechanics
 from tkamb.run.metrics import map_rows
+from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.run.rerun import RUN_AGAIN, case_of_results, same_files
 from tkamb.run.results import Results
 from tkamb.run.results_folder import SUMMARY_NAME, read_results
@@ -53,9 +54,8 @@ class CaseResults:
             rows = map_rows(self.results)
             return [self._geometry(k, rows.get(row)) for row, k in enumerate(progress(self.frames))]
         from tkamb.knee.equilibrium.frame_contact import FrameContact
-        from tkamb.run.contact_side import ContactSide
 
-        side, result = ContactSide(self.case, self.mechanics), list[KneeGeometry]()
+        side, result = contact_side(self.case, self.mechanics), list[KneeGeometry]()
         touched: list[FrameContact] = []
         for k in progress(self.frames):
             body, contact_of_frame = side.frame(k, touched)
@@ -73,10 +73,10 @@ class CaseResults:
         maps, mechanics = self.results.maps, self.mechanics
         if maps is None or row is None or mechanics.muscles is not None:
             return mechanics.frame(k).geometry
-        place = self.case.motion.coordinates[k]
+        instant = mechanics.instant(k)
         points, normals = maps.contact_points_m[row], maps.contact_normals[row]
         condyles = {
-            side: CondylePoint(point, normal, mechanics.sliding(k, place, point), np.nan)
+            side: CondylePoint(point, normal, instant.sliding(instant.coordinates, point), np.nan)
             for side, point, normal in zip(SIDES, points[:2], normals[:2], strict=True)
             if np.isfinite(point).all()
         }
@@ -85,7 +85,7 @@ class CaseResults:
         patella = None
         if mechanics.extensor is not None and np.isfinite(points[2]).all():
             patella = touching_patella(mechanics.extensor.joints(k)[0], points[2], normals[2])
-        return replace(mechanics.geometry(k, patella=patella), condyles=condyles)
+        return replace(instant.geometry(patella=patella), condyles=condyles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ def match_frames(case: Case, results: Results) -> CaseResults:
         raise InputError(
             f"no frame at {error.args[0]} s in the scene's motion", "results", RUN_AGAIN
         ) from None
-    return CaseResults(case, Mechanics(case, near=True), results, frames)
+    return CaseResults(case, mechanics_of(case, near=True), results, frames)
 
 
 def run_of_results(results: Results) -> CaseResults:

@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.contact.registry import contact_names
+from tkamb.contact.registry import contact_model, contact_names
 from tkamb.errors import InputError, TkambError
 from tkamb.run.contact_side import ContactSide
 from tkamb.run.guard import say, unforeseen_words
+from tkamb.run.read_scene import contact_side
 from tkamb.show.style import SIDE_COLOURS
 from tkamb.show.view.draw import lattice_lines
 from tkamb.show.view.drawing import PressureMap
@@ -157,9 +158,11 @@ class ContactSwitch:
             assert case.scene.contact is not None
             own = model == case.scene.contact.model
             changes = {"model": model} if own else {"model": model, "options": {}}
-            contact = case.scene.contact.model_copy(update=changes)
-            scene = case.scene.model_copy(update={"contact": contact})
-            self._sides[model] = ContactSide(replace(case, scene=scene), self.run.mechanics)
+            table = case.scene.contact.model_copy(update=changes)
+            case = replace(case, scene=case.scene.model_copy(update={"contact": table}))
+            other = contact_model(table.model, table.resolution_mm, **table.options)
+            mechanics = self.run.mechanics.with_contact(other)
+            self._sides[model] = contact_side(case, mechanics)
         return self._sides[model]
 
 

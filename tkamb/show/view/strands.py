@@ -91,11 +91,11 @@ def extensor_strands(
     paths: list[tuple[TautPath | None, ...]] = []
     for state in states:
         try:
-            paths.append(extensor.paths(state))
+            paths.append(extensor.lines.paths(state))
         except ComputationError:
             paths.append((None, None))
     muscle, ligament = (list(result) for result in zip(*paths, strict=True))
-    name = extensor.muscle.name.replace("_", " ")
+    name = extensor.lines.muscle.name.replace("_", " ")
     slack = [
         results[f"{one}_N"] < VIEW_STRAND.slack_force for one in ("quadriceps", "patellar_ligament")
     ]

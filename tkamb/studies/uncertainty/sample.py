@@ -6,7 +6,7 @@ varying input that changes them is the insert's modulus, for which the contact i
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.equilibrium.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
-from tkamb.run.known import SharedState
 from tkamb.run.mechanics import Mechanics
+from tkamb.run.read_scene import SharedState, contact_side, mechanics_of
 from tkamb.run.status import failures_of, frame_status
 from tkamb.run.tabulate import frame_row
 from tkamb.studies.uncertainty.correlation import correlation_root
@@ -82,9 +82,9 @@ class Sampler:
             uncertainty_of(self.case).correlation, [one.name for one in self.inputs]
         )
         self._split = self.case.split
-        self._mechanics = Mechanics(self.case)
+        self._mechanics = mechanics_of(self.case)
         contact = self.case.scene.contact
-        self._side = ContactSide(self.case, self._mechanics) if contact else None
+        self._side = contact_side(self.case, self._mechanics) if contact else None
 
     def draw(self, point: Point) -> Draw:
         """Return what the sample at a point makes of the inputs."""
@@ -111,8 +111,14 @@ class Sampler:
         values = np.full((len(self.names), len(self._frames)), np.nan)
         try:
             case = self._varied(draw)
-            mechanics = Mechanics(case, self._known(draw))
-            side = self._contact(case, mechanics, draw)
+            contact = self._mechanics.knee.contact
+            if contact is not None:
+                table = case.scene.contact
+                assert table is not None
+                contact = contact.changed(table.friction, draw.factor("young_modulus"))
+            mechanics, side = mechanics_of(case, self._shared(draw), contact=contact), None
+            if self._side is not None:
+                side = contact_side(case, mechanics, sensitivity=False, post=self._side.post)
         except TkambError as error:  # the varied inputs cannot be used: no frame has a number
             return Sample(values, np.full(len(self._frames), str(error)), errors)
         problems: list[str] = []
@@ -124,27 +130,16 @@ class Sampler:
                 values[:, column] = [row.get(name, np.nan) for name in self.names]
         return Sample(values, np.array(problems), errors)
 
-    def _known(self, draw: Draw) -> SharedState:
+    def _shared(self, draw: Draw) -> SharedState:
         nominal = self._mechanics
-        muscles = varied_muscles(nominal.muscles, draw)
-        return SharedState(nominal.query, muscles, nominal.extensor, self._frames)
+        muscles, contact = varied_muscles(nominal.muscles, draw), nominal.knee.contact
+        pair = None if contact is None else contact.pair
+        return SharedState(pair, muscles, nominal.extensor, self._frames)
 
     def _varied(self, draw: Draw) -> Case:
         case = varied_case(self.case, draw)
         case.__dict__["split"] = self._split  # of the same femoral component: found once
         return case
-
-    def _contact(self, case: Case, mechanics: Mechanics, draw: Draw) -> ContactSide | None:
-        """Return the contact side, with the scene's prepared contact where it is still valid."""
-        if self._side is None:
-            return None
-        factor = draw.factor("young_modulus")
-        state = self._side.state
-        if factor != 1.0:
-            material = state.pair.material
-            stiffer = replace(material, young_modulus=material.young_modulus * factor)
-            state = self._side.model.prepare(replace(state.pair, material=stiffer))
-        return ContactSide(case, mechanics, state, sensitivity=False, post=self._side.post)
 
 
 class BandWorker:

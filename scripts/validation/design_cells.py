@@ -21,8 +21,8 @@ from tkamb.geometry.condyles import condyle_faces
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.geometry.surface import Surface
 from tkamb.studies.designs.design import Design
-from tkamb.studies.validation import dissertation
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+from validation import dissertation
 
 Condyle = Literal["medial", "lateral"]
 RANGES = {

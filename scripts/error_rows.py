@@ -1,4 +1,4 @@
-"""Errors of the contact models on the pairs of `tkamb.studies.error_cases`.
+"""Errors of the contact models on the pairs of `error_cases`.
 
 The reference of a pair is the B-bar finite elements at cells of
 `ERROR_REFERENCE.resolution_mm`. Its uncertainty is half the change from cells twice as large.
@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from error_cases import ErrorCase, error_cases
 from tkamb.contact.narrow import TOO_NARROW
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import InputError
-from tkamb.studies.error_cases import ErrorCase, error_cases
 from tkamb.studies.quantities import Quantities, errors, quantities
 
 

@@ -20,10 +20,10 @@ from tkamb.geometry.frames import Array, knee_pose
 from tkamb.studies.bodies import balls, block, dishes, flat
 from tkamb.studies.designs.design import Design, load_design
 from tkamb.studies.elastic_layer import sphere_on_layer
-from tkamb.studies.validation.design_cells import PressedDesign
-from tkamb.studies.validation.design_tables import FOLDERS
-from tkamb.studies.validation.film import worst_errors
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+from validation.design_cells import PressedDesign
+from validation.design_tables import FOLDERS
+from validation.film import worst_errors
 
 Values = dict[str, float]
 UPRIGHT = knee_pose([0.0] * 6)

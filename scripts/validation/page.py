@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.studies.validation import dissertation
-from tkamb.studies.validation.design_tables import (
+from validation import dissertation
+from validation.design_tables import (
     CONDYLES,
     QUANTITIES,
     by_design,
@@ -30,7 +30,7 @@ WORDS = {
 
 MADE = """\
 Made by `{command}` on {date}, tkamb {version}, in {cpu_minutes:.0f} minutes of processor time.
-Nothing here is typed: numbers of others stand in `tkamb/studies/validation/*.toml` with their
+Nothing here is typed: numbers of others stand in `scripts/validation/*.toml` with their
 source, ours in `scripts/data/validation.json`. The designs' radii were chosen before the first
 press and left alone. Two benchmarks were set up anew after a first look, which made hits of four
 misses: the load on the bonded layer (60 N made a contact two cells wide), and how malrotation is

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from tkamb.studies.validation import dissertation
+from validation import dissertation
 
 HEAD = """\
 # The dissertation, reproduced
@@ -27,7 +27,7 @@ below), and the coupling of body and contact differs.
 """
 MADE = """\
 Made by `{command}` on {date}, tkamb {version}. Nothing in the tables is typed: the source's
-numbers stand in `tkamb/studies/validation/reproduction.toml` and `dissertation_tables.toml`, ours
+numbers stand in `scripts/validation/reproduction.toml` and `dissertation_tables.toml`, ours
 in `scripts/data/dissertation.json` and `scripts/data/validation.json`."""
 SET = """\
 Why each of them: `tkamb/io/presets/sharma_2008.py`. Another study adds its own by a class and a

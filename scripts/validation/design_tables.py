@@ -10,8 +10,8 @@ import numpy as np
 
 from tkamb.geometry.frames import Array
 from tkamb.studies.designs.design import load_design
-from tkamb.studies.validation import dissertation
-from tkamb.studies.validation.design_cells import (
+from validation import dissertation
+from validation.design_cells import (
     Condyle,
     PressedDesign,
     assumptions,
