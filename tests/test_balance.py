@@ -189,6 +189,15 @@ def test_energy_falls_in_every_step_through_a_stiffening_contact():
     assert sum(end.work) == pytest.approx(lost, rel=0.25)
 
 
+def test_a_stiffness_that_is_singular_but_for_rounding_gets_a_status():
+    """Rank 1: no elimination solves it, though its smallest eigenvalue comes out as +2e-12."""
+    matrix = np.array([[16000.0, 8000.0], [20000.0, 10000.0]])
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.solve(matrix, np.ones(2))
+    rest = find_balance(lambda x: Trial(np.array([10.0, 5.0]) - matrix @ x, matrix), np.zeros(2))
+    assert rest.status is not BalanceStatus.OK
+
+
 def test_ends_that_are_no_rest_are_named():
     def free(x):
         return Trial(np.array([-1e5 * x[0], 0.0]), np.diag([1e5, 0.0]))

@@ -281,6 +281,7 @@ def test_a_page_cannot_ask_for_nonsense(values):
 
 def test_the_window_answers_its_own_page_only(knee, tmp_path):
     server = LiveWindow(knee, tmp_path, 60).server()
+    knee.answer(states(knee)["pressed"])  # what is not prepared would have to be asked for again
     serve_in_background(server)
     try:
         with urllib.request.urlopen(server.url, timeout=30) as page:

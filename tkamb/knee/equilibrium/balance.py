@@ -252,7 +252,9 @@ class _Search:
         if symmetric > 0 or smallest_stiffness <= 0 or self._refused:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
         # The stiffness is K = -dr/dx, so that K dx = r is Newton's step.
-        newton = np.linalg.solve(self.stiffness, self.force)
+        newton = newton_step(self.stiffness, self.force)
+        if newton is None:
+            return bounded_step(self.stiffness, self.force, self._radius), 0.0
         part = min(1.0, self._radius / float(np.linalg.norm(newton)))
         if self._downhill and part < 1.0:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
@@ -350,6 +352,17 @@ class _Search:
         )
 
 
+def newton_step(stiffness: Array, force: Array) -> Array | None:
+    """Return Newton's step (n,), m; None where a direction has no stiffness at all.
+
+    Rounding can make the smallest eigenvalue of such a stiffness positive.
+    """
+    try:
+        return np.asarray(np.linalg.solve(stiffness, force))
+    except np.linalg.LinAlgError:
+        return None
+
+
 def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
     """Return the Newton step (n,), or a descending step within the radius.
 
@@ -361,9 +374,9 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
     symmetric, smallest_stiffness = smallest_eigenvalues(stiffness)
     identity = np.eye(len(force))
     if smallest_stiffness > 0:
-        step = np.linalg.solve(stiffness, force)
-        if np.linalg.norm(step) <= radius:
-            return np.asarray(step)
+        newton = newton_step(stiffness, force)
+        if newton is not None and np.linalg.norm(newton) <= radius:
+            return newton
     # Levenberg's shift: large enough that the shifted matrix is positive definite, and found by
     # bisection so that the step has the trust region's length.
     low = 1.0 + 1.001 * max(0.0, -symmetric)

@@ -178,8 +178,11 @@ class LiveWindow:
         """Return the answer that a run of the saved scene gives, with the scene's file.
 
         Raises:
+            NotYet: its contact model is being prepared.
             TkambError: the state has no answer, or cannot be written.
         """
+        if words := self.knee.preparing(request):
+            raise NotYet(words)
         answer = self.knee.answer(request, from_rest=True)
         if answer.failed:
             raise TkambError(f"not saved: {answer.status.removeprefix('failed: ')}")

@@ -181,7 +181,7 @@ class Bench {
     while (this.waiting) {
       const asked = this.waiting;
       this.waiting = null;
-      if (!asked.coarse) element("mark").textContent = `computing ${asked.request.contact} …`;
+      if (!asked.coarse && !this.preparing) element("mark").textContent = `computing ${asked.request.contact} …`;
       try {
         const response = await fetch("live", {method: "POST",
           headers: {"Content-Type": "application/json"}, body: JSON.stringify(asked.request)});
@@ -200,15 +200,18 @@ class Bench {
     this.busy = false;
   }
 
-  // A model that is being prepared: the coarse one is shown, and the fine one asked for again.
+  // A model that is being prepared: the coarse one is shown, once, and the fine one asked for again.
   waitFor(words, asked) {
-    const mark = element("mark");
-    mark.className = "coarse";
-    mark.textContent = `${words} …`;
     if (this.waiting) return;
-    const request = structuredClone(asked.request);
-    [request.contact, request.resolution_mm] = this.coarse;
-    this.waiting = {request, coarse: true, number: asked.number, words};
+    const key = JSON.stringify(asked.request);
+    if (this.preparing !== key) {
+      this.preparing = key;
+      element("mark").className = "coarse";
+      element("mark").textContent = `${words} …`;
+      const request = structuredClone(asked.request);
+      [request.contact, request.resolution_mm] = this.coarse;
+      this.waiting = {request, coarse: true, number: asked.number, words};
+    }
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.ask(false), RETRY_MS);
   }
@@ -217,6 +220,7 @@ class Bench {
     const mark = element("mark");
     mark.className = "failed";
     mark.textContent = words;
+    this.preparing = "";
     document.body.classList.add("stale");
     this.refused = words;
   }
@@ -229,6 +233,7 @@ class Bench {
       return;
     }
     this.answer = answer;
+    if (!asked.coarse) this.preparing = "";
     mark.className = asked.coarse ? "coarse" : "";
     const how = asked.words ? `${asked.words} …; shown: ` : `${COARSE_NAME}: `;
     mark.textContent = `${asked.coarse ? how : ""}${answer.label}; ${answer.error}`;
@@ -314,13 +319,13 @@ class Bench {
   }
 
   // What is kept is computed from rest, as a run of the saved scene computes it.
-  async keep() {
-    const request = structuredClone(this.state);
+  async keep(request = structuredClone(this.state)) {
     element("saved").textContent = "saving …";
     const response = await fetch("save", {method: "POST",
       headers: {"Content-Type": "application/json"}, body: JSON.stringify(request)});
-    if (!response.ok) {
-      element("saved").textContent = response.status === 202 ? "" : await response.text();
+    if (response.status === 202 || !response.ok) {
+      element("saved").textContent = await response.text();
+      if (response.status === 202) setTimeout(() => this.keep(request), RETRY_MS);
       return;
     }
     const packed = await tkamb.unpack(new Uint8Array(await response.arrayBuffer()));
