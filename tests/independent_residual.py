@@ -9,11 +9,14 @@ from contextlib import contextmanager
 import numpy as np
 
 from tkamb.contact.lattice import model as lattice_model
+from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.lattice.solids.solid import chunks
 
 
 def internal_force(solid, field):
     """Return f(u) (n, 3), N: mu_s K_d u + K V g (g · u), 3 mu_s = q(e)/e, e² = uᵀ K_d u/(3 V)."""
+    if not isinstance(solid, CalibratedNetwork):
+        return solid.internal_force(field)  # by the assembled stiffness
     total = np.zeros_like(field)
     for some in chunks(len(solid.cells)):
         cells, volume = solid.cells[some], solid.volume[some]

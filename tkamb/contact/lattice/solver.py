@@ -103,10 +103,10 @@ def solve(
         planes, passes = sliding.planes, passes + 1
         forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
         active = forces.active
-        if guess.loads is not None and not active.any():
+        balance.displace(forces.force[:, None] * planes.normals, moved)
+        if guess.loads is not None and not (active.any() and balance.residual.force < DIVERGED):
             # What a heavier contact left behind holds the nodes down: begin without it.
             return solve(problem, pose, load, guess.cold, settings)
-        balance.displace(forces.force[:, None] * planes.normals, moved)
         residual = replace(balance.residual, gap=sliding.follow(moved, forces))
         last = passes == settings.max_passes or not residual.force < DIVERGED
         if last or residual.within(settings):
