@@ -38,7 +38,7 @@ class Outcome:
     forces: np.ndarray
 
     def notices(self, untouched):
-        """Say whether a reader is warned: by a refusal, or a question or flag that was not there."""
+        """Say whether a reader is warned: a refusal, or a question or flag that was not there."""
         return bool(self.refused) or bool(self.words - untouched.words)
 
     def same(self, untouched):

@@ -177,7 +177,7 @@ FLAGGED = {
         both(*(cells("motion.csv", f"patella_{a}_mm", lambda v: v / 10) for a in ("ap", "si"))),
         "patella lies # to # mm from the flexion axis"),
     "origin behind the femur": (key("quadriceps.origin.point_mm", [-32.0, 205.0, 0.0]),
-                                "quadriceps. origin lies where no such line ends"),
+                                "quadriceps. origin: no such line ends there"),
     "friction": (key("contact.friction", 0.5), "friction of # is more than metal"),
     "opening backward": (key("implant.femoral.axes", "-y,+x,+z"), "opens backward.* is it turned"),
     "insert back to front": (key("implant.insert.axes", "-x,+y,-z"), "insert is cut out in front"),

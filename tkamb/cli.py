@@ -28,7 +28,7 @@ from tkamb.commands.view import add_view
 from tkamb.commands.wear import add_wear
 from tkamb.geometry.threads import threads
 from tkamb.io.starter import add_new
-from tkamb.run.guard import guarded, log_to_stderr, printable, say
+from tkamb.run.guard import guarded, log_to_stderr, say
 from tkamb.run.settings import add_settings
 
 if TYPE_CHECKING:
@@ -171,9 +171,9 @@ def _run(options: argparse.Namespace) -> int:
         write_results(results, directory, progress=stages.plots)
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
-        print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)
+        say(f"frame {k}: {results.status[k]}")
     for question in results.summary.get("questions", []):
-        print(f"tkamb: question: {question}", file=sys.stderr)
+        say(f"question: {question}")
     if options.json:
         print((directory / "summary.json").read_text(encoding="utf-8"), end="")
     else:
@@ -213,7 +213,7 @@ def _verify(options: argparse.Namespace) -> int:
     for line in verdict.differs:
         say(f"{options.folder}: {line}")
     for line in verdict.lines()[len(verdict.differs) :]:
-        print(printable(f"{options.folder}: {line}"))
+        print(f"{options.folder}: {line}")
     return 1 if verdict.differs else 0
 
 

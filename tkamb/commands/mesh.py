@@ -8,6 +8,7 @@ from typing import Any
 from tkamb.commands.scene_options import add_force
 from tkamb.errors import InputError
 from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.run.guard import say
 from tkamb.units import LENGTH
 
 UNIT_OPTIONS = ("--units", "--mesh-unit")
@@ -108,7 +109,10 @@ def _press(options: argparse.Namespace) -> int:
     if options.out:
         report.write_map(options.out)
     print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
-    return 0 if report.carried else 1
+    if not report.carried:
+        say(f"the load is not carried: {report.as_dict()['status']}")
+        return 1
+    return 0
 
 
 def add_mesh(commands: Any) -> None:

@@ -1,7 +1,6 @@
 """`tkamb uncertainty`: arguments in, exit status out."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,7 +69,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
     for line in warnings_of(result):
-        print(f"tkamb: {line}", file=sys.stderr)
+        say(line)
     print("\n".join([*headline(result), f"bands: {directory / 'bands.csv'}"]))
     if all(one.failed.all() for one in result.samples):
         say("every frame of every sample failed")
@@ -113,14 +112,17 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         "insert"
     )
     print("\n".join([*screen_lines(rows), *(f"({line})" for line in text)]))
-    return 0 if rows else 1
+    if not rows:
+        say("no sample could be computed")
+        return 1
+    return 0
 
 
 def headline(uncertainty: "Uncertainty") -> list[str]:
     """Return the peak's band and the inputs with the largest influence, in lines of text."""
     from numpy import isfinite, nanargmax
 
-    from tkamb.show.headline import peak_legend, peak_words, peaks_of
+    from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
 
     total = uncertainty.results["force_total_BW"]
     if not isfinite(total).any():
@@ -141,6 +143,8 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
     lines = [f"peak {name} force: {peak_words(one)} BW" for name, one in peaks.items()]
     lines += [f"({peak_legend(peaks)})"] if peaks else []
     lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
+    limits = muscle_limits(uncertainty.results)
+    lines += [limits.line()] if limits is not None else []
     of_chance = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
     chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):

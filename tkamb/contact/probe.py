@@ -121,7 +121,6 @@ class Probe:
         load: float,
         pose: Array,
         start: Guess | None,
-        like: tuple[WarmStart, WarmStart] | None = None,
     ) -> tuple[ContactResult, WarmStart]:
         """Return the contact under a load (N), of which only the forces need be right.
 
@@ -129,8 +128,6 @@ class Probe:
             load: N.
             pose: (4, 4) pose_femoral_in_insert.
             start: of a contact at a neighbouring pose.
-            like: warm starts before and after a similar step near by, from which the one after this
-                            step can be guessed.
         """
         return self._model.press_from(self._state, load, pose, start)
 

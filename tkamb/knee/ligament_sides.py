@@ -1,4 +1,7 @@
-"""A collateral ligament's side: the MCL is medial, the LCL lateral, whatever the knee's side."""
+"""A ligament's side by its name: the MCL is medial, the LCL lateral, whatever the knee's side.
+
+Retinacula and patellofemoral ligaments have a side too, and the iliotibial band is lateral.
+"""
 
 import re
 from collections.abc import Iterable
@@ -25,12 +28,19 @@ class LigamentSideSettings:
 LIGAMENT_SIDE = LigamentSideSettings()
 
 
-_MEDIAL = re.compile(r"mcl|(medial|tibial)[ _-]*collateral", re.IGNORECASE)
-_LATERAL = re.compile(r"(?<![a-z])l[ _-]?cl|fcl|(lateral|fibular)[ _-]*collateral", re.IGNORECASE)
+_KINDS = r"(collateral|retinacul|patell[ao])"
+_MEDIAL = re.compile(
+    rf"mcl|mpfl|(medial|tibial)[ _-]*{_KINDS}|{_KINDS}\w*[ _-]+medial", re.IGNORECASE
+)
+_LATERAL = re.compile(
+    rf"(?<![a-z])l[ _-]?cl|fcl|lpfl|(?<![a-z])itb|iliotibial|(lateral|fibular)[ _-]*{_KINDS}"
+    rf"|{_KINDS}\w*[ _-]+lateral",
+    re.IGNORECASE,
+)
 
 
 def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: str) -> None:
-    """Raise if a collateral ligament lies on the other side of the knee than its name says.
+    """Raise where a ligament's name and its place are of different sides of the knee.
 
     Args:
         ligaments: the bundles, of a right knee or mirrored to one: z points laterally.
@@ -56,13 +66,13 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
 
 
 def _lateral_sign(name: str) -> int:
-    """Return -1 for a medial collateral ligament, 1 for a lateral one, else 0."""
+    """Return -1 for a ligament that is medial by its name, 1 for a lateral one, else 0."""
     medial, lateral = bool(_MEDIAL.search(name)), bool(_LATERAL.search(name))
     return int(lateral) - int(medial)
 
 
 def _lateral_place(end: LinkPoint, chain: Chain) -> float:
-    """Return how far (m) an end lies laterally in the femur link or the insert frame."""
+    """Return how far (m) an end lies laterally in the insert frame, or the femur's or patella's."""
     carrier = chain.carrier(end.link)
     place = transform(chain.link_in(end.link, carrier), end.position)
     if carrier == "tibia":

@@ -129,18 +129,13 @@ class ContactSide:
             return body, contact
         if not self._sensitivity:
             return body, contact
-        start, adjusted = clock.perf_counter(), None
+        start = clock.perf_counter()
         if self._probe.exact:
             sensitivity = split_tangent(self._probe, contact.result)
         else:
-            last = before[-1] if before else None
-            like = (last.start, last.turned) if last and last.start and last.turned else None
-            sensitivity, rotated = split_sensitivity(
-                self._probe, contact.result, contact.start, like
-            )
-            adjusted = None if rotated is None else rotated[1]
+            sensitivity = split_sensitivity(self._probe, contact.result, contact.start)
         seconds = contact.seconds + clock.perf_counter() - start
-        return body, replace(contact, sensitivity=sensitivity, turned=adjusted, seconds=seconds)
+        return body, replace(contact, sensitivity=sensitivity, seconds=seconds)
 
     def _press_recorded(
         self, k: int, before: Sequence[FrameContact]

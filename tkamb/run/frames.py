@@ -87,7 +87,7 @@ class FrameSolver:
     def _keep(self, contact: "FrameContact") -> None:
         """Keep a contact; only the last that was found keeps its warm start, which is large."""
         if contact.result is not None:
-            self.before = [replace(each, start=None, turned=None) for each in self.before]
+            self.before = [replace(each, start=None) for each in self.before]
         self.before.append(contact)
         del self.before[: -FRAME_LOOP.kept_contacts]
 

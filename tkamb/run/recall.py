@@ -1,8 +1,8 @@
 """The contact of a frame as arrays, from which the next frame of a resumed run begins.
 
 The warm start is the one that the frame left, without what is not kept: the lattice's
-displacements, the contact and muscle forces from which a released knee begins, and the contact
-with more adduction. Answers stay within the solver's tolerance.
+displacements, and the contact and muscle forces from which a released knee begins. Answers stay
+within the solver's tolerance.
 """
 
 from collections.abc import Mapping

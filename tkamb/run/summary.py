@@ -287,8 +287,7 @@ def assumptions(case: Case) -> list[str]:
         sentences.append("The force plate lies at the laboratory's height 0: no column says where.")
     if case.motion.unrecorded:
         sentences.append(
-            f"{', '.join(case.motion.unrecorded)} were not recorded: they are computed, and the "
-            f"rates "
+            f"{', '.join(case.motion.unrecorded)} were not recorded: they are computed. The rates "
             "in inertia and in the direction of sliding are those of an initial guess."
         )
     if scene.motion.motion == "roll-slip":
@@ -361,7 +360,7 @@ def _agreement(table: ContactTable) -> str:
     """Return how body and contact were brought together."""
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
-        return f"{names} are not the recorded ones: the equilibrium of body and contact gives them."
+        return f"{names} are computed, not recorded: body and contact are in equilibrium there."
     sentence = (
         "The contact model is loaded with the superior-inferior force at the measured rotation; "
     )

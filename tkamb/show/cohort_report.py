@@ -71,6 +71,7 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
         rows=[_row(group, _there(groups)) for group in groups],
         plots=list(_plots(groups)),
         designs=_designs(cohort, groups),
+        wear=_wear_table(groups),
         maps=_maps(cohort, outcomes, groups),
         failed=_failed(cohort, outcomes)[: COHORT_REPORT.most_failed],
         failed_count=sum(bool(one.reason) for one in outcomes.values()),
@@ -150,33 +151,36 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
 
 
 def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:
-    """Return each group's worn volume, its range by the wear factor, and what other laws say."""
-    failures = sum(bool(one.wear_problem) for one in outcomes.values())
-    parts = []
+    """Return the groups' worn volumes from least to most, and what they say of designs."""
+    lost = sum(bool(one.wear_problem) for one in outcomes.values())
+    name = "volume_mm3_per_Mc"
+    means = [float(np.nanmean(group.wear[name])) for group in groups if name in group.wear]
+    value = f"{min(means):.3g}–{max(means):.3g} mm³ per million cycles" if means else "none"
+    text = (
+        f"mean of the runs by group; {len(outcomes) - lost} of {len(outcomes)} runs. By archard "
+        "and cross-shear the contact area cancels: the volume hardly follows the design's "
+        "conformity. A difference that only one law shows is that law's: see the table of wear"
+    )
+    if lost:
+        text += f". {lost} runs have none, see wear_failed in runs.csv"
+    return Card("Worn volume", value, text, lost > 0)
+
+
+def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:
+    """Return each group's worn volume, its range, its depth and the first cycle by every law."""
+    groups = [group for group in groups if "volume_mm3_per_Mc" in group.wear]
+    if not groups:
+        return None
+    laws = [name for name in groups[0].wear if name.startswith("first_")]
+    words = [name.removeprefix("first_").removesuffix("_mm3_per_Mc") for name in laws]
+    rows = []
     for group in groups:
-        if "volume_mm3_per_Mc" not in group.wear:
-            continue
-        ends = ("volume_mm3_per_Mc", "volume_mm3_per_Mc_low", "volume_mm3_per_Mc_high")
-        mean, low, high = (float(np.nanmean(group.wear[name])) for name in ends)
-        laws = ", ".join(
-            f"{name.removeprefix('first_').removesuffix('_mm3_per_Mc')} {np.nanmean(values):.3g}"
-            for name, values in group.wear.items()
-            if name.startswith("first_")
-        )
-        parts.append(
-            f"{group.name} {mean:.3g} ({low:.3g} to {high:.3g} by the wear factor; {laws})"
-        )
-    text = "mean of the runs, mm³ per million cycles: " + "; ".join(parts or ["none"])
-    text += (
-        ". In the laws archard and cross-shear the contact area cancels, so that the volume hardly "
-        "depends on the design's conformity. A difference that only one law shows is due to that "
-        "law"
-    )
-    if failures:
-        text += f". {failures} runs have none, see wear_failed in runs.csv"
-    return Card(
-        "Worn volume", f"{len(outcomes) - failures} of {len(outcomes)} runs", text, failures > 0
-    )
+        mean = {name: float(np.nanmean(values)) for name, values in group.wear.items()}
+        low, high = mean["volume_mm3_per_Mc_low"], mean["volume_mm3_per_Mc_high"]
+        cells = [f"{mean['volume_mm3_per_Mc']:.3g} ({low:.3g}–{high:.3g})"]
+        cells += [f"{mean['max_depth_mm']:.3g}"] if "max_depth_mm" in mean else ["–"]
+        rows.append([group.name, *cells, *(f"{mean[law]:.3g}" for law in laws)])
+    return {"laws": words, "rows": rows}
 
 
 def _row(group: Group, names: Sequence[str]) -> list[str]:
@@ -268,8 +272,8 @@ def _maps(
     cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
 ) -> dict[str, Any] | None:
     """Return one map of each group side by side on one scale; None without contact."""
-    rows = [(group, _typical(group, outcomes)) for group in groups]
-    with_map = [(group, n) for group, n in rows if n is not None][: COHORT_REPORT.most_maps]
+    shown, alike = _typical(cohort, outcomes, groups)
+    with_map = shown[: COHORT_REPORT.most_maps]
     if not with_map:
         return None
     flexion = cohort.table.map_flexion_deg
@@ -277,19 +281,47 @@ def _maps(
     return {
         "svg": svg_text(draw_group_maps(cohort, outcomes, with_map), "maps"),
         "frame": frame,
+        "whose": "one run in all groups alike but for the group's own labels, that with the peak "
+        "forces nearest to the groups' medians"
+        if alike
+        else "the run whose peak force is its group's median",
         "more": len(groups) - len(with_map),
     }
 
 
-def _typical(group: Group, outcomes: Mapping[int, Outcome]) -> int | None:
-    """Return the run whose peak force is the group's median, of those with a map."""
-    peaks = {
-        n: float(np.nanmax(outcomes[n].columns["force_total_BW"]))
-        for n in group.numbers
-        if outcomes[n].chosen is not None
-    }
-    ordered = sorted(peaks, key=lambda n: peaks[n])
-    return ordered[(len(ordered) - 1) // 2] if ordered else None
+def _typical(
+    cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
+) -> tuple[list[tuple[Group, int]], bool]:
+    """Return each group's run to show, and whether the runs differ in the groups' labels alone.
+
+    Of the subjects, trials and so on that every group has, those whose peak forces are nearest
+    to the groups' medians: maps of one person beside each other. Where no such set is in all
+    groups, each group's own median. Runs without a map are left out.
+    """
+    peaks = [
+        {
+            _rest(cohort, group, n): (n, float(np.nanmax(outcomes[n].columns["force_total_BW"])))
+            for n in group.numbers
+            if outcomes[n].chosen is not None
+        }
+        for group in groups
+    ]
+    there = [(group, own) for group, own in zip(groups, peaks, strict=True) if own]
+    if not there:
+        return [], False
+    medians = [sorted(peak for _, peak in own.values())[(len(own) - 1) // 2] for _, own in there]
+    pairs = list(zip((own for _, own in there), medians, strict=True))
+    common = [rest for rest in there[0][1] if all(rest in own for _, own in there)]
+    if common:
+        rest = min(common, key=lambda rest: sum(abs(own[rest][1] - m) for own, m in pairs))
+        return [(group, own[rest][0]) for group, own in there], True
+    nearest = [min(own.values(), key=lambda one: abs(one[1] - m))[0] for own, m in pairs]
+    return [(group, n) for (group, _), n in zip(there, nearest, strict=True)], False
+
+
+def _rest(cohort: Cohort, group: Group, number: int) -> tuple[str, ...]:
+    """Return the labels of a run that do not make its group."""
+    return tuple(v for k, v in cohort.runs[number].labels.items() if k not in group.labels)
 
 
 def draw_group_maps(

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.articular_edge import AT_EDGE
-from tkamb.contact.narrow import TOO_NARROW
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run import metrics
 from tkamb.run.agreement import AGREEMENT
@@ -80,13 +78,6 @@ def run_title(summary: Mapping[str, Any]) -> str:
     return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
 
 
-PEAK_DOUBTS = {
-    AT_EDGE: "contact reaches the edge of the insert's articular surface",
-    TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
-}
-"""Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
-
-
 def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     """Return the headline numbers that the run has."""
     result = (
@@ -96,7 +87,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
         _band(results, axis),
         _measured(results),
         _discrepancy(results),
-        _muscle_limits(results),
+        muscle_limits(results),
         _shares(results),
         _peak_pressure(results, axis),
         _post(results, axis),
@@ -169,12 +160,12 @@ def _discrepancy(results: "Results") -> Card | None:
     words = (results.summary.get("discrepancy") or {}).get("words")
     if not words or results.summary.get("measured"):
         return None
-    value = f"error {results.summary['discrepancy']['rmse_BW']:.2f} BW (rms, total force)"
-    return Card("Error of this method in measured knees", value, words)
+    value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW RMS"
+    return Card("Error of this method in measured knees", value, f"total force; {words}")
 
 
-def _muscle_limits(results: "Results") -> Card | None:
-    """Return the moment of the hip's reserves, and the saturated muscles."""
+def muscle_limits(results: "Results") -> Card | None:
+    """Return what the hip's reserves carry, and which muscles pull as hard as they can."""
     reserves = results.summary.get("reserves") or {}
     saturated = results.summary.get("saturated_muscles") or {}
     if not reserves:
@@ -312,7 +303,7 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     if result is None:
         return None
     detail = f"{result.side}, {_where(results, axis, result.frame)}"
-    doubt = _doubt_of_peak(results, result.side, result.frame)
+    doubt = metrics.doubt_of_peak(results, result.side, result.frame)
     detail += f", where {doubt}" if doubt else ""
     detail += _above_yield(results, result.side)
     error = results.summary.get("known_error")
@@ -342,16 +333,6 @@ def _above_yield(results: "Results", first: str) -> str:
         return f"; never above yield ({stress:g}\u00a0MPa)"
     words = " and ".join(f"{percent:.0f} % of the {side} area" for percent, side in parts)
     return f"; up to {words} is above yield ({stress:g}\u00a0MPa)"
-
-
-def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
-    """Return in words why a condyle's peak pressure at a frame is unreliable; "" if it is not.
-
-    The run's status has the flags of each frame.
-    """
-    status = str(results.status[frame])
-    words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
-    return " and ".join(words)
 
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:

@@ -114,7 +114,7 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
     """Return the flags and whether the insert is compressed to nothing."""
     if solution.field is not None:
         solid = state.problem.solid
-        least = solid.least_principal_strain(solution.field, solution.noticed)
+        least = solid.least_principal_strain(solution.field)
         kind = "principal strain"
     else:
         # A linear solver keeps no field of displacements: the mean strain of a column stands for
@@ -151,8 +151,9 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
 
 def unsettled_flag(solution: Solution) -> str:
     """Return in words how large the residual of a solution is that has not converged."""
+    percent = 100 * solution.residual.reported
     return (
         f"the solver has not converged: after {solution.passes} passes the residual is "
-        f"{100 * solution.residual:.2g} % of the force or of the distance to the femoral surface; "
+        f"{percent:.2g} % of the force or of the distance to the femoral surface; "
         "check whether the femoral mesh is rough"
     )

@@ -192,8 +192,8 @@ def _name_muscles(links: Links, remarks: list[str]) -> None:
     ]
     if across:
         remarks.append(
-            f"{len(across)} muscles run from thigh or pelvis to the shank; without --muscles none "
-            f"but the quadriceps line acts: {some_names(across)}"
+            f"{len(across)} muscles run from thigh or pelvis to the shank; they act with "
+            f"--muscles, without it the quadriceps line alone: {some_names(across)}"
         )
 
 

@@ -141,7 +141,9 @@ class UncertaintyTable(SceneTable):
     )
     ground_reaction: Share = Field(0.02, description="relative, force and free moment" + _ASSUMED)
     centre_of_pressure_ap_mm: Length = Field(
-        3.0, description="laboratory x; default: Exell et al. 2012, 3 ± 2 mm"
+        3.0,
+        description="laboratory x; default: Exell et al. 2012 (PMID 23259242), 3 ± 2 mm for a "
+        "wheel that rolled from one force plate to the next, against markers",
     )
     centre_of_pressure_ml_mm: Length = Field(3.0, description="laboratory z; likewise")
     segment_mass: Share = Field(0.1, description="relative, all segments together" + _ASSUMED)
@@ -171,7 +173,8 @@ class UncertaintyTable(SceneTable):
     friction: Annotated[Number, Field(ge=0, le=0.5)] = Field(
         0.017,
         description="of the coefficient, which stays at or above 0; default: as wide as a "
-        "uniform distribution over 0.039 to 0.099, measured for CoCr on UHMWPE",
+        "uniform distribution over 0.039 to 0.099, measured for CoCr on UHMWPE at 3 to 9 MPa "
+        "(doi:10.1155/2015/185142, table 5)",
     )
     young_modulus: Share = Field(
         0.0,

@@ -36,8 +36,6 @@ class FrameContact:
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
         start: where a contact of the next frame may begin; None where there is no result.
-        turned: where a contact with a little more adduction may begin: the start that came with
-            the contact that gave the sensitivity; None without a sensitivity.
         triangles: (k, 3) of the map.
         post: cam and post, where the scene asks for their contact.
     """
@@ -54,7 +52,6 @@ class FrameContact:
     equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
     start: WarmStart | None = None
-    turned: WarmStart | None = None
     triangles: NDArray[np.int64] | None = None
     post: "PostContact | None" = None
 

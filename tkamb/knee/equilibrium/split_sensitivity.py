@@ -34,8 +34,7 @@ def split_sensitivity(
     probe: "Probe",
     result: ContactResult,
     start: WarmStart | None = None,
-    like: tuple[WarmStart, WarmStart] | None = None,
-) -> tuple[float, tuple[ContactResult, WarmStart] | None]:
+) -> float:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
     Zero where one condyle carries everything: the value then holds until the other condyle touches.
@@ -45,21 +44,15 @@ def split_sensitivity(
         probe: of the contact model.
         result: a contact; its load is the force along -y.
         start: that came with it.
-        like: the starts of another contact and of its contact with more adduction, which may save
-            time.
-
-    Returns:
-        The change, and the contact with more adduction with its start; None where that press
-        fails.
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
     place[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
     begin = WarmStart.after(result) if start is None else start
-    rotated, end = probe.pressed(load, knee_pose(place), begin, like)
+    rotated, _ = probe.pressed(load, knee_pose(place), begin)
     if rotated.status is not ContactStatus.OK:
-        return float("nan"), None
-    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step, (rotated, end)
+        return float("nan")
+    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:

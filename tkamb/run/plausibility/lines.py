@@ -69,8 +69,8 @@ def attachment_questions(case: Case) -> Iterator[Question]:
     far = [name for name, end in ends if not _belongs(*_on_carrier(case, end))]
     if far:
         yield Question(
-            f"{some(far)} ends more than {LINE_LIMITS.max_attachment_distance / MILLIMETRE:.0f} mm "
-            "from the knee, or beyond the joint: is its point_mm, sign or link another one?",
+            f"{some(far)}: more than {LINE_LIMITS.max_attachment_distance / MILLIMETRE:.0f} mm "
+            "from the knee, or beyond the joint; is point_mm, its sign or the link another one?",
             "attachment far from its place",
         )
     for muscle in case.muscles:
@@ -85,7 +85,7 @@ def attachment_questions(case: Case) -> Iterator[Question]:
     tiny = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
     if tiny:
         yield Question(
-            f"{some(tiny)} lies within 1 mm of its link's origin: is point_mm in metres?",
+            f"{some(tiny)}: within 1 mm of the link's origin; is point_mm in metres?",
             "attachment within 1 mm of its link's origin",
         )
 
@@ -171,8 +171,8 @@ def strain_questions(
     ]
     if loose:
         yield Question(
-            f"{some(loose)} is never within {-100 * LINE_LIMITS.min_strain:.0f} % of "
-            "being taut: is an attachment or slack_length_mm in another unit?",
+            f"{some(loose)}: never within {-100 * LINE_LIMITS.min_strain:.0f} % of being taut; "
+            "is an attachment, slack_length_mm or [motion] length_unit in another unit?",
             "ligament far from taut throughout",
         )
 
@@ -218,7 +218,7 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
             off.append(name)
     if off:
         yield Question(
-            f"{some(off)} lies where no such line ends: is its point_mm, sign or link another one?",
+            f"{some(off)}: no such line ends there; is point_mm, its sign or the link another one?",
             "extensor line ends off its bone",
         )
     ends = [transform(poses[e.link], e.position) for e in (ligament.proximal, ligament.distal)]

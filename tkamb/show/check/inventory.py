@@ -107,9 +107,26 @@ def _motion(case: Case) -> Entry:
             ranges.append(_range(name, values / MILLIMETRE, "mm", 1))
     text = (
         f"{len(motion.time)} frames, {motion.time[0]:.3g} to {motion.time[-1]:.3g} s, "
-        f"{rate:.0f} a second; {', '.join(reversed(ranges))}"
+        f"{rate:.0f} a second; {', '.join(reversed(ranges))}{_in_words(case)}"
     )
     return Entry("motion", table.file, text)
+
+
+def _in_words(case: Case) -> str:
+    """Return what the signs of AP and axial rotation mean, between least and most flexion."""
+    motion = case.motion
+    if {"ap", "axial_rotation"} & set(motion.unrecorded):
+        return ""
+    values = dict(zip(KNEE_COORDINATES, motion.coordinates.T, strict=True))
+    flexion = values["flexion"] / DEGREE
+    first, last = int(flexion.argmin()), int(flexion.argmax())
+    ap = (values["ap"][last] - values["ap"][first]) / MILLIMETRE
+    turn = (values["axial_rotation"][last] - values["axial_rotation"][first]) / DEGREE
+    return (
+        f"; from {flexion[first]:.0f} to {flexion[last]:.0f} deg of flexion the femur moves "
+        f"{abs(ap):.1f} mm {'forward' if ap > 0 else 'backward'} on the insert and turns "
+        f"{abs(turn):.1f} deg {'outward' if turn > 0 else 'inward'}"
+    )
 
 
 def _shank(case: Case) -> Entry:

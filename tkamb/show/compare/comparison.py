@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.errors import InputError
+from tkamb.run import metrics
 from tkamb.run.columns import KINDS
 from tkamb.run.metrics import failed
 from tkamb.run.plug_ins import CONTACT_CODE
@@ -120,6 +121,7 @@ class Comparison:
                     "frames": len(run.results),
                     "failed_frames": int(failed(run.results).sum()),
                     "peaks_BW": peaks_of(run.results.summary),
+                    "peak_pressure": metrics.peak_pressure(run.results),
                     "paired": _pairing_word(run.pairing),
                 }
                 for run in self.runs

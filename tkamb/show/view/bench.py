@@ -8,6 +8,7 @@ origin as recorded. It is computed by the same code as a frame of a run, so that
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -234,11 +235,24 @@ class Bench:
 
     Args:
         case: with [contact]; as a run reads it.
-        bundles: its ligaments with their slack lengths.
+        ligaments: its ligaments with their slack lengths.
     """
 
     case: Case
-    bundles: "tuple[Ligament, ...]"
+    ligaments: "tuple[Ligament, ...]"
+
+    @cached_property
+    def bundles(self) -> "tuple[Ligament, ...]":
+        """The ligaments, with both ends on femur or tibia itself."""
+        return tuple(
+            replace(one, proximal=self._carried(one.proximal), distal=self._carried(one.distal))
+            for one in self.ligaments
+        )
+
+    def _carried(self, end: LinkPoint) -> LinkPoint:
+        chain = self.case.chain
+        link = chain.carrier(end.link)
+        return LinkPoint(link, transform(chain.link_in(end.link, link), end.position))
 
     def case_of(self, request: BenchRequest, height: Any = None, like: Case | None = None) -> Case:
         """Return the case that stands still as a request says.
@@ -331,14 +345,13 @@ class Bench:
         )
 
     def _end(self, end: LinkPoint, request: BenchRequest) -> LinkPoint:
-        chain = self.case.chain
-        link = chain.carrier(end.link)
-        position = transform(chain.link_in(end.link, link), end.position)
-        if link == "femur":
-            position = transform(inverse(request.femoral.matrix()), position)
-        elif link == "tibia":
-            position = transform(self._bone(request), position)
-        return LinkPoint(link, position)
+        if end.link == "femur":
+            position = transform(inverse(request.femoral.matrix()), end.position)
+        elif end.link == "tibia":
+            position = transform(self._bone(request), end.position)
+        else:
+            return end
+        return LinkPoint(end.link, position)
 
 
 def still_motion(coordinates: Array) -> KneeMotion:

@@ -10,10 +10,19 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.run.discrepancy import COLUMNS, band_with_discrepancy, coverage, discrepancy_of
+from tkamb.run.discrepancy import (
+    COLUMNS,
+    QUANTILE_METHOD,
+    band_with_discrepancy,
+    coverage,
+    discrepancy_of,
+    load_of,
+)
 from tkamb.run.results import PERCENTILES, STATISTICS_LIMITS
 
 ENDS = ("p05", "p95")
+TOTALS_N = ("force_si_N", "force_total_N")
+"""Columns of results.csv with the total force, of which the first that is there is taken."""
 ROUND_OFF = 1e-9
 """1: a result with a smaller standard deviation over magnitude counts as constant."""
 SAMPLES_PER_INPUT = 6
@@ -30,17 +39,25 @@ def varies(variance: float, square: float) -> bool:
 def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Array]:
     """Return p05, p50 and p95 over samples, each of the shape of one sample.
 
-    Of the samples that have a number (linear between order statistics); NaN where fewer than
-    `STATISTICS_LIMITS.min_samples` have one, or where more than
+    Of the n samples that have a number the p quantile is at place p (n + 1) of the ordered ones,
+    linear between them: a value that is drawn like the samples then lies between p05 and p95 with
+    a probability of 0.90 whatever n is. At place 1 + p (n - 1), which is usual for describing a
+    sample, it would be 0.81 of 20 samples and 0.87 of 60. NaN where fewer than
+    `STATISTICS_LIMITS.min_samples` have a number, or where more than
     `STATISTICS_LIMITS.max_failed_share` of all failed.
 
     Args:
         values: (n, ...) NaN where a sample has no number.
         failed: (n, ...) of the last axes of `values`, which samples failed; None: none.
+
+    Reference: Hyndman & Fan, Am Stat 50:361 (1996), doi:10.1080/00031305.1996.10473566, their
+    sixth definition.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # slices of only NaN, hidden below
-        limits = np.nanpercentile(values, list(PERCENTILES.values()), axis=0)
+        warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN, hidden below
+        limits = np.nanpercentile(
+            values, list(PERCENTILES.values()), axis=0, method=QUANTILE_METHOD
+        )
     hidden = np.isfinite(values).sum(axis=0) < STATISTICS_LIMITS.min_samples
     if failed is not None:
         hidden = hidden | (failed.mean(axis=0) > STATISTICS_LIMITS.max_failed_share)
@@ -124,7 +141,8 @@ def discrepancy_columns(
 ) -> dict[str, Array]:
     """Return the columns `<name>_discrepancy_p05`, `_p95`: band of inputs and discrepancy.
 
-    Empty if the discrepancy of the run's method is not known; NaN where a force has no band.
+    Empty where nothing is known of the run's discrepancy; NaN where a force, or the total force of
+    which the discrepancy is a share, has no band.
 
     Args:
         names: (m,) columns of results.csv.
@@ -133,13 +151,17 @@ def discrepancy_columns(
         body_weight: N.
     """
     discrepancy = discrepancy_of(summary)
+    totals = [name for name in TOTALS_N if name in names]
+    if not totals:
+        return {}
+    load = load_of(values[:, list(names).index(totals[0])], body_weight)
     columns: dict[str, Array] = {}
     for index, name in enumerate(names):
         spread = discrepancy.get(COLUMNS.get(name, ""))
         if spread is None:
             continue
-        unit = 1.0 if name.endswith("_BW") else body_weight
-        ends = band_with_discrepancy(values[:, index], spread, unit)
+        unit = body_weight if name.endswith("_BW") else 1.0
+        ends = band_with_discrepancy(values[:, index], spread, load / unit)
         ends[:, np.isnan(percentiles(values[:, index])["p50"])] = np.nan
         columns |= {f"{name}_discrepancy_{end}": one for end, one in zip(ENDS, ends, strict=True)}
     return columns

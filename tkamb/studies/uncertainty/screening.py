@@ -21,6 +21,17 @@ SCREENED = (
 
 
 @dataclass(frozen=True)
+class ScreeningSettings:
+    """What a screening prints."""
+
+    least_share: float = 0.01
+    """Share of the largest change of a result; inputs that change it less are only counted."""
+
+
+SCREENING = ScreeningSettings()
+
+
+@dataclass(frozen=True)
 class Screened:
     """Effect of one input on one result at the frame where the result is largest.
 
@@ -106,24 +117,44 @@ def _of_result(
 
 
 def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
-    """Return the tornado as text: a bar either way per input."""
+    """Return the tornado as text: a bar either way per input that moves the result notably.
+
+    Inputs that move it by less than `SCREENING.least_share` of the largest change are counted.
+
+    Args:
+        rows: of `screen`.
+        width: of a bar, characters.
+    """
     lines: list[str] = []
+    names = max((len(_named(row)) for row in rows), default=0)
     for result in dict.fromkeys(row.result for row in rows):
         own = [row for row in rows if row.result == result]
         lines.append(f"{result}: {own[0].nominal:.4g} at {own[0].flexion:.0f} deg")
         sizes = np.abs([[row.minus, row.plus] for row in own])
         largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
-        for row in own:
-            unit = "" if row.varied.unit == "1" else f" {row.varied.unit}"
-            name = f"{row.varied.name} ± {row.varied.deviation:g}{unit}"
+        # an input whose frame failed is NaN here, and not below
+        small = (sizes < SCREENING.least_share * largest).all(axis=1) | (sizes == 0.0).all(axis=1)
+        for row in (row for row, hidden in zip(own, small, strict=True) if not hidden):
             bar = _bar(row, largest, width)
-            lines.append(f"  {name:<34} {_change(row.minus)} {_change(row.plus)}  {bar}")
+            lines.append(
+                f"  {_named(row):<{names}} {_change(row.minus)} {_change(row.plus)}  {bar}"
+            )
+        if small.any():
+            share = f"{SCREENING.least_share:.0%}"
+            lines.append(
+                f"  {small.sum()} more inputs: each less than {share} of the largest change"
+            )
     if any(not np.isfinite([row.minus, row.plus]).all() for row in rows):
         lines.append(
             "failed: with this error of the input the frame has no result, often because no load "
             "balances the pose; the change is not known, so the input is listed first"
         )
     return lines
+
+
+def _named(row: Screened) -> str:
+    unit = "" if row.varied.unit == "1" else f" {row.varied.unit}"
+    return f"{row.varied.name} ± {row.varied.deviation:g}{unit}"
 
 
 def _change(value: float) -> str:

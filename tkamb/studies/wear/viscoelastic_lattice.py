@@ -139,7 +139,7 @@ class ViscoelasticLattice:
         if load is not None:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load / slope) + sunk
         for _ in range(self._settings.max_expansions):
-            guess = initial_guess(state.compliance, gaps, planes, depth, load is None, None, None)
+            guess = initial_guess(state.compliance, gaps, planes, depth, load is None)
             result = solve(state.problem, pose, load, _softer(guess, slope, offset), self._settings)
             if not result.converged:
                 break
