@@ -38,7 +38,7 @@ class Outcome:
     forces: np.ndarray
 
     def notices(self, untouched):
-        """Return whether a reader is warned: by a refusal, or by a new question or flag."""
+        """Say whether a reader is warned: a refusal, or a question or flag that was not there."""
         return bool(self.refused) or bool(self.words - untouched.words)
 
     def same(self, untouched):

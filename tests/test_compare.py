@@ -108,7 +108,7 @@ def test_a_place_with_two_answers_is_not_compared(folders, tmp_path):
     there_and_back.columns["flexion_deg"][20:] = there_and_back["flexion_deg"][19:9:-1] - 0.5
     found = compare_folders([folders[0], written(tmp_path / "back", there_and_back)])
     assert found.differences == ()
-    assert any("are not unique" in note for note in found.notes)
+    assert any("on the axis are not unique" in note for note in found.notes)
 
 
 def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd):

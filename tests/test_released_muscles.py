@@ -84,7 +84,7 @@ def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
 
 
 def test_the_sharing_is_that_of_the_released_knee(resting):
-    """Quadriceps of sharing and equations agree to 1 N; equilibrium removes the residuals."""
+    """Quadriceps of sharing and equations agree to 1 N; what equilibrium removes is zero."""
     for body, contact in resting:
         quadriceps = body.geometry.extensor.tension(body.loads.values)
         assert quadriceps == pytest.approx(body.geometry.share.force[0], abs=1.0)

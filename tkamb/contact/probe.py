@@ -127,7 +127,7 @@ class Probe:
         Args:
             load: N.
             pose: (4, 4) pose_femoral_in_insert.
-            start: of a contact near by.
+            start: of a contact at a neighbouring pose.
         """
         return self._model.press_from(self._state, load, pose, start)
 

@@ -94,7 +94,7 @@ def say(line: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return text with what could steer a terminal written out as in JSON; lines and tabs stay."""
+    """Return a text with characters that could steer a terminal as in JSON; lines and tabs stay."""
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
     return "".join(c if _is_harmless(c) else json.dumps(c)[1:-1] for c in text)
@@ -105,7 +105,7 @@ def _is_harmless(character: str) -> bool:
 
 
 class _PrintableFormatter(logging.Formatter):
-    """Writes out what could steer a terminal: messages quote names and texts of others."""
+    """Escapes what could steer a terminal: messages quote names and texts of others."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -147,7 +147,7 @@ def open_streams() -> None:
 
 
 def _watch(stream: TextIO) -> None:
-    """Have a stream say `StreamError` when it cannot be written, as on a full disk.
+    """Make a stream raise `StreamError` when it cannot be written, as on a full disk.
 
     What is written is `printable`: commands print names and texts from files of others.
     """

@@ -1,7 +1,7 @@
 """The contact of a frame as arrays, from which the next frame of a resumed run begins.
 
-The start is as good as the one that the frame left, but for what is not kept: the lattice's
-displacements, and the contact and muscle forces that a released knee begins from. Answers stay
+The warm start is the one that the frame left, without what is not kept: the lattice's
+displacements, and the contact and muscle forces from which a released knee begins. Answers stay
 within the solver's tolerance.
 """
 

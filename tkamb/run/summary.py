@@ -287,8 +287,8 @@ def assumptions(case: Case) -> list[str]:
         sentences.append("The force plate lies at the laboratory's height 0: no column says where.")
     if case.motion.unrecorded:
         sentences.append(
-            f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are computed. The "
-            "rates that enter inertia and the direction of sliding are those of an initial guess."
+            f"{', '.join(case.motion.unrecorded)} were not recorded: they are computed. The rates "
+            "in inertia and in the direction of sliding are those of an initial guess."
         )
     if scene.motion.motion == "roll-slip":
         sentences.append(
@@ -361,7 +361,9 @@ def _agreement(table: ContactTable) -> str:
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
         return f"{names} are computed, not recorded: body and contact are in equilibrium there."
-    sentence = "The contact model presses in the superior-inferior force at the measured rotation; "
+    sentence = (
+        "The contact model is loaded with the superior-inferior force at the measured rotation; "
+    )
     if table.coupling == "points":
         return sentence + "the deformed contact's resultants act in the body's equations."
     return sentence + "its result does not change the forces of the body."

@@ -34,7 +34,7 @@ def press_adjusted(
     query: ClosestPointQuery,
     start: Guess | None = None,
 ) -> tuple[ContactResult, Adjustment, WarmStart]:
-    """Press the adjusted femur in, check the adjustment, undo its rotation if it must be.
+    """Press the adjusted femur in, check the adjustment, and undo its rotation if required.
 
     Args:
         model: any contact model.

@@ -42,7 +42,7 @@ def split_sensitivity(
 
     Args:
         probe: of the contact model.
-        result: a contact; the load is what it carries along -y.
+        result: a contact; its load is the force along -y.
         start: that came with it.
     """
     load = -float(result.wrench_on_insert[1])

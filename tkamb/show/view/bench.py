@@ -50,7 +50,7 @@ class BenchLimitSettings:
     adduction_deg: float = 20.0
     """deg; largest varus or valgus. Chosen: as `flexion_deg`."""
     axial_rotation_deg: float = 60.0
-    """deg; largest axial rotation either way, likewise."""
+    """deg; largest axial rotation either way. Chosen: as `flexion_deg`."""
     length_mm: float = 60.0
     """mm; largest translation of the knee that is accepted. Chosen: the femur is then beside the
     insert."""
@@ -58,20 +58,23 @@ class BenchLimitSettings:
     """deg; largest change of a component's orientation. Chosen: no component is placed as far
     off."""
     placement_mm: float = 20.0
-    """mm; largest change of a component's position."""
+    """mm; largest change of a component's position. Chosen: no component is placed as far off."""
     load_N: float = 15_000.0
-    """N; largest axial load. With the shank's weight it stays below what a force plate may read."""
+    """N; largest axial load. Chosen: with the shank's weight it stays below the largest force that
+    a plate may measure."""
     slack_percent: float = 20.0
     """%; largest change of the ligaments' slack length, either way. Chosen: ligaments of the knee
     rupture at 12 to 20 %."""
     finest_mm: float = 0.5
-    """mm; finest map."""
+    """mm; finest map. Chosen: a finer one takes too long to follow a slider."""
     coarsest_mm: float = 10.0
-    """mm; coarsest map, as `MapGridSettings`."""
+    """mm; coarsest map. Chosen: as `MapGridSettings`."""
     thickness_mm: tuple[float, float] = (4.0, 25.0)
-    """mm; thinnest and thickest insert of a parametric design. Inserts are sold from 6 to 20 mm."""
+    """mm; thinnest and thickest insert of a parametric design. Chosen: inserts are sold from 6 to
+    20 mm."""
     kept_models: int = 8
-    """Prepared contact models that are kept: of a lattice each takes 0.1 to 0.5 GB."""
+    """Number of prepared contact models that are kept. Chosen: of a lattice each takes 0.1 to
+    0.5 GB."""
     first_penetration: float = 5e-5
     """m; penetration at which a search for released coordinates begins. Chosen: as in
     `initial_pose.first_penetration`."""

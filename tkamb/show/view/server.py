@@ -41,9 +41,10 @@ class ViewServerSettings:
     """Bytes of a request; a longer one is refused. Chosen: the page's own requests are far
     shorter."""
     idle_seconds: float = 15.0
-    """s: without a byte from a client that is connected, before it is cut off."""
+    """s: time without a byte from a client that is connected, after which it is cut off. Chosen: a
+    browser sends its request at once."""
     longest_line: int = 2000
-    """Characters of an answer in words; a longer one is cut."""
+    """Characters of an answer in words; a longer one is cut. Chosen: a page shows it whole."""
     token_bytes: int = 18
     """Random bytes of the token in the address. Chosen: it cannot be guessed."""
 

@@ -153,7 +153,7 @@ class RestingPoses:
         self._stiffness: Array | None = None
 
     def at(self, k: int, load: float, start: Guess | None) -> tuple[Array, str]:
-        """Return the pose (4, 4) of row k at rest, and why it is none; empty: it is one.
+        """Return the equilibrium pose (4, 4) of row k, and why there is none; empty: there is one.
 
         Args:
             k: row.
