@@ -76,7 +76,7 @@ def test_fewer_frames_of_one_recording_pair_without_interpolation(folders, tmp_p
     assert found.runs[1].pairing.exact
     assert of(found, "force_total_N").frames == 6
     assert of(found, "force_total_N").max_abs == 0.0
-    assert any("15 frames of a have no partner" in note for note in found.notes)
+    assert any("15 frames of a have no matching frame" in note for note in found.notes)
 
 
 def test_other_frames_are_interpolated_to_second_order(folders, tmp_path):
@@ -108,7 +108,7 @@ def test_a_place_with_two_answers_is_not_compared(folders, tmp_path):
     there_and_back.columns["flexion_deg"][20:] = there_and_back["flexion_deg"][19:9:-1] - 0.5
     found = compare_folders([folders[0], written(tmp_path / "back", there_and_back)])
     assert found.differences == ()
-    assert any("two answers" in note for note in found.notes)
+    assert any("are not unique" in note for note in found.notes)
 
 
 def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd):
@@ -119,7 +119,7 @@ def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd)
     assert "over cycle" in said and "--axis" in said and said.count("\n") == 1
     assert not out.exists()
     notes = compare_folders([folders[0], gait], "cycle").notes
-    assert any("Not the same side. a: right; gait: left" in note for note in notes)
+    assert any("The runs differ in side. a: right; gait: left" in note for note in notes)
 
 
 def test_what_each_run_released_is_said_whole_and_in_any_order(folders, tmp_path):

@@ -20,8 +20,9 @@ class LigamentSideSettings:
     """Whether a collateral ligament is on its side of the knee."""
 
     wrong_side_distance: float = 8.0 * MILLIMETRE
-    """m beyond the middle of the knee, on the other side. Collateral ligaments end 20 to 45 mm
-    from the middle, and no frame is displaced by as much as this."""
+    """m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen:
+    collateral ligaments end 20 to 45 mm from the middle, and no frame is displaced by as much as
+    this."""
 
 
 LIGAMENT_SIDE = LigamentSideSettings()
@@ -57,7 +58,7 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
                 opposite, own = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
                 raise InputError(
                     f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {opposite} "
-                    f"side of this {side} knee, a ligament of the {own} side by its name",
+                    f"side of this {side} knee, but by its name it is a {own} ligament",
                     f"[[ligament]] {bundle.name}",
                     "turn the sign of z in point_mm (z points to the right on either side), or "
                     "correct [patient] side or the name",

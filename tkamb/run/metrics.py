@@ -22,12 +22,14 @@ class MetricSettings:
     """What counts as a jump of a centre of pressure, and as an unloaded quadriceps."""
 
     jump: float = 8.0 * MILLIMETRE
-    """m; a centre of pressure that moves farther between two frames may have jumped."""
+    """m; a centre of pressure that moves farther between two frames may have jumped. Chosen: on one
+    dish a contact point moves by less from frame to frame."""
     jump_steps: float = 5.0
-    """A centre of pressure that moves by more than `jump` and by many median steps from a frame to
-the next has not travelled there."""
+    """Median steps: a centre of pressure that moves by more than these and by more than `jump` from
+    a frame to the next has jumped. Chosen: a movement does not speed up as much."""
     least_tension: float = 1.0
-    """N: below this quadriceps tension its ratios are not shown."""
+    """N: below this quadriceps tension its ratios are not shown. Chosen: a quotient of small
+    numbers says nothing."""
 
 
 METRICS = MetricSettings()

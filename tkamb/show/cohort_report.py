@@ -1,4 +1,4 @@
-"""The cohort's report: one page that stands by itself, groups side by side."""
+"""The cohort's report: one self-contained page, with the groups side by side."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,9 +48,9 @@ class CohortReportSettings:
     """How much a cohort's page shows."""
 
     most_maps: int = 24
-    """Pressure maps on the page; more make it slow to open."""
+    """Pressure maps on the page. Chosen: more make it slow to open."""
     most_failed: int = 100
-    """Failed runs that the page lists."""
+    """Failed runs that the page lists. Chosen: the page stays readable."""
 
 
 COHORT_REPORT = CohortReportSettings()
@@ -87,7 +87,7 @@ def _designs(cohort: Cohort, groups: Sequence[Group]) -> dict[str, str] | None:
 
 
 def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
-    """Return by how much the cohort's contact models are known to err; None without contact."""
+    """Return the known error of the cohort's contact models; None without contact."""
     words: dict[str, str] = {}
     large = False
     for n in outcomes:
@@ -202,7 +202,7 @@ def _row(group: Group, names: Sequence[str]) -> list[str]:
 
 
 def _plots(groups: Sequence[Group]) -> Any:
-    """Yield plots per quantity and axis, each of so many groups as one can tell apart."""
+    """Yield plots per quantity and axis, each with as many groups as colours can distinguish."""
     for name in _there(groups):
         for axis in dict.fromkeys(group.axis for group in groups):
             own = [group for group in groups if group.axis == axis and name in group.bins]
@@ -214,10 +214,10 @@ def _plots(groups: Sequence[Group]) -> Any:
 
 
 def _told_apart(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
-    """Return plots: what all groups of one have in common, and name -> group.
+    """Return plots: the common labels of their groups, and name -> group.
 
-    Too many for one plot are divided by the label with the fewest values that makes them few
-    enough, so that what differs in all else stands in one plot; else in their order.
+    If there are too many groups for one plot, they are divided by the label with the fewest values
+    that makes them few enough; if no label does, in their order.
     """
     if len(groups) > AT_ONCE:
         values = {

@@ -23,12 +23,14 @@ class GroundReactionLimitSettings:
     """Which ground reactions are plausible."""
 
     max_lateral_distance: float = 0.075
-    """m, to either side; half the breadth of a shoe, and as much again for an oblique foot."""
+    """m, to either side. Chosen: half the breadth of a shoe, and as much again for an oblique
+    foot."""
     loaded_share: float = 0.2
-    """Share of the peak force; at less the centre of pressure is a quotient of small numbers."""
+    """Share of the peak force. Chosen: at less the centre of pressure is a quotient of small
+    numbers."""
     min_lean: float = 0.03
-    """Forward over upward force; at less the force hardly leans and the sign of its lean says
-    nothing."""
+    """Forward over upward force. Chosen: at less the force hardly leans and the sign of its lean
+    says nothing."""
     max_outward_lean: float = 0.02
     """Sideways over upward force, outwards. In standing, walking and squatting it is inwards, by
     0.04 to 0.07 in six recordings; on the stairs of subject JW it is 0.007 outwards."""
@@ -39,15 +41,16 @@ class GroundReactionLimitSettings:
     """m, of the centre of pressure ahead of the ankle, in the mean over the loaded frames: 0.019 to
     0.061 in seven recordings; with the sign turned, -0.019 and less."""
     ankle_distance: float = 0.015
-    """m; a standing person has the centre of pressure 0.04 ahead of the ankle. A path as near as
-    this is in another unit."""
+    """m; a standing person has the centre of pressure 0.04 ahead of the ankle. Chosen: a path as
+    near as this is in another unit."""
     max_unloaded_stance: float = 0.15
-    """s; in four recorded walks no foot stands unloaded for longer than 0.02, and for 0.4 where a
-    plate is left out."""
+    """s; longest time that a standing foot is unloaded. Chosen: 0.02 s at most in four recorded
+    walks, and 0.4 s where a plate is left out."""
     unloaded_force: float = 0.05
-    """BW; a foot with less force is unloaded."""
+    """BW: a foot with less force is unloaded. Chosen: above the noise of plates."""
     max_peak_ratio: float = 1.6
-    """Ratio of one foot's largest to its smallest peak in a walk; 1.1 in three recordings."""
+    """Ratio of one foot's largest to its smallest peak in a walk. Chosen: 1.1 in three
+    recordings."""
 
 
 GROUND_REACTION_LIMITS = GroundReactionLimitSettings()

@@ -24,12 +24,14 @@ class LineLimitSettings:
     """Strain; ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al.
     1986)."""
     min_strain: float = -0.4
-    """Strain; a bundle that is never nearer to being taut has no effect in this movement."""
+    """Strain. Chosen: a bundle that is never nearer to being taut has no effect in this
+    movement."""
     max_attachment_distance: float = 0.16
-    """m, from the insert's centre; the superficial MCL, the farthest, ends 0.06 to 0.12 below
-    it."""
+    """m, from the insert's centre. Chosen: the superficial MCL, the farthest, ends 0.06 to 0.12
+    below it."""
     max_overlap: float = 0.03
-    """m; of a tibial end above the insert's bottom, or of a femoral end below the flexion axis."""
+    """m; of a tibial end above the insert's bottom, or of a femoral end below the flexion axis.
+    Chosen: attachments of a knee overlap by less."""
     min_anterior_offset: float = 0.01
     """m; of the quadriceps origin ahead of the line from hip to knee, 0.029 to 0.044 in three
     models. Vasti begin on the front of a shaft that is bowed forward, the rectus femoris ahead of
@@ -37,8 +39,8 @@ class LineLimitSettings:
     max_patella_distance: float = 0.06
     """m; of the ends of both lines from the patella's origin. A patella is 0.045 long."""
     max_tendon_change: float = 0.15
-    """Share of its mean length by which the patellar ligament may change between recorded ends; it
-    strains by a few per cent."""
+    """Share of its mean length by which the patellar ligament may change between recorded ends.
+    Chosen: it strains by a few per cent."""
 
 
 LINE_LIMITS = LineLimitSettings()

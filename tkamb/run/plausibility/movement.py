@@ -18,8 +18,8 @@ class MovementLimitSettings:
     """Which movements are plausible."""
 
     max_flexion_as_radians: float = 3.3
-    """deg; a bend of more than 10 deg that is stored in radians but read as degrees stays below
-    this."""
+    """deg; largest flexion that may be stored in radians but read as degrees. Chosen: a bend of
+    more than 10 deg stays below this."""
     max_marker_residual: float = 12.0 * MILLIMETRE
     """m; root mean square in the median frame. Skin moves by up to 10 mm in a cluster, 5 mm on the
     stairs of subject JW."""

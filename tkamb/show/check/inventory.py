@@ -1,4 +1,4 @@
-"""What each file of a scene gave, in a line: frames, durations, ranges, sizes."""
+"""Content of each file of a scene, one line each: frames, durations, ranges, sizes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,8 @@ class InventorySettings:
     """What `tkamb check` lists."""
 
     high_strain: float = 0.1
-    """Strain from which a bundle is named; ligaments of the knee tear at 12 to 20 %."""
+    """1: strain from which a bundle is listed. Chosen: ligaments of the knee rupture at 12 to 20
+    %."""
 
 
 INVENTORY = InventorySettings()
@@ -43,7 +44,7 @@ class Entry:
     Args:
         part: what it is, as its table is called.
         file: where it was read from; None: the scene itself.
-        found: what it gave.
+        found: its content.
     """
 
     part: str
@@ -57,7 +58,7 @@ class Entry:
 
 
 def inventory(mechanics: Mechanics) -> tuple[Entry, ...]:
-    """Return what every file and table of a case gave."""
+    """Return the content of every file and table of a case."""
     case = mechanics.case
     result = [_patient(case), _motion(case)]
     if case.scene.tibia or case.motion.markers:
@@ -87,7 +88,7 @@ def _patient(case: Case) -> Entry:
     masses = ", ".join(f"{link} {chain.segment(link)[0]:.2f} kg" for link in ("tibia", "femur"))
     text = (
         f"{patient.side} knee, {patient.mass_kg:g} kg (1 BW is {case.body_weight:.0f} N); "
-        f"with all that is fixed to them: {masses}"
+        f"masses with everything fixed to the link: {masses}"
     )
     return Entry("patient", patient.urdf, text)
 
@@ -174,7 +175,7 @@ def _surface(surface: Surface) -> str:
 
 
 def _ligaments(mechanics: Mechanics) -> Entry:
-    """Return the bundles, and which are torn where: the strains that the report prints."""
+    """Return the bundles, and those with a high strain and where: the strains of the report."""
     strains = mechanics.strains
     torn = [
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
@@ -217,7 +218,7 @@ def _contact(case: Case) -> Entry:
 
 
 def _measured(measured: "MeasuredForce", weight: float) -> Entry:
-    """Return what an instrumented implant measured: held against a run, never used in it."""
+    """Return what an instrumented implant measured: compared with a run, never used in it."""
     forces = [
         _range(name, values[np.isfinite(values)] / weight, "BW", 2)
         for name, values in measured.force.items()

@@ -1,4 +1,4 @@
-"""A comparison as one page that stands by itself."""
+"""A comparison as one self-contained page."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from tkamb.show.compare.figures import (
     run_colour,
     shown_frame,
 )
-from tkamb.show.headline import peak_legend, peak_words, peaks_of
+from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import svg_text
 
@@ -30,11 +30,11 @@ FIRST = (
     "medial_cop_ap_mm", "lateral_cop_ap_mm", "quadriceps_N", "patellar_ligament_N",
     "patellofemoral_N", "approach_mm",
 )  # fmt: skip
-"""Columns of the table that is printed and shown first; all others are below it in the page."""
+"""Columns of the table that is printed and shown first; the page has the others below it."""
 
 
 def headline(comparison: Comparison) -> list[Difference]:
-    """Return the differences of the columns that are looked at first."""
+    """Return the differences of the most important columns."""
     return [one for name in FIRST for one in comparison.differences if one.column == name]
 
 
@@ -54,7 +54,7 @@ def check_frame(comparison: Comparison, frame: int | None) -> int:
 
 
 def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
-    """Return the page: what is not the same, curves, maps at a frame, differences.
+    """Return the page: different settings, curves, maps at a frame, differences.
 
     Raises:
         InputError: the first run has no such frame.
@@ -135,6 +135,8 @@ def peak_lines(comparison: Comparison) -> list[str]:
             words += f", at {pressure['time_s']:.4g} s"
             words += f", where {pressure['doubt']}" if pressure["doubt"] else ""
             lines.append(f"{run.label}: {words}")
+        limits = muscle_limits(run.results)
+        lines += [f"{run.label}: {limits.line()}"] if limits is not None else []
     return lines
 
 
