@@ -11,11 +11,12 @@ import pytest
 from mistakes import DATA, DM
 from scenes import MODEL, as_toml
 from tkamb.errors import InputError
+from tkamb.io.recordings.samples import OddSample
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.ligament_sides import check_collateral_sides
 from tkamb.run.plausibility.ground import direction_questions, foot_questions, load_questions
-from tkamb.run.plausibility.movement import motion_questions
+from tkamb.run.plausibility.movement import motion_questions, sample_questions
 from tkamb.run.plausibility.signs import sign_questions
 from tkamb.show.check.scene_check import check_scene
 
@@ -270,3 +271,12 @@ def test_a_spike_that_the_filter_makes_small_is_not_asked_about(knee, cutoff, as
     path.write_text("\n".join([header, *(",".join(map(repr, map(float, r))) for r in rows)]) + "\n")
     case = load_case(load_scene(knee, {"ground_reaction.cutoff_Hz": cutoff}))
     assert bool(case.ground.odd) is asked
+
+
+@pytest.mark.parametrize(("away", "asked"), [(0.15, True), (0.3, False)])
+def test_a_spike_far_from_every_frame_is_not_asked_about(knee, away, asked):
+    case = load_case(load_scene(knee))
+    last = float(case.motion.time[-1])
+    odd = (OddSample(knee, "flexion", last + away, 5.0, "deg"),)
+    case = replace(case, motion=replace(case.motion, odd=odd))
+    assert bool(list(sample_questions(case))) is asked

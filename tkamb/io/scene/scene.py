@@ -222,7 +222,7 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
 
 
 def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
-    """Return the scene of a content with overrides laid over it."""
+    """Return the scene of a content with overrides applied."""
     _apply_overrides(content, overrides)
     try:
         result = Scene.model_validate(content)

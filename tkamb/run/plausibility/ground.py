@@ -237,8 +237,9 @@ def foot_questions(case: Case) -> Iterator[Question]:
     ahead = np.einsum("fi,fi->f", away, forward)
     if (mean := float(ahead[loaded].mean())) < GROUND_REACTION_LIMITS.min_mean_forward:
         yield Question(
-            f"the centre of pressure is {-mean / MILLIMETRE:.0f} mm behind the ankle in the mean, "
-            "but a foot reaches forward: is its forward sign turned, or the ankle's place wrong?",
+            f"the centre of pressure lies {-mean / MILLIMETRE:.0f} mm behind the ankle in the "
+            "mean, where no foot is (a foot reaches forward): is its sign or axis another one, or "
+            "the ankle's place?",
             "centre of pressure behind the ankle",
         )
     aside = away[:, 2] * forward[:, 0] - away[:, 0] * forward[:, 2]

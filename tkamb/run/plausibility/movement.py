@@ -25,6 +25,9 @@ class MovementLimitSettings:
     stairs of subject JW."""
     min_duration: float = 0.15
     """s; no movement of a leg is shorter."""
+    odd_sample_window: float = 0.2
+    """s; a sample farther from every frame reaches them through a low-pass of 6 Hz by less than
+    3 % of what its own instant gets."""
     min_translation: float = 0.1 * MILLIMETRE
     """m; the femur of a knee that bends by 20 deg moves by more than this on the insert.
     Millimetres that are metres in the file stay below."""
@@ -162,7 +165,12 @@ def sample_questions(case: Case) -> Iterator[Question]:
     parts = (case.motion, case.tibia, case.ground)
     time = case.motion.time
     reach = float(np.ptp(time)) / max(len(time) - 1, 1)
-    for samples in (part.odd for part in parts if part is not None and part.odd):
+    window = max(3.0 * reach, MOVEMENT_LIMITS.odd_sample_window)
+    for part in parts:
+        recorded = () if part is None else part.odd
+        samples = [one for one in recorded if np.abs(time - one.time).min() <= window]
+        if not samples:
+            continue
         worst = max(samples, key=lambda sample: sample.away)
         near = np.zeros(len(time), bool)
         for sample in samples:

@@ -200,7 +200,8 @@ def draw_leg(case: Case, mechanics: Mechanics) -> Figure:
         words = [f"{part}, {place}" for part in ("leg", "knee") for place in places]
         for row, label in zip(grid, words, strict=True):
             row[0].set_ylabel(label)
-        figure.supxlabel(LEGEND, fontsize=8)
+        knee = f"{mechanics.case.scene.patient.side.capitalize()} knee. "
+        figure.supxlabel(knee + LEGEND, fontsize=8)
     return figure
 
 
@@ -262,6 +263,7 @@ def _name_sides(axes: Axes, view: View) -> None:
         axes.text(
             place, height, words, ha=align, va="bottom", fontsize=8, color=GREY,
             transform=axes.transAxes, gid=f"side-{align}",
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )  # fmt: skip
 
 
