@@ -212,11 +212,9 @@ def _is_frame(shard: Shard, points: int | None) -> bool:
         return True
     if points is None:
         return False
-    n = points
-    shapes = dict.fromkeys(("pressure", "gap", "area"), (n,))
-    shapes |= dict.fromkeys(("nodal_force", "normals"), (n, 3))
-    shapes |= {"pose": (4, 4), "wrench_on_insert": (6,)} | dict.fromkeys(CONTACT_PLACES, (3, 3))
-    kept = shard.contact
+    kept, n = shard.contact, points
+    shapes: dict[str, tuple[int, ...]] = {"pressure": (n,), "gap": (n,), "nodal_force": (n, 3)}
+    shapes |= {"pose": (4, 4)} | dict.fromkeys(CONTACT_PLACES, (3, 3))
     whole = all(array.dtype.kind == "f" for array in kept.values())
     return whole and all(name in kept and kept[name].shape == shapes[name] for name in shapes)
 
