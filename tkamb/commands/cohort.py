@@ -11,10 +11,11 @@ from tkamb.run.guard import say
 
 @dataclass(frozen=True)
 class CohortOutputSettings:
-    """What `tkamb cohort` prints."""
+    """Output of `tkamb cohort`."""
 
     max_failed_runs: int = 10
-    """Failed runs that are printed; the folder has them all."""
+    """Number of failed runs that are printed; the folder has them all. Chosen: they fit on a
+    screen."""
 
 
 COHORT_OUTPUT = CohortOutputSettings()

@@ -180,7 +180,7 @@ def unfinished(count: int, total: int) -> list[str]:
 
 
 def _goes_on(directory: Path) -> str:
-    return f"what was finished is in {directory}; --resume goes on from there"
+    return f"finished rows are in {directory}; --resume continues from there"
 
 
 def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:

@@ -104,7 +104,7 @@ def _wear(options: argparse.Namespace) -> int:
     with claimed_directory(folder, options.force, "wear") as claimed:
         crew, run = PoolOptions(options.workers), _prepared(options)
         if crew.workers > 1 and run.sampling is None:
-            raise InputError("has no samples to compute", "--workers", "give --samples too")
+            raise InputError("has no samples to compute", "--workers", "also give --samples")
         with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
             report = run.compute(
                 claimed,
