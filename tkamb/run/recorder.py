@@ -215,8 +215,8 @@ def _is_frame(shard: Shard, points: int | None) -> bool:
     if points is None:
         return False
     kept, n = shard.contact, points
-    shapes: dict[str, tuple[int, ...]] = {"pressure": (n,), "gap": (n,), "nodal_force": (n, 3)}
-    shapes |= {"pose": (4, 4)} | dict.fromkeys(CONTACT_PLACES, (3, 3))
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(CONTACT_PLACES, (3, 3))
+    shapes |= {"pressure": (n,), "gap": (n,), "nodal_force": (n, 3), "pose": (4, 4)}
     whole = all(array.dtype.kind == "f" for array in kept.values())
     return whole and all(name in kept and kept[name].shape == shapes[name] for name in shapes)
 
