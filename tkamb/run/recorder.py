@@ -5,6 +5,7 @@ begins. contact.h5 grows beside them; every few seconds a copy takes its place t
 results.csv, which calls the other frames not computed, and summary.json.
 """
 
+import os
 import shutil
 import signal
 import threading
@@ -243,7 +244,7 @@ def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results |
     Raises:
         InputError: they are another run's, or no longer what was written.
     """
-    if not (directory / SUMMARY_NAME).exists():
+    if not os.path.exists(directory / SUMMARY_NAME):
         return None
     results = read_results(directory)
     check_same_run(results.summary.get("identity"), identity, directory)

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,7 +49,7 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """
     directory = Path(directory)
     settle(directory)
-    if not (directory / CSV_NAME).exists():
+    if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it raises nothing
         raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
     columns = read_csv(directory / CSV_NAME)
     summary = read_summary(directory)
