@@ -355,7 +355,7 @@ def opensim(folder: Path, chance: random.Random) -> list[str]:
     moved = chance.choice([["--motion", "leg.mot"], ["--motion", "leg.mot"], ["--trc", "leg.trc"]])
     given = ["import", str(folder / "leg.osim"), moved[0], str(folder / moved[1])]
     given += ["--side", "right", "--mass-kg", "53.5", "--out", str(folder / "out")]
-    return given + (["--muscles"] if chance.random() < 0.3 else [])
+    return given
 
 
 @cache

@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 NEEDED = (
     "tkamb.cli",
@@ -49,6 +50,23 @@ def import_all(report: bool = True) -> None:
         import tkamb.show.report
 
         tkamb.show.report.report_html = lambda results, progress=None: "<html></html>"
+
+
+def prepare_once() -> None:
+    """Have runs of equal scenes share what prepares their frames, guesses not; forked ones too."""
+    from tkamb.run import simulation
+    from tkamb.run.frames import FrameSolver
+
+    solvers: dict[str, FrameSolver] = {}
+
+    def solver(case: Any, frames: Any = None) -> FrameSolver:
+        key = case.scene.model_dump_json()
+        if key not in solvers:
+            solvers[key] = FrameSolver(case, frames)
+        solvers[key].before = []
+        return solvers[key]
+
+    simulation.FrameSolver = solver  # type: ignore[assignment,misc]
 
 
 class Forked:

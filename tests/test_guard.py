@@ -120,6 +120,9 @@ def test_files_that_are_none(tmp_path, capfd, kind):
     refused(capfd, "mesh", "check", path)
     refused(capfd, "verify", path)
     refused(capfd, "report", path)
+    refused(capfd, "methods", path)
+    refused(capfd, "export", path, "--vtp", "--out", tmp_path / "o")
+    refused(capfd, "compare", path, path, "--out", tmp_path / "o")
     refused(
         capfd, "run", MODEL / "scene.toml", "--set", f"patient.urdf='{path}'".replace("\0", "x")
     )

@@ -252,6 +252,7 @@ def test_a_frame_that_somebody_forged_is_computed_anew(tmp_path, forged):
     """Its digest is right: it ended a run with an error that nobody foresaw."""
     frames = slice(0, 8)
     stop_after(tmp_path, 3, frames=frames)
+    assert (tmp_path / ".frames" / "000002.frame").exists()
     identity = json.loads((tmp_path / ".frames" / "run.json").read_text())
     Shards(tmp_path, identity, resume=True).put(1, forged)
     found = simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)

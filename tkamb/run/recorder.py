@@ -5,6 +5,7 @@ begins. contact.h5 grows beside them; every few seconds a copy takes its place t
 results.csv, which calls the other frames not computed, and summary.json.
 """
 
+import os
 import shutil
 import signal
 import threading
@@ -214,10 +215,9 @@ def _is_frame(shard: Shard, points: int | None) -> bool:
         return True
     if points is None:
         return False
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("pressure", "gap", "area"), (points,))
-    shapes |= dict.fromkeys(("nodal_force", "normals"), (points, 3))
-    shapes |= {"pose": (4, 4), "wrench_on_insert": (6,)} | dict.fromkeys(CONTACT_PLACES, (3, 3))
-    kept = shard.contact
+    kept, n = shard.contact, points
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(CONTACT_PLACES, (3, 3))
+    shapes |= {"pressure": (n,), "gap": (n,), "nodal_force": (n, 3), "pose": (4, 4)}
     whole = all(array.dtype.kind == "f" for array in kept.values())
     return whole and all(name in kept and kept[name].shape == shapes[name] for name in shapes)
 
@@ -244,7 +244,7 @@ def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results |
     Raises:
         InputError: they are another run's, or no longer what was written.
     """
-    if not (directory / SUMMARY_NAME).exists():
+    if not os.path.exists(directory / SUMMARY_NAME):
         return None
     results = read_results(directory)
     check_same_run(results.summary.get("identity"), identity, directory)

@@ -1,6 +1,7 @@
 """The case of results: reads their scene again, if it has not changed since the run."""
 
 import json
+import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -68,7 +69,7 @@ def _scene_of(summary: Mapping[str, Any]) -> Scene:
     if not name:
         raise InputError("names no scene file", "summary", "give the scene itself to tkamb view")
     path = Path(name)
-    if not path.exists():
+    if not os.path.exists(path):
         what = "the scene of these results is not there"
         raise InputError(what, path, "put it back, or run it again")
     contact = summary.get("contact") or {}

@@ -49,7 +49,7 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """
     directory = Path(directory)
     settle(directory)
-    if not os.path.exists(directory / CSV_NAME):  # False too for a name that no file can have
+    if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it raises nothing
         raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
     columns = read_csv(directory / CSV_NAME)
     summary = read_summary(directory)

@@ -1,5 +1,6 @@
 """Writes OpenSim's files: `.sto` and `.mot` tables, `.trc` markers."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,7 +70,7 @@ def write_results_storage(results: "Results", path: Path) -> str:
     """
     if path.suffix.lower() not in STORAGE:
         raise InputError(f"is none of {', '.join(STORAGE)}", path, "name a file that ends so")
-    if path.exists():
+    if os.path.lexists(path):
         raise InputError(
             "exists already", path, "give a new file: tkamb does not replace your files"
         )

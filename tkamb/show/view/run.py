@@ -154,7 +154,7 @@ def read_source(path: str | Path, contact: str | None = None) -> Source:
     scene = load_scene(path, {"contact.model": contact} if contact else {})
     case = load_case(scene)
     folder = scene.output.directory or Path("out") / path.resolve().parent.name
-    if (folder / SUMMARY_NAME).exists():
+    if os.path.exists(folder / SUMMARY_NAME):
         results = read_results(folder)
         same = results.summary.get("scene_sha256") == scene_hash(case)
         same = same and same_files(case, results.summary)
