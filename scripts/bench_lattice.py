@@ -36,18 +36,18 @@ def measure(case, data, name, resolution, load, repeats):
     state = model.prepare(pair)
     prepare = time.perf_counter() - begun
     begun = time.perf_counter()
-    result = model.press(state, load, at)
+    result, start = model.press_from(state, load, at)
     cold = time.perf_counter() - begun
     warm, again, reading = [], [], []
-    guess, passes = result, []
+    passes = []
     for k in range(1, repeats + 1):
         there = nearby(at, 0.2 * k)
         begun = time.perf_counter()
-        guess = model.press(state, load, there, guess)
+        pressed, start = model.press_from(state, load, there, start)
         warm.append(time.perf_counter() - begun)
-        passes.append(guess.iterations)
+        passes.append(pressed.iterations)
         begun = time.perf_counter()
-        _ = guess.approach
+        _ = pressed.approach
         reading.append(time.perf_counter() - begun)
         begun = time.perf_counter()
         model.press(state, load, there)

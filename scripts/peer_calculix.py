@@ -70,10 +70,10 @@ def measure(job):
         return took_row(job, answer.nodes, *took, answer.run.peak_rss_MB) | found(answer.result)
     model = contact_model(job["model"], job["resolution_mm"], cache=False)
     prepare, state = timed(model.prepare, case.pair)
-    cold, result = timed(model.press, state, case.load, case.pose)
-    warm, guess = [], result
+    cold, (result, start) = timed(model.press_from, state, case.load, case.pose)
+    warm = []
     for step in range(1, WARM_PRESSES + 1):
-        seconds, guess = timed(model.press, state, case.load, case.nearby(step), guess)
+        seconds, (_, start) = timed(model.press_from, state, case.load, case.nearby(step), start)
         warm.append(seconds)
     took = (prepare, cold, median(warm))
     return took_row(job, state.node_count, *took, peak_rss()) | found(result)

@@ -1,4 +1,4 @@
-"""A few of the abusive inputs of scripts/study_abuse: nothing but a line, and nothing written."""
+"""A few of the inputs of scripts/study_abuse and scripts/fuzz_http: none breaks anything."""
 
 import subprocess
 import sys
@@ -6,13 +6,27 @@ from pathlib import Path
 
 import pytest
 
-STUDY = Path(__file__).parents[1] / "scripts" / "study_abuse"
+SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 
 @pytest.mark.parametrize(
-    ("inputs", "seed"), [(15, 1), pytest.param(1000, 10_000, marks=pytest.mark.slow)]
+    ("inputs", "seed"), [(6, 1), pytest.param(1000, 10_000, marks=pytest.mark.slow)]
 )
 def test_abusive_inputs_break_nothing(inputs, seed):
-    command = [sys.executable, STUDY, "--inputs", str(inputs), "--seed", str(seed)]
+    command = [
+        sys.executable,
+        SCRIPTS / "study_abuse",
+        "--inputs",
+        str(inputs),
+        "--seed",
+        str(seed),
+    ]
+    ran = subprocess.run(command, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_hostile_requests_break_no_server():
+    """To `tkamb view` and `tkamb live`."""
+    command = [sys.executable, SCRIPTS / "fuzz_http", "--inputs", "150"]
     ran = subprocess.run(command, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout + ran.stderr

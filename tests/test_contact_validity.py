@@ -75,7 +75,7 @@ def test_a_spike_longer_than_the_insert_is_thick_is_out_of_range(name, body):
 @pytest.mark.parametrize(
     ("length", "pose", "words"),
     [
-        (5e-3, above(), "mm thick: is there a spike"),
+        (5e-3, above(), "mm thick: check the meshes for a spike"),
         (1e-3, above(0.7e-3, 0.9e-3), "meshes first touch 0.8"),
     ],
 )
@@ -105,7 +105,7 @@ def test_a_peak_above_100_megapascal_is_flagged(name, insert):
     result, state = pressed(name, one, insert, 2500.0, size=1.0)
     assert result.status is ContactStatus.OK
     assert result.medial.peak_pressure > 100e6
-    words = "peak above 100 MPa: polyethylene's law is not known there; is this the lip or an edge?"
+    words = "peak above 100 MPa: polyethylene's law is not known there; check whether"
     assert any(words in flag for flag in result.flags)
     report = PressReport(
         name, 1.0, state.node_count, 2500.0, result, None, state.triangles, state.pair, "right",

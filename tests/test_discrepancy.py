@@ -14,6 +14,7 @@ from tkamb.run.discrepancy import (
     discrepancy_words,
     fitted,
     known_errors,
+    load_of,
     trial_error,
 )
 from tkamb.run.summary import peaks, saturated_muscles
@@ -23,21 +24,35 @@ from tkamb.studies.uncertainty.bands import discrepancy_columns, influences, pea
 def one_trial(
     rng, name="a", activity="walking", bias=0.0, scatter=0.2, inputs=0.1, frames=40, count=50
 ):
-    """A trial whose truth is off by a bias and white noise, with samples about the nominal."""
+    """A trial whose truth is off by shares of the load, with samples about the nominal.
+
+    Its error is a bias and white noise. Returned are the error, samples, truth and load.
+    """
     nominal = 700.0 * (1.5 + np.sin(np.linspace(0, 6, frames)))
-    truth = nominal + 700.0 * (bias + scatter * rng.standard_normal(frames))
-    samples = nominal + 700.0 * inputs * rng.standard_normal((count, frames))
+    load = np.hypot(nominal, 350.0)
+    truth = nominal + load * (bias + scatter * rng.standard_normal(frames))
+    samples = nominal + load * inputs * rng.standard_normal((count, frames))
     time = np.arange(frames) / 30
     names = (name, "S", activity, "total")
-    return trial_error(names, time, samples, truth, nominal, 700.0), samples, truth
+    known = load_of(samples, 700.0)
+    return trial_error(names, time, samples, truth, nominal, known, 700.0), samples, truth, known
 
 
 def test_a_known_bias_scatter_and_input_deviation_are_found_again():
-    error, _, _ = one_trial(np.random.default_rng(0), bias=0.3, frames=2000, count=200)
-    assert error.bias_BW == pytest.approx(0.3, abs=0.02)
-    assert error.scatter_BW == pytest.approx(0.2, abs=0.01)
-    assert error.inputs_BW == pytest.approx(0.1, abs=0.005)
-    assert error.nominal_bias_BW == pytest.approx(-0.3, abs=0.02)  # predicted minus measured
+    error, _, _, load = one_trial(np.random.default_rng(0), bias=0.3, frames=2000, count=200)
+    assert error.bias == pytest.approx(0.3, abs=0.02)
+    assert error.scatter == pytest.approx(0.2, abs=0.01)
+    assert error.inputs == pytest.approx(0.1, abs=0.005)
+    assert error.independent_frames == pytest.approx(2000.0, rel=0.05)
+    expected = -0.3 * np.mean(load) / 700.0  # predicted minus measured
+    assert error.nominal_bias_BW == pytest.approx(expected, abs=0.02)
+
+
+def test_the_load_is_the_median_total_and_never_below_half_a_body_weight():
+    totals = np.array([[700.0, 0.0, np.nan], [1400.0, 0.0, np.nan], [2100.0, 0.0, np.nan]])
+    load = load_of(totals, 700.0)
+    np.testing.assert_allclose(load[:2], [np.hypot(1400.0, 350.0), 350.0])
+    assert np.isnan(load[2])
 
 
 def test_the_correlation_time_of_an_ar1_is_found_again():
@@ -49,8 +64,11 @@ def test_the_correlation_time_of_an_ar1_is_found_again():
     nominal = np.full(len(truth), 1400.0)
     names = ("a", "S", "walking", "total")
     time = np.arange(len(truth)) * step
-    error = trial_error(names, time, np.tile(nominal, (30, 1)), truth, nominal, 700.0)
+    error = trial_error(names, time, np.tile(nominal, (30, 1)), truth, nominal, nominal, 700.0)
     assert error.correlation_s == pytest.approx(tau, rel=0.1)
+    # variance of the variance of an AR(1): (1 + rho²)/(1 - rho²) of that of white noise
+    share = (1 - rho**2) / (1 + rho**2)
+    assert error.independent_frames == pytest.approx(6001 * share, rel=0.1)
 
 
 def test_the_band_of_inputs_and_discrepancy_covers_a_trial_that_it_was_not_fitted_on():
@@ -59,9 +77,9 @@ def test_the_band_of_inputs_and_discrepancy_covers_a_trial_that_it_was_not_fitte
         of_activity = rng.standard_normal()  # m and b of the module's docstring, S = 0.4
         biases = 0.4 * (of_activity + rng.standard_normal(9)) / np.sqrt(2)
         trials = [one_trial(rng, str(k), bias=bias, frames=10) for k, bias in enumerate(biases)]
-        found = fitted([error for error, _, _ in trials[1:]], "total", "walking")
-        _, samples, truth = trials[0]
-        shares.append(coverage(*band_with_discrepancy(samples, found, 700.0), truth)[1])
+        found = fitted([one[0] for one in trials[1:]], "total", "walking")
+        _, samples, truth, load = trials[0]
+        shares.append(coverage(*band_with_discrepancy(samples, found, load), truth)[1])
     assert 0.85 <= np.mean(shares) <= 0.95
 
 
@@ -77,8 +95,8 @@ def test_an_activity_s_own_bias_moves_its_band_and_another_s_does_not():
 def test_a_band_with_discrepancy_is_never_below_zero_and_empty_without_samples():
     samples = np.full((30, 2), 100.0)
     samples[:, 1] = np.nan
-    found = Discrepancy(0.0, 1.0, 4, 1, 3)
-    low, high = band_with_discrepancy(samples, found, 700.0)
+    found = Discrepancy(0.0, 1.0, 4.0, 1, 3)
+    low, high = band_with_discrepancy(samples, found, np.full(2, 700.0))
     assert low[0] == 0.0 and high[0] > 100.0 + 1.64 * 700.0  # Student's t is wider
     assert np.isnan([low[1], high[1]]).all()
 

@@ -79,15 +79,15 @@ def test_files_and_object_give_the_same_columns(scene, read, model):
         read = tkamb.read_scene(scene)
     knee, motion, _ = read
     results = tkamb.simulate(scene, frames=FRAMES)
-    guess = None
+    start = None
     for row, k in enumerate(range(*FRAMES.indices(len(motion)))):
         loads = knee.inverse_dynamics(*at(read, k))
         for name, value in columns(loads).items():
             assert value == pytest.approx(results[name][row], rel=1e-9, abs=1e-9), name
-        guess = knee.press(motion.q[k], loads.contact_force[1], guess)
+        pressed, start = knee.press_from(motion.q[k], loads.contact_force[1], start)
         tolerance = 1e-9 if model == "foundation" else 1e-6
         for side in ("medial", "lateral"):
-            condyle = getattr(guess, side)
+            condyle = getattr(pressed, side)
             force, peak = results[f"{side}_force_N"][row], results[f"{side}_peak_pressure_MPa"][row]
             assert condyle.force == pytest.approx(force, rel=tolerance)
             assert condyle.peak_pressure == pytest.approx(1e6 * peak, rel=tolerance)

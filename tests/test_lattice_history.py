@@ -13,6 +13,7 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import medial_points
+from tkamb.contact.warm_start import WarmStart
 from tkamb.geometry.frames import knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
@@ -38,9 +39,9 @@ def prepared(name):
 
 
 def too_deep(state, result, factor):
-    """Return a guess without a warm start, whose approach is too large by a factor."""
+    """Return an answer that is no start, whose approach is too large by a factor."""
     pose = state.pair.pose_at_approach(result.pose, factor * result.approach)
-    return replace(result, pose=pose, warm_start=None)
+    return replace(result, pose=pose)
 
 
 def columns(state, result):
@@ -72,10 +73,9 @@ def test_answers_do_not_depend_on_the_guess(name, frame):
     (model, state), (_, poses) = prepared(name), shipped()
     cold = model.press(state, LOADS[frame], poses[frame])
     wanted = columns(state, cold)
-    before = model.press(state, LOADS[frame - 1], poses[frame - 1])
-    far = model.press(state, LOADS[FAR], poses[FAR])
-    assert before.warm_start is not None
-    for guess in (before, far, replace(before, warm_start=None), too_deep(state, far, 3.0)):
+    before, start = model.press_from(state, LOADS[frame - 1], poses[frame - 1])
+    far, far_start = model.press_from(state, LOADS[FAR], poses[FAR])
+    for guess in (start, far_start, before, WarmStart.after(before), too_deep(state, far, 3.0)):
         found = columns(state, model.press(state, LOADS[frame], poses[frame], guess))
         for key, value in found.items():
             near = {"abs": 5e-6} if "centre" in key else {"rel": 5e-3, "abs": 2e-7}

@@ -32,13 +32,13 @@ def moved(pose, twist):
     return result
 
 
-def stiffness_by_differences(model, state, result):
+def stiffness_by_differences(model, state, result, start):
     """Return the central differences (6, 6) of the wrench on the insert."""
     found = np.zeros((6, 6))
     for column, step in enumerate([2e-6] * 3 + [1e-4] * 3):
         twist = step * np.eye(6)[column]
         ahead, behind = (
-            model.evaluate(state, moved(result.pose, sign * twist), result).wrench_on_insert
+            model.evaluate(state, moved(result.pose, sign * twist), start).wrench_on_insert
             for sign in (1, -1)
         )
         found[:, column] = (ahead - behind) / (2 * step)
@@ -52,14 +52,14 @@ def stiffness_by_differences(model, state, result):
 def test_the_stiffness_is_the_slope_of_the_wrench(name, load, within):
     """Hooke's law: the tangent. Yielding polyethylene: stiffer, by as much as it has softened."""
     model, state = prepared(name)
-    result = model.press(state, load, above(x=0.5e-3, y=0.03))
-    found = model.probe(state, result).at(result.pose)
+    result, start = model.press_from(state, load, above(x=0.5e-3, y=0.03))
+    found = model.probe(state, start).at(result.pose)
     assert found.tangent
     assert found.exact == (name == "lattice-linear")
     scale = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
     scale = np.outer(scale, scale)
     given = sum(condyle.stiffness for condyle in found.condyles.values()) / scale
-    wanted = stiffness_by_differences(model, state, result) / scale
+    wanted = stiffness_by_differences(model, state, result, start) / scale
     assert np.linalg.norm(given - wanted) < within * np.linalg.norm(wanted)
     assert given[1, 1] > 0.99 * wanted[1, 1]
 
@@ -69,9 +69,60 @@ def test_the_stiffness_is_the_slope_of_the_wrench(name, load, within):
 def test_a_light_contact_carries_the_same_after_a_heavy_one(name, depth):
     """The heavy one's yielding lifts every node off the femur of the light one, at first."""
     model, state = prepared(name)
-    heavy = model.press(state, 15_000.0, above(y=0.03))
+    heavy, start = model.press_from(state, 15_000.0, above(y=0.03))
     pose = state.pair.pose_at_approach(heavy.pose, depth * 2e-4)
-    cold, warm = model.evaluate(state, pose), model.evaluate(state, pose, heavy)
+    cold, warm = model.evaluate(state, pose), model.evaluate(state, pose, start)
     force = np.linalg.norm(cold.nodal_force, axis=1).sum()
     assert force > 5.0
     assert warm.nodal_force == pytest.approx(cold.nodal_force, abs=1e-3 * force)
+
+
+@pytest.fixture(scope="module")
+def usual():
+    """A model with the default tolerance, and two balls in a dish under 2.5 kN."""
+    model = contact_model("lattice", 1.5)
+    bodies = pair(condyles(), dished_insert(), material("polyethylene"))
+    state = model.prepare(bodies)
+    return model, state, model.press(state, 2500.0, above(y=0.03)).pose
+
+
+def residual(state, result, start):
+    """Return what is out of balance anywhere in the solid, relative to the contact forces."""
+    problem = state.problem
+    applied = np.zeros_like(problem.solid.nodes)
+    applied[problem.contact_nodes] = result.nodal_force
+    field = problem.operator.solve(applied + start.loads)
+    outside = (applied - problem.solid.internal_force(field)).ravel()[~problem.held]
+    return np.linalg.norm(outside) / np.linalg.norm(applied)
+
+
+def test_near_by_a_probe_measures_the_region_alone_and_the_rest_is_in_balance(usual, monkeypatch):
+    """Steps as of a search; farther away, or under more force, the whole solid is measured."""
+    model, state, pose = usual
+    measured, forces = [], type(state.problem.solid).forces
+    monkeypatch.setattr(
+        type(state.problem.solid), "forces", lambda *given: measured.append(1) or forces(*given)
+    )
+    probe = model.probe(state)
+    probe.at(pose)
+    for step in range(1, 6):
+        measured.clear()
+        there = moved(pose, np.array([2e-5 * step, 0.0, 0.0, 3e-4 * step, 0.0, 0.0]))
+        result, start = probe.evaluated(there)
+        assert not measured
+        assert residual(state, result, start) < 1.2 * model.settings.force_tolerance
+        whole = model.evaluate(state, there).nodal_force
+        assert np.linalg.norm(result.nodal_force - whole) < 2e-3 * np.linalg.norm(whole)
+    for twist in ([3e-3, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, -3e-5, 0.0, 0.0, 0.0, 0.0]):
+        probe = model.probe(state)
+        probe.at(pose)
+        measured.clear()
+        probe.at(moved(pose, np.array(twist)))
+        assert measured
+
+
+def test_beyond_the_bound_the_region_alone_would_not_do(usual):
+    model, state, pose = usual
+    _, start = model.evaluate_from(state, pose)
+    result, end = model.evaluate_from(state, moved(pose, np.array([3e-3, *[0.0] * 5])), start, True)
+    assert residual(state, result, end) > 2 * model.settings.force_tolerance

@@ -1,6 +1,9 @@
 """`tkamb live`: what it shows is what a run of the saved scene gives, whatever a hand does."""
 
+import gzip
 import json
+import shutil
+import struct
 import urllib.error
 import urllib.request
 from dataclasses import asdict, replace
@@ -9,15 +12,19 @@ import numpy as np
 import pytest
 
 import tkamb
+from knee_bodies import whole_body
 from mirrored_patient import write_mirrored_patient
-from scenes import MODEL
+from scenes import MODEL, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError, TkambError
 from tkamb.io.scene.case import load_case
 from tkamb.show.view.bench import BenchRequest, Placement
+from tkamb.show.view.knee_on_bench import bench_of_knee
 from tkamb.show.view.live import LiveKnee
 from tkamb.show.view.live_window import LiveWindow
 from tkamb.show.view.show import serve_in_background
+from tkamb.studies.designs.design import DESIGN_FILE, FEMORAL_MESH, INSERT_MESH, load_design
+from tkamb.studies.designs.solids import write_stl
 
 COARSE = {"contact": "foundation", "resolution_mm": 3.0}
 
@@ -54,6 +61,142 @@ def assert_saved_scene_gives_the_same(knee, request, folder):
 @pytest.mark.parametrize("name", ["pressed", "heavy", "placed", "released"])
 def test_a_saved_scene_runs_to_the_same_numbers(knee, name, tmp_path):
     assert_saved_scene_gives_the_same(knee, states(knee)[name], tmp_path / "kept")
+
+
+def test_the_load_stays_with_the_bone_when_the_insert_is_tilted(knee):
+    """On an insert with slope the part of the load along its own axis is the cosine."""
+    request = replace(states(knee)["pressed"], slack_percent=20.0, tibial=Placement(slope_deg=12.0))
+    expected = request.load_N * np.cos(np.radians(12.0))
+    assert knee.answer(request).numbers["force_si_N"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_load_stays_with_the_bone_when_the_components_are_moved(knee):
+    """Components moved laterally: the same load line lies medial of their middle."""
+    request = replace(states(knee)["pressed"], slack_percent=20.0, flexion_deg=20.0)
+    request = replace(request, released=("adduction",), axial_rotation_deg=0.0)
+    both = {"femoral": Placement(ml_mm=2.0), "tibial": Placement(ml_mm=2.0)}
+    before, after = (knee.answer(one).numbers for one in (request, replace(request, **both)))
+    total = request.load_N
+    apart = before["lateral_cop_ml_mm"] - before["medial_cop_ml_mm"]
+    moved = (after["medial_force_N"] - before["medial_force_N"]) / total * apart
+    assert moved == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_scene_of_another_make_is_saved_whole(tmp_path):
+    """A material of its own, a force at the ankle, a yield stress: the run has them all."""
+    changes = {
+        "contact__material": None,
+        "ground_reaction__applied": "ankle",
+        "material": {"base": "polyethylene", "young_modulus_MPa": 900.0, "name": "stiff PE"},
+        "output__yield_stress_MPa": 15.0,
+    }
+    scene = tkamb.load_scene(write_scene(tmp_path / "scene", **changes))
+    other = LiveKnee(load_case(scene))
+    request = replace(other.recorded(60), resolution_mm=3.0)
+    assert_saved_scene_gives_the_same(other, request, tmp_path / "kept")
+    saved = tkamb.load_scene(tmp_path / "kept" / "scene.toml")
+    assert saved.material == scene.material
+    assert saved.yield_stress_MPa == 15.0
+
+
+def test_a_scene_of_knee_coordinates_alone_carries_the_load(tmp_path):
+    drop = ("tibia", "ground_reaction", "patella", "quadriceps", "patellar_ligament")
+    bare = LiveKnee(load_case(tkamb.load_scene(write_scene(tmp_path / "scene", drop))))
+    request = replace(bare.recorded(60), **COARSE, slack_percent=20.0)
+    assert bare.answer(request).numbers["force_si_N"] == pytest.approx(request.load_N, rel=1e-9)
+    assert_saved_scene_gives_the_same(bare, request, tmp_path / "kept")
+
+
+def test_the_thickness_of_a_parametric_insert_changes_and_is_saved(tmp_path):
+    design = load_design(MODEL.parent / "designs" / "cr_flex")
+    design.write_meshes(tmp_path)
+    shutil.copy(MODEL.parent / "designs" / "cr_flex" / DESIGN_FILE, tmp_path)
+    meshes = {"femoral": FEMORAL_MESH, "insert": INSERT_MESH}
+    changes = {f"implant.{part}.mesh": str(tmp_path / name) for part, name in meshes.items()}
+    case = load_case(tkamb.load_scene(MODEL / "scene.toml", changes))
+    parametric = LiveKnee(case)
+    thin = replace(parametric.recorded(60), **COARSE)
+    thick = replace(thin, thickness_mm=thin.thickness_mm + 2.5)
+    before, after = parametric.answer(thin), parametric.answer(thick)
+    # the femur rises with the dishes, and the ligaments stretch
+    assert 1e3 * (after.pose[1, 3] - before.pose[1, 3]) == pytest.approx(2.5, abs=0.1)
+    strains = [name for name in before.numbers if name.endswith("strain_percent")]
+    assert all(after.numbers[name] > before.numbers[name] for name in strains)
+    assert_saved_scene_gives_the_same(parametric, thick, tmp_path / "kept")
+
+    write_stl(tmp_path / INSERT_MESH, *replace(design.insert, dish_half=22.5).mesh())
+    other = LiveKnee(load_case(case.scene))
+    assert other.design is None  # this mesh is not that of the design beside it
+    with pytest.raises(InputError, match="parametric"):
+        other.answer(replace(thick, thickness_mm=8.0))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """Return the shipped knee as an object, and the configuration of a frame."""
+    changes = {"contact.model": "foundation", "contact.resolution_mm": 3.0}
+    plain, motion, ground = tkamb.read_scene(tkamb.load_scene(MODEL / "scene.toml", changes))
+    return plain, (motion.q[60], motion.v[60], motion.a[60], ground[60])
+
+
+def test_a_knee_object_is_pressed_as_its_own_call_presses_it(plain, tmp_path):
+    own, state = plain
+    bench = bench_of_knee(own, state[0])
+    request = replace(bench.recorded(0), load_N=900.0)
+    slack, pressed = bench.answer(replace(request, slack_percent=20.0)), own.press(state[0], 900.0)
+    for side in ("medial", "lateral"):
+        condyle = getattr(pressed, side)
+        assert slack.numbers[f"{side}_force_N"] == pytest.approx(condyle.force, rel=1e-6)
+        peak = slack.numbers[f"{side}_peak_pressure_MPa"]
+        assert 1e6 * peak == pytest.approx(condyle.peak_pressure, rel=1e-6)
+    assert_saved_scene_gives_the_same(bench, request, tmp_path / "kept")
+
+
+def test_a_left_knee_object_is_the_mirror_image(plain, tmp_path):
+    own, state = plain
+    body = whole_body(own, True, False)
+    left = bench_of_knee(body.knee, body.state(*state)[0])
+    right = bench_of_knee(own, state[0])
+    request = replace(right.recorded(0), load_N=900.0, tibial=Placement(ml_mm=1.0))
+    places = left.recorded(0).coordinates(), right.recorded(0).coordinates()
+    assert places[0] == pytest.approx(places[1], abs=1e-9)
+    there, here = right.answer(request).numbers, left.answer(request).numbers
+    assert here == pytest.approx(there, rel=1e-5, abs=1e-5)
+    assert left.case.scene.patient.side == "left"
+    assert_saved_scene_gives_the_same(left, request, tmp_path / "kept")
+
+
+def test_a_knee_object_needs_a_contact_model_with_a_name(plain):
+    own, state = plain
+    bare = tkamb.Knee(own.model)
+    with pytest.raises(InputError, match="contact"):
+        bare.live(state[0])
+
+    class Nameless(type(own.contact.model)):
+        pass
+
+    nameless = tkamb.Knee(own.model, implant=own.implant, contact=Nameless(resolution=3e-3))
+    with pytest.raises(InputError, match="Nameless"):
+        nameless.live(state[0])
+
+
+def test_what_is_kept_was_computed_from_rest(knee, tmp_path):
+    """A lattice's answer depends on the state before, within its tolerance; a run's does not."""
+    window = LiveWindow(knee, tmp_path, 60)
+    request = replace(knee.recorded(60), contact="lattice", resolution_mm=4.0)
+    for flexion in (50.0, 58.0, 60.0):
+        knee.answer(replace(request, flexion_deg=flexion))
+    kept = words(window.question("save", asdict(request)))
+    results = tkamb.simulate(kept["saved"], frames=slice(0, 1))
+    for name in ("force_si_N", "medial_force_N", "medial_peak_pressure_MPa", "approach_mm"):
+        assert results[name][0] == pytest.approx(kept["numbers"][name], rel=1e-9)
+
+
+def words(packed):
+    """Return what a packed answer says beside its map."""
+    content = gzip.decompress(packed)
+    (size,) = struct.unpack("<I", content[:4])
+    return json.loads(json.loads(content[4 : 4 + size])["words"])
 
 
 def test_a_left_knee_is_saved_as_a_left_one(tmp_path):
@@ -125,6 +268,10 @@ def test_no_hand_breaks_it(knee):
         {"released": ["flexion"]},
         {"flexion_deg": True},
         {"resolution_mm": 0.001},
+        {"load_N": 10**400},
+        {"femoral": {"slope_deg": -(10**400)}},
+        {"released": [["ap"]]},
+        {"released": [{}, "ap"]},
     ],
 )
 def test_a_page_cannot_ask_for_nonsense(values):
@@ -145,13 +292,20 @@ def test_the_window_answers_its_own_page_only(knee, tmp_path):
         with urllib.request.urlopen(
             urllib.request.Request(server.url + "save", question), timeout=60
         ) as saved:
-            assert (tmp_path / "kept-1" / "scene.toml").samefile(saved.read().decode())
+            assert (tmp_path / "kept-1" / "scene.toml").samefile(words(saved.read())["saved"])
     finally:
         server.close()
 
 
-def test_a_scene_without_contact_is_refused(tmp_path, capfd):
-    from scenes import write_scene
+def test_what_nobody_foresaw_of_a_preparation_is_said_to_the_page(knee, monkeypatch, tmp_path):
+    """The thread ended with a traceback, and the page waited for ever."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(knee, "_side", lambda request: 1 / 0)
+    request = replace(states(knee)["pressed"], resolution_mm=7.0)
+    with pytest.raises(TkambError, match="not foreseen: ZeroDivisionError"):
+        list(iter(lambda: knee.preparing(request), ""))
 
+
+def test_a_scene_without_contact_is_refused(tmp_path, capfd):
     assert main(["live", str(write_scene(tmp_path, ("contact",)))]) == 2
     assert "[contact]" in capfd.readouterr().err

@@ -10,9 +10,10 @@ from tkamb.cli import main
 from tkamb.commands.uncertainty import headline
 from tkamb.studies.uncertainty.bands import influences
 from tkamb.studies.uncertainty.indices import sobol_indices
+from tkamb.studies.uncertainty.inputs import VariedInput
 from tkamb.studies.uncertainty.run import estimate_uncertainty
 from tkamb.studies.uncertainty.sampling import crossed_points, noise, noise_of_point, normal_samples
-from tkamb.studies.uncertainty.screening import screen, screen_lines
+from tkamb.studies.uncertainty.screening import Screened, screen, screen_lines
 
 A, B = 7.0, 0.1
 
@@ -150,6 +151,21 @@ def test_screening_is_the_central_difference_and_says_what_moves_most():
     assert rows[0].slope == pytest.approx(rows[0].plus, rel=0.15)
     lines = screen_lines(rows)
     assert "force_total_BW" in lines[0] and "#|#" in lines[1]
+
+
+def test_a_screening_counts_the_inputs_that_move_nothing_and_never_one_that_fails():
+    def row(name, minus, plus):
+        return Screened("force_total_BW", 2.0, 40.0, VariedInput(name, 1.0, "mm"), minus, plus)
+
+    failing, moving = row("a", float("nan"), 1e-9), row("a.much.longer.name", -0.5, 0.4)
+    small, none = row("c", 1e-13, -0.001), row("d", 0.0, 0.0)
+    lines = screen_lines([failing, moving, small, none])
+    assert [line.split()[0] for line in lines[1:3]] == ["a", "a.much.longer.name"]
+    assert lines[1].index("failed") + len("failed") == lines[2].index("-0.5") + len("-0.5")
+    assert lines[3].split()[:3] == ["2", "more", "inputs:"]
+    assert lines[4].startswith("failed: ")
+    only = screen_lines([none])
+    assert only[1].split()[:3] == ["1", "more", "inputs:"]
 
 
 @pytest.mark.parametrize("option", [["--out", "x"], ["--indices"], ["--resume"]])

@@ -70,6 +70,15 @@ def test_the_90_percent_band_covers_the_truth_in_85_to_95_percent_of_trials():
     assert 0.85 <= covered / 200 <= 0.95
 
 
+@pytest.mark.parametrize("count", [20, 40, 200])
+def test_a_value_drawn_like_the_samples_is_within_the_band_however_few_they_are(count):
+    drawn = np.random.default_rng(count).standard_normal((count + 1, 4000))
+    band = percentiles(drawn[1:])
+    inside = (band["p05"] <= drawn[0]) & (drawn[0] <= band["p95"])
+    error = np.sqrt(0.9 * 0.1 / inside.size)  # linear between the samples' ends: 0.81 of 20
+    assert inside.mean() == pytest.approx(0.90, abs=3 * error)
+
+
 def test_shares_of_a_linear_map_are_its_squared_slopes_and_noise_is_the_rest():
     rng = np.random.default_rng(1)
     x = normal_samples("lhs", 2048, len(SLOPES), seed=1)

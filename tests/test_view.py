@@ -188,9 +188,17 @@ def test_the_server_listens_on_loopback_only(server):
 
 
 @pytest.mark.parametrize(
-    "headers", [{"Host": "knee.example"}, {"Origin": "http://knee.example"}, {"Origin": "null"}]
+    "headers",
+    [
+        {"Host": "knee.example"},
+        {"Origin": "http://knee.example"},
+        {"Origin": "null"},
+        {"Origin": "HOST"},
+    ],
 )
 def test_other_hosts_and_sites_are_refused(server, headers):
+    host = server.url.split("/")[2]
+    headers = {name: value.replace("HOST", host) for name, value in headers.items()}
     assert ask(server, "GET", "/scene.bin", **headers)[0] == 403
     body = json.dumps({"frame": 0, "model": "hertz"})
     assert ask(server, "POST", "/contact", body, **headers)[0] == 403
@@ -222,6 +230,30 @@ def test_no_other_page_may_frame_the_window(server, path):
     assert headers["Referrer-Policy"] == "no-referrer"
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "GET {} ",
+        "GET {}",
+        "x",
+        "GET {} HTTP/9",
+        "POST {}contact",
+        "TRACE {} HTTP/1.1",
+        "GET {} x x",
+    ],
+)
+def test_what_the_library_refuses_has_the_headers_of_all_answers(server, line):
+    """Without a version the answer was bare content, as HTTP/0.9 has it."""
+    where, own, _ = server.url.removeprefix("http://").split("/")
+    host, port = where.split(":")
+    with socket.create_connection((host, int(port)), timeout=60) as client:
+        client.sendall(f"{line.format(f'/{own}/')}\r\nHost: {where}\r\n\r\n".encode())
+        told = b"".join(iter(lambda: client.recv(4096), b""))
+    head, _, body = told.partition(b"\r\n\r\n")
+    assert head.startswith((b"HTTP/1.0 4", b"HTTP/1.0 5")) and b"nosniff" in head
+    assert b"<" not in body and b"\n" not in body
+
+
 def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
     handler = server._server.RequestHandlerClass
     monkeypatch.setattr(handler, "timeout", 0.2)
@@ -251,6 +283,7 @@ def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
         (b'{"frame": 1' + b"0" * 5000 + b', "model": "hertz"}', "limit"),
         (b'{"frame": 999, "model": "hertz"}', "999"),
         (b'{"frame": 0, "model": "none such"}', "none such"),
+        (b'{"frame": 0, "model": "\\ud800"}', "ud800"),
     ],
 )
 def test_a_bad_question_gets_one_line(server, body, word):

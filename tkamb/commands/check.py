@@ -23,10 +23,10 @@ POLICY = (
 
 def add_check(commands: Any) -> None:
     """Add `check` to the command line."""
-    check = commands.add_parser("check", help="read a scene's files and look at them; no run")
+    check = commands.add_parser("check", help="read and check a scene's files, without a run")
     check.add_argument("scene", type=Path, help="scene.toml")
     check.add_argument(
-        "--out", type=Path, metavar="F", help="the leg at three frames: .png, or .html with it all"
+        "--out", type=Path, metavar="F", help="picture of the leg: .png, or .html with all findings"
     )
     add_set(check)
     add_force(check)
@@ -54,20 +54,20 @@ def _check(options: argparse.Namespace) -> int:
     return 0
 
 
-def _write_picture(found: "SceneCheck", path: Path) -> None:
+def _write_picture(check: "SceneCheck", path: Path) -> None:
     from tkamb.atomic import replaced_file, write_text
     from tkamb.show.check.leg_picture import draw_leg
 
-    figure = draw_leg(found.mechanics)
+    figure = draw_leg(check.mechanics)
     if path.suffix.lower() == ".html":
-        write_text(path, check_html(found, figure))
+        write_text(path, check_html(check, figure))
         return
     with replaced_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130)
 
 
-def check_html(found: "SceneCheck", figure: "Figure") -> str:
-    """Return the page: questions first, then the picture, then what each file gave."""
+def check_html(check: "SceneCheck", figure: "Figure") -> str:
+    """Return the page: questions first, then the picture, then the content of each file."""
     from tkamb.show.pages import asset, policy_sources, render
     from tkamb.show.style import svg_text
 
@@ -77,7 +77,7 @@ def check_html(found: "SceneCheck", figure: "Figure") -> str:
         "check.html",
         policy=POLICY.format(style=policy_sources(style)),
         style=style,
-        title=f"Check of {found.scene.resolve().parent.name}/{found.scene.name}",
-        found=found,
+        title=f"Check of {check.scene.resolve().parent.name}/{check.scene.name}",
+        found=check,
         picture=svg_text(figure, "leg"),
     )

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -62,25 +61,27 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.row import as_json, with_fronts
 
-    wanted = study.jobs(options.quick, options.scene, options.full)
-    cases = study.cases_of(wanted)
-    kept = KeptRows(directory, options.resume)
-    references = study.references_for(cases, options.recompute, _announce, kept)
+    jobs = study.jobs(options.quick, options.scene, options.full)
+    cases = study.cases_of(jobs)
+    kept_rows = KeptRows(directory, options.resume)
+    references = study.references_for(cases, options.recompute, say, kept_rows)
     rows, whole = gather(
-        study.run_tradeoff(wanted, references, kept), study.expected_seconds(wanted, cases)
+        study.run_tradeoff(jobs, references, kept_rows), study.expected_seconds(jobs, cases)
     )
     result = len(rows)
     if whole and options.peer:
-        sizes = {job.resolution_mm for job in wanted if job.label == DEFAULT}
-        more, whole = gather(study.run_peer(cases, references, kept, sizes), [1.0] * len(cases))
+        sizes = {job.resolution_mm for job in jobs if job.label == DEFAULT}
+        more, whole = gather(
+            study.run_peer(cases, references, kept_rows, sizes), [1.0] * len(cases)
+        )
         rows += more
     body: list[BodyRow] = []
     planned = 0
     if whole and not options.quick:
         planned = len(CHANGES)
-        body, whole = gather(run_body_trade(kept), [1.0] * planned)
+        body, whole = gather(run_body_trade(kept_rows), [1.0] * planned)
     rows = with_fronts(rows)
-    lines = [*unfinished(result + len(body), len(wanted) + planned), *table(rows, references)]
+    lines = [*unfinished(result + len(body), len(jobs) + planned), *table(rows, references)]
     lines += ["", *comparison(rows), "", *recommendations(rows)]
     if body:
         lines += ["", *body_table(body)]
@@ -122,17 +123,19 @@ def _stability(options: argparse.Namespace) -> int:
 
 
 def _study_stability(options: argparse.Namespace, directory: Path) -> int:
+    from tkamb.run.workers import PoolOptions
     from tkamb.show.stability_picture import picture
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.stability import table
 
+    workers = PoolOptions(options.workers).workers
     cases = study.stability_cases(options.quick)
-    kept = KeptRows(directory, options.resume)
-    judged = study.run_stability(cases, kept=kept, workers=max(1, options.workers))
+    rows = KeptRows(directory, options.resume)
+    judged = study.run_stability(cases, kept=rows, workers=workers)
     verdicts, whole = gather(judged, [1.0] * len(cases))
     if not whole:
-        verdicts = study.kept_verdicts(cases, kept)
+        verdicts = study.kept_verdicts(cases, rows)
     text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
     lines = [*unfinished(len(verdicts), len(cases)), *table(verdicts)]
     _write(directory, "stability", text, lines, picture(verdicts) if verdicts else None)
@@ -177,7 +180,7 @@ def unfinished(count: int, total: int) -> list[str]:
 
 
 def _goes_on(directory: Path) -> str:
-    return f"what was finished is in {directory}; --resume goes on from there"
+    return f"finished rows are in {directory}; --resume continues from there"
 
 
 def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
@@ -189,7 +192,3 @@ def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any)
     if figure is not None:
         with replaced_file(directory / f"{name}.png") as temporary:
             figure.savefig(temporary, format="png", dpi=150)
-
-
-def _announce(line: str) -> None:
-    print(f"tkamb: {line}", file=sys.stderr, flush=True)

@@ -1,7 +1,6 @@
 """`tkamb uncertainty`: arguments in, exit status out."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +14,13 @@ SHOWN = 5
 """Inputs of the tornado table that are printed."""
 QUICK_CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 QUICK_FRAMES = 11
-"""What a screening takes where nothing else is asked for."""
+"""Frames of a screening without --frames."""
 LEAST_SHOWN = 0.01
-"""Share of a result's variance."""
+"""Smallest share of a result's variance that is printed."""
 TERMS = 2
 """Of each input in the regression, its value and its square: each explains 1/n by chance."""
 NOTABLE_FAILED = 0.05
-"""Share of samples: where more fail, the bands leave out a whole tail."""
+"""Share of failed samples above which the bands are cut off at one end."""
 
 
 def add_uncertainty(commands: Any) -> None:
@@ -70,7 +69,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
     for line in warnings_of(result):
-        print(f"tkamb: {line}", file=sys.stderr)
+        say(line)
     print("\n".join([*headline(result), f"bands: {directory / 'bands.csv'}"]))
     if all(one.failed.all() for one in result.samples):
         say("every frame of every sample failed")
@@ -105,62 +104,68 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     )
     from tkamb.studies.uncertainty.inputs import held_inputs
 
-    if held := held_inputs(load_case(scene)):
-        text.append(f"not varied: {', '.join(held)}")
+    if constants := held_inputs(load_case(scene)):
+        text.append(f"not varied: {', '.join(constants)}")
     text.append("one input at a time by one standard deviation: minus, plus; no interactions")
     text.append(
-        "an offset either way may raise a force: it climbs one flank of the insert or other"
+        "an offset in either direction may raise a force, because the femur climbs a flank of the "
+        "insert"
     )
     print("\n".join([*screen_lines(rows), *(f"({line})" for line in text)]))
-    return 0 if rows else 1
+    if not rows:
+        say("no sample could be computed")
+        return 1
+    return 0
 
 
-def headline(found: "Uncertainty") -> list[str]:
-    """Return the peak's band and what moves it most, in lines of text."""
+def headline(uncertainty: "Uncertainty") -> list[str]:
+    """Return the peak's band and the inputs with the largest influence, in lines of text."""
     from numpy import isfinite, nanargmax
 
-    from tkamb.show.headline import peak_legend, peak_words, peaks_of
+    from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
 
-    total = found.results["force_total_BW"]
+    total = uncertainty.results["force_total_BW"]
     if not isfinite(total).any():
         return ["no frame of the nominal run has a force"]
     peak = int(nanargmax(total))
-    flexion = found.results["flexion_deg"][peak]
-    of_samples = found.results.summary["uncertainty"]["peak_force_total_BW"]
+    flexion = uncertainty.results["flexion_deg"][peak]
+    of_samples = uncertainty.results.summary["uncertainty"]["peak_force_total_BW"]
     words = of_samples["words"]
     if of_samples["median"] is None:
-        why = found.results.why_no_band(peak)
-        value = f"{total[peak]:.2f} BW as the inputs stand, no median or band: {why}"
+        why = uncertainty.results.why_no_band(peak)
+        value = f"{total[peak]:.2f} BW with the inputs as given, no median or band: {why}"
     else:
         value = (
             f"median {of_samples['median']:.2f} BW, 5 to 95 %: {of_samples['p05']:.2f} to "
             f"{of_samples['p95']:.2f}"
         )
-    peaks = peaks_of(found.results.summary)
+    peaks = peaks_of(uncertainty.results.summary)
     lines = [f"peak {name} force: {peak_words(one)} BW" for name, one in peaks.items()]
     lines += [f"({peak_legend(peaks)})"] if peaks else []
     lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
-    of_chance = TERMS / found.results.summary["uncertainty"]["samples"]
+    limits = muscle_limits(uncertainty.results)
+    lines += [limits.line()] if limits is not None else []
+    of_chance = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
     chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):
-        rows = [row for row in found.tornado if row.result == result][:SHOWN]
+        rows = [row for row in uncertainty.tornado if row.result == result][:SHOWN]
         parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= LEAST_SHOWN)
         if parts:
             lines.append(f"{result} varies by {parts} (shares of variance, by regression{chance})")
-    for name, one in found.results.summary["uncertainty"].get("measured_inside", {}).items():
+    for name, one in uncertainty.results.summary["uncertainty"].get("measured_inside", {}).items():
         more = one.get("share_with_discrepancy")
         lines.append(
             f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
             f"{one['frames']} frames"
             + ("" if more is None else f", with the discrepancy in {more:.0%}")
         )
-    if words := (found.results.summary.get("discrepancy") or {}).get("words"):
+    if words := (uncertainty.results.summary.get("discrepancy") or {}).get("words"):
         lines.append(words)
     for result in ("force_total_N", "medial_force_N"):
         parts = ", ".join(
             f"{one.name} {_with_error(one.first, one.first_error)} alone, "
             f"{_with_error(one.total, one.total_error)} in all"
-            for one in [row for row in found.indices if row.result == result][:SHOWN]
+            for one in [row for row in uncertainty.indices if row.result == result][:SHOWN]
         )
         if parts:
             lines.append(f"{result}, Sobol' indices and standard errors: {parts}")
@@ -171,13 +176,13 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.2f} ± {error:.2f}".replace("-", "−")
 
 
-def warnings_of(found: "Uncertainty") -> list[str]:
-    """Return what the bands leave out."""
-    lines, summary = [], found.results.summary["uncertainty"]
+def warnings_of(uncertainty: "Uncertainty") -> list[str]:
+    """Return the limits of the bands, in lines of text."""
+    lines, summary = [], uncertainty.results.summary["uncertainty"]
     if summary["not_varied"]:
         names = ", ".join(summary["not_varied"])
         lines.append(f"not varied, so the bands are too narrow for them: {names}")
-    share = found.bands["failed_share"]
+    share = uncertainty.bands["failed_share"]
     if (share > NOTABLE_FAILED).any():
         causes = summary["causes_of_failure"].items()
         why = ", ".join(f"{text} ({part:.0%} of the failures)" for text, part in causes)
@@ -186,6 +191,6 @@ def warnings_of(found: "Uncertainty") -> list[str]:
             f"{NOTABLE_FAILED:.0%} of the samples failed (at most {share.max():.0%}), most often: "
             f"{why}; their bands hold for the poses that are possible, see failed_share"
         )
-    if not found.tornado:
+    if not uncertainty.tornado:
         lines.append("too few samples for tornado.csv: give 6 per input or more")
     return lines

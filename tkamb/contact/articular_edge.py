@@ -1,8 +1,8 @@
 """How near contact comes to the edge of the insert's articular surface.
 
-At the edge an insert has no neighbour that helps to carry, a real one is rounded more finely than
-any map resolves, and it wears and chips there. A peak pressure at the edge is a place and not a
-number, so that contact there is flagged.
+A peak pressure at the edge is not reliable: a real edge is rounded more finely than any map
+resolves, and it wears and chips. Contact there is flagged, so that a reader knows where the peak
+lies and does not rely on its value.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,17 +24,20 @@ class EdgeSettings:
     """When contact is at the edge of an insert."""
 
     spacing: float = 0.5 * MILLIMETRE
-    """m, of the vertical rays that find the edge; the distance is known to half of it."""
+    """m: spacing of the vertical rays that find the edge. Chosen: the distance from the edge is
+    known to half of it."""
     steepest: float = 50.0 * DEGREE
-    """rad, from the horizontal: what is steeper beside the outline is its rim."""
+    """rad from the horizontal: a steeper surface beside the outline belongs to the rim. Chosen: it
+    is 50 deg, steeper than any part of a dish that carries."""
     rim: float = 4.0 * MILLIMETRE
-    """m, the rim is at most so wide. What is steep farther inside is a flank of the eminence or of
-    a post."""
+    """m: largest width of the rim. Chosen: a steep surface farther inside is a flank of the
+    eminence or of a post."""
     reach: float = 2.5 * MILLIMETRE
-    """m, contact nearer to the edge is flagged: the radius of a usual insert's rounded rim (1 to
-    2 mm) and half a map's spacing."""
+    """m: contact that is nearer to the edge is flagged. Chosen: the radius of a usual insert's
+    rounded rim (1 to 2 mm) plus half the spacing of a map."""
     share: float = 0.05
-    """Of the peak pressure, from which a point counts as loaded."""
+    """1: share of the peak pressure from which a point counts as loaded. Chosen: a smaller pressure
+    does no harm."""
 
 
 EDGE = EdgeSettings()

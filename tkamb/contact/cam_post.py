@@ -1,8 +1,8 @@
 """Cam and post as a contact pair of its own: the same contact model, in a turned frame.
 
-The contract presses a femoral component along -y into an insert whose flat bottom lies in
-y = 0. A post that is met from behind answers it when it is turned: with the insert's axes x
-anterior, y superior, z to the right, the turned ones are
+Contact models press a femoral component along -y into an insert whose flat bottom lies in
+y = 0. A cam meets the post from behind. The post is therefore turned until its posterior face
+looks up. With the insert's axes x anterior, y superior, z to the right, the turned axes are
 
     x' = y,    y' = x_f - x,    z' = z,
 
@@ -45,15 +45,15 @@ class CamPostSettings:
     ray_start_height: float = 1e-3
     """m: height above the post at which rays down begin. Chosen well above the noise of a mesh."""
     search_margin: float = 3 * MILLIMETRE
-    """m: how far beside the post the cam is still taken, because the femur's medial-lateral
-    position moves it. """
+    """m: the part of the component within this distance beside the post counts as cam. Chosen: the
+    femur moves from side to side."""
 
 
 CAM_POST = CamPostSettings()
 
 TICKS, ZOOMS = 41, 3
-"""Rays along either edge of the grid on which the clearance is looked for, and how often it is made
-twenty times finer: 16 mm are known to less than a micrometre."""
+"""Rays along each edge of the grid on which the clearance is searched, and how often the grid is
+made twenty times finer. Over 16 mm the place is then known to less than a micrometre."""
 NO_LINE_CONTACT = ("hertz",)
 """Models that know no contact along a line."""
 
@@ -68,8 +68,8 @@ class PostPair(ContactPair):
     def clearance(self, pose: Array) -> float:
         """Return the least distance (m) along y' between cam and post; NaN beside each other.
 
-        Rays along y' on a grid over the post, then twice on a finer one about the least: parts
-        are drawn with triangles as long as they are wide, and line up in lines.
+        Rays along y' on a grid over the post find the smallest distance; two finer grids around
+        it follow. Nearest vertices would not do: long triangles meet along lines.
 
         Args:
             pose: (4, 4) pose_femoral_in_turned.
@@ -92,7 +92,7 @@ class PostPair(ContactPair):
         return least
 
     def _apart(self, points: Array, pose: Array) -> Array:
-        """Return the distance (n,) along y' at places (n, 3); NaN where either is not there."""
+        """Return the distance (n,) along y' at places (n, 3); NaN where a ray misses one part."""
         far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
         below = points + (pose[1, 3] - 2 * far) * UP
         up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
@@ -104,7 +104,7 @@ class PostPair(ContactPair):
 
 @dataclass(frozen=True, eq=False)
 class PostContact:
-    """Cam and post at one pose, insert frame; nothing carried: zero force, no place.
+    """Cam and post at one pose, insert frame. Without contact the force is zero.
 
     Args:
         load: on the insert, normal forces alone; None where nothing is carried.
@@ -213,11 +213,11 @@ class CamPost:
         return pair.clearance(self.in_turned @ pose)
 
     def probe(self) -> "PostProbe":
-        """Return what a search for equilibrium asks: wrench and stiffness, insert frame."""
+        """Return a probe for equilibrium searches: wrench and stiffness, insert frame."""
         return PostProbe(self, self.model.probe(self.state))
 
     def probe_with(self, condyles: Any) -> Any:
-        """Return the same, together with a probe of the condyles."""
+        """Return a probe of the condyles and the post together."""
         return CondylesAndPost(condyles, self.probe())
 
     def seen(self, contact: ProbedContact) -> ProbedContact:
@@ -237,7 +237,7 @@ class CamPost:
         loaded = transform(inverse(self.in_turned), result.points[result.pressure > 0])
         words = [flag.replace("medial", "post") for flag in result.flags]
         if loaded[:, 1].min() < self._foot + self.model.resolution:
-            words.append("cam meets the foot of the post: what lies below it is not seen")
+            words.append("cam meets the foot of the post: contact below the foot is not modelled")
         return tuple(words)
 
 

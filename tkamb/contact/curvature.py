@@ -16,15 +16,15 @@ class CurvatureSettings:
     """Rays per side of the square patch. Chosen: a quadric has six coefficients, 441 rays
     average out the mesh."""
     max_iterations: int = 12
-    """Iterations that find the contact point at most."""
+    """Iterations that find the contact point at most. Chosen: contacts of knees need fewer."""
     position_tolerance: float = 1e-7
-    """m: the contact point has converged when an iteration moves it by less. Far below the
+    """m: the contact point has converged when an iteration moves it by less. Chosen: far below the
     size of a triangle."""
     max_distance: float = 3.0
     """Patch radii: farthest distance of the contact point from where the meshes touch first.
-    Farther away the two surfaces are not described by the patch."""
+    Chosen: farther away the two surfaces are not described by the patch."""
     least_cover: float = 0.6
-    """Share of a patch, 1: part that both meshes must cover. With less the quadric is an
+    """Share of a patch, 1: part that both meshes must cover. Chosen: with less the quadric is an
     extrapolation."""
 
 
@@ -61,9 +61,9 @@ def osculate(
     """Fit both surfaces about a contact point and move it to where the quadrics are nearest.
 
     On a disc of `radius` in the tangent plane both meshes are sampled by rays along the
-    normal (uniformly, whatever their triangles), z = c0 + c1 u + c2 v + c3 u² + c4 uv +
-    c5 v² is fitted to each by least squares, and the disc is centred anew at the minimum of
-    the difference, with the mean normal there, until it stays. Facets smaller than the disc
+    normal, evenly spaced. z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each by
+    least squares. The disc is then moved to the minimum of the difference, with the mean normal
+    there, until it no longer moves. Facets smaller than the disc
     average out; on a sphere of radius R curvature comes out too large by radius²/(4 R²),
     relative (the quartic term).
 

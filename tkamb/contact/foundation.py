@@ -19,6 +19,7 @@ from tkamb.contact.samples import (
     gaps_along_normals,
     gaps_and_facets,
 )
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse, rotate, transform
 
@@ -30,28 +31,29 @@ class FoundationSettings:
     """The elastic foundation (bed of springs)."""
 
     least_thickness: float = 1e-6
-    """m: a layer thinner than this, at the insert's rim, counts as this thick. It keeps
+    """m: a layer thinner than this, at the insert's rim, counts as this thick. Chosen: it keeps
     pressure = modulus * penetration / thickness finite."""
     approach_step: float = 1e-9
-    """m: distance of two approaches between which a reaction is taken as constant. With a
+    """m: distance of two approaches between which a reaction is taken as constant. Chosen: with a
     stiffness of some 1e8 N/m it changes by 0.1 N."""
     reached_share: float = 0.99
-    """1: a reaction below this share of the load, less `reached_force`, does not reach the
-    load within `approach_step`."""
+    """1: a reaction below this share of the load, less `reached_force`, does not reach the load
+    within `approach_step`. Chosen: a jump of the reaction, as map points come into contact, is
+    smaller."""
     reached_force: float = 1.0
-    """N: see `reached_share`; ten times what `approach_step` changes."""
+    """N: see `reached_share`. Chosen: ten times what `approach_step` changes."""
 
 
 FOUNDATION = FoundationSettings()
 
 TOO_DEEP = "the penetration exceeds half the insert's thickness"
 OVER_THE_EDGE = (
-    "the femoral component reaches over the insert's edge, deeper than half of what is there"
+    "the femoral component reaches over the insert's edge, deeper than half of its thickness there"
 )
 WIDEST_EDGE = NEAR
-"""m: no gap is taken to change by more across a column."""
+"""m: largest change of the gap across a column that is counted."""
 SUMS = 46
-"""Numbers that the columns of one condyle add up to."""
+"""Count of the sums over the columns of one condyle; see `_add_up`."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,9 @@ class ElasticFoundation(ContactModel):
     Blankevoort's law p = -M ln(1 - d/h).
 
     Limits: neighbours do not help to carry, so that pressure ends at the edge of the
-    overlap and peaks at rims are too high; d >= h/2 is OUT_OF_RANGE, and so is half of what
-    an edge has along the normal. Walls parallel to y carry nothing. A mobile bearing is
-    pressed like a fixed one.
+    overlap and peaks at rims are too high. A penetration of half the thickness or more, along y
+    or along the normal, is OUT_OF_RANGE. Walls parallel to y carry nothing. A mobile bearing
+    is pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -103,7 +105,7 @@ class ElasticFoundation(ContactModel):
     law: Law = "nonlinear"
 
     def evaluate(
-        self, state: SampledContact, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():
@@ -122,7 +124,7 @@ class ElasticFoundation(ContactModel):
         return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=tuple(flags))
 
     def press(
-        self, state: SampledContact, load: float, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, load: float, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
         """Find the approach that carries `load` (N); see `ContactModel`.
 
@@ -139,11 +141,11 @@ class ElasticFoundation(ContactModel):
         return press_by_search(self, state, load, pose, guess)
 
     def _holds(self, nearby: "_NearColumns", load: float) -> bool:
-        """Say whether the whole bed is out of range where the near columns are.
+        """Say whether the whole bed, too, goes out of range before it carries the load.
 
-        Their reaction is a part of the whole bed's, so that this is out of range too where they
-        are; and it carries less than the load up to there if it does just before, since it rises
-        with the approach. One evaluation there thus says what a search over the bed would.
+        The near columns are a part of the bed. Where they are out of range the bed is, too. The
+        reaction rises with the approach: if the bed carries less than the load just before that
+        place, it carries less everywhere before. One evaluation there replaces a search.
         """
         if nearby.beyond - nearby.within > FOUNDATION.approach_step:
             return False
@@ -155,7 +157,7 @@ class ElasticFoundation(ContactModel):
             and reaction < FOUNDATION.reached_share * load - FOUNDATION.reached_force
         )
 
-    def probe(self, state: SampledContact, guess: ContactResult | None = None) -> Any:
+    def probe(self, state: SampledContact, guess: Guess | None = None) -> Any:
         """Return the probe with near columns and exact stiffness; see `ContactModel`."""
         return FoundationProbe(self.law, state)
 
@@ -171,16 +173,14 @@ class LinearFoundation(ElasticFoundation):
 
 
 class _NearColumns:
-    """The reaction of the columns that lie near the femoral component, by less than `NEAR`.
+    """The reaction of the columns whose gap to the femoral component is less than `NEAR`.
 
     Attributes:
-        within: m, the greatest approach so far that is in their range; -inf: none.
-        beyond: m, the smallest that is not; inf: none.
+        within: m, the greatest approach so far that is in range; -inf: none.
+        beyond: m, the smallest approach so far that is out of range; inf: none.
     """
 
-    def __init__(
-        self, law: Law, state: SampledContact, pose: Array, guess: ContactResult | None
-    ) -> None:
+    def __init__(self, law: Law, state: SampledContact, pose: Array, guess: Guess | None) -> None:
         self._law, self.state, self.pose = law, state, pose
         self._reach, self._near, self._around = -np.inf, state.surface, Neighbourhood(state)
         if guess is not None and guess.points is state.points and not np.isnan(guess.gap).any():
@@ -200,8 +200,8 @@ class _NearColumns:
         if approach > self._reach:
             samples, (gap, _, _) = self._around.at(pose)
             close = gap < NEAR
-            # The columns near by serve until the femur has come down by half of what they were
-            # chosen with; the other half is the margin for oblique gaps.
+            # The near columns serve until the femur has come down by half of the distance with
+            # which they were chosen; the other half is the margin for oblique gaps.
             self._near, self._reach, gap = samples.part(close), approach + NEAR / 2, gap[close]
         else:
             gap = gaps_along_normals(self._near, pair.femoral, pose)
@@ -243,7 +243,7 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
 
 
 class FoundationProbe:
-    """The columns near by, and their tangent; see `tkamb.contact.probe.Probe`.
+    """Forces and tangent stiffness of the near columns; see `tkamb.contact.probe.Probe`.
 
     A femoral displacement u at the point that a column meets, with femoral normal m there,
     changes the gap along the insert's normal n by (m . u)/(m . n). With p'(d) the slope of the
@@ -273,8 +273,8 @@ class FoundationProbe:
         loaded = gap < 0
         return self._of(samples.part(loaded), gap[loaded], femoral_normal[loaded], pose)
 
-    def seen(self, result: ContactResult) -> ProbedContact:
-        """Return what `at` does at a result's pose, from the columns that it says are loaded."""
+    def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
+        """Return the contact at a result's pose, from its loaded columns; see `at`."""
         if np.isnan(result.gap).any():
             return self.at(result.pose)
         samples = self._state.surface.part(result.gap < 0)
@@ -303,10 +303,10 @@ class FoundationProbe:
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a column's width; see `Probe`.
 
-        A column's stiffness starts at once when it is touched, so that the tangent jumps when
-        one is, the one across the normal by half. Here a column counts by the share of its cell
-        that lies within the contact's edge, the gap being linear across it, and femoral
-        normals are the smooth surface's, as a displacement by a cell meets them on the mean.
+        The stiffness of a column jumps when the column is touched; the transverse stiffness of
+        the contact may jump by half. Here a column counts by the share of its cell that lies
+        inside the edge of contact, with a linear gap across the cell. Femoral normals are those
+        of the smooth surface: their mean over a displacement by one cell.
         """
         samples, (gap, _, face) = self._columns(pose)
         near = gap < WIDEST_EDGE
@@ -327,7 +327,7 @@ class FoundationProbe:
         return replace(contact, condyles=condyles)
 
     def _columns(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
-        """Return the columns near by, and their gaps and facets."""
+        """Return the near columns, and their gaps and facets."""
         if self._seen is None or not np.array_equal(self._seen[0], pose):
             self._seen = pose.copy(), *self._around.at(pose)
         return self._seen[1:]
@@ -347,7 +347,7 @@ class FoundationProbe:
         rate: Array,
         pose: Array,
     ) -> dict[str, Array]:
-        """Return side -> what its columns add up to (`SUMS`,), see `_add_up`."""
+        """Return side -> sums over its columns (`SUMS`,), see `_add_up`."""
         medial = medial_points(samples.points, pose, self._state.pair.split)
         sums = np.zeros((2, SUMS))
         _add_up(samples.points, samples.normals, femoral_normal, gap, force, rate, medial, sums)
@@ -365,18 +365,19 @@ def _add_up(
     medial: Mask,
     sums: Array,
 ) -> None:
-    """Add up what columns carry, and how that changes as the femoral component moves.
+    """Sum the columns' forces, and their change as the femoral component moves.
 
     Args:
         points: (n, 3) m, on the insert.
         normals: (n, 3) unit, there.
         femoral_normals: (n, 3) unit, where the columns meet the femoral component.
         gap: (n,) m.
-        force: (n,) N, of each.
-        rate: (n,) N/m, its slope by the penetration along the insert's normal.
-        medial: (n,) whether the medial condyle's.
-        sums: (2, `SUMS`) zeros, to be written, medial and lateral: force (N), force times point
-            (N·m), wrench on the femoral component (6,), stiffness of that on the insert (6, 6).
+        force: (n,) N, force of each column.
+        rate: (n,) N/m, derivative of the force by the penetration along the insert's normal.
+        medial: (n,) whether a column belongs to the medial condyle.
+        sums: (2, `SUMS`) output, zeros at first, medial and lateral: force (N), force times
+            point (N·m), wrench on the femoral component (6,), stiffness of the wrench on the
+            insert (6, 6).
     """
     push, met = np.empty(6), np.empty(6)
     for n in range(len(points)):

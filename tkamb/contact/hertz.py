@@ -11,6 +11,7 @@ from tkamb.contact.ellipse import ContactEllipse, contact_ellipse
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, peak_flags, thickness_under
 from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
+from tkamb.contact.warm_start import Guess
 from tkamb.geometry.frames import SIDES, Array, Index
 
 
@@ -20,13 +21,13 @@ class HertzSettings:
 
     short_axis_sub_cells: int = 10
     """Sub-cells on the ellipse's short semi-axis over which the pressure of a map point is
-    averaged."""
+    averaged. Chosen: the mean of the semi-ellipsoid is then exact to a per cent."""
     least_share_on_insert: float = 0.95
-    """1: share of the semi-ellipsoid of pressure that must lie on the insert. With less the
+    """1: share of the semi-ellipsoid of pressure that must lie on the insert. Chosen: with less the
     contact reaches over the rim and Hertz's solution does not hold."""
     smallest_curvature_ratio: float = 1e-6
-    """1: smallest ratio of the two relative curvatures that still makes an ellipse; below it,
-    a line contact."""
+    """1: smallest ratio of the two relative curvatures that still makes an ellipse. Chosen: below
+    it, a line contact."""
 
 
 HERTZ = HertzSettings()
@@ -59,9 +60,9 @@ class Hertz(ContactModel):
     quadrics fitted there give normal and relative curvatures (`curvature.osculate`), the
     elliptic solution gives the law F = c delta^1.5 with E* = E/(1 - nu²) of the insert at
     zero strain (`ellipse.contact_ellipse`). Both condyles move down together, so each has
-    delta = travel beyond its own touch times n_y: the tilt decides how they share. Contact
-    point and curvatures stay those of first touch; E is the slope at the origin whatever
-    the material's curve.
+    delta = travel beyond its own touch times n_y: the tilt decides how they share the load.
+    Contact point and curvatures stay those of first touch. E is the slope of the material's
+    curve at the origin.
 
     The map holds the semi-ellipsoid, averaged over each grid cell and scaled so that its
     vertical force is the law's exactly; the wrench is the sum over the map. Area and peak
@@ -89,7 +90,7 @@ class Hertz(ContactModel):
     patch_radius: float = 4e-3
 
     def evaluate(
-        self, state: SampledContact, pose: Array, guess: ContactResult | None = None
+        self, state: SampledContact, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():

@@ -20,9 +20,9 @@ from tkamb.geometry.frames import Array
 from tkamb.units import MEGAPASCAL
 
 MOST_STEPS = 60
-"""Of Newton's method for one strain; most need five."""
+"""Largest number of Newton steps for one strain; most strains need five."""
 ROUNDING = 2e-16
-"""Share of the solution that a last step may have."""
+"""Relative size of a Newton step below which the solution has converged."""
 
 
 class StressStrainLaw(Protocol):
@@ -195,11 +195,11 @@ class Material:
     """An isotropic material with a one-dimensional stress-strain law.
 
     Args:
-        name: what to call it.
+        name: name in messages.
         young_modulus: E, Pa, the slope at the origin.
         poisson_ratio: nu, -1 < nu < 0.5.
         law: shape of the curve.
-        sources: where the numbers come from; they make no other material.
+        sources: where the numbers come from; not compared between materials.
 
     Raises:
         InputError: E not positive and finite, or nu out of range.

@@ -1,6 +1,6 @@
 """The generic way to press: find the approach along -y that carries a load.
 
-And where the answer stops being one: bodies pressed through each other.
+It also checks that the bodies are not pressed through each other.
 """
 
 import math
@@ -12,6 +12,7 @@ import numpy as np
 
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array
@@ -37,20 +38,20 @@ class PressSettings:
     """Evaluations of the reaction in one press; bisection of `max_approach` to `least_bracket`
     needs 48."""
     flagged_thickness_share: float = 0.5
-    """1: approach over thickness from which a result is flagged. At 1 the result is a failed
-    contact."""
+    """1: approach over thickness from which a result is flagged. Chosen: at 1 the result is a
+    failed contact."""
     rim_distance: float = 0.5 * MILLIMETRE
-    """m: within this distance of its rim the insert counts as thick as anywhere so near,
-    because it has no thickness at the rim."""
+    """m: near the rim the largest thickness within this distance counts. Chosen: the insert has no
+    thickness at the rim itself."""
     ray_start_depth: float = 1e-7
-    """m: depth below the surface at which rays into the insert begin; nothing counts as
-    thinner."""
+    """m: depth below the surface at which rays into the insert begin; it is also the smallest
+    thickness. Chosen: above the rounding of a mesh."""
 
 
 PRESS = PressSettings()
 
 
-THROUGH = "is there a spike or a thin place in a mesh?"
+THROUGH = "check the meshes for a spike or a thin place"
 COLUMNS = np.array([(x, 0.0, z) for x in (0, -1, 1) for z in (0, -1, 1)]) * PRESS.rim_distance
 DOWN = np.array([0.0, -1.0, 0.0])
 
@@ -60,19 +61,22 @@ Reaction = Callable[[float], float]
 class Evaluates(Protocol):
     """What the search needs of a contact model."""
 
-    def evaluate(
-        self, state: Any, pose: Array, guess: ContactResult | None = None
-    ) -> ContactResult:
+    def evaluate(self, state: Any, pose: Array, guess: Guess | None = None) -> ContactResult:
         """Return the contact at a pose."""
 
 
 class Presses(Evaluates, Protocol):
-    """A contact model that finds the approach of a load, too."""
+    """A contact model that finds the approach of a load, too, and says where to go on."""
 
-    def press(
-        self, state: Any, load: float, pose: Array, guess: ContactResult | None = None
-    ) -> ContactResult:
-        """Return the contact under a load (N)."""
+    def evaluate_from(
+        self, state: Any, pose: Array, start: Guess | None = None
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact at a pose, and the start of the next."""
+
+    def press_from(
+        self, state: Any, load: float, pose: Array, start: Guess | None = None
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact under a load (N), and the start of the next."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ def press_by_search(
     state: Any,
     load: float,
     pose: Array,
-    guess: ContactResult | None = None,
+    guess: Guess | None = None,
     reaction: Reaction | None = None,
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
@@ -116,7 +120,7 @@ def press_by_search(
         state: what its `prepare` returned.
         load: N, superior-inferior.
         pose: (4, 4) pose_femoral_in_insert.
-        guess: an earlier result; its approach starts the search.
+        guess: an earlier result or warm start; its approach starts the search.
         reaction: a faster way to the reaction (N) at an approach (m) than `evaluate`; inf
             where it is out of range.
 
@@ -149,7 +153,7 @@ def press_by_search(
 
 
 def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
-    """Return the result with what the search says about it."""
+    """Return the result with status, residual and flags of the search."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
     # Written with `not`, so that NaN counts as missed.
     missed = not residual <= PRESS.coarse_tolerance
@@ -165,9 +169,7 @@ def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactR
 class _Evaluations:
     """Evaluates a model at approaches and keeps the last result."""
 
-    def __init__(
-        self, model: Evaluates, state: Any, pose: Array, guess: ContactResult | None
-    ) -> None:
+    def __init__(self, model: Evaluates, state: Any, pose: Array, guess: Guess | None) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
         self._last: ContactResult | None = None
@@ -214,8 +216,8 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
             break
         side = -1 if force < load else 1
         if side < 0:
-            # Illinois rule: an end that stays twice is halved, so that both ends of the bracket
-            # move.
+            # Illinois rule: the value at an end that stays twice is halved, so that both ends of
+            # the bracket move.
             high_value *= 0.5 if last_side < 0 else 1.0
             low, low_value = trial, math.sqrt(max(force, 0.0)) - target
         else:
@@ -236,7 +238,7 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
 
 
 def _ahead(trial: float, force: float, load: float) -> float:
-    """Return a deeper trial: the reaction taken as quadratic, a little beyond, at most x4."""
+    """Return a deeper trial, extrapolated by a quadratic reaction; at most 4 times deeper."""
     # No upper end yet: extrapolate by F ~ d^2, a little beyond, so that the load is bracketed next.
     factor = 2.0 if force <= 0 else min(1.05 * math.sqrt(load / force), 4.0)
     return min(trial * factor + 1e-9, PRESS.max_approach)

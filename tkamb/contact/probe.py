@@ -1,7 +1,7 @@
-"""What a search for equilibrium asks of a contact model: wrenches at neighbouring poses.
+"""Wrenches at neighbouring poses, for searches of equilibrium.
 
-A probe answers many poses in a row and may keep what it has learnt; the answers are those
-of `evaluate`. A model that knows its tangent brings a faster probe with stiffness.
+A probe evaluates many poses in a row and may reuse earlier evaluations; its answers are those
+of `evaluate`. A model that knows its tangent offers a faster probe with stiffness.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ import numpy as np
 
 from tkamb.contact.pressing import Presses
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points, wrench_of
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.frames import Array, cross
 
 
@@ -56,13 +57,13 @@ class CondyleWrench:
 
 @dataclass(frozen=True, eq=False)
 class ProbedContact:
-    """The contact at one pose, condyle by condyle; a side that carries nothing is absent.
+    """The contact at one pose, condyle by condyle; an unloaded side is absent.
 
     Args:
         condyles: side -> wrench.
         known: False where the model is out of range or has not converged.
-        tangent: the condyles' stiffness is known,
-        exact: and is the tangent, no guide to it.
+        tangent: whether the condyles' stiffness is known.
+        exact: whether that stiffness is the exact tangent, not an approximation.
         accuracy: share of the contact force to which the model knows it.
         post: what a cam does to the insert's post; None where it carries nothing.
     """
@@ -76,7 +77,7 @@ class ProbedContact:
 
     @property
     def loads(self) -> tuple[CondyleWrench, ...]:
-        """What each condyle, and the post, takes."""
+        """Wrench of each condyle, and of the post."""
         return (*self.condyles.values(), *(() if self.post is None else (self.post,)))
 
     @property
@@ -86,62 +87,61 @@ class ProbedContact:
 
 
 class Probe:
-    """The probe of any model: `evaluate`, each answer the next one's guess.
+    """The probe of any model: `evaluate`, each pose the start of the next.
 
     Args:
         model: any contact model.
         state: what its `prepare` returned.
-        guess: an earlier result.
+        start: an earlier result or warm start.
 
     Attributes:
         exact: every answer brings the tangent, and it costs less than a press.
+        start: where the next evaluation begins.
     """
 
     exact: ClassVar[bool] = False
 
-    def __init__(self, model: Presses, state: Any, guess: ContactResult | None = None) -> None:
-        self._model, self._state, self._guess = model, state, guess
+    def __init__(self, model: Presses, state: Any, start: Guess | None = None) -> None:
+        self._model, self._state, self.start = model, state, start
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4)."""
-        result = self.evaluated(pose)
+        result, start = self.evaluated(pose)
         if result.status is not ContactStatus.OK:
             return ProbedContact({}, known=False)
-        self._guess = result
-        return self.seen(result)
+        self.start = start
+        return self.seen(result, start)
 
-    def evaluated(self, pose: Array) -> ContactResult:
+    def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
         """Return the contact at a pose (4, 4), of which only the forces need be right."""
-        return self._model.evaluate(self._state, pose, self._guess)
+        return self._model.evaluate_from(self._state, pose, self.start)
 
     def pressed(
         self,
         load: float,
         pose: Array,
-        guess: ContactResult,
-        like: tuple[ContactResult, ContactResult] | None = None,
-    ) -> ContactResult:
+        start: Guess | None,
+    ) -> tuple[ContactResult, WarmStart]:
         """Return the contact under a load (N), of which only the forces need be right.
 
         Args:
             load: N.
             pose: (4, 4) pose_femoral_in_insert.
-            guess: the contact near by.
-            like: start and end of a like step near by, by which a probe may guess this one's end.
+            start: of a contact near by.
         """
-        return self._model.press(self._state, load, pose, guess)
+        return self._model.press_from(self._state, load, pose, start)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
-        """Return the contact with a stiffness that holds on the mean of a finite displacement.
+        """Return the contact with a stiffness averaged over a finite displacement.
 
         Args:
             pose: (4, 4) pose_femoral_in_insert.
-            contact: there; a model that does not know better returns it.
+            contact: contact at that pose. A model without an averaged stiffness returns it.
         """
         return contact
 
-    def seen(self, result: ContactResult) -> ProbedContact:
-        """Return what a result says of the condyles."""
+    def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
+        """Return what a result, and the warm start that came with it, say of the condyles."""
         return ProbedContact(condyle_wrenches(result, self._state.pair.split))
 
 

@@ -1,6 +1,6 @@
 """Contact models by name: the built-in ones and those of other packages.
 
-A built-in is one row here, "name": "module:Class", imported only when asked for. Another
+A built-in model is one row here, "name": "module:Class", imported when it is used. Another
 package offers a model through the entry-point group `tkamb.contact`:
 
     [project.entry-points."tkamb.contact"]
@@ -22,7 +22,7 @@ class MapGridSettings:
     """The spacing of a pressure map."""
 
     coarsest_mm: float = 10.0
-    """mm: largest spacing that is accepted. A condyle's contact is 5 to 20 mm across; a
+    """mm: largest spacing that is accepted. Chosen: a condyle's contact is 5 to 20 mm across; a
     coarser map resolves nothing."""
 
 
@@ -85,8 +85,8 @@ def contact_model(
         options: the model's own options, the fields of its class (SI).
 
     Raises:
-        InputError: no such name or option, an option's value that is none of its words, or
-            a resolution that is not positive, resolves no contact, or is given twice.
+        InputError: no such name or option; a value that the option does not accept; a
+            resolution that is not positive, too coarse, or given twice.
     """
     cls, where = contact_class(name), f"contact model '{name}'"
     if resolution is not None and resolution_mm is not None:
@@ -136,8 +136,8 @@ def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) 
     low, high = OPTION_RANGES.get(option, (-math.inf, math.inf))
     is_number = isinstance(value, float | int) and not isinstance(value, bool)
     if is_number and not (math.isfinite(value) and low <= value <= high):
-        known = option in OPTION_RANGES
-        mend = f"give {low:g} to {high:g}" if known else "give a finite number"
+        is_option = option in OPTION_RANGES
+        mend = f"give {low:g} to {high:g}" if is_option else "give a finite number"
         raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
     kind = get_type_hints(model)[option]
     try:

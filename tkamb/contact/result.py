@@ -19,16 +19,17 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class ContactResultSettings:
-    """What a contact result is flagged and split by."""
+    """Limits from which a contact result is flagged, and counts as two condyles."""
 
     max_measured_pressure: float = 100.0 * MEGAPASCAL
-    """Pa: peak pressure beyond which polyethylene's stress-strain curves are extrapolated.
-    They end at 40 to 60 MPa."""
+    """Pa: peak pressure beyond which polyethylene's stress-strain curves are extrapolated. Chosen:
+    they end at 40 to 60 MPa."""
     least_patch_share: float = 0.05
-    """1: share of the force that a patch of contact must carry to count as a second condyle's."""
+    """1: share of the force that a patch of contact must carry to count as a second condyle's.
+    Chosen: a smaller patch is a crumb of one condyle's contact."""
     least_patch_distance: float = 15.0 * MILLIMETRE
-    """m: smallest distance between the centres of two condyles' patches; those of a knee are
-    40 to 50 mm apart."""
+    """m: smallest distance between the centres of two condyles' patches. Chosen: those of a knee
+    are 40 to 50 mm apart."""
 
 
 CONTACT_RESULT = ContactResultSettings()
@@ -87,8 +88,6 @@ class ContactResult:
         iterations: of the model's own solver.
         residual: relative residual of that solver.
         flags: plain words for what a reader must know (strain below -0.4, ...).
-        warm_start: where the solver of the same state may begin when this result is handed
-            back as a guess; None for a model that needs none.
     """
 
     pair: ContactPair
@@ -106,10 +105,9 @@ class ContactResult:
     iterations: int = 0
     residual: float = 0.0
     flags: tuple[str, ...] = ()
-    warm_start: Any = None
 
     def __repr__(self) -> str:
-        """Return in a line what each condyle carries."""
+        """Return force, area and peak of each condyle in one line."""
         sides = [
             f"{name} {one.force:.0f} N on {one.area / MILLIMETRE**2:.0f} mm², "
             f"peak {one.peak_pressure / MEGAPASCAL:.1f} MPa"
@@ -153,11 +151,11 @@ class ContactResult:
             pressure: (n,) Pa, >= 0.
             gap: (n,) m, positive when apart.
             nodal_force: (n, 3) N on the insert, for a model that knows it better.
-            area: (n,) m², that the forces stand on; by default the points' tributary area.
+            area: (n,) m², area of each point's force; by default the tributary area.
             covered: (n,) m², in contact around each point, for the condyles' areas; by
                 default `area`.
             medial: (n,) points under the medial condyle; by default `medial_points`.
-            ending: status, iterations, residual, flags, warm_start.
+            ending: status, iterations, residual, flags.
         """
         surface, pose = state.surface, np.array(pose, float)
         if not np.isfinite(pressure).all():
@@ -210,7 +208,7 @@ class ContactResult:
         iterations: int = 0,
         residual: float = math.nan,
     ) -> "ContactResult":
-        """Return a result that holds nothing but the reasons: OUT_OF_RANGE and NaN."""
+        """Return a result without numbers: OUT_OF_RANGE, NaN, and the reasons."""
         points = state.surface.points
         unknown, vectors = np.full(len(points), np.nan), np.full_like(points, np.nan)
         return cls(
@@ -321,11 +319,11 @@ def thickness_under(position: Array, points: Array, thickness: Array) -> float:
 
 
 def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
-    """Yield a flag for each condyle whose peak pressure is beyond what any law was fitted to."""
+    """Yield a flag for each condyle whose peak pressure is beyond the fitted material laws."""
     limit = CONTACT_RESULT.max_measured_pressure
     for side, condyle in sides.items():
         if condyle is not None and condyle.peak_pressure > limit:
             yield (
                 f"{side} peak above {limit / MEGAPASCAL:.0f} MPa: polyethylene's law is "
-                "not known there; is this the lip or an edge?"
+                "not known there; check whether the contact lies on the lip or at an edge"
             )

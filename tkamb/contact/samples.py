@@ -14,7 +14,8 @@ from tkamb.geometry.surface import Surface
 
 DOWN = np.array([0.0, -1.0, 0.0])
 DEEPEST = 0.5
-"""Share of the thickness that a penetration is seen to: rays against the femur start there."""
+"""Largest penetration that is measured, as a share of the thickness. Rays towards the femur start
+at this depth."""
 
 
 @dataclass(frozen=True)
@@ -25,17 +26,19 @@ class MapPointSettings:
     """Rays per edge of a map cell at the rim, by which its covered part is measured (64 rays a
     cell)."""
     least_normal_y: float = 0.1
-    """1: smallest superior component of the normal that a tributary area is divided by: 84 deg
-    from the horizontal."""
+    """1: smallest superior component of the normal that a tributary area is divided by: 84 deg from
+    the horizontal. Chosen: it keeps a division from zero."""
     side_start_normal_y: float = 0.5
     """1: below this superior component of the normal (60 deg) a column begins well beside its
-    point, seen from above."""
+    point, seen from above. Chosen: flatter surfaces have their column below the point."""
     ray_start_depth: float = 1e-6
-    """m: depth below the surface at which rays into the insert begin."""
+    """m: depth below the surface at which rays into the insert begin. Chosen: above the rounding of
+    a mesh."""
     max_map_cells: int = 4_000_000
-    """Map cells over the bounding box: a knee's map at about 0.03 mm."""
+    """Map cells over the bounding box. Chosen: a knee's map at about 0.03 mm."""
     max_inner_walls: int = 8
-    """Walls within the insert that a ray along the normal passes at most."""
+    """Walls within the insert that a ray along the normal passes at most. Chosen: an insert of
+    several bodies has fewer."""
 
 
 MAP_POINT = MapPointSettings()
@@ -111,10 +114,11 @@ def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -
     """Return the gap (n,) m along the insert's normals; negative = penetration.
 
     Rays start half-way through the insert, outside the femoral component, and go up along
-    the normal; the first crossing counts. inf where no femoral surface lies above, -inf
-    where the femoral component reaches deeper than where the rays start. Columns of a steep rim
-    start beside it, under the dish, where the femoral component may be although it leaves the
-    rim alone: theirs counts only where it holds their point of the surface.
+    the normal; the first crossing counts. The gap is inf where no femoral surface lies above,
+    and -inf where the femoral component reaches deeper than the start of the ray. Columns of a
+    steep rim start under the dish, beside the rim. The femoral component may be there without
+    touching the rim: such a penetration counts only where the point of the surface, too, lies
+    inside the femoral component.
     """
     return _gaps(samples, femoral, inverse(pose))[0]
 
@@ -135,7 +139,7 @@ def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array
     columns = samples.points, samples.normals, samples.thickness, samples.depth
     origins, normals, below = _columns(*columns, back)
     gap, face = _first_entry(femoral, origins, normals)
-    # Rays start inside the insert, so that a femur that has penetrated is still met from outside.
+    # Rays start inside the insert, so that they meet a penetrating femur from outside.
     gap -= below
     # On a steep wall a column starts well beside its point, seen from above, and may start in the
     # femur there. Where the surface point itself is free, the gap above it counts.
@@ -152,7 +156,7 @@ def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array
 def _columns(
     points: Array, normals: Array, thickness: Array, depth: Array, back: Array
 ) -> tuple[Array, Array, Array]:
-    """Return where columns' rays start and go (n, 3), femoral frame, and how far below (n,), m."""
+    """Return start and direction of the columns' rays (n, 3), femoral frame, and depth (n,), m."""
     origins, along = np.empty((len(points), 3)), np.empty((len(points), 3))
     below = np.empty(len(points))
     for n in range(len(points)):
@@ -167,7 +171,7 @@ def _columns(
 
 
 def _first_entry(femoral: Surface, origins: Array, directions: Array) -> tuple[Array, Index]:
-    """Return where rays (n, 3) enter the femur first (n,), m, -inf: they start in it; the facet."""
+    """Return where rays (n, 3) first enter the femur (n,), m, and the facet; -inf: start inside."""
     distance, face = femoral.rays.first(origins, directions)
     _mark_within(distance, face, directions, femoral.face_normals)
     return distance, face
@@ -181,8 +185,8 @@ def _mark_within(distance: Array, face: Index, directions: Array, normals: Array
             facing = 0.0
             for k in range(3):
                 facing += directions[n, k] * normals[face[n], k]
-            # The ray leaves the femur at its first hit, so that it began inside: penetrated deeper
-            # than the column sees.
+            # The ray leaves the femur at its first hit, so that it began inside: the penetration
+            # is deeper than the column measures.
             if facing > 0.0:
                 distance[n] = -np.inf
 
@@ -248,7 +252,7 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
     """Return first hits (n, 3), their faces (n,) and the thickness (n,) below them.
 
     The thickness ends where the column leaves the insert for good. A wall or a void within the
-    insert does not end it: what lies below carries the load on.
+    insert does not end it, because the material below transmits the load.
     """
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)

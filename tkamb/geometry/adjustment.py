@@ -42,26 +42,29 @@ class AdjustmentSettings:
     """The limits of the adjustment and the rule by which it is undone."""
 
     largest_angle: float = 0.5 * DEGREE
-    """rad: a coronal angle from here on is lift-off and is not corrected (Sharma 2008: 0.5
-    deg, what fluoroscopy errs by)."""
+    """rad: a coronal angle of this size or more is lift-off and is not corrected (Sharma 2008:
+    0.5 deg, the error of fluoroscopy)."""
     largest_translation: float = 0.5 * MILLIMETRE
     """m: the adjustment moves the femur by no more than this along y (Sharma 2008: 0.5 mm,
-    what fluoroscopy errs by)."""
+    the error of fluoroscopy)."""
     restore_when: RestoreRule = "both"
     """"both": the recorded rotation is restored if penetration and coronal angle after the
     press exceed the adjustment (Sharma 2008); "either": if one of them does."""
     input_change: float = 0.1 * MILLIMETRE
-    """m: a change of the recorded pose that must not change the answer by a step without a
-    flag. A fifth of what fluoroscopy errs by."""
+    """m: if a change of the recorded pose by this much can change the answer by a step, the
+    result is flagged. Chosen: a fifth of the error of fluoroscopy."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
-    """m: with both condyles farther than this from the insert the pose is no recorded contact."""
+    """m: with both condyles farther than this from the insert the pose is no recorded contact.
+    Chosen: it is more than the errors of fluoroscopy."""
     level_difference: float = 5e-6
-    """m: condyles whose gaps differ by less are level as far as a mesh can say, and the femur
-    is not turned."""
+    """m: condyles whose gaps differ by less count as level, and the femur is not turned. Chosen:
+    meshes do not resolve smaller differences."""
     touch_difference: float = 1e-7
-    """m: difference of the condyles' clearances at which they touch together."""
+    """m: difference of the condyles' clearances below which they touch together. Chosen: far below
+    what changes a force."""
     max_turns: int = 20
-    """Most steps of the search for the turn at which they do."""
+    """Largest number of steps of the search for the turn at which both condyles touch together.
+    Chosen: the search ends after fewer."""
 
 
 ADJUSTMENT = AdjustmentSettings()
@@ -76,7 +79,7 @@ class Adjustment:
         recorded: (4, 4) the pose as recorded.
         translation: m along y, of the component's centre; negative is downwards.
         coronal_angle: rad about the insert's x axis by which the femur was turned.
-        measured_angle: rad, coronal angle of the recorded pose that was found.
+        measured_angle: rad, coronal angle of the recorded pose.
         intercondylar_distance: m; NaN with one condyle.
         settings: the limits that it was made with.
         penetration: m, how deep the femur sank in afterwards; NaN before the press.
@@ -147,8 +150,9 @@ def _limited_turn(
         outcome = "turned level" if largest < limit else "left as lift-off"
         flags = (
             f"coronal angle of {largest / DEGREE:.2f} deg is {outcome}: the limit of "
-            f"{limit / DEGREE:g} deg is less than {settings.input_change / MILLIMETRE:g} mm at a "
-            "condyle away, and the split steps there",
+            f"{limit / DEGREE:g} deg is so near that {settings.input_change / MILLIMETRE:g} mm at "
+            f"a "
+            "condyle would cross it, and the medial-lateral split jumps there",
         )
     return (turn if largest < limit else 0.0), flags
 
@@ -171,7 +175,7 @@ def moved_to_touch(
         where = "above" if travel > 0 else "below"
         flags = (
             f"recorded femur is {abs(travel) / MILLIMETRE:.2f} mm {where} first touch: adjusted by "
-            f"the {limit / MILLIMETRE:g} mm that fluoroscopy errs by, the press moves it on",
+            f"the {limit / MILLIMETRE:g} mm that fluoroscopy errs by; the press moves it further",
         )
     return raised(at, translation), translation, flags
 

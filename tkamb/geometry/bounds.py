@@ -1,4 +1,4 @@
-"""Bounds of a surface's height that spare closest points most of their rays."""
+"""Bounds of a surface's height, which save most of the rays of a closest-point search."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,13 +14,16 @@ class HeightBoundSettings:
     """The grid of planes that bounds a surface's height from below."""
 
     cell_edge: float = 1e-3
-    """m."""
+    """m: edge of a cell. Chosen: about the edge of a mesh's triangles."""
     most_cells: int = 400
-    """Cells along an edge of the grid; a larger surface gets larger ones."""
+    """Largest number of cells along an edge of the grid; a larger surface gets larger cells.
+    Chosen: it bounds memory."""
     wide_triangle_cells: int = 4
-    """Cells along an edge; larger triangles are dealt with one by one."""
+    """Cells along an edge: triangles that span more are processed one by one. Chosen: such
+    triangles are few."""
     largest_slope: float = 3.0
-    """Rise over run of a bound's planes."""
+    """1: largest slope of a plane that bounds the height. Chosen: a steeper plane bounds too
+    loosely."""
 
 
 HEIGHT_BOUND = HeightBoundSettings()

@@ -21,19 +21,25 @@ class ClosestPointSettings:
     """How the closest points of two surfaces are searched and weighted."""
 
     region_radius: float = 1.6e-2
-    """m; the close region ends this far from the closest point."""
+    """m; the close region ends this far from the closest point. Chosen: a condyle's contact lies
+    within it."""
     facing_cosine: float = 0.7
-    """Cosine of the angle between the surfaces, above which they face each other."""
+    """Cosine of the angle between the surfaces, above which they face each other. Chosen: surfaces
+    at more than 45 deg do not touch face to face."""
     clearance: float = 1e-6
-    """m; a point that far above a bound of the insert's height is outside it, rounding included."""
+    """m: a point farther than this above the bound of the insert's height is outside the insert,
+    whatever the rounding. Chosen: above the rounding of a mesh."""
     gap_range: float = 10 * CONDYLE.facet_depth
-    """m; by how much the gap of a sample may exceed the smallest: it then weighs 5e-5 of that."""
+    """m: samples count up to this much above the smallest gap. Chosen: their weight there is
+    5e-5."""
     rounds: int = 3
-    """Rounds of projection between the two surfaces."""
+    """Rounds of projection between the two surfaces. Chosen: more rounds move the points by less
+    than the tolerance."""
     kept_candidates: int = 8
-    """Triangles that are looked at around each nearest vertex."""
+    """Triangles that are searched around each nearest vertex. Chosen: the nearest triangle is among
+    them."""
     batch_size: int = 64
-    """Samples that are projected together, for speed alone."""
+    """Samples that are projected together, for speed alone. Chosen: it changes speed alone."""
 
 
 CLOSEST_POINT = ClosestPointSettings()
@@ -147,8 +153,8 @@ class ClosestPointQuery:
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the deepest few vertices inside the insert, deepest first; none if apart.
 
-        The depth along y bounds the depth from above and orders the search; what lies above all
-        that faces up over its place has none.
+        The depth along y is an upper bound of the depth and orders the search. A vertex above every
+        upward-facing triangle over its place is outside.
         """
         near, points = _within_box(condyle.points, pose, *self.insert.bounds)
         under = points[:, 1] < self._ceiling.over(points) + CLOSEST_POINT.clearance
@@ -171,7 +177,7 @@ class ClosestPointQuery:
         return np.where(inside, distance, 0.0)
 
     def _refined(self, faces: Index, pose: Array) -> tuple[float, Array, Array]:
-        """Return gap and points of the deepest point of triangles, cutting the best finer."""
+        """Return gap and points of the deepest point of triangles; the deepest are subdivided."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
         _, first = np.unique(self.femoral.faces[faces], return_index=True)
@@ -208,7 +214,7 @@ class _Condyle:
 
     @cached_property
     def tree(self) -> fcl.BVHModel:
-        """The triangles as a tree; only a condyle that is apart asks for it."""
+        """The triangles as a tree; needed only for a condyle that is apart."""
         return _tree(self._femoral, self.faces)
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
@@ -276,7 +282,7 @@ class _CloseRegion:
 
 
 def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
-    """Keep one sample of each cube of the spacing: its index, and the area of them all."""
+    """Return the index of one sample per cube of the spacing, and the area of all in the cube."""
     cubes = np.floor(samples / CONDYLE.sample_spacing).astype(np.int64)
     cubes -= cubes.min(axis=0)
     number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
@@ -301,7 +307,7 @@ def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
 
 @compiled_as_written
 def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[Index, Array]:
-    """Return which points (n, 3) lie within a box once they are moved, and where they are then."""
+    """Return which points (n, 3) lie within a box after a move, and their new positions."""
     inside, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
     for i in range(len(points)):
         within = True
@@ -321,7 +327,7 @@ def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[In
 
 @compiled_as_written
 def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
-    """Return the samples within a radius of a place that face as the nearest of all does (60 deg).
+    """Return the samples within a radius of a place that face within 60 deg of the nearest.
 
     Args:
         samples: (n, 3) m.
@@ -349,7 +355,7 @@ def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -
 
 @compiled_as_written
 def _quartered(triangles: Array) -> Array:
-    """Return the four halves-by-edge triangles (4k, 3, 3) of triangles (k, 3, 3)."""
+    """Return the four triangles (4k, 3, 3) into which halved edges divide triangles (k, 3, 3)."""
     count = len(triangles)
     parts = np.empty((4 * count, 3, 3))
     for k in range(count):

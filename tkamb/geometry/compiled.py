@@ -1,9 +1,9 @@
 """Loops compiled by numba when they are first called, and kept on disk for the next process.
 
-Import it only where meshes or a lattice are: it takes 0.1 to 0.4 s. The compiled code lies beside
-the module or, where that folder cannot be written, in the user's cache (`NUMBA_CACHE_DIR` says
-where). Indices are not held against bounds. A compiled function uses nothing of another file:
-what is kept would not notice that one changed.
+Import it only where meshes or a lattice are needed: it takes 0.1 to 0.4 s. The compiled code lies
+beside the module or, where that folder cannot be written, in the user's cache (`NUMBA_CACHE_DIR`
+names it). Indices are not checked against bounds. A compiled function uses nothing of another
+file, because the cache would not notice a change there.
 """
 
 import logging
@@ -21,8 +21,7 @@ _log = logging.getLogger("tkamb")
 def compiled(function: Function) -> Function:
     """Return the function compiled; it lets other threads run.
 
-    Sums may be taken in another order, as vector registers do; nothing else of IEEE arithmetic is
-    given up.
+    Sums may be taken in another order, for vector registers; all other IEEE arithmetic holds.
     """
     return _compiled(function, {"reassoc", "contract", "nsz"})
 
@@ -30,7 +29,7 @@ def compiled(function: Function) -> Function:
 def compiled_as_written(function: Function) -> Function:
     """Return the function compiled without that freedom: equal numbers stay equal.
 
-    What is divided by zero is inf or NaN, as with numpy.
+    A division by zero gives inf or NaN, as in numpy.
     """
     return _compiled(function, set(), error_model="numpy")
 
@@ -48,6 +47,7 @@ def _compiled(function: Function, fastmath: set[str], **more: str) -> Function:
 @cache
 def _say_once() -> None:
     _log.warning(
-        "compiled loops are not kept: every process compiles them anew, ten seconds or more; let "
-        "NUMBA_CACHE_DIR name a folder that can be written to"
+        "compiled loops cannot be stored: every process compiles them again, in ten seconds or "
+        "more; "
+        "set NUMBA_CACHE_DIR to a folder that can be written to"
     )

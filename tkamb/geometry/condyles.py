@@ -17,26 +17,32 @@ class CondyleSettings:
     """How the two condyles of a femoral component are told apart."""
 
     notch_depth: float = 2e-3
-    """m; a shallower notch along z makes no two condyles; real components have 6 to 14 mm."""
+    """m: a component with a shallower notch along z has one condyle. Chosen: real components with
+    two have 6 to 14 mm."""
     yawed_notch_depth: float = 3e-3
-    """m; a shallower notch along another direction is no line through two condyles. A single
-    condyle of a real component has up to 2.4 mm along some direction (DM, JW and the shipped knee
-    cut in halves)."""
+    """m: least notch along another direction than z that shows two condyles. A single condyle of
+    a real component has up to 2.4 mm along some direction (DM, JW and the shipped knee cut in
+    halves)."""
     extended_notch_depth: float = 0.5e-3
-    """m; least notch at 0 deg of flexion along the line through two condyles: a single long body
-    has none there, whatever its ends make of it when it is flexed."""
+    """m: least notch at 0 deg of flexion along the line through two condyles. Chosen: a single long
+    body has none there, although its ends may look like condyles in flexion."""
     facet_depth: float = 3e-5
-    """m; what facets of 1–2 mm cut off a condyle: heights that differ by less are the same."""
+    """m: depth that facets of 1 to 2 mm cut off a condyle. Chosen: heights that differ by less
+    count as equal."""
     strip_width: float = 1e-3
-    """m; of the strips along z in which the notch is looked for."""
+    """m: width of the strips along z in which the notch is searched. Chosen: a condyle's ridge is
+    wider."""
     sample_spacing: float = 1e-3
-    """m; between the samples of a condyle's surface."""
+    """m: spacing of the samples of a condyle's surface. Chosen: about the facets of a mesh."""
     highest_sample: float = 10 * facet_depth
-    """m above the lowest vertex; higher samples weigh nothing."""
+    """m above the lowest vertex: higher samples have no weight. Chosen: higher samples are not in
+    contact."""
     samples_per_box: int = 32
-    """Samples of a surface that share one box of the search tree."""
+    """Samples of a surface that share one box of the search tree. Chosen: it changes speed
+    alone."""
     deepest_notch: float = 15e-3
-    """m; how far above the condyles the notch between them is looked for."""
+    """m: height above the condyles up to which the notch between them is searched. Chosen: real
+    notches have 6 to 14 mm."""
 
 
 CONDYLE = CondyleSettings()
@@ -232,7 +238,7 @@ class LowestPoints:
 
 @dataclass(frozen=True, eq=False)
 class _SampledCondyle:
-    """A condyle's samples, in boxes about each few of them that spare most from being looked at.
+    """A condyle's samples, in boxes of a few, so that most samples need not be evaluated.
 
     Args:
         vertices: (v, 3) m, femoral frame.
@@ -276,7 +282,7 @@ class _SampledCondyle:
     def _low_samples(self, up: Array, height: float) -> Index:
         """Return the samples in boxes that reach down to a height, m along up (3,)."""
         least = self.centres @ up - self.halves @ np.abs(up)
-        # a box's rounding is far below the weight's reach
+        # The rounding of a box is far smaller than the height over which samples have weight.
         boxes = np.flatnonzero(least < height)
         chosen = boxes[:, None] * CONDYLE.samples_per_box + np.arange(CONDYLE.samples_per_box)
         return chosen[chosen < len(self.samples)]

@@ -11,7 +11,7 @@ from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
 
 SMALLEST_COSINE = 0.1
-"""Smallest cosine between normal and direction that a shift is divided by: 84 deg."""
+"""Smallest cosine between normal and direction by which a shift is divided: 84 deg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,10 @@ class CurvedSurface:
 
     s is the sagitta of the edge e from corner i to j, t_i = -n_i.e / n_i.N and
     t_j = n_j.e / n_j.N how far the tangent planes at its ends rise over it. On a quadratic
-    surface t_i = t_j and h is exact. Where they differ their harmonic mean counts, and none
-    where they bend opposite ways: a flat that meets a fillet stays flat, where the mean
-    would swell it. Where a surface has been cut finer without being curved, the patches are
-    those of the triangles before (`coarsened`).
+    surface t_i = t_j and h is exact. Where they differ, s uses their harmonic mean; where they
+    have opposite signs, s is zero. So a flat that meets a fillet stays flat; the arithmetic mean
+    would swell it. Where triangles were subdivided without being curved, the patches are those of
+    the coarser triangles (`coarsened`).
 
     Args:
         surface: its triangles share their vertices.

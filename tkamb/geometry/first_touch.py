@@ -13,22 +13,22 @@ from tkamb.geometry.surface import Surface
 from tkamb.geometry.tree import TriangleTree
 
 STEEP = 1e-9
-"""Share of its area that a triangle shows from above, below which it is a wall: its rim counts, by
-its neighbours."""
+"""1: a triangle whose area in plan view is a smaller share of its area is a wall. Its edges count
+as edges of its neighbours."""
 FACING = 0.2
-"""Up or down component of a mean normal, below which its plane says nothing of heights."""
+"""1: below this vertical component of a mean normal, its plane does not bound heights."""
 ROUNDING = 1e-12
-"""m; what a plane's height may be wrong by."""
+"""m: rounding error of a plane's height."""
 MOST_WAITING = 256
-"""Pairs of boxes that wait at one time: two for each level of both trees."""
+"""Largest number of pairs of boxes on the stack: two for each level of both trees."""
 MOST_CORNERS = 9
-"""Of one triangle cut by another: six, and what rounding adds. A cut that crosses c of n sides
-leaves at most n + c / 2 corners, and c is even: 4, 6 and 9 after the three cuts."""
+"""Corners of one triangle cut by another: six, and more by rounding. A cut that crosses c of n
+sides leaves at most n + c / 2 corners, and c is even: 4, 6 and 9 after the three cuts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Where one condyle comes down first.
+    """Where one condyle first touches the insert as it moves down.
 
     Args:
         travel: m along -y until it touches; negative when it is in the insert already.
@@ -44,8 +44,8 @@ class FirstTouch:
 
     It is the least, over all pairs of triangles that lie over each other, of the difference of
     their heights: linear over the polygon that both cover in the projection, so least at one of
-    its corners. Pairs of boxes, and of triangles, that cannot have a smaller one than what is
-    found are left out.
+    its corners. Pairs of boxes and of triangles are skipped if they cannot be below the smallest
+    clearance so far.
 
     Args:
         femoral: in the femoral frame.
@@ -125,10 +125,10 @@ def _bound(
     rotation: Array,
     translation: Array,
 ) -> float:
-    """Return a lower bound of the clearance of what two boxes hold, inf if not over each other.
+    """Return a lower bound of the clearance of two boxes' contents; inf: not over each other.
 
-    That of the boxes or, over the rectangle that both cover, of the planes that bound their
-    triangles' heights.
+    It is that of the boxes or, over the rectangle that both cover, that of the planes that bound
+    the heights of their triangles.
 
     Args:
         upper: (6,) m, at its place.

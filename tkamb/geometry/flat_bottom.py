@@ -18,15 +18,20 @@ class FlatBottomSettings:
     """What counts as the flat bottom of an insert."""
 
     flatness: float = 5e-5
-    """m; corners of one flat may lie this far from its plane (noise of the mesh)."""
+    """m; corners of one flat may lie this far from its plane (noise of the mesh). Chosen: noise of
+    a mesh is smaller."""
     comparable_share: float = 0.5
-    """Flats whose area is at least this share of the largest compete with it."""
+    """1: a flat whose area is at least this share of the largest may be the bottom, too. Chosen: a
+    smaller flat is a recess."""
     clear_share: float = 0.9
-    """Between two flats that face down, the larger wins below this ratio of areas."""
+    """Between two flats that face down, the larger wins below this ratio of areas. Chosen: two
+    flats that differ by less are asked about."""
     uneven_noise: float = 1e-6
-    """m; a bottom that is rougher than this gets a notice: noise, or no flat at all."""
+    """m: a rougher bottom gets a notice: its mesh is noisy, or it is not flat. Chosen: a mesh in
+    single precision rounds by less."""
     level_tilt: float = 1e-6
-    """rad; a smaller tilt is rounding and stays as it is."""
+    """rad; a smaller tilt is rounding and stays as it is. Chosen: it moves no end of the insert by
+    more than rounding does."""
 
 
 FLAT_BOTTOM = FlatBottomSettings()
@@ -40,7 +45,8 @@ class InnerFlatSettings:
     """Flat faces inside a part."""
 
     inner_share: float = 0.5
-    """1: a flat face of which a larger share faces material is a wall inside the part."""
+    """1: a flat face of which a larger share faces material is a wall inside the part. Chosen: the
+    larger part decides."""
 
 
 INNER_FLAT = InnerFlatSettings()
@@ -112,7 +118,9 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
     rotation = np.eye(3) if rotation is None else rotation
     flats = find_flats(surface)
     if not flats:
-        raise InputError(f"{surface.name} has no flat bottom", None, "is it a tibial insert?")
+        raise InputError(
+            f"{surface.name} has no flat bottom", None, "give the mesh of a tibial insert"
+        )
     down = [flat for flat in flats if -flat.normal[1] >= math.cos(TILT_LIMIT)]
     if len(down) > 1:  # the wall between two touching bodies faces down too
         outer = [flat for flat in down if not _is_inner(surface, flat)]

@@ -1,17 +1,17 @@
 """Where the lines of a structured grid run inside a closed surface, exactly and at once.
 
-Every triangle is offered to the grid lines in its own projected rectangle; three signed areas
-say whether a line passes through it. Their signs are those of whole numbers, exact
-(`tkamb.geometry.winding.PlanGrid`), so that all triangles agree on every line and none slips
-between them. A line that meets an edge exactly is moved by an
+Every triangle is compared with the grid lines in its own projected rectangle. Three signed areas
+tell whether a line passes through it. Their signs are computed in whole numbers and exact
+(`tkamb.geometry.winding.PlanGrid`), so that no line slips between two triangles. A line that meets
+an edge exactly is moved by an
 infinitesimal into each of the four quadrants around it (simulation of simplicity, Edelsbrunner
 & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639); what is inside for any of the
 four is inside, so that a line along a wall belongs to the part.
 
-What is inside is where the surface winds around the line (`tkamb.geometry.winding`): entries less
-exits below are more than 0. So a wall between two touching bodies divides nothing, and a void stays
-empty. Only a line that passes a hole of the mesh, and so has not as many entries as exits, is taken
-by pairs of crossings.
+A place is inside where the surface winds around it (`tkamb.geometry.winding`): the number of
+entries below it is larger than the number of exits. So a wall between two touching bodies divides
+nothing, and a void stays empty. A line through a hole of the mesh has unequal numbers of entries
+and exits; its crossings are taken in pairs.
 """
 
 from dataclasses import dataclass
@@ -31,9 +31,10 @@ class HeightFieldSettings:
     """How vertical lines through a surface are read."""
 
     odd_share: float = 0.01
-    """Largest share of lines with an odd number of crossings that is mended, not refused."""
+    """1: up to this share of lines with an odd number of crossings the lines are repaired; above it
+    the mesh is refused. Chosen: small defects of a mesh touch fewer lines."""
     same_height: float = 1e-12
-    """Crossings of duplicate faces, m."""
+    """m: crossings nearer to each other belong to duplicate faces. Chosen: above rounding."""
 
 
 HEIGHT_FIELD = HeightFieldSettings()
@@ -44,7 +45,7 @@ class BodyContactSettings:
     """Bodies of one mesh that touch."""
 
     touching_distance: float = 1e-7
-    """m: two bodies nearer to one another touch. Ten times the rounding of single precision."""
+    """m: bodies closer than this touch. Chosen: ten times the rounding of single precision."""
 
 
 BODY_CONTACT = BodyContactSettings()
@@ -59,7 +60,7 @@ class Intervals:
         second: (m,) index of the line along the axis before `axis`.
         lower: (m,) m, where the line enters, along `axis`.
         upper: (m,) m, where it leaves.
-        mended: lines whose odd number of crossings was mended from their neighbours.
+        mended: lines whose odd number of crossings was repaired from their neighbours.
     """
 
     first: Index
@@ -202,7 +203,7 @@ def _signed_areas(
 
 
 def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index, Array]:
-    """Return where lines begin and cease to run inside, in turn, sorted by line and height.
+    """Return where lines enter and leave the inside, in turn, sorted by line and height.
 
     Args:
         line: (m,) of each crossing.

@@ -1,11 +1,11 @@
-"""Walls inside a part: bodies of one file that touch or overlap, made one where that is easy.
+"""Walls inside a part: touching or overlapping bodies of one file, joined where possible.
 
 CAD systems export touching bodies with the wall between them still there. Its two sides face one
 another, each towards the other's material. A triangle whose outer side lies in material separates
 nothing. Where all of the wall is made of such triangles, they are taken out, and the two skins are
 joined along the wall's rim: an open edge is divided where vertices of the other skin lie on it.
-Where bodies overlap, or a triangle reaches beyond the wall, the wall stays. Everything that asks
-what is inside goes by the winding number (`tkamb.geometry.winding`), which does not see it.
+Where bodies overlap, or a triangle reaches beyond the wall, the wall stays. That does no harm:
+what is inside is decided by the winding number (`tkamb.geometry.winding`), which ignores walls.
 """
 
 from collections import defaultdict
@@ -25,12 +25,12 @@ class InnerWallSettings:
     """Walls inside a part."""
 
     probe_distance: float = 2e-5
-    """m: distance from a triangle at which material is looked for; wider gaps separate two
-    bodies."""
+    """m: distance from a triangle at which the program checks for material. Chosen: bodies with a
+    wider gap are separate."""
     edge_distance: float = 1e-6
-    """m: a vertex this near to an open edge lies on it."""
+    """m: a vertex this near to an open edge lies on it. Chosen: above the rounding of a mesh."""
     least_area: float = 2e-6
-    """m²: less is no wall, but triangles in a narrow corner."""
+    """m²: smaller areas are not a wall. Chosen: triangles in a narrow corner have less."""
 
 
 INNER_WALL = InnerWallSettings()
@@ -39,7 +39,7 @@ SAMPLES = np.array(
     [[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.45, 0.45, 0.1],
      [0.1, 0.45, 0.45], [0.45, 0.1, 0.45]]
 )  # fmt: skip
-"""Barycentric coordinates at which a triangle is asked."""
+"""Barycentric coordinates of the places at which a triangle is tested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def facing_material(surface: Surface, faces: Index) -> Mask:
 def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
     """Return the walls inside a closed surface as one; None if there are none.
 
-    Nor where a whole body lies within another one: that is a void wound the wrong way, or not.
+    None, too, where a whole body lies within another one: that may be a void with wrong winding.
 
     Args:
         vertices: (n, 3) m.

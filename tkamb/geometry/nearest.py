@@ -21,15 +21,15 @@ class NearestSettings:
     """Nearest points of two surfaces."""
 
     max_samples: int = 150_000
-    """Samples of a surface at most; it bounds memory and time."""
+    """Samples of a surface at most. Chosen: it bounds memory and time."""
 
 
 NEAREST = NearestSettings()
 
 FLAT = 1e-14
-"""A triangle whose squared area is less, relative to its edges', has no plane."""
+"""1: a triangle with a smaller ratio of squared area to squared edges has no plane."""
 DEEPEST = 64
-"""Boxes that wait at one time: one of each level."""
+"""Largest number of boxes on the stack: one of each level."""
 NO_TRIANGLE = -1
 
 
@@ -205,7 +205,7 @@ def _nearest_place(
         corners: (p c, 9) m, theirs.
         point: (3,) m.
         reach: m.
-        guess: the place of a triangle that may be near, and spares looks then; -1: none.
+        guess: place of a triangle that is likely to be near, which speeds up the search; -1: none.
         waiting: (`DEEPEST`,) to work in.
         apart: likewise.
 
@@ -274,7 +274,7 @@ def _nearest_points(
             boxes, faces, corners, point, reach, guess, waiting, apart
         )
         if place >= 0:
-            guess = place  # the next point may lie beside this one
+            guess = place  # the next point is often close to this one
             distance[n], face[n] = np.sqrt(square), faces[place]
             weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - s - t, s, t
     return distance, face, weights

@@ -23,7 +23,7 @@ class NormalSettings:
     """Normals of a mesh."""
 
     cosine_rounding: float = 1e-9
-    """1: difference of two cosines that is rounding."""
+    """1: difference of two cosines that is rounding. Chosen: above rounding."""
 
 
 NORMAL = NormalSettings()
@@ -46,7 +46,8 @@ def corner_normals(surface: "Surface", crease: float, weights: Array) -> Array:
     mean = _sums(vertex, weighted)
     total = mean[vertex]
     if crease < NO_CREASE:
-        # two within half the crease of the mean turn by no more than all of it: those need no pairs
+        # Normals within half the crease angle of their mean are within the crease angle of each
+        # other, so they need no comparison in pairs.
         lean = np.einsum("cj,cj->c", normals, _unit(mean)[vertex])
         rough = np.zeros(len(mean), bool)
         rough[vertex[~(lean > np.cos(crease / 2) + NORMAL.cosine_rounding)]] = True

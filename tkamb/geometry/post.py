@@ -1,4 +1,4 @@
-"""A post on the insert: found, and divided from the dishes where its contact is modelled.
+"""The post of an insert: finds it, and separates it from the dishes if its contact is modelled.
 
 A posterior-stabilised insert carries a post that meets a cam of the femoral component
 sideways. Contact along y, as of the condyles, cannot see that: `divide_insert` makes two bodies of
@@ -23,27 +23,32 @@ class PostSettings:
     """What counts as the post of an insert, and where it is cut off."""
 
     line_spacing: float = 1e-3
-    """m between the lines along y."""
+    """m between the lines along y. Chosen: a post is several times as wide."""
     least_rise: float = 8e-3
-    """m: what stands higher than this above the dishes may be a post."""
+    """m: what stands higher than this above the dishes may be a post. Chosen: flanks and lips of
+    dishes are lower."""
     side_drop: float = 3e-3
-    """m: a side of a post falls by this within two lines (56 deg) ..."""
+    """m: a side of a post falls by this within two lines (see `steep_share`). Chosen: it is 56 deg,
+    steeper than a dish."""
     steep_share: float = 0.75
-    """... on at least this share of its outline."""
+    """1: share of a post's outline that must be as steep as `side_drop` says. Chosen: a post may
+    lean on the rest."""
     middle_share: float = 0.25
-    """The centre of a post lies within this share of the width from the middle."""
+    """1: the centre of a post lies within this share of the width from the middle. Chosen: dishes
+    lie farther out."""
     foot_clearance: float = 0.25e-3
-    """m above that ground: where the post is cut off the dishes."""
+    """m above the dishes' level: where the post is cut off. Chosen: above the noise of a mesh."""
     back_share: float = 0.75
-    """Of the post's height above its foot: where its front is taken to hold it."""
+    """1: height above the foot, as a share of the post's height, at which its front is measured."""
     least_thickness: float = 2e-3
-    """m: a post with less behind its front is none that carries."""
+    """m: least thickness of a post. Chosen: a thinner one cannot carry a cam."""
 
 
 POST = PostSettings()
 
 FOOT_RING = (3, 5)
-"""Lines outwards from the patch: the ground around the foot, clear of a post's draft."""
+"""Lines outwards from the patch between which the ground around the foot is measured, beyond the
+slanted sides of the post."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Post:
         z: m, its centre.
         height: m, of its tip above the lowest dish.
         area: m², its footprint.
-        foot: m, y at which it rises free of everything around it.
+        foot: m, y above which it stands free of everything around it.
         front: m, x of its anterior face, at three quarters of its height above the foot.
         half_width: m, along z.
     """
@@ -119,9 +124,9 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     """Return the insert without its post, and the post, both closed, insert frame.
 
     The post is what stands above its foot, a plane across y just above all that surrounds it;
-    what is left of it below belongs to the dishes. It ends in front in a plane across x, its flat
-    back in the contact of the cam: what lies before that plane is left out, and the plane
-    takes no part in the deformation.
+    what is below it belongs to the dishes. In front the post ends in a plane across x. That plane
+    is the fixed bottom of the cam's contact: the part before it is left out, and the plane does not
+    deform.
 
     Args:
         insert: closed, insert frame.

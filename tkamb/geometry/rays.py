@@ -22,23 +22,27 @@ class RaySettings:
     """Tolerances of the ray caster."""
 
     edge_tolerance: float = 1e-9
-    """How far outside a triangle, in barycentric units, a crossing still belongs to it."""
+    """1: a crossing up to this far outside a triangle, in barycentric coordinates, belongs to it.
+    Chosen: above rounding."""
     same_crossing: float = 1e-10
-    """Crossings of one ray nearer than this, relative to the part's radius, are one crossing."""
+    """Crossings of one ray nearer than this, relative to the part's radius, are one crossing.
+    Chosen: above rounding."""
     usual_crossings: int = 4
-    """Crossings of a ray that there is room for at first."""
+    """Crossings per ray for which memory is reserved at first. Chosen: most rays have fewer."""
     threaded_rays: int = 500
-    """Rays from which on two threads share them."""
+    """Number of rays from which two threads share them. Chosen: for fewer, starting a thread costs
+    more than it gains."""
 
 
 RAY = RaySettings()
 
 STILL = 1e-200
-"""A smaller part of a direction is none; its inverse times a length is still a number."""
+"""A smaller component of a direction counts as zero; its inverse, times a length, is still
+finite."""
 PARALLEL = 1e-9
 """Sine of the angle to a triangle's plane below which a ray does not cross it."""
 DEEPEST = 64
-"""Boxes that wait at one time: one of each level."""
+"""Largest number of boxes on the stack: one of each level."""
 NO_TRIANGLE = -1
 
 
@@ -47,7 +51,7 @@ class RayGapSettings:
     """Gaps between shells along a ray."""
 
     touching_distance: float = 1e-6
-    """m: shells so near to each other have no gap between them."""
+    """m: shells closer than this have no gap between them. Chosen: above the rounding of a mesh."""
 
 
 RAY_GAP = RayGapSettings()
@@ -245,9 +249,9 @@ def _entry(box: Array, origin: Array, slowness: Array) -> float:
 
 @compiled_as_written
 def _set_direction(vector: Array, direction: Array, slowness: Array) -> None:
-    """Write a vector (3,) at unit length, and one over that; a number where it does not go.
+    """Write the unit vector of a vector (3,), and its inverse, finite where a component is zero.
 
-    One of no length makes a direction of NaN, which meets nothing.
+    A vector of zero length gives NaN, and such a ray meets nothing.
     """
     length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     for axis in range(3):
@@ -335,7 +339,7 @@ def _all_crossings(
     distance: Array,
     face: Index,
 ) -> int:
-    """Count every crossing of every ray, and write as many as there is room for.
+    """Count every crossing of every ray, and write as many as fit into the arrays.
 
     Args:
         boxes: see `_first_crossings`, as all but the following.

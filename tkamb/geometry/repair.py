@@ -1,4 +1,4 @@
-"""What can be mended in a triangulated surface, mended; and said."""
+"""Repairs of a triangulated surface, with a notice of each."""
 
 from dataclasses import dataclass
 
@@ -26,11 +26,12 @@ class RepairSettings:
     """Which openings of a mesh are closed when it is read."""
 
     weld_distance: float = 5e-5
-    """m; open edges whose ends are closer than this are one edge."""
+    """m; open edges whose ends are closer than this are one edge. Chosen: below the facets of a
+    mesh, above the rounding of its file."""
     gap_width: float = 2e-3
-    """m; a hole up to this wide (about one lattice cell) is closed by a fan of triangles."""
+    """m; a hole up to this wide is closed by a fan of triangles. Chosen: about one lattice cell."""
     triangle_width: float = 5e-3
-    """m; a hole of three edges is one lost triangle, and is put back up to this width."""
+    """m; a hole of three edges is filled up to this width. Chosen: it is one missing triangle."""
 
 
 REPAIR = RepairSettings()
@@ -38,12 +39,12 @@ REPAIR = RepairSettings()
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A mended surface and what was done to it.
+    """A repaired surface and what was done to it.
 
     Args:
         vertices: (n, 3) m.
         faces: (k, 3), wound consistently; outward if closed.
-        notices: one phrase per kind of repair; empty when there was nothing to mend.
+        notices: one phrase per kind of repair; empty when there was nothing to repair.
         holes: the loops that stay open, widest first.
         forks: (m,) vertex indices where an odd number (3 or more) of faces share an edge.
         one_sided: whether the surface has no consistent winding (a Möbius strip).
@@ -58,7 +59,7 @@ class Repair:
 
 
 def repair(vertices: Array, faces: Index) -> Repair:
-    """Mend duplicate and degenerate faces, winding, cracks, small holes, loose vertices.
+    """Repair duplicate and degenerate faces, winding, cracks, small holes, loose vertices.
 
     The corners of the triangles may be unmerged, as in an STL file; merging equal corners
     is not a repair. Triangles of no area but three different corners stay: they close the
@@ -150,8 +151,8 @@ def _without_duplicates(faces: Index) -> tuple[Index, int]:
 def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
     """Turn the minority (by area) of each connected part so that neighbours agree.
 
-    Every face is two nodes, as it is and turned; neighbours are linked in the states that
-    agree. The two states of a face end in one component only on a one-sided surface.
+    Every face has two states, as it is and reversed. A graph links the states of neighbours that
+    agree. Both states of a face are in one component only on a one-sided surface.
     """
     k = len(faces)
     edge, count = edge_use(faces)
@@ -216,7 +217,7 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
 
 
 def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Turn closed bodies that are inside out; a void within another body stays one."""
+    """Turn closed bodies that are inside out; a void within another body stays a void."""
     part = connected_parts(faces)
     volume = np.bincount(part, signed_volumes(vertices, faces))
     if (volume >= 0).all():

@@ -80,7 +80,7 @@ def sagittal_outline(
 def _outline(
     surfaces: tuple[Surface, ...], z_values: tuple[float, ...], offset: float, below: float
 ) -> Array:
-    """Return what `sagittal_outline` does; the last few are kept, for a scene's many samples."""
+    """Return what `sagittal_outline` does; the last few are cached, for a scene's many samples."""
     cuts = [sagittal_section(surface, z) for surface in surfaces for z in z_values]
     points = _points_below(np.concatenate([*cuts, np.empty((0, 2, 2))]), below - offset)
     if len(points) == 0:

@@ -22,11 +22,12 @@ class SubdivisionSettings:
     """When coarse triangles of a surface are divided."""
 
     halving_tolerance: float = 1e-6
-    """Of the surface's size: how far a halved edge's middle may be off its line, as files round."""
+    """1: largest distance of a halved edge's middle from its line, as a share of the surface's
+    size. Chosen: files round coordinates by less."""
     most_levels: int = 8
-    """Times that a triangle may be divided."""
+    """Times that a triangle may be divided. Chosen: a triangle is then divided into 65,536."""
     most_parts: int = 100
-    """Parts of a surface beyond which it is left as it is: no implant has as many."""
+    """Parts of a surface beyond which it is left as it is. Chosen: no implant has as many."""
 
 
 SUBDIVISION = SubdivisionSettings()
@@ -92,7 +93,7 @@ def _coarsened_once(surface: Surface) -> Coarsened | None:
 
 
 class _Search:
-    """Looks for the middle ones of the four triangles that one was cut into.
+    """Searches the middle triangles of triangles that were cut into four.
 
     A middle triangle's corners are the middles of the edges between the tips of its three
     neighbours. From one of them the next are found across the neighbours' tips.
@@ -123,7 +124,7 @@ class _Search:
         return np.zeros(0, np.int64)
 
     def _spread(self, start: Index) -> Index | None:
-        """Return all middle triangles that follow from one; None where they contradict."""
+        """Return all middle triangles that follow from one; None if they contradict each other."""
         kind = np.zeros(len(self._faces), np.int8)  # 1: middle, 2: at a tip
         even = np.zeros(len(self._points), bool)
         new, layers = start, []
@@ -171,7 +172,7 @@ def _across(faces: Index) -> Index:
 
 
 def _parts(across: Index) -> tuple[int, Index]:
-    """Return how many parts hang together across edges, and whose each face is (k,)."""
+    """Return the number of parts that are connected across edges, and each face's part (k,)."""
     face, corner = np.nonzero(across >= 0)
     ones = np.ones(len(face), np.int8)
     graph = coo_array((ones, (face, across[face, corner])), shape=(len(across),) * 2)

@@ -27,14 +27,14 @@ SMOOTH_WITHIN = np.radians(30.0)
 class Surface:
     """A triangulated surface, outward normals by the right-hand rule.
 
-    What is costly to derive from it (rays, nearest points, normals) is made when first asked
-    for and kept with it.
+    Derived objects that are costly (rays, nearest points, normals) are made on first use and kept
+    with the surface.
 
     Args:
         vertices: (n, 3) m, in the frame that the owner states.
         faces: (k, 3) indices into the vertices.
-        name: what to call it in messages.
-        merged: no two vertices lie at one place, as is known of a mesh that has been read.
+        name: name in messages.
+        merged: whether no two vertices lie at one place, as in a mesh that has been read.
     """
 
     vertices: Array
@@ -126,7 +126,7 @@ class Surface:
     def corner_normals(self) -> Array:
         """Unit normals (k, 3, 3) at the corners: angle-weighted, edges over 40 deg kept sharp.
 
-        They err by a tenth or less of what a facet does.
+        Their error is at most a tenth of the error of facet normals.
         """
         return corner_normals(self, SHARP_EDGE, corner_angles(self))
 
@@ -154,7 +154,7 @@ class Surface:
     def upward_tree(self) -> "TriangleTree":
         """The same over its triangles that face up (+y); over all where none does.
 
-        What faces down or aside is never the topmost but at an edge of what faces up.
+        Triangles that face down or sideways are topmost only at an edge of one that faces up.
         """
         from tkamb.geometry.tree import TriangleTree
 
@@ -196,5 +196,5 @@ class Surface:
         return Surface(vertices, self.faces, self.name, self.merged)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is derived: larger by far, and made again where it is needed."""
+        """Leave out derived objects: they are far larger, and are made again where needed."""
         return {field.name: getattr(self, field.name) for field in fields(self)}

@@ -1,4 +1,4 @@
-"""A second thread, for what is compiled and lets others run meanwhile.
+"""A second thread, for compiled loops that release Python's interpreter lock.
 
 TKAMB_THREADS says how many threads a process may use, 1 or 2; without it 2, where the machine
 gives it two processors. What is computed does not depend on it, to the last bit: work is divided
@@ -45,7 +45,7 @@ def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[Firs
 
 
 def in_halves(part: Callable[[slice], First], count: int) -> tuple[First, First]:
-    """Return what is made of the first and of the second half of so many things; see `both`."""
+    """Return the results for the first and the second half of `count` items; see `both`."""
     half = count // 2
     return both(lambda: part(slice(0, half)), lambda: part(slice(half, count)))
 
@@ -68,7 +68,7 @@ def threads() -> int:
 
 @cache
 def _second() -> tuple[Lock, ThreadPoolExecutor]:
-    """The second thread, and what is locked while it works."""
+    """The second thread, and the lock that is held while it works."""
     return Lock(), ThreadPoolExecutor(1, "tkamb")
 
 

@@ -1,4 +1,4 @@
-"""How a triangulated surface hangs together: its edges, open loops, parts and bodies."""
+"""How a triangulated surface is connected: its edges, open loops, parts and bodies."""
 
 from dataclasses import dataclass
 
@@ -49,8 +49,8 @@ def is_closed(faces: Index) -> bool:
 def same_places(points: Array) -> tuple[Index, Index]:
     """Return which points (n, 3) are the first of those at one place, and each one's place (n,).
 
-    Places are numbered as their first points follow each other. Points are held together by a
-    hash of their bits, and compared where it says that they are the same.
+    Places are numbered in the order of their first points. Points are grouped by a hash of their
+    bits, and compared where the hashes agree.
     """
     bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # of -0 and 0 the same
     mixed = bits * _ODD

@@ -2,9 +2,9 @@
 
 The triangles are halved at the median along the longest side of their box, again and again, until
 a leaf holds a few. All leaves lie equally deep, so that the tree needs no pointers: the children
-of box i are 2i and 2i + 1, from the root, 1. What asks it goes to the nearer child first and
-leaves out boxes beyond what it has found. Triangles are looked at in double precision, each by
-itself: which of them is found does not hang on the way there.
+of box i are 2i and 2i + 1, from the root, 1. A search visits the nearer child first and skips
+boxes beyond its best result. Every triangle is evaluated by itself in double precision, so that
+the result does not depend on the order of the search.
 """
 
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ class BoxTreeSettings:
     """The tree of boxes around a surface's triangles."""
 
     triangles_per_leaf: int = 4
-    """Triangles in a leaf, at most."""
+    """Triangles in a leaf, at most. Chosen: it changes speed alone."""
     margin: float = 1e-7
-    """Of the surface's size: by so much boxes are wider, whatever the rounding."""
+    """1: boxes are wider by this share of the surface's size. Chosen: above rounding."""
 
 
 BOX_TREE = BoxTreeSettings()
@@ -37,7 +37,7 @@ BOX_TREE = BoxTreeSettings()
 def rows(vectors: ArrayLike) -> Array:
     """Return vectors (n, 3) as the loops take them; one (3,) as (1, 3).
 
-    Double precision, row after row, to be written: for others they would be compiled anew.
+    Contiguous, writable, double precision: other arrays would compile the loops again.
     """
     return np.require(vectors, np.float64, ["C", "W", "E"]).reshape(-1, 3)
 
@@ -58,7 +58,7 @@ class TriangleTree:
         self._surface, corners = surface, surface.triangles
         low, high = corners.min(axis=1), corners.max(axis=1)
         chosen = np.arange(len(corners)) if chosen is None else chosen
-        # one without area has no normal, and its edges are those of others
+        # A triangle without area has no normal, and its edges belong to other triangles, too.
         real = chosen[surface.areas[chosen] > 0.0]
         chosen = real if len(real) else chosen
         leaves = chosen[_halved(0.5 * (low + high)[chosen])]
@@ -137,7 +137,7 @@ def _halve(centres: Array, order: Index, leaves: int) -> None:
 
 @compiled_as_written
 def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle: int) -> None:
-    """Bring the smaller ones of a part before its middle, the larger ones after (Hoare 1961).
+    """Move smaller values before the middle of a part, larger ones behind it (Hoare 1961).
 
     Args:
         centres: (n, 3) m.
@@ -145,7 +145,7 @@ def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle
         axis: by which they are compared.
         first: place of the first in the order.
         last: of the last.
-        middle: of the one that is to stand where it would if all were sorted.
+        middle: place whose item is the one that a full sort would put there.
     """
     while first < last:
         pivot = centres[order[(first + last) // 2], axis]

@@ -9,12 +9,12 @@ It is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one fi
 between two touching bodies changes it by -1 and +1 at one place, so that the wall does not count.
 (The number of crossings alone, even or odd, gets all three wrong.)
 
-No ray hangs on a tie. Whether it passes a triangle is decided by the signs of three areas in the
-plan view. There, positions are whole numbers (`PlanGrid`, steps of about 1e-10 m), so that the
+No ray is undecided. The signs of three areas in the plan view tell whether it passes a triangle.
+There, positions are whole numbers (`PlanGrid`, steps of about 1e-10 m), so that the
 areas are exact and all triangles about an edge or a vertex agree. A ray that meets an edge exactly
 is moved by an infinitesimal to +z, and by a much smaller one to +x (simulation of simplicity,
-Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). So the answer is wrong
-nowhere but for points that lie on the surface itself, where there is none.
+Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). The answer is
+therefore right for all points that do not lie on the surface itself.
 
 A ray may leave through a small hole in the mesh unseen. Then the count of the triangles above
 differs from that of the triangles below, which must be equal in a closed surface; the larger one
@@ -39,10 +39,10 @@ class WindingSettings:
     """Winding numbers by a plan view."""
 
     max_buckets: int = 1_000_000
-    """Buckets of the plan view in all; more cost memory and gain nothing."""
+    """Largest number of buckets of the plan view. Chosen: more would cost memory and not save
+    time."""
     plan_bits: int = 29
-    """Bits of half the size of the plan view, so that products of differences fit into 63
-    bits."""
+    """Bits of half the size of the plan view. Chosen: products of differences fit into 63 bits."""
 
 
 WINDING = WindingSettings()
@@ -69,11 +69,11 @@ class PlanGrid:
 
     @property
     def step(self) -> float:
-        """What separates two whole numbers, m."""
+        """Distance of two whole numbers, m."""
         return 1.0 / self.scale
 
     def whole(self, plan: Array) -> Index:
-        """Return positions (n, 2), m, as whole numbers; what lies far outside is brought near."""
+        """Return positions (n, 2), m, as whole numbers; positions far outside are clipped."""
         numbers = np.rint((plan - self.middle) * self.scale)
         return np.clip(
             numbers, -(2 ** (WINDING.plan_bits + 1)), 2 ** (WINDING.plan_bits + 1)

@@ -1,4 +1,4 @@
-"""TOML that users give: read within limits, so that a small text cannot take hours or gigabytes.
+"""TOML from users, read within limits, so that a small text cannot take hours or gigabytes.
 
 Python's reader takes time with the square of a dotted key's parts, memory with nesting, and
 refuses integers of thousands of digits in its own way. Each is refused before it is read.
@@ -16,7 +16,7 @@ from tkamb.files import MEGABYTE, read_text
 
 @dataclass(frozen=True)
 class TomlLimits:
-    """What a TOML text may have. Scenes, cohorts and materials stay a hundred times below."""
+    """Limits of a TOML text. Scenes, cohorts and materials stay a hundred times below them."""
 
     size: int = 8 * MEGABYTE
     """Bytes of a file: ten seconds of Python's reader."""
@@ -30,7 +30,7 @@ class TomlLimits:
 
 LIMITS = TomlLimits()
 
-# strings and comments, whose content is no structure; each stands for itself as an empty string
+# Strings and comments, whose content is not structure; each is replaced by an empty string.
 _STRINGS = re.compile(
     r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
 )
@@ -66,7 +66,9 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # the parser's own error is a ValueError
-        raise InputError(f"is not TOML ({str(error)[:200]})", where) from None
+        raise InputError(
+            f"is not TOML ({str(error)[:200]})", where, "correct that line, or give a TOML file"
+        ) from None
 
 
 def check_key(dotted: str, where: object) -> None:
@@ -78,12 +80,12 @@ def check_key(dotted: str, where: object) -> None:
 def check_limits(text: str, where: object) -> None:
     """Raise an InputError for TOML text, or a value of it, beyond `TomlLimits`."""
     structure = _STRINGS.sub('""', text)
-    for found in _KEYS.finditer(structure):
-        check_key(found.group(), where)
+    for match in _KEYS.finditer(structure):
+        check_key(match.group(), where)
     if _DIGITS.search(structure):
         raise InputError(f"has a number of more than {LIMITS.digits} digits", where)
     depth = 0
-    for found in _BRACKETS.finditer(structure):
-        depth = depth + 1 if found.group() in "[{" else max(depth - 1, 0)
+    for match in _BRACKETS.finditer(structure):
+        depth = depth + 1 if match.group() in "[{" else max(depth - 1, 0)
         if depth > LIMITS.depth:
             raise InputError(f"nests values more than {LIMITS.depth} deep", where)

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.probe import CondyleWrench, ProbedContact
-from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.result import ContactStatus
+from tkamb.contact.warm_start import Guess
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, cross, pose
 from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
@@ -26,14 +27,17 @@ class DifferenceSettings:
     """How the stiffness of a model without an exact tangent is found: by central differences."""
 
     step: float = 4e-6
-    """m: of a translation. Large against what the solver's tolerance leaves open, small
-    against the radius of the contact."""
+    """m: step of a translation. Chosen: large against the solver's residual error, small against
+    the radius of the contact."""
     exact_step: float = 1e-9
-    """m: the same for a model without a solver, whose answers are exact."""
+    """m: step for a model without a solver, whose answers are exact. Chosen: far above rounding,
+    far below the size of a facet."""
     arm: float = 0.025
-    """m: a rotation is this step over this arm."""
+    """m: lever arm; the step of a rotation is the step of a translation over this arm. Chosen: half
+    the distance of the condyles."""
     tolerance: float = 1e-6
-    """Solver tolerance of a model that has one, for these evaluations."""
+    """Solver tolerance of a model that has one, for these evaluations. Chosen: a finite difference
+    divides the solver's error by the step."""
 
 
 CONTACT_DIFFERENCE = DifferenceSettings()
@@ -60,17 +64,17 @@ class KneeContact:
         self.state: Any = model.prepare(pair)
         self._settings = settings or CONTACT_DIFFERENCE
 
-    def probe(self, guess: ContactResult | None = None) -> Any:
+    def probe(self, start: Guess | None = None) -> Any:
         """Return a new probe (`tkamb.contact.probe.Probe`), which a caller keeps as warm start."""
-        return self.model.probe(self.state, guess)
+        return self.model.probe(self.state, start)
 
-    def precise_probe(self, guess: ContactResult | None = None) -> Any:
+    def precise_probe(self, start: Guess | None = None) -> Any:
         """Return a new probe whose answers are precise enough for differences."""
         names = {field.name for field in fields(self.model)}  # type: ignore[arg-type]
         if "tolerance" not in names:
-            return self.probe(guess)
+            return self.probe(start)
         model = replace(self.model, tolerance=self._settings.tolerance)  # type: ignore[type-var]
-        return model.probe(self.state, guess)
+        return model.probe(self.state, start)
 
     def at(self, probe: Any, place: Array) -> ProbedContact:
         """Return the contact at a pose (4, 4).
@@ -108,7 +112,7 @@ class KneeContact:
         return total
 
     def _rubbing(self, load: CondyleWrench, twist: Array) -> Array:
-        """Return the friction's wrench (6,) on the insert per unit force of a condyle."""
+        """Return the wrench (6,) of friction on the insert per unit force of a condyle."""
         sliding = twist[:3] + cross(twist[3:], load.point)
         touch = CondylePoint(load.point, load.normal, sliding, 0.0)
         return wrench_of(touch.point, touch.normal - touch.direction(self.friction))
@@ -141,8 +145,8 @@ class KneeContact:
             probe: warm start.
             place: (4, 4) pose.
             contact: there.
-            twist: (6,) of the femur, held.
-            exact: a tangent that the model knows only roughly is not taken.
+            twist: (6,) of the femur, held constant.
+            exact: do not use an approximate tangent of the model.
         """
         rubs = bool(self.friction and np.any(twist) and contact.loads)
         if contact.tangent and not (exact and (rubs or not contact.exact)):
@@ -154,7 +158,7 @@ class KneeContact:
                     pressed = -load.normal @ load.stiffness[:3]
                     total += np.outer(self._rubbing(load, twist), pressed)
             return total
-        precise = self.precise_probe(getattr(probe, "_guess", None))
+        precise = self.precise_probe(getattr(probe, "start", None))
         self.at(precise, place)
         settings = self._settings
         if contact.tangent and contact.exact and not hasattr(self.model, "tolerance"):

@@ -9,6 +9,7 @@ call changes the next: what may save time is a `KneeData` that the caller makes 
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ContactModel
     from tkamb.contact.probe import ProbedContact
     from tkamb.contact.result import ContactResult
+    from tkamb.contact.warm_start import Guess, WarmStart
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.geometry.surface import Surface
     from tkamb.knee.contact import KneeContact
@@ -60,13 +62,16 @@ class KneeSettings:
     """The knee object: frames and poses."""
 
     frame_tolerance: float = 1e-9
-    """m and rad: an insert frame this near to that of its flat bottom is the same frame."""
+    """m and rad: an insert frame this near to that of its flat bottom is the same frame. Chosen:
+    above rounding."""
     pose_tolerance: float = 1e-12
-    """m and rad: residual of the joint coordinates that make a given pose of the knee."""
+    """m and rad: residual of the joint coordinates that make a given pose of the knee. Chosen: near
+    the rounding of double precision."""
     accepted_pose_error: float = 1e-8
-    """m and rad: at most what is left after the last Newton step of a pose that is reached."""
+    """m and rad: at most what is left after the last Newton step of a pose that is reached. Chosen:
+    far below what changes a force."""
     max_pose_steps: int = 30
-    """Newton steps at most to find these coordinates."""
+    """Newton steps at most to find these coordinates. Chosen: poses that converge need fewer."""
 
 
 KNEE = KneeSettings()
@@ -403,14 +408,14 @@ class Knee:
         self,
         q: Array,
         load: float,
-        guess: "ContactResult | None" = None,
+        guess: "Guess | None" = None,
     ) -> "ContactResult":
         """Return the contact when the femur carries a load, at the rotation, AP and ML of q.
 
         Args:
             q: (nq,).
             load: N, along the insert's y axis, pressing; not negative.
-            guess: an earlier result, to save time.
+            guess: an earlier result or warm start, to save time.
 
         Returns:
             Pressure, area and forces of both condyles, in the insert frame of a right knee: a
@@ -419,13 +424,25 @@ class Knee:
         Raises:
             InputError: no contact model, or a load that is negative or not finite.
         """
+        return self.press_from(q, load, guess)[0]
+
+    def press_from(
+        self, q: Array, load: float, start: "Guess | None" = None
+    ) -> "tuple[ContactResult, WarmStart]":
+        """Return what `press` does, and the warm start of a press near by.
+
+        Args:
+            q: (nq,).
+            load: N, as of `press`.
+            start: the warm start that the last press returned; it saves time.
+        """
         contact = self._need_contact()
         if not (np.isfinite(load) and load >= 0):
             raise InputError(f"load {load} N", "press", "give a load of 0 or more")
         place = self._kinematics(self.create_data_for_kinematics(), q)
-        return contact.model.press(contact.state, float(load), place.pose, guess)
+        return contact.model.press_from(contact.state, float(load), place.pose, start)
 
-    def evaluate(self, q: Array, guess: "ContactResult | None" = None) -> "ContactResult":
+    def evaluate(self, q: Array, guess: "Guess | None" = None) -> "ContactResult":
         """Return the contact at q: pressure, area and forces by the overlap of the bodies there.
 
         As `press`, but for the height, which is that of q.
@@ -507,6 +524,25 @@ class Knee:
         from tkamb.knee.show import show_knee
 
         show_knee(self, viewer, q, **options)
+
+    def live(self, q: Array, load: float = 1000.0, folder: Any = None) -> Any:
+        """Serve a page on which the knee is pressed and moved by hand; see docs/live.md.
+
+        The load acts along the insert's y axis; ligaments between femur and tibia pull. Nothing
+        that is done there changes this object.
+
+        Args:
+            q: (nq,), or (f, nq) for the slider "recorded frame".
+            load: N, at first.
+            folder: for what is kept; None: out/live.
+
+        Returns:
+            The server: its address is `url`, and it answers until `close()`.
+
+        Raises:
+            InputError: no contact model, or one without a name (`tkamb.contact_model`).
+        """
+        return import_module("tkamb.show.view.knee_on_bench").live_knee(self, q, load, folder)
 
     def at(self, q: Array, data: KneeData) -> KneePlace:
         """Return where the knee is at q, and bring the placements in `data` up to date."""

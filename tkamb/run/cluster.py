@@ -27,9 +27,11 @@ class ClusterSettings:
     """Patience with a Dask cluster."""
 
     answer_seconds: float = 10.0
-    """s that a scheduler may take to answer."""
+    """s that a scheduler may take to answer. Chosen: an idle scheduler answers within one
+    second."""
     most_deaths: int = 5
-    """Workers that may die under one job before it is taken to be what kills them."""
+    """Workers that may die under one job. Chosen: after that the job is taken to be what kills
+    them."""
 
 
 CLUSTER = ClusterSettings()
@@ -38,13 +40,13 @@ LOST = "what is finished is kept: go on with --resume"
 
 
 def answers_of_cluster(
-    task: "Task", wanted: Sequence["Numbered"], address: str, workers: int
+    task: "Task", tasks: Sequence["Numbered"], address: str, workers: int
 ) -> Iterator["Numbered"]:
     """Yield answers with their numbers as they are finished, in any order.
 
     Args:
         task: what each process of the cluster prepares.
-        wanted: numbers and contents of the jobs.
+        tasks: numbers and contents of the jobs.
         address: of the scheduler, "tcp://host:8786"; "local": one on this machine.
         workers: processes of a local one.
 
@@ -67,7 +69,7 @@ def answers_of_cluster(
                 )
             )
         client = stack.enter_context(_connected(distributed, place, address))
-        yield from _answers(distributed, client, task, wanted)
+        yield from _answers(distributed, client, task, tasks)
 
 
 def _own_security(distributed: Any) -> Any:
@@ -116,12 +118,12 @@ def _connected(distributed: Any, place: Any, address: str) -> Any:
 
 
 def _answers(
-    distributed: Any, client: Any, task: "Task", wanted: Sequence["Numbered"]
+    distributed: Any, client: Any, task: "Task", tasks: Sequence["Numbered"]
 ) -> Iterator["Numbered"]:
     packed = pickle.dumps((task.make, task.arguments))
     try:
         futures = {
-            client.submit(answer, packed, number, job, pure=False): number for number, job in wanted
+            client.submit(answer, packed, number, job, pure=False): number for number, job in tasks
         }
         for future in distributed.as_completed(futures):
             if future.cancelled():

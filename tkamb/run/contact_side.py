@@ -21,6 +21,7 @@ from tkamb.contact.pressing import within_insert
 from tkamb.contact.probe import condyle_wrenches
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
+from tkamb.contact.warm_start import WarmStart
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
@@ -49,14 +50,16 @@ class CouplingSettings:
     """The iteration between contact and muscles of one frame."""
 
     force_tolerance: float = 0.1
-    """N; the iteration has converged when the load changes by less. A ten-thousandth of a body
-    weight is not resolved by any contact model."""
+    """N; the iteration has converged when the load changes by less. Chosen: a ten-thousandth of a
+    body weight is not resolved by any contact model."""
     point_tolerance: float = 1e-6
-    """m; and when the centres of pressure move by less."""
+    """m; and when the centres of pressure move by less. Chosen: far below what changes a force."""
     max_iterations: int = 20
-    """Iterations after which a frame without convergence gets a status."""
+    """Iterations after which a frame without convergence gets a status. Chosen: frames that
+    converge need fewer."""
     stiffness_error: float = 0.02
-    """Share of the stiffness of the muscles that a converged search may neglect."""
+    """Share of the stiffness of the muscles that a converged search may neglect. Chosen: the search
+    converges nevertheless."""
 
 
 COUPLING = CouplingSettings()
@@ -115,7 +118,7 @@ class ContactSide:
 
         Args:
             k: frame.
-            before: the contacts of the frames before: the last is a guess that saves time,
+            before: the contacts of the frames before: the last one's warm start saves time,
                 and the last that were found are where released coordinates begin.
         """
         if self.released is None:
@@ -126,54 +129,52 @@ class ContactSide:
             return body, contact
         if not self._sensitivity:
             return body, contact
-        start, turned = clock.perf_counter(), None
+        start = clock.perf_counter()
         if self._probe.exact:
             sensitivity = split_tangent(self._probe, contact.result)
         else:
-            last = before[-1] if before else None
-            like = (last.result, last.turned) if last and last.result and last.turned else None
-            sensitivity, turned = split_sensitivity(self._probe, contact.result, like)
+            sensitivity = split_sensitivity(self._probe, contact.result, contact.start)
         seconds = contact.seconds + clock.perf_counter() - start
-        return body, replace(contact, sensitivity=sensitivity, turned=turned, seconds=seconds)
+        return body, replace(contact, sensitivity=sensitivity, seconds=seconds)
 
     def _press_recorded(
         self, k: int, before: Sequence[FrameContact]
     ) -> tuple[FrameLoads, FrameContact]:
         """Return body and contact at the recorded rotation."""
-        guess, pose = before[-1].result if before else None, self.mechanics.poses[k]
+        begin, pose = before[-1].start if before else None, self.mechanics.poses[k]
         # Every press asks where the bodies first touch, of which the body's equations need nothing.
         body, _ = both(lambda: self.mechanics.frame(k), lambda: self.state.pair.touch_at(pose))
-        contact = self.carry(body, self.mechanics.poses[k], guess)
+        contact = self.carry(body, self.mechanics.poses[k], begin)
         if contact.adjustment and contact.adjustment.restored:
             body = self.mechanics.frame(k, contact.adjustment)
-            contact = self.carry(body, self.mechanics.poses[k], contact.result)
+            contact = self.carry(body, self.mechanics.poses[k], contact.start)
         if self.table.coupling == "none" and self.post is None:
             return body, contact
         return self._couple(k, body, contact)
 
-    def carry(self, body: FrameLoads, pose: Array, guess: ContactResult | None) -> FrameContact:
+    def carry(self, body: FrameLoads, pose: Array, begin: WarmStart | None) -> FrameContact:
         """Press in what the body asks for, at the measured (or adjusted) rotation.
 
         Args:
             body: the body side of the frame.
             pose: (4, 4) measured pose_femoral_in_insert.
-            guess: the previous frame's contact, which may save time.
+            begin: the previous frame's warm start, which may save time.
         """
         load = float(body.loads.contact_force[1])
         if not np.isfinite(load):
             return self.nothing("no load from the equations")
         if load <= 0:
             return self.nothing("no compressive load")
-        start = clock.perf_counter()
+        began = clock.perf_counter()
         adjustment, query = body.adjustment, self.mechanics.query
         if adjustment is None or query is None:
-            result = self.model.press(self.state, load, pose, guess)
+            result, start = self.model.press_from(self.state, load, pose, begin)
         else:
-            result, adjustment = press_adjusted(
-                self.model, self.state, load, adjustment, query, guess
+            result, adjustment, start = press_adjusted(
+                self.model, self.state, load, adjustment, query, begin
             )
-        seconds = clock.perf_counter() - start
-        return self._contact(result, adjustment, seconds)
+        seconds = clock.perf_counter() - began
+        return self._contact(result, start, adjustment, seconds)
 
     def _couple(
         self, k: int, body: FrameLoads, contact: FrameContact
@@ -195,7 +196,7 @@ class ContactSide:
             geometry = replace(body.geometry, condyles=body.geometry.condyles | result, post=pushed)
             geometry, loads = self.mechanics.solved(k, geometry)
             body = replace(body, geometry=geometry, loads=loads)
-            contact = self.carry(body, self.mechanics.poses[k], contact.result)
+            contact = self.carry(body, self.mechanics.poses[k], contact.start)
             seconds += contact.seconds
             change = abs(float(body.loads.contact_force[1] - load))
             moved = _travel(points, _points(body))
@@ -222,10 +223,10 @@ class ContactSide:
             before: the contacts of the frames before; where the last three that were found
                 go on is where the search begins.
         """
-        released, start = self.released, clock.perf_counter()
+        released, began = self.released, clock.perf_counter()
         assert released is not None
-        good = [contact for contact in before if contact.equilibrium and contact.result][-3:]
-        guess = good[-1].result if good else None
+        good = [contact for contact in before if contact.equilibrium and not contact.problem][-3:]
+        begin = good[-1].start if good else None
         points = {} if len(released.released) == 5 else self._nearest_points(k)
         try:
             knee = self.starts.rest(k, [c.equilibrium for c in good if c.equilibrium], points)
@@ -237,17 +238,18 @@ class ContactSide:
         if not knee.problem:
             pose, pair = knee_pose(knee.coordinates), self.state.pair
             # The check that follows asks where the bodies first touch.
-            result, _ = both(
-                lambda: self.model.evaluate(self.state, pose, guess), lambda: pair.touch_at(pose)
+            (result, start), _ = both(
+                lambda: self.model.evaluate_from(self.state, pose, begin),
+                lambda: pair.touch_at(pose),
             )
             result = within_insert(self.state, result)
-            contact = self._contact(result, None, 0.0)
+            contact = self._contact(result, start, None, 0.0)
             flags = (*contact.flags, *_doubts(knee))
             post = post_contact(self.post, result.pose, self.table)
             contact = replace(contact, flags=flags, post=post)
         contact = replace(
             contact,
-            seconds=clock.perf_counter() - start,
+            seconds=clock.perf_counter() - began,
             iterations=knee.passes,
             load_change=knee.change,
             equilibrium=knee,
@@ -292,7 +294,11 @@ class ContactSide:
         return result | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
     def _contact(
-        self, result: ContactResult, adjustment: Adjustment | None, seconds: float
+        self,
+        result: ContactResult,
+        start: WarmStart,
+        adjustment: Adjustment | None,
+        seconds: float,
     ) -> FrameContact:
         medial = medial_points(self.state.points, result.pose, self.case.split)
         if result.status is not ContactStatus.OK:
@@ -300,8 +306,9 @@ class ContactSide:
             words = "; ".join((reason, *result.flags))
             return FrameContact(None, medial, adjustment, seconds, words, ())
         return FrameContact(
-            result, medial, adjustment, seconds, "", result.flags, triangles=self.state.triangles
-        )
+            result, medial, adjustment, seconds, "", result.flags,
+            start=start, triangles=self.state.triangles,
+        )  # fmt: skip
 
     def nothing(self, problem: str) -> FrameContact:
         """Return a contact that could not be computed, and why."""

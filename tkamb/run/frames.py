@@ -28,12 +28,11 @@ class FrameLoopSettings:
     """How frames are shared and which contacts are kept as guesses."""
 
     kept_contacts: int = 20
-    """How many contacts are kept as guesses for the next."""
+    """How many contacts are kept as guesses for the next. Chosen: older ones are farther away than
+    a new search begins."""
     frames_per_chunk: int = 10
-    """Frames that a worker computes in a row: the first of them has no guess from the one before.
-
-The same for any number of workers, so that their number changes no answer.
-"""
+    """Frames that a worker computes in a row; the first of them has no guess from the one before.
+    Chosen: the same for any number of workers, so that their number changes no answer."""
 
 
 FRAME_LOOP = FrameLoopSettings()
@@ -86,9 +85,9 @@ class FrameSolver:
         return k, frame_row(self._case, k, body, contact, self.slips, status), arrays
 
     def _keep(self, contact: "FrameContact") -> None:
-        """Keep a contact as a guess; only the last that was found says where a solver begins."""
+        """Keep a contact; only the last that was found keeps its warm start, which is large."""
         if contact.result is not None:
-            self.before = [_without_warm_start(earlier) for earlier in self.before]
+            self.before = [replace(each, start=None) for each in self.before]
         self.before.append(contact)
         del self.before[: -FRAME_LOOP.kept_contacts]
 
@@ -100,13 +99,6 @@ class FrameSolver:
         from tkamb.run.contact_side import ContactSide
 
         return ContactSide(self._case, self.mechanics)
-
-
-def _without_warm_start(contact: "FrameContact") -> "FrameContact":
-    result = contact.result
-    if result is None or (result.warm_start is None and contact.turned is None):
-        return contact
-    return replace(contact, result=replace(result, warm_start=None), turned=None)
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
@@ -145,7 +137,7 @@ class ChunkSolver:
 
 
 def finished_in_order(
-    team: WorkerPool, slips: "dict[str, CondyleSlip]", indices: range, left: Sequence[int]
+    team: WorkerPool, slips: "dict[str, CondyleSlip]", indices: range, remaining: Sequence[int]
 ) -> Iterator[Finished]:
     """Yield frames over worker processes, in order.
 
@@ -153,13 +145,13 @@ def finished_in_order(
         team: of workers whose task is a `ChunkSolver`.
         slips: of the recorded motion, see `FrameSolver`.
         indices: all frames of the run, which make its chunks.
-        left: those that are still to do.
+        remaining: frames that are not computed yet.
 
     Raises:
         ComputationError: a worker was killed.
     """
     chunks: dict[int, Chunk] = {}
-    for k in left:
+    for k in remaining:
         chunks.setdefault(indices.index(k) // FRAME_LOOP.frames_per_chunk, ([], slips))[0].append(k)
     early: dict[int, list[Finished]] = {}
     turn = iter(chunks)

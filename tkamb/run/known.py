@@ -33,13 +33,15 @@ class SharedState:
     frames: range
 
 
-def extensor_frames(case: Case, poses: Array, known: SharedState | None = None) -> "ExtensorFrames":
+def extensor_frames(
+    case: Case, poses: Array, shared: SharedState | None = None
+) -> "ExtensorFrames":
     """Return the extensor mechanism of a case with [patella].
 
     Args:
         case: the case.
         poses: (f, 4, 4) pose_femur_in_insert.
-        known: what is known already of a case that this one is a sample of.
+        shared: state of the case that this one is a sample of.
 
     Raises:
         InputError: no patella was recorded, or see `ExtensorFrames`.
@@ -53,9 +55,9 @@ def extensor_frames(case: Case, poses: Array, known: SharedState | None = None) 
         muscle, case.patellar_ligament, case.chain, case.femoral, case.patella, case.insert
     )
     motion, recorded = case.motion, None
-    if known is not None and case.scene.patella.motion == "solved":
-        assert known.extensor is not None
-        return known.extensor.moved(parts, poses, known.frames)
+    if shared is not None and case.scene.patella.motion == "solved":
+        assert shared.extensor is not None
+        return shared.extensor.moved(parts, poses, shared.frames)
     if case.scene.patella.motion == "recorded":
         if motion.patella is None:
             raise InputError(

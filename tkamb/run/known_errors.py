@@ -23,7 +23,8 @@ class KnownErrorSettings:
     """How known errors of the contact settings are shown."""
 
     notable_share: float = 0.10
-    """Share of the reference; a known error above it is shown in colour."""
+    """1: share of the reference; a known error above it is shown in colour. Chosen: a reader should
+    not miss it."""
 
 
 KNOWN_ERROR = KnownErrorSettings()
@@ -107,25 +108,25 @@ def as_json(error: KnownError | None) -> dict[str, Any] | str:
     return NOT_MEASURED if error is None else asdict(error)
 
 
-def known_error_words(said: Mapping[str, Any] | str, names: Iterable[str]) -> str:
+def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
     """Return in words what `as_json` made, for some of its quantities.
 
     Args:
-        said: what summary.json holds under `known_error`.
+        error: what summary.json holds under `known_error`.
         names: quantities, fields of `KnownError`.
     """
-    if isinstance(said, str):
-        return f"error of this setting: {said}"
-    parts = ", ".join(f"{100 * said[name]:.2g} % in {name.replace('_', ' ')}" for name in names)
-    words = f"on {said['cases']} reference cases off by {parts}"
-    situations = said.get("situations") or {}
-    shown = [name for name in names if name in ("peak_pressure", "area")]
+    if isinstance(error, str):
+        return f"error of this setting: {error}"
+    parts = ", ".join(f"{100 * error[name]:.2g} % in {name.replace('_', ' ')}" for name in names)
+    words = f"on {error['cases']} reference cases off by {parts}"
+    situations = error.get("situations") or {}
+    stated = [name for name in names if name in ("peak_pressure", "area")]
     places = [
-        f"{_PLACES[place]} {' and '.join(f'{100 * errors[name]:.2g} %' for name in shown)}"
+        f"{_PLACES[place]} {' and '.join(f'{100 * errors[name]:.2g} %' for name in stated)}"
         for place, errors in situations.items()
     ]
-    if shown and places:
-        quantities = " and ".join(name.replace("_", " ") for name in shown)
+    if stated and places:
+        quantities = " and ".join(name.replace("_", " ") for name in stated)
         words += f" ({quantities}: {', '.join(places)})"
     return words
 
@@ -133,16 +134,16 @@ def known_error_words(said: Mapping[str, Any] | str, names: Iterable[str]) -> st
 _PLACES = {"interior": "in the interior", "flank": "on a flank", "edge": "at an edge"}
 
 
-def is_large(said: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
+def is_large(error: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
     """Return whether one of the quantities is known to be off by more than 10 %.
 
     Contact at an edge carries its own flag: where situations were measured, the interior and
     flanks decide.
     """
-    if isinstance(said, str):
+    if isinstance(error, str):
         return False
-    situations = said.get("situations") or {}
+    situations = error.get("situations") or {}
     smooth = [errors for place, errors in situations.items() if place != "edge"]
     return any(
-        errors[name] > KNOWN_ERROR.notable_share for name in names for errors in smooth or [said]
+        errors[name] > KNOWN_ERROR.notable_share for name in names for errors in smooth or [error]
     )

@@ -67,7 +67,7 @@ class Mechanics:
 
     Args:
         case: the scene with its files read.
-        known: what is known already of a case that this one is a sample of.
+        shared: state of the case that this one is a sample of.
         near: whether the condyles are known to be near the insert.
 
     Attributes:
@@ -79,18 +79,18 @@ class Mechanics:
         muscles: those that share the load; None if the quadriceps alone acts.
     """
 
-    def __init__(self, case: Case, known: SharedState | None = None, near: bool = False) -> None:
-        self.case, self._known = case, known
+    def __init__(self, case: Case, shared: SharedState | None = None, near: bool = False) -> None:
+        self.case, self._known = case, shared
         self.poses = knee_pose(case.motion.coordinates)
         self.friction = case.scene.contact.friction if case.scene.contact else 0.0
-        if known is None and not near:
+        if shared is None and not near:
             self._check_near()
         self.extensor = None
         if case.scene.patella:
-            self.extensor = extensor_frames(case, self.poses, known)
+            self.extensor = extensor_frames(case, self.poses, shared)
         self.ligaments, self.strains = self._build_ligaments()
-        self.muscles = known.muscles if known else None
-        if case.scene.muscles and known is None:
+        self.muscles = shared.muscles if shared else None
+        if case.scene.muscles and shared is None:
             from tkamb.run.muscles.shared_muscles import load_muscles
 
             self.muscles = load_muscles(case)
@@ -142,9 +142,9 @@ class Mechanics:
             geometry, condyles=points.condyles, lifted=points.lifted, problems=problems
         )
         geometry, loads = self.solved(k, geometry)
-        done = clock.perf_counter()
+        end = clock.perf_counter()
         effect = self._effect(geometry, loads, recorded) if recorded else None
-        return FrameLoads(geometry, loads, adjustment, queried - start, done - queried, effect)
+        return FrameLoads(geometry, loads, adjustment, queried - start, end - queried, effect)
 
     def solved(self, k: int, geometry: KneeGeometry) -> tuple[KneeGeometry, KneeLoads]:
         """Return frame k with the muscles' shares in it, and its loads.
@@ -320,8 +320,8 @@ class Mechanics:
             return None
         from tkamb.knee.adjustment_effect import adjustment_effect
 
-        there = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
-        before = solve_knee(there, self.friction)
+        recorded_geometry = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
+        before = solve_knee(recorded_geometry, self.friction)
         if before.problems:
             return None
         return adjustment_effect(loads, before, geometry.condyles, recorded.condyles)

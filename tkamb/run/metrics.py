@@ -1,11 +1,13 @@
 """The few numbers that say what happened in a run."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.articular_edge import AT_EDGE
+from tkamb.contact.narrow import TOO_NARROW
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run.agreement import AGREEMENT
@@ -20,15 +22,23 @@ class MetricSettings:
     """What counts as a jump of a centre of pressure, and as an unloaded quadriceps."""
 
     jump: float = 8.0 * MILLIMETRE
-    """m; a centre of pressure that moves farther between two frames may have jumped."""
+    """m; a centre of pressure that moves farther between two frames may have jumped. Chosen: on one
+    dish a contact point moves by less from frame to frame."""
     jump_steps: float = 5.0
-    """A centre of pressure that moves by more than `jump` and by many median steps from a frame to
-the next has not travelled there."""
+    """Median steps: a centre of pressure that moves by more than these and by more than `jump` from
+    a frame to the next has jumped. Chosen: a movement does not speed up as much."""
     least_tension: float = 1.0
-    """N: below this quadriceps tension its ratios are not shown."""
+    """N: below this quadriceps tension its ratios are not shown. Chosen: a quotient of small
+    numbers says nothing."""
 
 
 METRICS = MetricSettings()
+
+PEAK_DOUBTS = {
+    AT_EDGE: AT_EDGE,
+    TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
+}
+"""Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +79,30 @@ def peak(results: "Results", column: str) -> Peak | None:
     return max(result, key=lambda one: one.value, default=None)
 
 
+def doubt_of_peak(results: "Results", side: str, frame: int) -> str:
+    """Return in words why the peak pressure of a condyle at a frame is in doubt; "" if it is not.
+
+    A run's status tells the flags of each frame.
+    """
+    status = str(results.status[frame])
+    words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
+    return " and ".join(words)
+
+
+def peak_pressure(results: "Results") -> dict[str, Any] | None:
+    """Return the largest peak pressure, where it is and what is in doubt; None without contact."""
+    largest = peak(results, "<side>_peak_pressure_MPa")
+    if largest is None:
+        return None
+    return {
+        "MPa": largest.value,
+        "side": largest.side,
+        "frame": largest.frame,
+        "time_s": float(results["time_s"][largest.frame]),
+        "doubt": doubt_of_peak(results, largest.side, largest.frame),
+    }
+
+
 def medial_share(results: "Results", estimate: str) -> Array:
     """Return the medial share (f,) by "deformation" or by "equilibrium"."""
     if estimate == "equilibrium":
@@ -93,9 +127,9 @@ def moved_per_half_degree(results: "Results") -> Array:
     holds only until the other touches.
     """
     share = medial_share(results, "deformation")
-    moved = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
-    moved = np.minimum(moved, np.abs(results["force_si_N"]))
-    return np.where(np.abs(share - 0.5) < 0.5 - AGREEMENT.unloaded_share, moved, np.nan)
+    shift = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
+    shift = np.minimum(shift, np.abs(results["force_si_N"]))
+    return np.where(np.abs(share - 0.5) < 0.5 - AGREEMENT.unloaded_share, shift, np.nan)
 
 
 def shares_apart(results: "Results") -> Array:
@@ -159,8 +193,10 @@ def map_rows(results: "Results") -> dict[int, int]:
 def stretches(points: Array) -> list[slice]:
     """Return the parts, of two points or more, of a path (n, k) m that neither lacks nor jumps."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    known = steps[np.isfinite(steps)]
-    longest = max(METRICS.jump, METRICS.jump_steps * float(np.median(known))) if len(known) else 0.0
+    finite = steps[np.isfinite(steps)]
+    longest = (
+        max(METRICS.jump, METRICS.jump_steps * float(np.median(finite))) if len(finite) else 0.0
+    )
     near = np.concatenate([[False], steps <= longest, [False]])
     ends = np.flatnonzero(np.diff(near.astype(int))).reshape(-1, 2)
     return [slice(int(first), int(last) + 1) for first, last in ends]

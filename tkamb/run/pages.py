@@ -25,5 +25,5 @@ def page(name: str) -> Callable[..., Any]:
         KeyError: no such page.
     """
     module, _, function = PAGES[name].partition(":")
-    made: Callable[..., Any] = getattr(import_module(module), function)
-    return made
+    function_of_module: Callable[..., Any] = getattr(import_module(module), function)
+    return function_of_module

@@ -43,10 +43,10 @@ class PressLimitSettings:
     """Which loads are accepted, and which poses get a remark."""
 
     max_load: float = 1e5
-    """N; over a hundred body weights."""
+    """N; largest load. Chosen: over a hundred body weights."""
     max_turn: float = 30.0 * DEGREE
-    """rad, about the vertical; no knee turns its femur farther on the tibia. Beyond it, medial and
-    lateral of the femoral component do not lie over those of the insert."""
+    """rad; largest turn of the femoral component about the vertical without a remark. Chosen: no
+    knee turns farther. Beyond it, medial and lateral do not lie over those of the insert."""
 
 
 PRESS_LIMITS = PressLimitSettings()
@@ -139,11 +139,11 @@ class PressReport:
                     f"{name:8s}" + _CONDYLE.format(*result[name].pop("cop_mm"), **result[name])
                 )
         if self.adjustment is not None:
-            done = self.adjustment
-            restored = ", recorded rotation restored" if done.restored else ""
+            adjustment = self.adjustment
+            restored = ", recorded rotation restored" if adjustment.restored else ""
             lines.append(
-                f"adjusted {done.translation / MILLIMETRE:.3f} mm along y, "
-                f"{done.coronal_angle / DEGREE:.3f} deg coronal{restored}"
+                f"adjusted {adjustment.translation / MILLIMETRE:.3f} mm along y, "
+                f"{adjustment.coronal_angle / DEGREE:.3f} deg coronal{restored}"
             )
         lines.append(known_error_words(result["known_error"], _ERRORS_TOLD))
         lines += [f"note: {flag}" for flag in result["flags"]]
@@ -195,27 +195,27 @@ def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
     ]
 
 
-def _adjustment(done: Adjustment) -> dict[str, Any]:
+def _adjustment(adjustment: Adjustment) -> dict[str, Any]:
     return {
-        "translation_mm": done.translation / MILLIMETRE,
-        "coronal_deg": done.coronal_angle / DEGREE,
-        "penetration_mm": _known(done.penetration / MILLIMETRE),
-        "final_angle_deg": _known(done.final_angle / DEGREE),
-        "restore_when": done.settings.restore_when,
-        "restored": done.restored,
+        "translation_mm": adjustment.translation / MILLIMETRE,
+        "coronal_deg": adjustment.coronal_angle / DEGREE,
+        "penetration_mm": _known(adjustment.penetration / MILLIMETRE),
+        "final_angle_deg": _known(adjustment.final_angle / DEGREE),
+        "restore_when": adjustment.settings.restore_when,
+        "restored": adjustment.restored,
     }
 
 
-def _condyle(carried: CondyleContact | None, side: Side) -> dict[str, Any] | None:
-    if carried is None:
+def _condyle(condyle: CondyleContact | None, side: Side) -> dict[str, Any] | None:
+    if condyle is None:
         return None
     to_right = np.array([1.0, 1.0, -1.0 if side == "left" else 1.0])
     return {
-        "force_N": carried.force,
-        "area_mm2": carried.area / MILLIMETRE**2,
-        "mean_pressure_MPa": carried.mean_pressure / MEGAPASCAL,
-        "peak_pressure_MPa": carried.peak_pressure / MEGAPASCAL,
-        "cop_mm": (carried.centre_of_pressure * to_right / MILLIMETRE).tolist(),
+        "force_N": condyle.force,
+        "area_mm2": condyle.area / MILLIMETRE**2,
+        "mean_pressure_MPa": condyle.mean_pressure / MEGAPASCAL,
+        "peak_pressure_MPa": condyle.peak_pressure / MEGAPASCAL,
+        "cop_mm": (condyle.centre_of_pressure * to_right / MILLIMETRE).tolist(),
     }
 
 
@@ -344,7 +344,9 @@ def _press(
         return model.press(state, load, femoral_pose), None
     pair: ContactPair = state.pair
     query = ClosestPointQuery(pair.femoral, pair.insert, condyle_split(pair.femoral))
-    return press_adjusted(model, state, load, adjusted(query, femoral_pose, settings), query)
+    adjustment = adjusted(query, femoral_pose, settings)
+    result, adjustment, _ = press_adjusted(model, state, load, adjustment, query)
+    return result, adjustment
 
 
 def load_pair(

@@ -47,9 +47,9 @@ class Profile:
         seconds = dict(results.summary["seconds"])
         whole = seconds.pop("all")
         for name, column in CLOCKS.items():
-            known = [float(value) for value in results[column] if math.isfinite(value)]
-            if known:
-                seconds[name] = sum(known)
+            finite = [float(value) for value in results[column] if math.isfinite(value)]
+            if finite:
+                seconds[name] = sum(finite)
         seconds["all else"] = max(0.0, whole - sum(seconds.values()))
         modules = sorted(set(sys.modules) - self._before)
         return {
@@ -67,11 +67,11 @@ class Profile:
         own = [path for path in opened if path.is_relative_to(folder) or path in elsewhere]
         return [path for path in own if path.is_file()]
 
-    def _hear(self, event: str, given: tuple[Any, ...]) -> None:
-        if event != "open" or not isinstance(given[0], str):
+    def _hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if event != "open" or not isinstance(arguments[0], str):
             return
-        if given[2] & os.O_ACCMODE == os.O_RDONLY:
-            self.opened.append(Path(given[0]))
+        if arguments[2] & os.O_ACCMODE == os.O_RDONLY:
+            self.opened.append(Path(arguments[0]))
 
 
 def profile_lines(report: dict[str, Any]) -> list[str]:

@@ -1,19 +1,18 @@
-"""A frame's contact as arrays, and back: what a resumed run starts its next frame from.
+"""A frame's contact as arrays, and the warm start that they give a resumed run's next frame.
 
-It stands in for the frame before as a guess, as good as the frame itself but for what is not
-kept: the warm start, the contact and muscle forces that a released knee begins from, and the
-turned contact. Answers stay within the solver's tolerance.
+The start is as good as the one that the frame left, but for what is not kept: the lattice's
+displacements, and the contact and muscle forces that a released knee begins from. Answers stay
+within the solver's tolerance.
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.pair import PreparedContact
 from tkamb.contact.probe import ProbedContact
-from tkamb.contact.result import ContactResult
+from tkamb.contact.warm_start import WarmStart
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.knee.equilibrium.balance import Balance, BalanceStatus
 from tkamb.knee.equilibrium.frame_contact import FrameContact
@@ -25,7 +24,8 @@ if TYPE_CHECKING:
     from tkamb.knee.equations import KneeGeometry
     from tkamb.run.mechanics import Mechanics
 
-RESULT_ARRAYS = ("pose", "normals", "pressure", "area", "gap", "nodal_force", "wrench_on_insert")
+RESULT_ARRAYS = ("pose", "pressure", "gap", "nodal_force")
+"""What the map of a run and the start of a resumed one need of a result."""
 
 
 def contact_arrays(
@@ -60,17 +60,14 @@ def contact_arrays(
 def recalled(
     side: ContactSide, mechanics: "Mechanics", frame: int, arrays: Mapping[str, Array] | None
 ) -> FrameContact:
-    """Return a frame's contact from its arrays, as a guess for the next frame."""
+    """Return a frame's warm start from its arrays, in a contact that holds no result."""
     none = np.zeros(len(side.state.points), bool)
     if arrays is None:
         return FrameContact(None, none, None, 0.0, "not recalled", ())
     knee = _equilibrium(mechanics, frame, arrays) if "equilibrium_coordinates" in arrays else None
-    return FrameContact(_result(side.state, arrays), none, None, 0.0, "", (), equilibrium=knee)
-
-
-def _result(state: PreparedContact, arrays: Mapping[str, Array]) -> ContactResult:
-    fields: dict[str, Any] = {name: arrays[name] for name in RESULT_ARRAYS}
-    return ContactResult(pair=state.pair, points=state.points, medial=None, lateral=None, **fields)
+    state = side.state
+    start = WarmStart(state.pair, arrays["pose"], state.points, arrays["pressure"], arrays["gap"])
+    return FrameContact(None, none, None, 0.0, "", (), equilibrium=knee, start=start)
 
 
 def _equilibrium(

@@ -31,9 +31,11 @@ class ComparisonSettings:
     """How predicted and measured courses are compared."""
 
     least_correlation_rise: float = 1e-6
-    """By how much the largest correlation exceeds those at the ends, where it is a maximum."""
+    """1: least excess of the largest correlation over those at the ends of the range of lags, from
+    which it is a maximum. Chosen: above rounding."""
     fewest_frames: int = 8
-    """Frames below which nothing is said of correlation and lag."""
+    """Frames below which nothing is said of correlation and lag. Chosen: a correlation of fewer
+    means little."""
 
 
 COMPARISON = ComparisonSettings()
@@ -76,11 +78,11 @@ def measured_column(name: str) -> str:
 
 def predicted_columns(columns: Mapping[str, Any]) -> dict[str, str]:
     """Return force -> the column that predicts it: the first that holds a number."""
-    found = {}
+    labels = {}
     for name, candidates in PREDICTED.items():
-        known = [one for one in candidates if one in columns and np.isfinite(columns[one]).any()]
-        found[name] = next(iter(known or candidates))
-    return found
+        present = [one for one in candidates if one in columns and np.isfinite(columns[one]).any()]
+        labels[name] = next(iter(present or candidates))
+    return labels
 
 
 def compare_measured(
@@ -200,8 +202,10 @@ def fitted_normalisation(
     time, result = np.asarray(columns["time_s"]), {}
     for channel, value in envelopes.normalised_by.items():
         own = [name for name, one in envelopes.channel_of.items() if one == channel]
-        lost = np.full_like(time, np.nan)
-        a = np.array([columns.get(family_column(ACTIVATION, name), lost) for name in own])
+        nothing_measured = np.full_like(time, np.nan)
+        a = np.array(
+            [columns.get(family_column(ACTIVATION, name), nothing_measured) for name in own]
+        )
         e = np.array([envelopes.at(name, time) for name in own])
         both = np.isfinite(a) & np.isfinite(e)
         along = float(a[both] @ e[both])
@@ -227,8 +231,8 @@ def _correlations(a: Array, rows: Array) -> Array:
 def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
     """Return the lag (s) of the largest correlation; NaN where it has no maximum inside."""
     shifted = envelopes.at(muscle, time - LAGS[:, None])
-    known = np.isfinite(shifted).all(axis=0)
-    r = _correlations(activation[known], shifted[:, known])
+    finite = np.isfinite(shifted).all(axis=0)
+    r = _correlations(activation[finite], shifted[:, finite])
     if not r.max() > max(r[0], r[-1]) + COMPARISON.least_correlation_rise:  # NaN too
         return np.nan
     return float(LAGS[r.argmax()])

@@ -26,9 +26,9 @@ def case_of_results(results: "Results") -> Case:
     summary = results.summary
     case, scene = load_case(_scene_of(summary)), summary.get("scene")
     if scene_hash(case) != summary.get("scene_sha256"):
-        known = "overrides" in summary
+        has_overrides = "overrides" in summary
         what = "has changed since these results were computed"
-        what += "" if known else ", or was run with --set"
+        what += "" if has_overrides else ", or was run with --set"
         raise InputError(what, scene, run_again(summary))
     if not same_files(case, summary):
         what = "a mesh or table that it names has changed since these results were computed"
@@ -49,10 +49,10 @@ def preset_of_run(summary: Mapping[str, Any]) -> str | None:
 
 def run_again(summary: Mapping[str, Any]) -> str:
     """Return the command that computes results like these, for a shell."""
-    given = (f"{key}={json.dumps(value)}" for key, value in overrides_of_run(summary).items())
+    options = (f"{key}={json.dumps(value)}" for key, value in overrides_of_run(summary).items())
     preset = preset_of_run(summary)
     study = [] if preset is None else [f"--as {shlex.quote(preset)}"]
-    changed = (f"--set {shlex.quote(one)}" for one in given)
+    changed = (f"--set {shlex.quote(one)}" for one in options)
     return " ".join([RUN_AGAIN, str(summary["scene"]), *study, *changed])
 
 

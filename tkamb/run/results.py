@@ -30,9 +30,9 @@ class StatisticsSettings:
     """When a band of samples is stated."""
 
     min_samples: int = 20
-    """Number of samples; with fewer, the 5th percentile is not between the two smallest."""
+    """Number of samples. Chosen: with fewer, the 5th percentile is not between the two smallest."""
     max_failed_share: float = 0.5
-    """Share of samples; where more fail, the others say too little."""
+    """Share of samples. Chosen: where more fail, the others say too little."""
 
 
 STATISTICS_LIMITS = StatisticsSettings()
@@ -70,10 +70,10 @@ class Results:
 
     def __repr__(self) -> str:
         """Return in a line how much there is, of what."""
-        lost = sum(status.startswith("failed") for status in self.status)
+        failures = sum(status.startswith("failed") for status in self.status)
         contact = self.summary.get("contact") or {}
         parts = [
-            f"{len(self)} frames" + (f" ({lost} failed)" if lost else ""),
+            f"{len(self)} frames" + (f" ({failures} failed)" if failures else ""),
             contact.get("model", "no contact"),
             f"{len(self.columns)} columns, {len(self.not_modelled)} of them not modelled",
             "no maps" if self.maps is None else f"maps of {len(self.maps.points_m)} points",
@@ -118,8 +118,8 @@ class Results:
     def band_with_discrepancy(self, name: str) -> Array | None:
         """Return p05 and p95 (2, f) of a column by inputs and discrepancy; None: it has none."""
         ends = [self.bands.get(f"{name}_discrepancy_{end}") for end in ("p05", "p95")]
-        found = [end for end in ends if end is not None]
-        return np.array(found) if len(found) == len(ends) else None
+        finite = [end for end in ends if end is not None]
+        return np.array(finite) if len(finite) == len(ends) else None
 
     def why_no_band(self, frame: int) -> str:
         """Return why a frame's results have no band, in words."""

@@ -48,6 +48,8 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """
     directory = Path(directory)
     settle(directory)
+    if not (directory / CSV_NAME).exists():
+        raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
     columns = read_csv(directory / CSV_NAME)
     summary = read_summary(directory)
     maps = None
@@ -59,10 +61,10 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
         if len(maps) < frames and not summary.get("unfinished_frames"):
             what = f"holds {len(maps)} frames, and {CSV_NAME} {frames}"
             raise InputError(what, directory / MAPS_NAME, "run it again")
-    if check and (found := differences(directory, summary)):
-        raise InputError(found[0], directory, "`tkamb verify` tells all; run it again")
-    there = (directory / BANDS_NAME).exists()
-    bands = read_bands(directory / BANDS_NAME) if there else {}
+    if check and (changes := differences(directory, summary)):
+        raise InputError(changes[0], directory, "`tkamb verify` tells all; run it again")
+    has_bands = (directory / BANDS_NAME).exists()
+    bands = read_bands(directory / BANDS_NAME) if has_bands else {}
     return Results(columns, summary, maps, directory, bands)
 
 
@@ -73,11 +75,11 @@ def read_summary(directory: Path) -> dict[str, Any]:
         InputError: no such file, not a JSON object, or it holds what tkamb does not write.
     """
     path = directory / SUMMARY_NAME
-    found = read_json(path, SUMMARY_LIMIT, what="summary of a run")
-    if not isinstance(found, dict):
+    summary = read_json(path, SUMMARY_LIMIT, what="summary of a run")
+    if not isinstance(summary, dict):
         raise InputError("is no JSON object", path, "give a folder that `tkamb run` wrote")
-    check_summary(found, path)
-    return found
+    check_summary(summary, path)
+    return summary
 
 
 def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
@@ -91,12 +93,12 @@ def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     if summary.get("summary_sha256") != _summary_hash(summary):
         messages.append(f"{SUMMARY_NAME} has changed since it was written")
     for name in (CSV_NAME, MAPS_NAME, *UNCERTAINTY_NAMES):
-        there = (directory / name).exists()
-        if there and name not in recorded:
+        exists = (directory / name).exists()
+        if exists and name not in recorded:
             messages.append(f"{name} does not belong to these results")
-        elif not there and name in recorded:
+        elif not exists and name in recorded:
             messages.append(f"{name} is missing")
-        elif there and sha256_of(directory / name) != recorded[name]:
+        elif exists and sha256_of(directory / name) != recorded[name]:
             messages.append(f"{name} has changed since it was written")
     return messages
 
@@ -230,17 +232,17 @@ def verify_results(directory: str | Path) -> Verdict:
     summary = read_summary(directory)
     if not isinstance(summary.get("versions"), Mapping):
         raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
-    found = differences(directory, summary)
+    changes = differences(directory, summary)
     if not isinstance(summary.get("files"), Mapping):
-        found.append("carries no SHA-256: written by an earlier tkamb, nothing can be checked")
+        changes.append("carries no SHA-256: written by an earlier tkamb, nothing can be checked")
     try:
         read_results(directory, check=False)
     except InputError as error:
-        found.append(str(error))
+        changes.append(str(error))
     inputs = summary.get("inputs")
     inputs = inputs if isinstance(inputs, Mapping) else {}
-    found += [line for path, recorded in inputs.items() if (line := _input(path, recorded))]
-    return Verdict(tuple(found), tuple(_notes(summary)), len(inputs))
+    changes += [line for path, recorded in inputs.items() if (line := _input(path, recorded))]
+    return Verdict(tuple(changes), tuple(_notes(summary)), len(inputs))
 
 
 def _input(path: str, recorded: str) -> str | None:

@@ -14,6 +14,7 @@ from tkamb.io.scene import Scene, load_scene, with_overrides, with_preset
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.frames import FRAME_LOOP, ChunkSolver, Finished, FrameSolver, finished_in_order
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.metrics import peak_pressure
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.results import Results
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
@@ -94,9 +95,9 @@ def simulate(
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
     if directory is not None and resume:
-        done = finished_results(Path(directory), identity)
-        if done is not None:
-            return done
+        finished = finished_results(Path(directory), identity)
+        if finished is not None:
+            return finished
     path = None if scene_path is None else Path(scene_path)
     run = _Run(case, indices, identity, input_hashes(case, path), path, start)
     with ExitStack() as stack:
@@ -146,10 +147,10 @@ class _Run:
             self._begin_maps(self.solver.side)
         self._take_earlier()
         self.resumed = len(self.recorder.rows)
-        left = [k for k in self.indices if k not in self.recorder.rows]
+        remaining = [k for k in self.indices if k not in self.recorder.rows]
         try:
             with interrupt_as_such():
-                for frame in self._finished(left, progress, team):
+                for frame in self._finished(remaining, progress, team):
                     self.recorder.record(*frame)
                     if self.recorder.due() and len(self.recorder.rows) < len(self.indices):
                         self.recorder.publish(self.results)
@@ -157,8 +158,8 @@ class _Run:
             if not self.recorder.keeps_files or not self.recorder.rows:
                 raise
             self.recorder.publish(self.results)
-            done = f"{len(self.recorder.rows)} of {len(self.indices)} frames"
-            raise KeyboardInterrupt(f"{done} are kept; go on with --resume") from None
+            progress_words = f"{len(self.recorder.rows)} of {len(self.indices)} frames"
+            raise KeyboardInterrupt(f"{progress_words} are kept; go on with --resume") from None
         self.recorder.finish()
         return self.recorder.publish(self.results)
 
@@ -178,17 +179,20 @@ class _Run:
         summary["inputs"] = self.inputs
         summary["resumed_frames"] = self.resumed
         summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
-        return Results(columns, summary, self.recorder.maps)
+        results = Results(columns, summary, self.recorder.maps)
+        if (largest := peak_pressure(results)) is not None:
+            summary["peak_pressure"] = largest
+        return results
 
     def _finished(
-        self, left: Sequence[int], progress: Progress, team: WorkerPool | None
+        self, remaining: Sequence[int], progress: Progress, team: WorkerPool | None
     ) -> Iterator[Finished]:
         """Yield the frames that are left, in order, as they are finished."""
         if team is None:
-            yield from (self.solver.solve(k) for k in progress(left))
+            yield from (self.solver.solve(k) for k in progress(remaining))
             return
-        frames = finished_in_order(team, self.solver.slips, self.indices, left)
-        yield from (frame for _, frame in zip(progress(left), frames, strict=True))
+        frames = finished_in_order(team, self.solver.slips, self.indices, remaining)
+        yield from (frame for _, frame in zip(progress(remaining), frames, strict=True))
 
     def _begin_maps(self, side: "ContactSide") -> None:
         labels = {
@@ -216,17 +220,17 @@ def _dotted(overrides: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[str
     Raises:
         InputError: a keyword that is not a table of values, or a key that is given twice.
     """
-    found = dict(overrides)
+    merged = dict(overrides)
     for name, table in tables.items():
         if not isinstance(table, Mapping):
             hint = f'{name}={{"key": value}}, or overrides={{"{name}.key": value}}'
             raise InputError("is not an option, nor a table of the scene's values", name, hint)
         for key, value in table.items():
             dotted = f"{name}.{key}"
-            if dotted in found:
+            if dotted in merged:
                 raise InputError("is given twice", dotted, "leave one of them out")
-            found[dotted] = value
-    return found
+            merged[dotted] = value
+    return merged
 
 
 def _scene_with(scene: Scene | Case, overrides: dict[str, Any]) -> Scene:
@@ -242,8 +246,8 @@ def _scene_as(
     """Return the scene with a preset laid over it, and over that what else was asked for."""
     if isinstance(scene, Case):
         raise InputError("a case has been read already", "preset", "give its scene instead")
-    asked = {"contact.model": model, "contact.resolution_mm": resolution_mm}
-    return with_preset(scene, preset, {key: v for key, v in asked.items() if v is not None})
+    wishes = {"contact.model": model, "contact.resolution_mm": resolution_mm}
+    return with_preset(scene, preset, {key: v for key, v in wishes.items() if v is not None})
 
 
 def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: float | None) -> Case:

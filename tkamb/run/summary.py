@@ -51,7 +51,8 @@ class SummarySettings:
     """What a summary warns of."""
 
     notable_reserve: float = 0.05
-    """Share of a coordinate's largest moment; more reserve than this is a warning."""
+    """1: share of a coordinate's largest moment; more reserve than this is a warning. Chosen: less
+    changes no muscle force noticeably."""
 
 
 SUMMARY = SummarySettings()
@@ -124,26 +125,26 @@ def summary_of(
 
 def _gait(case: Case) -> dict[str, Any]:
     """Return foot strikes, toe-offs and stances of the force plates, and the gait cycle."""
-    found: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
     cycle = case.gait_cycle_s
     if cycle is not None:
-        found["cycle_percent_s"] = list(cycle)
+        inputs["cycle_percent_s"] = list(cycle)
     gait = None if case.ground is None else case.ground.gait
     if (
         gait is None
         or not gait.foot_strikes + gait.toe_offs
         or case.motion.cycle_percent is not None
     ):
-        return found
+        return inputs
     offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
-    found["gait"] = {
+    inputs["gait"] = {
         "foot_strike_s": gait.foot_strikes,
         "toe_off_s": gait.toe_offs,
         "stance_s": gait.spans(),
         "threshold_N": GAIT.contact_force_N,
         "toe_off_percent": [float(cycle_percent(np.array(off), cycle)) for off in offs if cycle],
     }
-    return found
+    return inputs
 
 
 def notes_of(scene: Scene) -> list[str]:
@@ -171,8 +172,8 @@ def _origin(case: Case, path: Path | None) -> dict[str, Any]:
 def _subject(case: Case) -> dict[str, Any]:
     """Return whose knee it is, in which frame, and how it is shown."""
     patient, output = case.scene.patient, case.scene.output
-    left = "lateral (a left knee, computed as its mirror image)"
-    lateral = left if patient.side == "left" else "right (lateral)"
+    words = "lateral (a left knee, computed as its mirror image)"
+    lateral = words if patient.side == "left" else "right (lateral)"
     return {
         "side": patient.side,
         "frame": f"insert frame: x anterior, y superior, z {lateral}",
@@ -285,8 +286,8 @@ def assumptions(case: Case) -> list[str]:
         sentences.append("The force plate lies at the laboratory's height 0: no column says where.")
     if case.motion.unrecorded:
         sentences.append(
-            f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are found, and the rates "
-            "that enter inertia and the direction of sliding are those of a first guess."
+            f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are computed. The "
+            "rates that enter inertia and the direction of sliding are those of an initial guess."
         )
     if scene.motion.motion == "roll-slip":
         sentences.append(
@@ -331,15 +332,15 @@ def _marker_reading(case: Case) -> str:
     markers = case.motion.markers
     assert markers is not None and case.scene.motion.markers is not None
     used = {"segments": "rigid fits of shank and thigh", "chain": "a chain with joints"}
-    taken = ", ".join(case.scene.motion.markers.coordinates)
+    names = ", ".join(case.scene.motion.markers.coordinates)
     time = case.motion.time
     off = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
-    turned = np.abs(markers.flexion["segments"] - markers.flexion["chain"])
-    turned = markers.at(np.nan_to_num(turned), time).max() / DEGREE
+    difference = np.abs(markers.flexion["segments"] - markers.flexion["chain"])
+    difference = markers.at(np.nan_to_num(difference), time).max() / DEGREE
     return (
-        f"Shank and {taken} are those of skin markers, by {used[markers.method]}: the knee "
+        f"Shank and {names} are those of skin markers, by {used[markers.method]}: the knee "
         f"centres of shank and thigh markers are up to {off:.0f} mm apart, and the two readings' "
-        f"flexions differ by up to {turned:.1f} deg."
+        f"flexions differ by up to {difference:.1f} deg."
     )
 
 
@@ -358,7 +359,7 @@ def _agreement(table: ContactTable) -> str:
     """Return how body and contact were brought together."""
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
-        return f"{names} are not the recorded ones: body and contact are at rest in them."
+        return f"{names} are computed, not recorded: body and contact are in equilibrium there."
     sentence = "The contact model presses in the superior-inferior force at the measured rotation; "
     if table.coupling == "points":
         return sentence + "the deformed contact's resultants act in the body's equations."

@@ -259,8 +259,8 @@ def _check_depth(value: object, path: object) -> None:
 def _difference(value: Any, kind: Kind, where: str) -> str | None:
     """Return in words where a value is not of a kind; None if it is."""
     if isinstance(kind, tuple):
-        found = [_difference(value, one, where) for one in kind]
-        return None if None in found else max(filter(None, found), key=_depth_of_message)
+        problems = [_difference(value, one, where) for one in kind]
+        return None if None in problems else max(filter(None, problems), key=_depth_of_message)
     if isinstance(kind, dict):
         return _difference_of_keys(value, kind, where)
     if isinstance(kind, list):
@@ -270,8 +270,8 @@ def _difference(value: Any, kind: Kind, where: str) -> str | None:
         if len(kinds) != len(value):
             return f"'{where}' has {len(value)} items, not {len(kinds)}"
         pairs = zip(value, kinds, strict=True)
-        found = [_difference(one, own, f"{where}.{k}") for k, (one, own) in enumerate(pairs)]
-        return next(filter(None, found), None)
+        problems = [_difference(one, own, f"{where}.{k}") for k, (one, own) in enumerate(pairs)]
+        return next(filter(None, problems), None)
     if kind in WORDS:
         return None if _is(value, kind) else f"'{where}' is {_shown(value)}, not a {kind}"
     return None if value == kind else f"'{where}' is {_shown(value)}, not {kind!r}"

@@ -73,8 +73,8 @@ def frame_row(
         row["split_determined"] = split_determined(body, contact)
     row |= {"body_seconds": body.seconds, "query_seconds": body.query_seconds}
     if status.startswith(FAILED):
-        kept = {*motion, *WHY_IT_FAILED}
-        row = {name: value if name in kept else NAN for name, value in row.items()}
+        columns_kept = {*motion, *WHY_IT_FAILED}
+        row = {name: value if name in columns_kept else NAN for name, value in row.items()}
     return {name: float(value) for name, value in row.items()} | {"status": status}
 
 
@@ -238,14 +238,14 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
 
 def _post_row(post: "PostContact") -> dict[str, float]:
     """Return what a cam does to the post."""
-    force, centre, gone = post.force, post.centre, NAN if post.problem else 1.0
+    force, centre, disengaged = post.force, post.centre, NAN if post.problem else 1.0
     return {
         "post_force_N": float(np.linalg.norm(force)),
         "post_force_ap_N": force[0],
         "post_force_si_N": -force[1],
         "post_force_ml_N": force[2],
-        "post_area_mm2": gone * post.area / MILLIMETRE**2,
-        "post_peak_pressure_MPa": gone * post.peak_pressure / MEGAPASCAL,
+        "post_area_mm2": disengaged * post.area / MILLIMETRE**2,
+        "post_peak_pressure_MPa": disengaged * post.peak_pressure / MEGAPASCAL,
         "post_cop_si_mm": centre[1] / MILLIMETRE,
         "post_cop_ml_mm": centre[2] / MILLIMETRE,
         "post_gap_mm": post.gap / MILLIMETRE,
@@ -276,21 +276,21 @@ def _pose_row(frame: "FrameContact") -> dict[str, float]:
 
 def _condyle_row(side: str, frame: "FrameContact", limit: float) -> dict[str, float]:
     result = frame.result
-    carried = getattr(result, side) if result else None
-    if result is not None and carried is None:
+    condyle = getattr(result, side) if result else None
+    if result is not None and condyle is None:
         values = {"force_N": 0.0, "area_mm2": 0.0}
-    elif carried is None:
+    elif condyle is None:
         values = {}
     else:
         values = {
-            "force_N": carried.force,
-            "area_mm2": carried.area / MILLIMETRE**2,
-            "mean_pressure_MPa": carried.mean_pressure / MEGAPASCAL,
-            "peak_pressure_MPa": carried.peak_pressure / MEGAPASCAL,
-            "cop_ap_mm": carried.centre_of_pressure[0] / MILLIMETRE,
-            "cop_ml_mm": carried.centre_of_pressure[2] / MILLIMETRE,
+            "force_N": condyle.force,
+            "area_mm2": condyle.area / MILLIMETRE**2,
+            "mean_pressure_MPa": condyle.mean_pressure / MEGAPASCAL,
+            "peak_pressure_MPa": condyle.peak_pressure / MEGAPASCAL,
+            "cop_ap_mm": condyle.centre_of_pressure[0] / MILLIMETRE,
+            "cop_ml_mm": condyle.centre_of_pressure[2] / MILLIMETRE,
             "area_above_yield": frame.area_above(side, limit),
-            "thickness_mm": carried.thickness / MILLIMETRE,
+            "thickness_mm": condyle.thickness / MILLIMETRE,
         }
     names = (
         "force_N area_mm2 mean_pressure_MPa peak_pressure_MPa cop_ap_mm cop_ml_mm "

@@ -28,7 +28,7 @@ class WorkerLimitSettings:
     """How many processes a run may start."""
 
     max_workers: int = 256
-    """Number of worker processes; no machine for which tkamb is meant has more cores."""
+    """Number of worker processes. Chosen: no machine for which tkamb is meant has more cores."""
 
 
 WORKER_LIMITS = WorkerLimitSettings()
@@ -86,18 +86,18 @@ class PoolOptions:
 
             check_cluster(self.dask)
 
-    def answers(self, task: Task, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
+    def answers(self, task: Task, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
         """Yield answers with their numbers as they are finished, in any order.
 
         Args:
             task: what every worker prepares.
-            wanted: numbers and contents of the jobs.
+            tasks: numbers and contents of the jobs.
 
         Raises:
             ComputationError: a worker was killed, or the scheduler is gone.
         """
-        with self.team(task, len(wanted)) as team:
-            yield from team.answers(wanted)
+        with self.team(task, len(tasks)) as team:
+            yield from team.answers(tasks)
 
     @contextmanager
     def team(self, task: Task, count: int) -> Iterator["WorkerPool"]:
@@ -115,9 +115,9 @@ class PoolOptions:
             team.stop()
 
 
-def _answers_here(task: Task, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
-    work = task.prepared() if wanted else None
-    for number, job in wanted if work else ():
+def _answers_here(task: Task, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
+    work = task.prepared() if tasks else None
+    for number, job in tasks if work else ():
         assert work is not None
         yield number, work(number, job)
 
@@ -145,29 +145,29 @@ class WorkerPool:
                 target=_attend, args=(process, task, self._jobs, self._answers), daemon=True
             ).start()
 
-    def answers(self, wanted: Sequence[Numbered]) -> Iterator[Numbered]:
+    def answers(self, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
         """Yield answers with their numbers as they are finished, in any order.
 
         See `PoolOptions.answers`.
 
         Args:
-            wanted: numbers and contents of the jobs.
+            tasks: numbers and contents of the jobs.
 
         Raises:
             InputError: what the workers prepare cannot be used.
             ComputationError: a worker was killed, or the scheduler is gone.
         """
-        if self._crew.dask is not None and wanted:
+        if self._crew.dask is not None and tasks:
             from tkamb.run.cluster import answers_of_cluster
 
-            yield from answers_of_cluster(self._task, wanted, self._crew.dask, self._crew.workers)
+            yield from answers_of_cluster(self._task, tasks, self._crew.dask, self._crew.workers)
             return
         if not self.processes:
-            yield from _answers_here(self._task, wanted)
+            yield from _answers_here(self._task, tasks)
             return
-        for job in wanted:
+        for job in tasks:
             self._jobs.put(job)
-        for _ in wanted:
+        for _ in tasks:
             answer = self._answers.get()
             if isinstance(answer, TkambError):
                 raise answer

@@ -19,12 +19,12 @@ UNITS = {"flexion": "°", "cycle": " %", "time": " s"}
 
 @dataclass(frozen=True, eq=False)
 class HorizontalAxis:
-    """What the results are drawn against, in time order; it need not be monotonic.
+    """Horizontal axis of the plots, in time order; it need not be monotonic.
 
     Args:
         kind: "flexion", "cycle" or "time".
         values: (f,) deg, per cent or s.
-        stances: from and to of each stance of gait on the axis; empty on one of flexion.
+        stances: begin and end of each stance on the axis; empty on an axis of flexion.
     """
 
     kind: str
@@ -42,7 +42,7 @@ class HorizontalAxis:
         return f"{self.values[frame]:.{digits}f}{UNITS[self.kind]}"
 
     def broken(self, values: Array) -> tuple[Array, Array]:
-        """Return x and y for drawing, interrupted where a cycle starts anew."""
+        """Return x and y for drawing, interrupted where a new cycle starts."""
         x = self.values
         if self.kind != "cycle":
             return x, values
@@ -61,12 +61,12 @@ class HorizontalAxis:
             return np.unique(np.linspace(0, len(x) - 1, count).round().astype(np.int64))
         low, high = float(np.min(x)), float(np.max(x))
         step = round_step((high - low) / max(count - 1, 1))
-        wanted = np.arange(np.ceil(low / step - 0.3), np.floor(high / step + 0.3) + 1) * step
-        return self.nearest(wanted)
+        ticks = np.arange(np.ceil(low / step - 0.3), np.floor(high / step + 0.3) + 1) * step
+        return self.nearest(ticks)
 
-    def nearest(self, wanted: Iterable[float]) -> NDArray[np.int64]:
+    def nearest(self, values: Iterable[float]) -> NDArray[np.int64]:
         """Return the frames nearest to these places, without repeats, in time order."""
-        return np.unique([int(np.argmin(np.abs(self.values - place))) for place in wanted])
+        return np.unique([int(np.argmin(np.abs(self.values - place))) for place in values])
 
 
 def round_step(step: float) -> float:
@@ -107,8 +107,8 @@ def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAx
 
 def _stances(results: "Results", start: float, end: float) -> tuple[tuple[float, float], ...]:
     """Return the stances (s) that the force plates show, cut at start and end (s)."""
-    found = (results.summary.get("gait") or {}).get("stance_s") or ()
-    cut = [(max(float(on), start), min(float(off), end)) for on, off in found]
+    stance = (results.summary.get("gait") or {}).get("stance_s") or ()
+    cut = [(max(float(on), start), min(float(off), end)) for on, off in stance]
     return tuple((on, off) for on, off in cut if on < off)
 
 

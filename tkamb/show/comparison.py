@@ -1,4 +1,4 @@
-"""What was measured against what a run predicts, in words (`tkamb.run.recorded`)."""
+"""Measured forces compared with those of a run, in words (`tkamb.run.recorded`)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,19 +10,19 @@ WHY_NOT = {
 }
 
 
-def comparison_words(found: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
+def comparison_words(comparison: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
     """Return the largest RMSE, all errors and the frames left out; whether any were.
 
     Args:
-        found: force -> what `compare_measured` returns, as in the summary.
+        comparison: force -> what `compare_measured` returns, as in the summary.
     """
-    (_, one), *others = found.items()
+    (_, one), *others = comparison.items()
     counts = [_count_words(one)]
     counts += [f"{n}: {words}" for n, o in others if (words := _count_words(o)) != counts[0]]
     if low_high := one["measured_where_not_compared_N"]:
         counts[0] += f", where {low_high[0]:.0f} to {low_high[1]:.0f} N were measured"
-    details = "; ".join([*(error_words(n, o) for n, o in found.items()), *counts])
-    incomplete = any(o[key] for o in found.values() for key in WHY_NOT)
+    details = "; ".join([*(error_words(n, o) for n, o in comparison.items()), *counts])
+    incomplete = any(o[key] for o in comparison.values() for key in WHY_NOT)
     if not one["frames_compared"]:
         return "no frame to compare", details, True
     return f"RMSE {one['rmse_BW']:.2f} BW", details, incomplete

@@ -1,4 +1,4 @@
-"""Designs of a cohort side by side: peak pressure and wear, each with what is not certain of it."""
+"""Designs of a cohort side by side: peak pressure and wear, each with its uncertainty."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from tkamb.studies.cohort.statistics import Group
 WEAR = "volume_mm3_per_Mc"
 """Name of the worn volume in a group's wear; its ends by the wear factor add _low and _high."""
 BANDS = (
-    "Dot: mean over the runs. Thick bar: smallest to largest run. Thin bar: pressure, those ends "
-    "with the known error of the contact model; wear, those ends by the range of the wear factor, "
+    "Dot: mean over the runs. Thick bar: smallest to largest run. Thin bar: these ends extended by "
+    "the known error of the contact model (pressure), or by the range of the wear factor (wear), "
     "which scales all designs alike."
 )
 
@@ -29,7 +29,8 @@ class DesignFigureSettings:
     """Looks of the figure."""
 
     spread: float = 0.5
-    """Of the room of a place on the horizontal axis, over which its dots stand side by side."""
+    """1: share of the width of a place on the horizontal axis over which its dots stand side by
+    side. Chosen by looks."""
 
 
 DESIGN_FIGURE = DesignFigureSettings()
@@ -45,8 +46,8 @@ class Bar:
         mean: over the runs.
         low: smallest run.
         high: largest run.
-        least: lower end of what is not certain.
-        most: upper end.
+        least: lower end of the uncertainty.
+        most: upper end of the uncertainty.
     """
 
     place: str
@@ -77,9 +78,9 @@ def design_bars(cohort: Cohort, groups: Sequence[Group]) -> dict[str, list[Bar]]
     found: dict[str, list[Bar]] = {"pressure": [], "wear": []}
     for group in groups:
         sides = [group.peaks.get(f"{side}_peak_pressure_MPa") for side in SIDES]
-        there = [values for values in sides if values is not None]
-        if there:
-            peaks = np.fmax.reduce(there)
+        present = [values for values in sides if values is not None]
+        if present:
+            peaks = np.fmax.reduce(present)
             errors = [run_error(cohort.runs[n]) for n in group.numbers]
             share = np.array([one.peak_pressure if one else np.nan for one in errors])
             bars = _bar(cohort, group, peaks, peaks * (1 - share), peaks * (1 + share))
@@ -116,15 +117,15 @@ def _labels(cohort: Cohort, group: Group) -> tuple[str, str]:
 
 def draw_designs(bars: Mapping[str, Sequence[Bar]]) -> Figure:
     """Return peak pressure and worn volume of the designs side by side, with their bands."""
-    shown = {name: own for name, own in bars.items() if own}
+    filled = {name: own for name, own in bars.items() if own}
     titles = {
         "pressure": "Peak contact pressure (MPa)",
         "wear": "Worn volume (mm³ per million cycles)",
     }
     with settings():
-        figure = new_figure(5.4 * len(shown), 3.6)
+        figure = new_figure(5.4 * len(filled), 3.6)
         for axes, (name, own) in zip(
-            figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True
+            figure.subplots(1, len(filled), squeeze=False)[0], filled.items(), strict=True
         ):
             _draw_bars(axes, own)
             axes.set_ylabel(titles[name])
@@ -145,8 +146,8 @@ def _draw_bars(axes: Axes, bars: Sequence[Bar]) -> None:
             x, [b.low for b in own], [b.high for b in own], color=colour, linewidth=5, alpha=0.4
         )
         axes.plot(x, [b.mean for b in own], "o", color=colour, markersize=5, label=name or None)
-    turned = max(map(len, places)) * len(places) > 60
-    axes.set_xticks(range(len(places)), places, rotation=30 if turned else 0)
+    slanted = max(map(len, places)) * len(places) > 60
+    axes.set_xticks(range(len(places)), places, rotation=30 if slanted else 0)
     axes.set_xlim(-0.6, len(places) - 0.4)
     axes.set_ylim(0.0, 1.06 * max(bar.most for bar in bars))
     if any(series):

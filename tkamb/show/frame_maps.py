@@ -31,11 +31,14 @@ class FrameMapSettings:
     """The pressure maps behind the report's frame slider."""
 
     rim_byte: int = 64
-    """Byte of the page's picture where the contact ends; above it there is pressure."""
+    """Byte of the page's picture where the contact ends; above it there is pressure. Chosen: bytes
+    below it describe the fading rim."""
     most_frames: int = 250
-    """A longer run shows, at each place of the slider, the nearest of so many maps."""
+    """Largest number of maps in the page. Chosen: a longer run shows the nearest one at each place
+    of the slider."""
     coarsening: int = 2
-    """The page's grid has every so-manieth point of the picture's."""
+    """Ratio of the grid in the page to the grid of the picture. Chosen: the page is a quarter of
+    the size."""
 
 
 FRAME_MAP = FrameMapSettings()
@@ -69,24 +72,24 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
     assert results.maps is not None
     rows = map_rows(results)
     frames = np.array(sorted(rows))
-    kept = frames[
+    chosen = frames[
         np.unique(np.linspace(0, len(frames) - 1, FRAME_MAP.most_frames).round().astype(int))
     ]
     largest = largest_pressure(results) * MEGAPASCAL
-    tiles, edges = _tiles(results, view, [rows[k] for k in kept], largest)
-    across = int(np.ceil(np.sqrt(len(kept))))
-    nearest = [int(np.argmin(np.abs(kept - k))) for k in range(len(results))]
+    tiles, edges = _tiles(results, view, [rows[k] for k in chosen], largest)
+    across = int(np.ceil(np.sqrt(len(chosen))))
+    nearest = [int(np.argmin(np.abs(chosen - k))) for k in range(len(results))]
     bottom, top = view.up_limits
-    left, right = view.across_limits
+    first, right = view.across_limits
     return {
         "picture": _png(tiles, across),
         "across": across,
         "rows": tiles.shape[1],
         "columns": tiles.shape[2],
         "tile": nearest,
-        "shown": [int(kept[n]) for n in nearest],
+        "shown": [int(chosen[n]) for n in nearest],
         "edges": edges,
-        "span": [left, right, bottom, top],
+        "span": [first, right, bottom, top],
         "rim": FRAME_MAP.rim_byte,
         "largest": largest / MEGAPASCAL,
         "colours": "".join(to_hex(one)[1:] for one in colormaps[PRESSURE_MAP](np.arange(256))),

@@ -1,4 +1,4 @@
-"""Pressure between a map's points, for the eye: where contact ends, and a grid to draw it on."""
+"""Pressure between a map's points, for pictures: the edge of contact, and a grid to draw on."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,14 +13,16 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class LevelSettings:
-    """How a pressure map becomes a picture."""
+    """Conversion of a pressure map to a picture."""
 
     edge_tolerance: float = 1e-9
-    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge."""
+    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge.
+    Chosen: above rounding."""
     largest_gap: float = 10 * MILLIMETRE
-    """A gap above this, infinite where nothing lies above, counts as this."""
+    """m: a larger gap, also an infinite one where nothing lies above, counts as this. Chosen: far
+    above any contact."""
     margin_points: int = 2
-    """Grid points kept around contacts."""
+    """Number of grid points kept around contacts. Chosen: the edge of a contact is drawn whole."""
 
 
 LEVELS = LevelSettings()
@@ -103,11 +105,11 @@ class PageGrid:
         height = (weights * self._points[self._triangles[face], 1]).sum(axis=1)
         order = np.argsort(
             height, kind="stable"
-        )  # of triangles over each other the highest is seen
-        seen = np.full(len(self.up) * len(self.across), -1)
-        seen[place[order]] = order
-        over = seen >= 0
-        chosen = seen[over]
+        )  # of triangles over each other the highest is visible
+        ids = np.full(len(self.up) * len(self.across), -1)
+        ids[place[order]] = order
+        over = ids >= 0
+        chosen = ids[over]
         shape = len(self.up), len(self.across)
         return over.reshape(shape), self._triangles[face[chosen]], weights[chosen]
 
@@ -127,8 +129,8 @@ class PageGrid:
         corners, weights = corners[chosen[over]], weights[chosen[over]]
         over = over[::every, ::every]
         result = np.full((*values.shape[:-1], *over.shape), -1.0)
-        for here in np.ndindex(values.shape[:-1]):
-            result[here][over] = np.einsum("ij,ij->i", weights, values[here][corners])
+        for place in np.ndindex(values.shape[:-1]):
+            result[place][over] = np.einsum("ij,ij->i", weights, values[place][corners])
         return result
 
 
@@ -138,12 +140,12 @@ def touched_part(touched: Mask) -> tuple[slice, slice]:
     Args:
         touched: (rows, columns); the first points where nothing is.
     """
-    rows, columns = (_range(there) for there in np.nonzero(touched))
+    rows, columns = (_range(indices) for indices in np.nonzero(touched))
     return rows, columns
 
 
-def _range(there: NDArray[np.int64]) -> slice:
-    low, high = (int(there.min()), int(there.max())) if len(there) else (0, 1)
+def _range(indices: NDArray[np.int64]) -> slice:
+    low, high = (int(indices.min()), int(indices.max())) if len(indices) else (0, 1)
     return slice(max(low - LEVELS.margin_points, 0), high + LEVELS.margin_points + 1)
 
 

@@ -1,4 +1,4 @@
-"""The report's section on muscles: activations beside EMG, forces, and what they do to the knee."""
+"""The report's section on muscles: activations and EMG, forces, and their effect on the knee."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,9 +37,11 @@ GROUP_COLOURS = (QUADRICEPS, *LIST, GREY, GREY)
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
 """Contributions beside those of single muscles."""
 HELD = (
-    "What makes a force: each load alone in the frame's equations, with pose, contact points and "
-    "normals, friction's direction and all lines of action held; they sum up to the force by "
-    "equilibrium. What a muscle alone leaves unbalanced in flexion is carried by a moment. "
+    "Contribution of each load to a force: the load acts alone in the frame's equations, with "
+    "constant "
+    "pose, contact points and normals, direction of friction and lines of action. The "
+    "contributions "
+    "sum up to the force by equilibrium. A moment balances the flexion moment of a single muscle. "
     "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
 )
 
@@ -49,7 +51,7 @@ class MuscleFigureSettings:
     """Pictures of muscle activations."""
 
     axis_top: float = 1.02
-    """Upper end of the axis of activations; lines at 1 stay visible."""
+    """Upper end of the axis of activations. Chosen: lines at 1 stay visible."""
 
 
 MUSCLE_FIGURE = MuscleFigureSettings()
@@ -80,12 +82,12 @@ class Cell:
 
 
 def muscle_panels(results: "Results") -> tuple[Panel, ...]:
-    """Return the plots of what makes either condyle's force, and of the forces by group."""
-    made = (
+    """Return the plots of the contributions to each condyle's force, and of the forces by group."""
+    panels = (
         *(_contributions(results, side) for side in CONTRIBUTIONS),
         _forces(results),
     )
-    return tuple(panel for panel in made if panel.lines)
+    return tuple(panel for panel in panels if panel.lines)
 
 
 def _groups(results: "Results") -> dict[str, tuple[str, ...]]:
@@ -121,15 +123,15 @@ def _contributions(results: "Results", side: str) -> Panel:
             dashed = part in (EXTERNAL, LIGAMENTS, POST)
             label = labels.get(part, part)
             lines.append(Line(f"part-{k}", label, scale * values, shades[part], dashed))
-    panel = Panel(f"from_{side}", f"What makes the {side} force", "BW", tuple(lines))
+    panel = Panel(f"from_{side}", f"Contributions to the {side} force", "BW", tuple(lines))
     return panel if len(lines) > 1 else Panel(panel.name, panel.title, "BW", ())
 
 
 def _sum(results: "Results", family: str, names: tuple[str, ...]) -> Array:
     """Return the sum (f,) of a family's columns, of those that are there; NaN without any."""
     columns = [family_column(family, name) for name in names]
-    there = [results[name] for name in columns if name in results.columns]
-    return np.sum(there, axis=0) if there else np.full(len(results), np.nan)
+    present = [results[name] for name in columns if name in results.columns]
+    return np.sum(present, axis=0) if present else np.full(len(results), np.nan)
 
 
 def activation_cells(results: "Results") -> list[Cell]:
@@ -180,21 +182,21 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
 def _place_cells(cells: Sequence[Axes], rows: int) -> None:
     """Put small plots beside and below each other, with room for what stands around them."""
     width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
-    left = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
-    beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - left)
-    left, right = (
-        max(left, LABEL_PLACE.edge_points + beyond[0]),
+    margin = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
+    beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - margin)
+    margin, right = (
+        max(margin, LABEL_PLACE.edge_points + beyond[0]),
         LABEL_PLACE.edge_points + beyond[1],
     )
     gap = max(BETWEEN[0], sum(beyond) + 2 * LABEL_PLACE.edge_points)
     labels_within = LABELS if len(cells) % CELLS_ACROSS and rows > 1 else 0.0
-    wide = (width - left - right + gap) / CELLS_ACROSS - gap
+    wide = (width - margin - right + gap) / CELLS_ACROSS - gap
     tall = (height - FOOT - TITLE - labels_within + BETWEEN[1]) / rows - BETWEEN[1]
     for k, axes in enumerate(cells):
         row, column = divmod(k, CELLS_ACROSS)
         raised = labels_within if row < rows - 1 else 0.0
         bottom = FOOT + (rows - 1 - row) * (tall + BETWEEN[1]) + raised
-        set_place(axes, left + column * (wide + gap), bottom, wide, tall)
+        set_place(axes, margin + column * (wide + gap), bottom, wide, tall)
     for axes in cells:
         leave_unmeasured(axes.xaxis)
         leave_unmeasured(axes.yaxis)
@@ -214,7 +216,7 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
 
 
 def _beyond(results: "Results", cell: Cell) -> str:
-    """Return in words how far an envelope goes beyond the plot: above its normalising value."""
+    """Return in words how far an envelope exceeds the plot, above its normalising value."""
     if cell.envelope is None:
         return ""
     envelope = results[family_column(ENVELOPE, cell.envelope)]
@@ -225,16 +227,16 @@ def _beyond(results: "Results", cell: Cell) -> str:
 def _agreement(results: "Results", cell: Cell) -> str:
     """Return Pearson's r of activation and envelope in words, the range over several muscles."""
     emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
-    known = [emg[name]["pearson_r"] for name in cell.muscles if name in emg]
-    known = [r for r in known if r is not None and np.isfinite(r)]
-    if not known:
+    correlations = [emg[name]["pearson_r"] for name in cell.muscles if name in emg]
+    correlations = [r for r in correlations if r is not None and np.isfinite(r)]
+    if not correlations:
         return ""
-    low, high = f"{min(known):.2f}", f"{max(known):.2f}"
+    low, high = f"{min(correlations):.2f}", f"{max(correlations):.2f}"
     return (f"r {low}" if low == high else f"r {low} to {high}").replace("-", "−")
 
 
 def reserve_words(summary: Mapping[str, Any]) -> str:
-    """Return in a sentence what no muscle carries; empty without reserves."""
+    """Return a sentence on the reserve moments; empty without reserves."""
     result: Mapping[str, Any] = summary.get("reserves") or {}
     if not result:
         return ""

@@ -48,13 +48,13 @@ class PlotSettings:
     """Looks of the report's plots."""
 
     label_offset_points: float = 12.0
-    """Points from a plot's edge to the near side of an axis' label."""
+    """Points from a plot's edge to the near side of an axis' label. Chosen by looks."""
     side_gap: float = 0.01
-    """Of the width, between the axes and what is written beside them."""
+    """1: share of the width between the axes and what is written beside them. Chosen by looks."""
     band_opacity: float = 0.16
-    """Opacity of the band around a line, 0 to 1."""
+    """1: opacity of the band around a line, 0 to 1. Chosen by looks."""
     wide_band_opacity: float = 0.07
-    """Opacity of the band that what the model leaves out adds, 0 to 1."""
+    """1: opacity of the band that includes the model's discrepancy, 0 to 1. Chosen by looks."""
 
 
 PLOT = PlotSettings()
@@ -69,8 +69,8 @@ STANCE = "#eef3f7"
 class Sheet:
     """A figure on which the plots of a run are drawn one after the other.
 
-    Axes and ticks are most of what a plot takes to make: they stay, all that is drawn goes. A plot
-    that `_place_alone` has no place for has a figure of its own.
+    Axes and ticks take most of the time of a plot, so they are reused and only the curves are
+    replaced. A plot that `_place_alone` cannot place has a figure of its own.
 
     Args:
         results: of the run.
@@ -85,7 +85,7 @@ class Sheet:
     def draw(self, panel: Panel) -> Figure:
         """Return one plot with its flagged and failed frames marked along the bottom.
 
-        Each curve's id in the picture is its line's name. It stands until the next is drawn.
+        Each curve's id in the picture is its line's name. The figure is valid until the next plot.
         """
         with settings():
             self._clear()
@@ -130,13 +130,13 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
     Raises:
         InputError: a plot or an axis that does not exist.
     """
-    known = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
-    unknown = [name for name in names if name not in known]
+    by_name = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
+    unknown = [name for name in names if name not in by_name]
     if unknown:
         raise InputError(
-            f"the run has no plot '{unknown[0]}'", "plot", f"it has {', '.join(known)}"
+            f"the run has no plot '{unknown[0]}'", "plot", f"it has {', '.join(by_name)}"
         )
-    chosen = [known[name] for name in names or DEFAULT if name in known]
+    chosen = [by_name[name] for name in names or DEFAULT if name in by_name]
     horizontal = horizontal_axis(results, axis)
     with settings():
         rows = max(1, -(-len(chosen) // 2))
@@ -156,9 +156,8 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
 def _place_alone(axes: Axes, panel: Panel) -> bool:
     """Give a plot that stands alone the room that its labels need; say whether that was possible.
 
-    The places are those that matplotlib's constrained layout finds, which looks at everything
-    four times; it still has to place what is not simple: a factor over a vertical axis, a legend
-    that is too wide.
+    The places are those of matplotlib's constrained layout, which is slow. That layout is still
+    used for plots with a factor over a vertical axis or with a legend that is too wide.
     """
     for second in axes.child_axes:
         second.apply_aspect()  # takes its range from the first
@@ -166,7 +165,7 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     widths = [label_width(side) for side in sides]
     if any(side.get_major_formatter().get_offset() for side in sides):
         return False
-    left, *others = (
+    first, *others = (
         LABEL_PLACE.edge_points
         + LABEL_PLACE.tick_points
         + width
@@ -181,17 +180,17 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     width, height = 72 * figure.get_size_inches()
     right = max(LABEL_PLACE.edge_points + outside + PLOT.side_gap * width, OVERHANG, *others)
     columns = _legend_columns(panel)
-    if _legend_width(panel, columns) > width - left - LABEL_PLACE.edge_points:
+    if _legend_width(panel, columns) > width - first - LABEL_PLACE.edge_points:
         return False
     rows = -(-len(panel.lines) // columns)
     top = LABEL_PLACE.edge_points + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
-    wide, tall = width - left - right, height - FOOT - top
-    set_place(axes, left, FOOT, wide, tall)
+    wide, tall = width - first - right, height - FOOT - top
+    set_place(axes, first, FOOT, wide, tall)
     axes.xaxis.set_label_coords(0.5, (PLOT.label_offset_points - FOOT) / tall)
     for side, place in zip(
         sides, (PLOT.label_offset_points, width - PLOT.label_offset_points), strict=False
     ):
-        side.set_label_coords((place - left) / wide, 0.5, axes.transAxes)
+        side.set_label_coords((place - first) / wide, 0.5, axes.transAxes)
     for axis in (axes.xaxis, *sides):
         leave_unmeasured(axis)
     return True

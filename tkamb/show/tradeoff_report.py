@@ -1,4 +1,4 @@
-"""The trade-off for a reader: table, picture, the fastest model for an error, comparisons."""
+"""Report of the trade-off: table, picture, fastest model for an error, comparisons."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,9 +22,10 @@ class TradeoffPictureSettings:
     """Looks of the trade-off's picture."""
 
     unlabelled_mm: float = 2.0
-    """The cell size at which most points lie."""
+    """mm: cell size that is not written beside its point. Chosen: most points have it."""
     short_axis_ratio: float = 30.0
-    """Largest over smallest value up to which a logarithmic axis has numbers within its decades."""
+    """Largest over smallest value up to which a logarithmic axis has numbers within its decades.
+    Chosen: with more decades, those alone have numbers."""
 
 
 TRADEOFF_PICTURE = TradeoffPictureSettings()
@@ -58,8 +59,8 @@ def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
     lines = []
     for case in dict.fromkeys(row.job.case for row in rows):
         some = [row for row in rows if row.job.case == case]
-        known = _uncertainty(references[case])
-        lines += [f"{case} (reference known to: {known})", head]
+        uncertainty = _uncertainty(references[case])
+        lines += [f"{case} (reference known to: {uncertainty})", head]
         lines += [_line(row) for row in some]
         lines.append("")
     names = ", ".join(name.replace("_", " ") for name in FRONT_ERRORS)
@@ -76,8 +77,8 @@ def _line(row: Row) -> str:
     times = (
         f"{measure.prepare_seconds:9.3f} {measure.cold_seconds:8.4f} {measure.warm_seconds:8.4f}"
     )
-    known = [row.errors[key] for key in KEYS]
-    shares = [f"{100 * error:6.2f}%" if error == error else f"{'–':>7s}" for error in known]
+    errors = [row.errors[key] for key in KEYS]
+    shares = [f"{100 * error:6.2f}%" if error == error else f"{'–':>7s}" for error in errors]
     return f"{start} {times} {measure.peak_rss_MB:6.0f} {shares[0]:>9s} {' '.join(shares[1:])}"
 
 
@@ -214,12 +215,12 @@ def _fastest(settings: dict[Setting, list[Row]], key: str, limit: float) -> str:
         for setting, some in settings.items()
     }
     times = {setting: median(warm_by_bodies(some)) for setting, some in settings.items()}
-    kept = [setting for setting, error in worst.items() if error <= limit]
-    if kept:
-        best = min(kept, key=lambda setting: times[setting])
+    within = [setting for setting, error in worst.items() if error <= limit]
+    if within:
+        best = min(within, key=lambda setting: times[setting])
         return f"the fastest is {_named(best)} ({milliseconds(times[best])} ms warm)"
     if not worst:
-        return "nothing can be said: no setting was tried on all bodies"
+        return "no recommendation: no setting was measured on all bodies"
     nearest = min(worst, key=lambda setting: worst[setting])
     return f"no setting: the nearest is {_named(nearest)} with {100 * worst[nearest]:.2g} %"
 
@@ -296,4 +297,4 @@ def _apart(own: Row, peer: Row) -> str:
         "condyle force": max(abs(a[f"{s}_force"] - b[f"{s}_force"]) for s in SIDES) / load,
     }
     text = ", ".join(f"{100 * share:.2g} % in {name}" for name, share in shares.items())
-    return f"the lattice is off it by {text}"
+    return f"the lattice differs from it by {text}"

@@ -1,4 +1,4 @@
-"""The report's section on wear: what `tkamb wear` wrote into the folder of a run."""
+"""The report's section on wear, from the files of `tkamb wear` in the folder of a run."""
 
 import base64
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class WearPageSettings:
     """The wear page."""
 
     max_bytes: float = 64 * MEGABYTE
-    """Bytes of a file of results; those of 10,000 updates have 10 MB."""
+    """Bytes of a file of results. Chosen: those of 10,000 updates have 10 MB."""
 
 
 WEAR_PAGE = WearPageSettings()
@@ -35,11 +35,11 @@ ROWS = (
     ("creep depth, mm", "creep_depth_mm"),
     ("creep volume, mm³", "creep_volume_mm3"),
 )
-"""What is shown, and its key."""
+"""Label of a number, and its key."""
 FIRST_RATE = "first_volume_mm3_per_Mc"
 OTHER = (
-    "The wear.json in this folder is of another scene, other frames or other meshes, or of a tkamb "
-    "that did not say which: it is not shown."
+    "The wear.json in this folder belongs to another scene, other frames or other meshes, or does "
+    "not state them; it is not shown."
 )
 
 
@@ -66,26 +66,26 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
         raise InputError("is not as tkamb wear writes it", folder / WEAR_NAME, hint) from None
 
 
-def _shown(found: dict[str, Any], picture: str) -> dict[str, Any]:
+def _shown(wear: dict[str, Any], picture: str) -> dict[str, Any]:
     """Return the section of wear.json and its picture in base 64."""
-    bands = found["bands"] or {}
+    bands = wear["bands"] or {}
     return {
         "other": None,
-        "first": found["first"],
-        "cycles": f"{found['cycles']:,.0f}",
+        "first": wear["first"],
+        "cycles": f"{wear['cycles']:,.0f}",
         "banded": bool(bands),
         "rows": [
-            (name, _number(found[key]), _range(found, key), _band(bands, key)) for name, key in ROWS
+            (name, _number(wear[key]), _range(wear, key), _band(bands, key)) for name, key in ROWS
         ],
-        "geometry": found.get("geometry"),
+        "geometry": wear.get("geometry"),
         "laws": [
             (one["law"], _number(one[FIRST_RATE]), _range(one, FIRST_RATE), one["geometry"])
-            for one in found.get("laws_side_by_side", ())
+            for one in wear.get("laws_side_by_side", ())
         ],
-        "legend": _legend(found, bands),
+        "legend": _legend(wear, bands),
         "picture": f"data:image/png;base64,{picture}",
         "alt": "maps of wear, sliding, cross-shear and pressure, and the worn volume over cycles",
-        "notes": [*found["questions"], *found["notes"]],
+        "notes": [*wear["questions"], *wear["notes"]],
     }
 
 
@@ -112,15 +112,15 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
     return result if same and files == result["files_sha256"] else {}
 
 
-def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:
-    """Return in words what was simulated, and what of it varied."""
+def _legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
+    """Return in words the simulation, and its varied inputs."""
     words = (
-        f"Law {found['law']}, material {found['material']}, {found['control']} control, contact "
-        f"{found['contact']} at {found['resolution_mm']:g} mm, {found['blocks']} blocks of cycles; "
-        f"status: {found['status']}. Motion: {found['source']}."
+        f"Law {wear['law']}, material {wear['material']}, {wear['control']} control, contact "
+        f"{wear['contact']} at {wear['resolution_mm']:g} mm, {wear['blocks']} blocks of cycles; "
+        f"status: {wear['status']}. Motion: {wear['source']}."
     )
-    if "range_source" in found:
-        words += f" Range: by the wear factor alone, {found['range_source']}."
+    if "range_source" in wear:
+        words += f" Range: by the wear factor alone, {wear['range_source']}."
     if not bands:
         return f"{words} No band: no input was varied."
     deviations = ", ".join(f"{name} {one:g}" for name, one in bands["standard_deviations"].items())
@@ -130,10 +130,10 @@ def _legend(found: dict[str, Any], bands: dict[str, Any]) -> str:
     )
 
 
-def _range(found: dict[str, Any], key: str) -> str:
+def _range(wear: dict[str, Any], key: str) -> str:
     """Return the range that the wear factor alone gives a number."""
-    given = found.get(f"{key}_range")
-    return "–" if given is None else f"{_number(given[0])} to {_number(given[1])}"
+    limits = wear.get(f"{key}_range")
+    return "–" if limits is None else f"{_number(limits[0])} to {_number(limits[1])}"
 
 
 def _band(bands: dict[str, Any], key: str) -> str:

@@ -101,12 +101,15 @@ def _ball(radius: float, waist: float, finest_deg: float, sectors: int) -> tuple
         axis=-1,
     ).reshape(-1, 3)
     vertices = radius * np.concatenate([[[0, -1, 0]], rings, [[0, 1, 0]]])
-    here = np.arange(sectors)
-    there = (here + 1) % sectors
-    parts = [_corners(np.zeros_like(here), 1 + here, 1 + there)]
+    first = np.arange(sectors)
+    second = (first + 1) % sectors
+    parts = [_corners(np.zeros_like(first), 1 + first, 1 + second)]
     for row in range(len(polar) - 1):
         a, b = 1 + row * sectors, 1 + (row + 1) * sectors
-        parts += [_corners(a + here, b + here, b + there), _corners(a + here, b + there, a + there)]
+        parts += [
+            _corners(a + first, b + first, b + second),
+            _corners(a + first, b + second, a + second),
+        ]
     last = 1 + (len(polar) - 1) * sectors
-    parts.append(_corners(last + here, np.full_like(here, len(vertices) - 1), last + there))
+    parts.append(_corners(last + first, np.full_like(first, len(vertices) - 1), last + second))
     return vertices, np.concatenate(parts)

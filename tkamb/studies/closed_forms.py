@@ -1,6 +1,6 @@
-"""Contacts with a solution in closed form, on which every family of models is judged.
+"""Contacts with a closed-form solution, on which every family of models is tested.
 
-Nothing here calls the models' own physics: the formulas are written out once more.
+The formulas are written out here and do not use the models' code.
 
 - plate: a rigid flat plate on a block of height h and area A whose nu is 0. Stress is F/A
   everywhere, the approach is h eps(F/A), with the material's curve eps(sigma) = sigma/E +
@@ -9,8 +9,8 @@ Nothing here calls the models' own physics: the formulas are written out once mo
   the column, p = sigma(-ln(1 - d/h)), here d = h (1 - exp(-eps)).
 - slide: the same on a mobile bearing, any nu and strain. Two nodes of its bottom are held
   against rigid motion, also from each other: that makes it stiffer by up to 2 %.
-- kept: the same with prepared operators kept on disk, after another modulus was kept there: each
-  has its own.
+- kept: the same with the operator cache on disk, after an operator of another modulus was stored
+  there. Each modulus must have its own.
 - layer: a rigid sphere on a layer bonded to a rigid base (`elastic_layer`), linear.
 - bed: the sphere on a bed of springs, F = 2 pi R h int_0^(d/h) p(e) de (paraboloid).
 - hertz: the sphere on a half-space, a³ = 3 F R / (4 E*), d = a²/R, p0 = 3 F / (2 pi a²).
@@ -50,13 +50,14 @@ class ClosedFormSettings:
     """Bodies with an analytic solution."""
 
     block_side_mm: float = 24.0
-    """Of the block under the plate: divides by the cells of 2 and 3 mm."""
+    """mm: side of the block under the plate. Chosen: cells of 2 and 3 mm divide it."""
     kept_grid_mm: float = 0.9
-    """Cells small enough that the operator of the block is worth a file."""
+    """mm: cell size of the block whose operator is stored in a file. Chosen: the operator is large
+    enough to be stored."""
     sharma_approach_ratio: float = 0.6808
     """Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
-0.35 whatever the material, and they are too stiff at free sides. A number of its own, kept so
-that a change is seen."""
+0.35 whatever the material, and they are too stiff at free sides. The number is measured, and
+stored so that a change is noticed."""
 
 
 CLOSED_FORM = ClosedFormSettings()
@@ -69,8 +70,8 @@ TOLERANCES: dict[str, tuple[float, float]] = {
     "bed": (0.01, 0.06),
     "hertz": (0.01, 0.01),
 }
-"""Largest relative distances of approach and pressure: for plates a few times the solver's
-tolerance, else what the cells leave, measured and half as much again."""
+"""Largest relative distances of approach and pressure. For plates: a few times the solver's
+tolerance. For others: 1.5 times the measured error of the cells."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +110,10 @@ class ClosedForm:
     @property
     def material(self) -> Material:
         """What the block is made of."""
-        given = {"young_modulus": self.modulus_MPa * MEGAPASCAL, "poisson_ratio": self.nu}
+        properties = {"young_modulus": self.modulus_MPa * MEGAPASCAL, "poisson_ratio": self.nu}
         if self.linear:
-            return material("polyethylene-linear", **given)
-        return material("polyethylene", **given, **CURVE)
+            return material("polyethylene-linear", **properties)
+        return material("polyethylene", **properties, **CURVE)
 
     @property
     def pair(self) -> ContactPair:
@@ -162,17 +163,17 @@ def apart(case: ClosedForm, result: ContactResult) -> dict[str, float]:
     """Return relative distances from the closed form: approach and pressure."""
     approach, pressure = solution(case)
     if case.model == "lattice-source":
-        found = result.pressure.mean()  # its rule gives every node the same area
+        mean_pressure = result.pressure.mean()  # its rule gives every node the same area
     elif case.plate:
-        found = np.median(result.pressure[_inner(result)])
+        mean_pressure = np.median(result.pressure[_inner(result)])
     else:
-        found = max(side.peak_pressure for side in (result.medial, result.lateral) if side)
+        mean_pressure = max(side.peak_pressure for side in (result.medial, result.lateral) if side)
     if case.kind == "hertz" and result.medial is not None:
         mean = 1.5 * result.medial.mean_pressure  # two thirds of the peak
-        found = max(found, mean, key=lambda value: abs(value / pressure - 1.0))
+        mean_pressure = max(mean_pressure, mean, key=lambda value: abs(value / pressure - 1.0))
     return {
         "approach": abs(result.approach / approach - 1.0),
-        "pressure": abs(float(found) / pressure - 1.0),
+        "pressure": abs(float(mean_pressure) / pressure - 1.0),
     }
 
 
@@ -219,10 +220,10 @@ def closed_forms(quick: bool) -> Iterator[ClosedForm]:
 
 
 def _wide(
-    kind: str, model: str, load_N: float = 3000.0, nu: float = 0.3, **given: bool
+    kind: str, model: str, load_N: float = 3000.0, nu: float = 0.3, **options: bool
 ) -> ClosedForm:
     """Return a sphere that presses as wide as the layer is thick: several cells of 3 mm."""
-    return ClosedForm(kind, model, load_N, 12.0, nu=nu, radius_mm=300.0, **given)
+    return ClosedForm(kind, model, load_N, 12.0, nu=nu, radius_mm=300.0, **options)
 
 
 def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
@@ -265,9 +266,9 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
         return lambda strain: young * confined * strain
 
     def pressure(strain: float) -> float:
-        wanted = -confined * np.log1p(-strain)
-        highest = young * wanted + 1.0
-        return float(brentq(lambda s: _strain(case, s) - wanted, 0.0, highest))
+        stress = -confined * np.log1p(-strain)
+        highest = young * stress + 1.0
+        return float(brentq(lambda s: _strain(case, s) - stress, 0.0, highest))
 
     return pressure
 

@@ -1,8 +1,8 @@
 """One row of the trade-off: a model on a case, timed, in a process of its own.
 
 `python -m tkamb.studies.measures` reads a `Job` as JSON from standard input and prints the
-measure as JSON, so that its peak memory is its own and a crash or a hang is a row too. The
-process computes with one thread: timings repeat, and are those of a worker among others.
+measure as JSON. So the peak memory is that of the job alone, and a crash or a hang gives a row,
+too. The process computes with one thread, so that timings are repeatable.
 """
 
 import json
@@ -20,6 +20,7 @@ from typing import Any
 from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import WarmStart
 from tkamb.errors import TkambError
 from tkamb.geometry import threads
 from tkamb.memory import peak_rss
@@ -33,13 +34,15 @@ class MeasureSettings:
     """How times of the trade-off study are measured."""
 
     longest_seconds: float = 300.0
-    """A job that takes longer is stopped and says so."""
+    """s: a job that takes longer is stopped and says so. Chosen: the whole page takes minutes."""
     repeats: int = 3
-    """Of preparing and pressing for the first time; of warm presses at least."""
+    """Repeats of the preparation and the first press; also the smallest number of warm presses.
+    Chosen: enough for a median."""
     warm_presses: int = 7
-    """Presses from a neighbouring pose that are timed."""
+    """Presses from a neighbouring pose that are timed. Chosen: enough for a median."""
     enough_seconds: float = 3.0
-    """No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
+    """s: no more repeats after this time of measurement, except `repeats` warm presses. Chosen: the
+    whole page takes minutes."""
 
 
 MEASURE = MeasureSettings()
@@ -93,7 +96,7 @@ class Measure:
         status: "ok" or why not.
         prepare_seconds: from bodies to a state, nothing taken from disk; median.
         cold_seconds: first press after it; median.
-        warm_seconds: press at the next pose, the last result as guess; median.
+        warm_seconds: press at the next pose, from where the last one ended; median.
         peak_rss_MB: of the process.
         iterations: of the first press.
         nodes: that the model solves for.
@@ -136,14 +139,14 @@ def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure
 def measure(job: Job) -> Measure:
     """Measure in this process."""
     model = _model(job)
-    (prepare, cold), (case, state, result) = _first(model, job)
+    (prepare, cold), (case, state, result, start) = _first(model, job)
     if result.status is not ContactStatus.OK:
         return Measure(f"{result.status.value}: {'; '.join(result.flags)}", prepare, cold)
     return Measure(
         "ok",
         prepare,
         cold,
-        _warm(model, state, case, result),
+        _warm(model, state, case, start),
         peak_rss(),
         result.iterations,
         state.node_count,
@@ -161,10 +164,10 @@ def _model(job: Job) -> ContactModel:
 
 def _first(
     model: ContactModel, job: Job
-) -> tuple[tuple[float, float], tuple[StudyCase, Any, ContactResult]]:
-    """Return the median seconds of prepare and first press, and the last of both.
+) -> tuple[tuple[float, float], tuple[StudyCase, Any, ContactResult, WarmStart]]:
+    """Return the median seconds of prepare and first press, and what the last of both gave.
 
-    The bodies are made anew each time: nothing that is remembered of them makes it faster.
+    The bodies are made again each time, so that no cached property of them saves time.
     """
     prepares: list[float] = []
     colds: list[float] = []
@@ -173,27 +176,27 @@ def _first(
         state = None
         case = study_case(job.case, Path(job.scene) if job.scene else None)
         prepare, state = _timed(model.prepare, case.pair)
-        cold, result = _timed(model.press, state, case.load, case.pose)
+        cold, (result, start) = _timed(model.press_from, state, case.load, case.pose)
         prepares.append(prepare)
         colds.append(cold)
         if len(colds) == MEASURE.repeats or sum(prepares) + sum(colds) > MEASURE.enough_seconds:
-            return (median(prepares), median(colds)), (case, state, result)
+            return (median(prepares), median(colds)), (case, state, result, start)
 
 
-def _warm(model: ContactModel, state: Any, case: StudyCase, guess: ContactResult) -> float:
+def _warm(model: ContactModel, state: Any, case: StudyCase, start: WarmStart) -> float:
     seconds: list[float] = []
     while len(seconds) < MEASURE.repeats or (
         len(seconds) < MEASURE.warm_presses and sum(seconds) < MEASURE.enough_seconds
     ):
         pose = case.nearby(len(seconds) + 1)
-        spent, guess = _timed(model.press, state, case.load, pose, guess)
+        spent, (_, start) = _timed(model.press_from, state, case.load, pose, start)
         seconds.append(spent)
     return median(seconds)
 
 
-def _timed(call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+def _timed(call: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
     start = clock.perf_counter()
-    result = call(*given)
+    result = call(*arguments)
     return clock.perf_counter() - start, result
 
 

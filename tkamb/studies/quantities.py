@@ -1,4 +1,4 @@
-"""What two contact results are compared by, and how far they are apart."""
+"""The quantities by which two contact results are compared, and their relative differences."""
 
 from collections.abc import Mapping
 
@@ -18,36 +18,36 @@ Quantities = dict[str, float]
 
 def quantities(result: ContactResult) -> Quantities:
     """Return approach (m) and each condyle's force (N), mean and peak pressure (Pa), area (m²)."""
-    found = {"approach": result.approach}
+    values = {"approach": result.approach}
     for side in SIDES:
         condyle = getattr(result, side)
         for part in PARTS:
-            found[f"{side}_{part}"] = 0.0 if condyle is None else float(getattr(condyle, part))
-    return found
+            values[f"{side}_{part}"] = 0.0 if condyle is None else float(getattr(condyle, part))
+    return values
 
 
-def errors(found: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
+def errors(values: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
     """Return relative errors: approach, force, mean_pressure, peak_pressure, area.
 
-    A condyle's error counts against what both carry (force, area) or against the higher one
-    (pressures), so that a condyle that hardly touches does not decide; of the two condyles
-    the larger error is given.
+    Errors of force and area are relative to the sum over both condyles, errors of pressure to the
+    higher one, so that a condyle that hardly touches does not dominate. The larger error of the two
+    condyles is returned.
     """
-    result = {"approach": _relative(found, reference, ["approach"], np.max)}
+    result = {"approach": _relative(values, reference, ["approach"], np.max)}
     for part in PARTS:
         names = [f"{side}_{part}" for side in SIDES]
         scale = np.sum if part in ("force", "area") else np.max
-        result[part] = _relative(found, reference, names, scale)
+        result[part] = _relative(values, reference, names, scale)
     return result
 
 
 def _relative(
-    found: Mapping[str, float], reference: Mapping[str, float], names: list[str], scale: object
+    values: Mapping[str, float], reference: Mapping[str, float], names: list[str], scale: object
 ) -> float:
     assert callable(scale)
-    given = np.array([found[name] for name in names])
+    own = np.array([values[name] for name in names])
     true = np.array([reference[name] for name in names])
-    return float(np.abs(given - true).max() / scale(np.abs(true)))
+    return float(np.abs(own - true).max() / scale(np.abs(true)))
 
 
 Raster = dict[tuple[int, int], float]
@@ -82,9 +82,9 @@ def raster_map(result: ContactResult) -> Raster:
     }
 
 
-def map_error(found: Raster, reference: Raster) -> float:
+def map_error(raster: Raster, reference: Raster) -> float:
     """Return the L2 norm of the maps' difference over that of the reference."""
-    places = sorted(set(found) | set(reference))
-    given = np.array([found.get(place, 0.0) for place in places])
+    places = sorted(set(raster) | set(reference))
+    own = np.array([raster.get(place, 0.0) for place in places])
     true = np.array([reference.get(place, 0.0) for place in places])
-    return float(np.linalg.norm(given - true) / np.linalg.norm(true))
+    return float(np.linalg.norm(own - true) / np.linalg.norm(true))

@@ -3,9 +3,9 @@
 A sphere on a linear layer has the elastic layer's solution. Elsewhere finite elements and the
 lattice are solved to a tolerance of 1e-6 on ever finer grids. Approach and forces are their
 common limit (Richardson); peak pressures and areas jump from node to node without order: theirs
-are the average of the two finest grids. The uncertainty is the largest of what the fit leaves,
-of the families' disagreement, and of the distance between limit and finest grids (half of it
-where the finest grids are the reference).
+are the average of the two finest grids. The uncertainty is the largest of three numbers: the
+residual of the fit, the disagreement of the two families, and the distance between limit and
+finest grids (half of it where the finest grids are the reference).
 """
 
 import json
@@ -41,9 +41,10 @@ class ReferenceSettings:
     """How the studies' reference solutions are computed."""
 
     large_volume: float = 2e-5
-    """m³: of an insert's bounding box from which on the coarser grids must do."""
+    """m³: volume of an insert's bounding box from which only the coarser grids are used. Chosen:
+    finer grids of it do not fit into memory."""
     tolerance: float = 1e-6
-    """Relative tolerance of the reference solutions."""
+    """Relative tolerance of the reference solutions. Chosen: far below what is compared."""
     width_effect: float = 0.005
     """Relative: a block 3.4 times as wide as high against an endless layer."""
 
@@ -118,10 +119,10 @@ def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
     for name in next(iter(solved.values())):
         series = np.array([row[name] for row in solved.values()])
         finest = series[h <= np.unique(h)[:2].max()]
-        limit, left = common_limit(h, series, family)
+        limit, residual = common_limit(h, series, family)
         middle = float(finest.mean())
         if name == "approach" or name.endswith("force"):
-            values[name], uncertainty[name] = limit, max(left, abs(limit - middle))
+            values[name], uncertainty[name] = limit, max(residual, abs(limit - middle))
         else:
             spread = float(np.ptp(finest) / 2)
             values[name], uncertainty[name] = middle, max(spread, abs(limit - middle) / 2)
@@ -144,13 +145,13 @@ def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
     slopes = np.where(family[:, None] == kinds, h[:, None] ** 2, 0.0)
     matrix = np.column_stack([np.ones(len(h)), slopes])
     solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
-    left = np.abs(matrix @ solution - values).max()
+    residual = np.abs(matrix @ solution - values).max()
     own = []
     for kind in kinds:
         some = family == kind
         line = np.column_stack([np.ones(some.sum()), h[some] ** 2])
         own.append(np.linalg.lstsq(line, values[some], rcond=None)[0][0])
-    return float(solution[0]), float(max(left, 0.5 * (max(own) - min(own))))
+    return float(solution[0]), float(max(residual, 0.5 * (max(own) - min(own))))
 
 
 def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
@@ -189,7 +190,9 @@ def read_references(path: Path = STORED) -> dict[str, Reference]:
             for name, entry in stored.items()
         }
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"is no file of references ({error})", path, "use --recompute") from None
+        raise InputError(
+            f"is not a file of references ({error})", path, "use --recompute"
+        ) from None
 
 
 def write_references(references: dict[str, Reference], path: Path) -> None:

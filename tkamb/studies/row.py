@@ -23,7 +23,8 @@ class TimingSettings:
     """How times are compared."""
 
     equal_ratio: float = 1.2
-    """Ratio; two medians of time within this factor count as equal."""
+    """Ratio: two medians of time within this factor count as equal. Chosen: repeated measurements
+    vary by as much."""
 
 
 TIMING = TimingSettings()
@@ -89,17 +90,17 @@ def row_of(content: dict[str, Any]) -> Row:
     return Row(job, measure, errors, content["reference_known"], content["on_front"])
 
 
-def compared(job: Job, found: Measure, reference: Reference) -> Row:
+def compared(job: Job, measure: Measure, reference: Reference) -> Row:
     """Return the row of what was measured, with its errors."""
     floor = floor_of(reference)
-    if found.status != "ok":
-        return Row(job, found, {}, floor)
-    apart = map_error(raster_of(found.map), reference.raster) if found.map else math.nan
-    return Row(job, found, errors(found.values, reference.values) | {"map": apart}, floor)
+    if measure.status != "ok":
+        return Row(job, measure, {}, floor)
+    apart = map_error(raster_of(measure.map), reference.raster) if measure.map else math.nan
+    return Row(job, measure, errors(measure.values, reference.values) | {"map": apart}, floor)
 
 
 def floor_of(reference: Reference) -> float:
-    """Return the largest relative uncertainty of what the front goes by."""
+    """Return the largest relative uncertainty among `FRONT_ERRORS`."""
     shifted = {k: v + reference.uncertainty[k] for k, v in reference.values.items()}
     apart = errors(shifted, reference.values)
     return max(apart[key] for key in FRONT_ERRORS)
@@ -146,4 +147,4 @@ def read_rows(path: Path) -> list[Row]:
     try:
         return [row_of(content) for content in json.loads(path.read_text(encoding="utf-8"))]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"is no table of a trade-off ({error})", path) from None
+        raise InputError(f"is not a table of a trade-off ({error})", path) from None

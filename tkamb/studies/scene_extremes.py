@@ -1,7 +1,7 @@
 """Extremes of a whole run: time steps, noise, friction, moment arms, meshes, flexion.
 
-The shipped knee bend is run on a few frames with one thing driven far out. What it must obey
-is known without a second solver:
+The shipped knee bend is run on a few frames with one extreme parameter. The right result is
+known without a second solver:
 
 - time: forces are F_rest + F_inertia / scale² where the same motion takes `scale` times as long;
 - always: the deformed insert carries the superior-inferior force that balance asks for;
@@ -39,8 +39,8 @@ class InertiaStudySettings:
     """How the effect of inertia is found."""
 
     slow_factor: float = 10.0
-    """Times as slow as recorded; the difference from the recorded motion is the effect of
-    inertia."""
+    """Ratio of the time of the slow motion to the recorded one; the difference from the recorded
+    motion is the effect of inertia. Chosen: inertia is then negligible."""
 
 
 INERTIA_STUDY = InertiaStudySettings()
@@ -48,8 +48,8 @@ INERTIA_STUDY = InertiaStudySettings()
 NOISES = (1e-3, 1e-2, 0.1, 1.0)
 FRICTIONS = (0.0, 0.2, 0.6, 1.0)
 ARMS_MM = (-20.0, -60.0, -90.0, -98.0, -101.0, -104.0, -108.0, -120.0)
-"""How far back the patellar ligament's insertion is moved, its line straight: to no moment arm (at
--98 to -108, by flexion) and past it."""
+"""mm: positions of the patellar ligament's insertion, with a straight line, until the moment arm is
+zero (at -98 to -108, depending on flexion) and beyond."""
 DEFECTS = ("hole", "flipped", "doubled", "sliver", "nan", "empty", "tiny")
 
 Check = Callable[["Results", Path], float]
@@ -85,7 +85,7 @@ def scene_extremes() -> Iterator[SceneExtreme]:
 
 
 def judge_scene(extreme: SceneExtreme) -> Verdict:
-    """Run an extreme and check what it must obey."""
+    """Run an extreme and check its result."""
     start = clock.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         scene = copied_scene(Path(folder))
@@ -105,8 +105,8 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     right = math.isfinite(apart) and apart <= VERDICT.max_error
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
     reason = flags if right or flags else f"{100 * apart:.3g} % from what it must be"
-    known = apart if math.isfinite(apart) else None
-    return Verdict(extreme.label, "run", kind, reason, known, seconds)
+    distance = apart if math.isfinite(apart) else None
+    return Verdict(extreme.label, "run", kind, reason, distance, seconds)
 
 
 def _run(scene: Path, overrides: dict[str, Any]) -> "Results":
@@ -127,8 +127,8 @@ def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
     elif extreme.kind == "arm":
         content = tomllib.loads(SHIPPED_SCENE.read_text(encoding="utf-8"))
         x, y, z = content["patellar_ligament"]["distal"]["point_mm"]
-        moved = {"link": "tibia", "point_mm": [x + extreme.value, y, z]}
-        return {"patellar_ligament.distal": moved, "patellar_ligament.wrap": False}
+        attachment = {"link": "tibia", "point_mm": [x + extreme.value, y, z]}
+        return {"patellar_ligament.distal": attachment, "patellar_ligament.wrap": False}
     else:
         name = "femoral_component" if extreme.kind == "femoral" else "insert"
         _damage(folder / f"{name}.stl", extreme.value)
@@ -139,8 +139,8 @@ def _apart(extreme: SceneExtreme, results: "Results", folder: Path) -> float:
     """Return how far (relative) the results are from what they must be."""
     assert results.maps is not None
     demanded = results["force_si_N"]
-    carried = -results.maps.nodal_force_N[:, :, 1].sum(axis=1)
-    apart = float(np.max(np.abs(carried - demanded) / np.abs(demanded)))
+    force = -results.maps.nodal_force_N[:, :, 1].sum(axis=1)
+    apart = float(np.max(np.abs(force - demanded) / np.abs(demanded)))
     if extreme.kind == "time":
         once = _run(SHIPPED_SCENE, {})["force_si_N"]
         stretch_time(folder, INERTIA_STUDY.slow_factor / extreme.value)

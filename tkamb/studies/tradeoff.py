@@ -1,8 +1,7 @@
 """Speed against accuracy: every contact model on every case, against converged references.
 
-The default matrix leaves out what repeats something else: fine grids and the solver's variants are
-measured on one case of each pair of bodies, not at every pose; `full` measures everything on every
-case.
+The default matrix is reduced: fine grids and the solver's variants are measured on one case of
+each pair of bodies, not at every pose. `full` measures every setting on every case.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -37,12 +36,12 @@ ONE_OF_EACH = ("sphere", "two condyles", "conforming", "knee 60 deg", "scene 60 
 TRIED_ON = ("two condyles", "conforming", "knee 60 deg")
 """Cases on which the variants are measured."""
 PEER_GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
-"""Cell sizes of the cases that CalculiX is given; two condyles at 1 mm take it minutes."""
+"""mm: cell sizes of the cases for CalculiX; two condyles at 1 mm take minutes."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is measured of a contact model.
+    """Settings at which a contact model is measured.
 
     Args:
         everywhere_mm: cell sizes on every case.
@@ -81,11 +80,11 @@ def jobs(quick: bool = False, scene: Path | None = None, full: bool = False) -> 
         scene: a user's scene, whose cases come last.
         full: every setting on every case.
     """
-    given = None if scene is None else str(scene)
+    scene_name = None if scene is None else str(scene)
     if quick:
         return [Job(case, model, 2.0) for case in QUICK_CASES for model in QUICK_MODELS]
     return [
-        Job(case, model, grid, options, given)
+        Job(case, model, grid, options, scene_name)
         for case in case_names(scene)
         for model in contact_names()
         for grid, options in _of(SETTINGS.get(model, Settings()), case, full)
@@ -102,12 +101,10 @@ def _of(settings: Settings, case: str, full: bool) -> list[tuple[float, dict[str
     return result
 
 
-def expected_seconds(wanted: Sequence[Job], cases: Sequence[StudyCase]) -> list[float]:
-    """Return roughly how long each job takes, for the time left: by the number of cells."""
+def expected_seconds(jobs: Sequence[Job], cases: Sequence[StudyCase]) -> list[float]:
+    """Return the approximate time of each job, from the number of cells, to show the time left."""
     box = {c.name: float(np.prod(np.ptp(c.pair.insert.vertices, axis=0))) for c in cases}
-    return [
-        2.0 + _per_node(job) * box[job.case] / (job.resolution_mm * 1e-3) ** 3 for job in wanted
-    ]
+    return [2.0 + _per_node(job) * box[job.case] / (job.resolution_mm * 1e-3) ** 3 for job in jobs]
 
 
 def _per_node(job: Job) -> float:
@@ -117,30 +114,30 @@ def _per_node(job: Job) -> float:
 
 
 def run_tradeoff(
-    wanted: Sequence[Job], references: dict[str, Reference], kept: KeptRows | None = None
+    jobs: Sequence[Job], references: dict[str, Reference], rows: KeptRows | None = None
 ) -> Iterator[Row]:
     """Measure and compare; yield the rows as they come, no front marked yet.
 
     Args:
-        wanted: what to measure.
+        jobs: what to measure.
         references: case name -> converged answer.
-        kept: rows of an earlier study that are taken as they are; new ones are added.
+        rows: rows of an earlier study, which are not computed again; new ones are added.
     """
-    for job in wanted:
+    for job in jobs:
         reference = references[job.case]
         code = contact_code(job.contact)
         key = row_key("tradeoff", asdict(job), code, reference.hash, reference.values)
-        result = kept.get(key) if kept else None
+        result = rows.get(key) if rows else None
         measured = Measure(**result) if result else measure_apart(job)
-        if kept and not result:
-            kept.put(key, asdict(measured))
+        if rows and not result:
+            rows.put(key, asdict(measured))
         yield compared(job, measured, reference)
 
 
 def run_peer(
     cases: Iterable[StudyCase],
     references: dict[str, Reference],
-    kept: KeptRows | None = None,
+    rows: KeptRows | None = None,
     sizes_mm: Collection[float] = (2.0,),
 ) -> Iterator[Row]:
     """Yield CalculiX's rows on the cases that it can do; one that fails is a row too.
@@ -148,7 +145,7 @@ def run_peer(
     Args:
         cases: that may be pressed.
         references: case name -> converged answer.
-        kept: rows of an earlier study that are taken as they are; new ones are added.
+        rows: rows of an earlier study, which are not computed again; new ones are added.
         sizes_mm: cell sizes that are wanted.
 
     Raises:
@@ -161,10 +158,10 @@ def run_peer(
             if size not in PEER_GRIDS_MM.get(case.name, ()):
                 continue
             key = row_key("calculix", case.hash, reference.values, size)
-            result = kept.get(key) if kept else None
+            result = rows.get(key) if rows else None
             measured = Measure(**result) if result else measure_by_calculix(case, size)
-            if kept and not result:
-                kept.put(key, asdict(measured))
+            if rows and not result:
+                rows.put(key, asdict(measured))
             yield compared(Job(case.name, f"calculix {ELEMENT}", size), measured, reference)
 
 
@@ -172,7 +169,7 @@ def references_for(
     cases: Iterable[StudyCase],
     recompute: bool,
     announce: Callable[[str], None],
-    kept: KeptRows | None = None,
+    rows: KeptRows | None = None,
 ) -> dict[str, Reference]:
     """Return the references of the cases: stored, or computed and stored where asked for.
 
@@ -186,7 +183,7 @@ def references_for(
     result: dict[str, Reference] = {}
     for case in cases:
         if case.name.startswith("scene"):
-            result[case.name] = _own_reference(case, announce, kept)
+            result[case.name] = _own_reference(case, announce, rows)
         elif recompute:
             announce(f"reference of case '{case.name}': {case.label}")
             stored[case.name] = result[case.name] = compute_reference(case)
@@ -197,20 +194,20 @@ def references_for(
 
 
 def _own_reference(
-    case: StudyCase, announce: Callable[[str], None], kept: KeptRows | None
+    case: StudyCase, announce: Callable[[str], None], rows: KeptRows | None
 ) -> Reference:
     key = row_key("reference", case.hash)
-    row = kept.get(key) if kept else None
+    row = rows.get(key) if rows else None
     if row is not None:
         return Reference(**row | {"grids_mm": tuple(row["grids_mm"])})
     announce(f"reference of case '{case.name}': {case.label}")
     result = compute_reference(case)
-    if kept:
-        kept.put(key, asdict(result))
+    if rows:
+        rows.put(key, asdict(result))
     return result
 
 
-def cases_of(wanted: Sequence[Job]) -> list[StudyCase]:
+def cases_of(jobs: Sequence[Job]) -> list[StudyCase]:
     """Return the cases of some jobs."""
-    names = {job.case: job.scene for job in wanted}
+    names = {job.case: job.scene for job in jobs}
     return [study_case(name, Path(scene) if scene else None) for name, scene in names.items()]

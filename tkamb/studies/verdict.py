@@ -1,9 +1,9 @@
 """One case judged: converged, flagged, or failed.
 
-An extreme is judged by what every answer must obey and by CalculiX where its answer is stored
-(`audit`), and by full Newton on the same grid, which finds what is the solver's
-alone. A closed form is judged by its formula (`closed_forms`). What a case was judged before is
-stored as well: converged once, it may not become flagged.
+An extreme is tested by the checks that every result must pass, by CalculiX where its result is
+stored (`audit`), and by full Newton on the same grid, which reveals errors of the solver alone. A
+closed form is tested by its formula (`closed_forms`). Earlier verdicts are stored: a case that was
+converged must not become flagged.
 
 - converged: status ok, no complaint, and within 2 % of the reference in approach, condyle force and
   peak.
@@ -23,6 +23,7 @@ from tkamb.contact.model import ContactModel
 from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import Guess
 from tkamb.errors import ComputationError, TkambError
 from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form
@@ -35,16 +36,17 @@ class VerdictSettings:
     """When a result of a study is wrong."""
 
     max_error: float = 0.02
-    """Relative distance from the reference from which a result counts as wrong."""
+    """1: relative distance from the reference above which a result is wrong. Chosen: below what is
+    published of models compared with tests."""
 
 
 VERDICT = VerdictSettings()
 
 JUDGED = ("approach", "force", "peak_pressure")
 NEWTON_TOLERANCES = (1e-6, 1e-4, 1e-3)
-"""Of the reference: the tightest that Newton's method reaches."""
+"""Tolerances that are tried for the reference; the tightest that converges is used."""
 LOAD_STEPS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
-"""Shares of the load in which Newton's method goes where it does not get at once."""
+"""Shares of the load in which it is applied if Newton's method does not converge at once."""
 KINDS = ("converged", "flagged", "unflagged_wrong", "unverified", "exception", "hang")
 PASSED_KINDS = ("converged", "flagged")
 
@@ -54,7 +56,7 @@ class Verdict:
     """How a case ended.
 
     Args:
-        case: what was driven out.
+        case: the extreme parameters.
         contact: model.
         kind: one of `KINDS`.
         reason: plain words; empty where all is well.
@@ -80,7 +82,7 @@ class Verdict:
 
     @property
     def worse(self) -> bool:
-        """Whether what was converged is flagged now."""
+        """Whether a case that was converged is flagged now."""
         return self.kind == "flagged" and self.expected == "converged"
 
     @property
@@ -127,16 +129,16 @@ def judge_closed_form(case: ClosedForm, pressed: Callable[[], None] = lambda: No
     pressed()
     if result.status is not ContactStatus.OK:
         return _verdict(case, "flagged", _words(result), None, seconds, result)
-    found = apart(case, result)
-    bounds = dict(zip(found, TOLERANCES[case.kind], strict=True))
+    distances = apart(case, result)
+    bounds = dict(zip(distances, TOLERANCES[case.kind], strict=True))
     wrong = [
         f"{name} {100 * value:.3g} % from the closed form"
-        for name, value in found.items()
+        for name, value in distances.items()
         if not value <= bounds[name]
     ]
     wrong += _audited(case.model, result, case.load_N)
     kind, reason = _judged(result, wrong)
-    return _verdict(case, kind, reason, max(found.values()), seconds, result)
+    return _verdict(case, kind, reason, max(distances.values()), seconds, result)
 
 
 def _judged(result: ContactResult, wrong: list[str]) -> tuple[str, str]:
@@ -168,9 +170,9 @@ def _beside_peer(extreme: Extreme, result: ContactResult) -> list[str]:
 def compared(
     extreme: Extreme, result: ContactResult, reference: ContactResult, seconds: float
 ) -> Verdict:
-    """Return the verdict on a result that calls itself ok."""
-    found = errors(quantities(result), quantities(reference))
-    distance = max(found[key] for key in JUDGED)
+    """Return the verdict on a result with status ok."""
+    misses = errors(quantities(result), quantities(reference))
+    distance = max(misses[key] for key in JUDGED)
     right = math.isfinite(distance) and distance <= VERDICT.max_error
     flags = "; ".join(result.flags)
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
@@ -186,8 +188,8 @@ def _verdict(
     seconds: float,
     result: ContactResult,
 ) -> Verdict:
-    known = distance if distance is not None and math.isfinite(distance) else None
-    return Verdict(case.label, case.model, kind, reason, known, seconds, int(result.iterations))
+    finite = distance if distance is not None and math.isfinite(distance) else None
+    return Verdict(case.label, case.model, kind, reason, finite, seconds, int(result.iterations))
 
 
 def _model(extreme: Extreme, **options: Any) -> ContactModel:
@@ -208,10 +210,10 @@ def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactRe
     for tolerance in NEWTON_TOLERANCES:
         newton = _model(extreme, newton=True, tolerance=tolerance)
         for shares, start in (((1.0,), None), (LOAD_STEPS, None), ((1.0,), result)):
-            found = _by_steps(newton, extreme, state, shares, start)
-            if found is not None:
-                return found
-    raise ComputationError("Newton's method does not get there, at once or in steps", "reference")
+            press = _by_steps(newton, extreme, state, shares, start)
+            if press is not None:
+                return press
+    raise ComputationError("Newton's method does not converge, at once or in steps", "reference")
 
 
 def _by_steps(
@@ -219,14 +221,15 @@ def _by_steps(
     extreme: Extreme,
     state: Any,
     shares: tuple[float, ...],
-    guess: ContactResult | None,
+    start: Guess | None,
 ) -> ContactResult | None:
     """Return Newton's answer after shares of the load; None where it finds none."""
     for share in shares:
         try:
-            guess = newton.press(state, share * extreme.load_N, extreme.pose, guess)
+            load = share * extreme.load_N
+            result, start = newton.press_from(state, load, extreme.pose, start)
         except ComputationError:
             return None
-        if guess.status is not ContactStatus.OK:
+        if result.status is not ContactStatus.OK:
             return None
-    return guess
+    return result

@@ -8,11 +8,11 @@ import numpy as np
 
 from tkamb.contact.lattice.flags import unseen_flags
 from tkamb.contact.lattice.initial_guess import (
-    FORCES_ONLY_GROWTH,
     InitialGuess,
-    WarmStart,
+    LatticeStart,
     guessed_depth,
     initial_guess,
+    lattice_start,
 )
 from tkamb.contact.lattice.linear.cache import cached_operator
 from tkamb.contact.lattice.linear.compliance import ComplianceCache
@@ -32,7 +32,7 @@ from tkamb.contact.lattice.problem import (
     TangentPlanes,
     undeformed,
 )
-from tkamb.contact.lattice.report import PressureRule, gaps_of_others, result_of
+from tkamb.contact.lattice.report import PressureRule, result_of
 from tkamb.contact.lattice.settings import LATTICE_SOLVER, LatticeSolverSettings
 from tkamb.contact.lattice.solids.bbar import BbarHexahedra
 from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
@@ -44,6 +44,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load, within_insert
 from tkamb.contact.probe import Probe
 from tkamb.contact.result import ContactResult
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
@@ -52,8 +53,6 @@ TOUCHING = 1e-13
 """m; bodies that overlap by less carry nothing: 1e-6 N at 1e7 N/m."""
 COARSE = 1e-3
 """From this tolerance on the factor is kept in 16 bits: they leave an imbalance of 3e-4."""
-TURNED_TOLERANCE = 3.0
-"""Times the tolerance, for a step that is extrapolated: what it changes is known to 1 %."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
 
@@ -158,70 +157,79 @@ class CellContact(ContactModel):
         return cached_operator(solid, held, nodes, make, coarse)
 
     def evaluate(
+        self, state: LatticeState, pose: Array, guess: Guess | None = None
+    ) -> ContactResult:
+        """Return the contact at a pose; see `ContactModel`."""
+        return self.evaluate_from(state, pose, guess)[0]
+
+    def press(
+        self, state: LatticeState, load: float, pose: Array, guess: Guess | None = None
+    ) -> ContactResult:
+        """Find the approach that carries `load` (N); see `ContactModel`."""
+        return self.press_from(state, load, pose, guess)[0]
+
+    def evaluate_from(
         self,
         state: LatticeState,
         pose: Array,
-        guess: ContactResult | None = None,
-        sketch: bool = False,
-    ) -> ContactResult:
-        """Return the contact at a pose; see `ContactModel`.
+        start: Guess | None = None,
+        forces_only: bool = False,
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact at a pose, and the start of the next; see `ContactModel`.
 
         Args:
             state: what `prepare` returned.
             pose: (4, 4) pose_femoral_in_insert.
-            guess: an earlier result.
-            sketch: forces alone count: areas are whole nodes', nothing is flagged, and close to
-                the guess the elements that did not count there are not looked at.
+            start: an earlier result, or the start that came with it.
+            forces_only: the elements that did not count at the start are not looked at, areas are
+                whole nodes', nothing is flagged. It holds near the start (`LatticeProbe`).
         """
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return ContactResult.failed(state, pose, "the pose is not finite")
+            return _alone(ContactResult.failed(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
         deepest = -float(gaps.min())
         if deepest <= TOUCHING:
-            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
-        return self._solved(state, pose, None, (gaps, planes), deepest, guess, sketch)
+            return _alone(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
+        return self._solved(state, pose, None, (gaps, planes), deepest, start, forces_only)
 
-    def press(
+    def press_from(
         self,
         state: LatticeState,
         load: float,
         pose: Array,
-        guess: ContactResult | None = None,
-        sketch: bool = False,
-    ) -> ContactResult:
-        """Find the approach that carries `load` (N); see `ContactModel` and `evaluate`."""
+        start: Guess | None = None,
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact under a load (N), and the start of the next; see `evaluate_from`."""
         check_load(load)
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return ContactResult.failed(state, pose, "the pose is not finite")
+            return _alone(ContactResult.failed(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
         lowest = float(gaps.min())
         if not np.isfinite(lowest):
-            return ContactResult.failed(
-                state, pose, "the femoral component does not lie over the insert"
-            )
+            missed = "the femoral component does not lie over the insert"
+            return _alone(ContactResult.failed(state, pose, missed))
         if load == 0:
             pose = state.pair.pose_at_approach(pose, 0.0)
             gaps, _ = undeformed(state.problem, pose)
-            return ContactResult.of(state, pose, np.zeros(len(gaps)), gaps)
+            return _alone(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
         pose[1, 3] -= lowest
         gaps, planes = gaps - lowest, planes.raised(-lowest)
-        warm = warm_start_of(state, guess)
-        if warm is not None:
-            depth = warm.depth
-        elif guess is not None and guess.approach > 0:
-            depth = guess.approach
+        own = lattice_start(state, start)
+        if own is not None:
+            depth = own.depth
+        elif start is not None and start.approach > 0:
+            depth = start.approach
         else:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load)
-        return self._solved(state, pose, load, (gaps, planes), depth, guess, sketch)
+        return self._solved(state, pose, load, (gaps, planes), depth, start)
 
-    def probe(self, state: LatticeState, guess: ContactResult | None = None) -> Probe:
+    def probe(self, state: LatticeState, guess: Guess | None = None) -> Probe:
         """Return the probe with stiffness; see `ContactModel`."""
         if self.direction == "vertical":
             return Probe(self, state, guess)
-        rough = replace(self, tolerance=TURNED_TOLERANCE * self.tolerance)
-        return LatticeProbe(self, state, guess, self.tolerance, rough)
+        return LatticeProbe(self, state, guess, self.tolerance)
 
     def _solved(
         self,
@@ -230,58 +238,41 @@ class CellContact(ContactModel):
         load: float | None,
         rest: tuple[Array, TangentPlanes],
         depth: float,
-        guess: ContactResult | None,
-        sketch: bool,
-    ) -> ContactResult:
+        begin: Guess | None,
+        region_only: bool = False,
+    ) -> tuple[ContactResult, WarmStart]:
         """Solve with growing candidate sets until they cover the approach.
 
         `rest` is what `undeformed` says at the pose.
         """
-        gaps, planes = rest
-        settings = self.settings
-        last = warm_start_of(state, guess)
-        warm = None if last is None else last.extrapolated(pose)
-        near = sketch and last is not None and last.near(pose)
-        unmeasured = FORCES_ONLY_GROWTH * last.looked[0] if last is not None and near else 0.0
-        touched = guess.pressure > 0 if guess and len(guess.pressure) == len(gaps) else None
+        (gaps, planes), settings = rest, self.settings
+        start = lattice_start(state, begin)
+        forces_only = region_only and start is not None and not self.newton
         for _ in range(settings.max_expansions):
-            start = initial_guess(
-                state.compliance,
-                gaps,
-                planes,
-                depth,
-                load is None,
-                touched,
-                warm,
-                unmeasured,
-                settings.candidate_margin,
-            )
+            guess = initial_guess(
+                state.compliance, gaps, planes, depth, load is None, start,
+                settings.candidate_margin, forces_only,
+            )  # fmt: skip
             below = -min(float(gaps.min()), 0.0)
-            covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
-            within = np.inf if covered else (start.reach - below) / REACH
-            solution = self._solution(state.problem, pose, load, start, settings, within)
-            outgrown = solution.forces.approach > within
-            if solution.converged:
-                moved = np.zeros_like(state.surface.points)
-                moved[solution.candidates] = solution.displacement
-                below += solution.forces.approach
-                looked = float(np.linalg.norm(solution.forces.force)), pose
-                if last is not None and not solution.seen:
-                    looked = last.looked
-                warm = WarmStart(
-                    state.problem, solution.loads, moved, below, solution.region,
-                    pose, looked, None if last is None else replace(last, before=None),
-                )  # fmt: skip
-            others = gaps <= solution.forces.approach * REACH + below
-            if not outgrown or _others_clear(state, pose, others, solution):
+            covered = load is None or len(guess.candidates) == np.isfinite(gaps).sum()
+            within = np.inf if covered else (guess.reach - below) / REACH
+            solution = self._solution(state.problem, pose, load, guess, settings, within)
+            approach = solution.forces.approach
+            if approach <= within:
                 rule = self.pressure_rule
-                result = result_of(state, pose, load, gaps, solution, rule, sketch)
-                if load is not None and not sketch:
-                    sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
+                result = result_of(state, pose, load, gaps, solution, rule, forces_only)
+                if load is not None:
+                    sunk = approach + max(-float(gaps.min()), 0.0)
                     result = within_insert(state, result, *unseen_flags(state, result, sunk))
-                return replace(result, warm_start=warm) if solution.converged else result
-            depth, touched = 1.1 * solution.forces.approach, None
-        return ContactResult.failed(state, pose, "the set of candidate nodes is saturated")
+                if not solution.converged:
+                    return _alone(result)
+                return result, _start_after(state, result, solution, below + approach)
+            if solution.converged:  # the repetition with more candidates begins here
+                place = WarmStart(state.pair, pose, state.points, np.zeros(len(gaps)), gaps)
+                start = _start_after(state, place, solution, below + approach)
+            depth = 1.1 * approach
+        saturated = "the set of candidate nodes is saturated"
+        return _alone(ContactResult.failed(state, pose, saturated))
 
     def _solution(
         self,
@@ -303,7 +294,7 @@ class CellContact(ContactModel):
         if (
             solution.converged
             or problem.solid.material.is_linear
-            or solution.gap == solution.residual
+            or solution.residual.gap >= solution.residual.force
         ):
             return solution
         if solution.forces.approach > within:
@@ -365,28 +356,28 @@ class FiniteElements(CellContact):
         return BbarHexahedra(lattice.nodes, lattice.cells, lattice.spacing, material)
 
 
-def warm_start_of(state: LatticeState, guess: ContactResult | None) -> WarmStart | None:
-    """Return where the solver may begin; None unless the guess is a result of this state."""
-    warm = None if guess is None else guess.warm_start
-    mine = isinstance(warm, WarmStart) and warm.problem is state.problem
-    return warm if mine else None
+def _alone(result: ContactResult) -> tuple[ContactResult, WarmStart]:
+    """Return an answer that leaves no solution behind, and the start that it gives by itself."""
+    return result, WarmStart.after(result)
 
 
-def _others_clear(state: LatticeState, pose: Array, near: Mask, solution: Solution) -> bool:
-    """Say whether no node touches the femoral component that was no candidate.
+def _start_after(
+    state: LatticeState, place: Guess, solution: Solution, depth: float
+) -> LatticeStart:
+    """Return where the next solution may begin after one that has converged.
 
     Args:
         state: prepared contact.
-        pose: (4, 4) at approach 0 of the solution.
-        near: (c,) nodes that might.
-        solution: under a load.
+        place: pose, pressure and gap of the solution.
+        solution: what the solver found.
+        depth: m, how far the femoral component is below the lowest contact node.
     """
-    if not (solution.converged and solution.seen):
-        return False
-    others, there = near.copy(), pose.copy()
-    others[solution.candidates] = False
-    there[1, 3] -= solution.forces.approach
-    return bool((gaps_of_others(state, there, np.flatnonzero(others), solution) > 0).all())
+    moved = np.zeros_like(state.surface.points)
+    moved[solution.candidates] = solution.displacement
+    return LatticeStart(
+        state.pair, place.pose, state.points, place.pressure, place.gap,
+        state.problem, solution.loads, moved, depth, solution.region,
+    )  # fmt: skip
 
 
 def _warm_up(problem: ContactProblem, pair: ContactPair) -> None:
@@ -395,6 +386,5 @@ def _warm_up(problem: ContactProblem, pair: ContactPair) -> None:
     pair.touch_at(np.eye(4))
     if not problem.solid.material.is_linear:
         still = np.zeros_like(problem.solid.nodes)
-        noticed = problem.solid.noticeable(still, 1.0)
-        problem.solid.nonlinear_residual(still, None if noticed is None else noticed.elements)
+        problem.solid.nonlinear_residual(still)
         problem.solid.least_principal_strain(still)

@@ -15,37 +15,33 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from tkamb.contact.lattice.initial_guess import lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
+from tkamb.contact.pressing import Presses
 from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, medial_points
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.frames import Array, Index
-from tkamb.units import DEGREE
 
 TURN_STEP = 5e-5
 """m: between the places where femoral normals are compared; well below a cell."""
-LARGEST_EXTRAPOLATION = 2.0 * DEGREE
-"""Farthest turn between two poses of which one's step is used for the other's: beyond it what the
-extrapolated step leaves open (1 %) grows to some per cent of what the step changes."""
+REGION_HOLDS_WITHIN = 0.1
+"""Of a cell: how far a search may go from the pose at which the whole solid was measured last. Up
+to there the residual of the whole solid stays within 1.2 times the tolerance
+(`tests/test_lattice_probe.py`), and an evaluation takes half the time."""
+REGION_HOLDS_TO = 1.1
+"""How much the contact forces may have grown since."""
+LEVER_ARM = 0.03
+"""m, from the femoral axis to the contact: turns a rotation into a distance."""
 
 
-class Sketches(Protocol):
-    """A model whose `evaluate` and `press` can leave out all but the forces."""
+class FindsForces(Presses, Protocol):
+    """A model that can leave out all but the forces."""
 
-    def evaluate(
-        self, state: Any, pose: Array, guess: ContactResult | None = None, sketch: bool = False
-    ) -> ContactResult:
-        """See `tkamb.contact.lattice.model.CellContact`."""
-
-    def press(
-        self,
-        state: Any,
-        load: float,
-        pose: Array,
-        guess: ContactResult | None = None,
-        sketch: bool = False,
-    ) -> ContactResult:
+    def evaluate_from(
+        self, state: Any, pose: Array, start: Guess | None = None, forces_only: bool = False
+    ) -> tuple[ContactResult, WarmStart]:
         """See `tkamb.contact.lattice.model.CellContact`."""
 
 
@@ -55,53 +51,42 @@ class LatticeProbe(Probe):
     Args:
         model: of the lattice family, nodes pressed along the femoral normal.
         state: what its `prepare` returned.
-        guess: an earlier result.
+        start: an earlier result or warm start.
         accuracy: the model's tolerance, share of the contact force.
-        rough: the model with a wider tolerance, for steps that are extrapolated.
     """
 
     def __init__(
-        self,
-        model: Sketches,
-        state: LatticeState,
-        guess: ContactResult | None,
-        accuracy: float,
-        rough: Sketches,
+        self, model: FindsForces, state: LatticeState, start: Guess | None, accuracy: float
     ) -> None:
-        super().__init__(model, state, guess)
-        self._sketches, self._accuracy, self._rough = model, accuracy, rough
+        super().__init__(model, state, start)
+        self._finds, self._accuracy = model, accuracy
+        self._measured: tuple[Array, float] | None = None
+        """Pose at which the whole solid was measured last, and norm of the forces there, N."""
 
-    def evaluated(self, pose: Array) -> ContactResult:
-        """Return the forces at a pose; see `Probe`."""
-        return self._sketches.evaluate(self._state, pose, self._guess, sketch=True)
+    def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
+        """Return the forces at a pose; the whole solid is measured unless that was done near by."""
+        if self._measured is not None:
+            way = (pose - self._measured[0])[:3] * [LEVER_ARM, LEVER_ARM, LEVER_ARM, 1.0]
+            way[1, 3] = 0.0  # what the height changes, the forces tell
+            if np.linalg.norm(way) <= REGION_HOLDS_WITHIN * self._state.lattice.spacing.min():
+                result, start = self._finds.evaluate_from(self._state, pose, self.start, True)
+                if np.linalg.norm(result.nodal_force) <= REGION_HOLDS_TO * self._measured[1]:
+                    return result, start
+        result, start = self._finds.evaluate_from(self._state, pose, self.start)
+        self._measured = pose, float(np.linalg.norm(result.nodal_force))
+        return result, start
 
-    def pressed(
-        self,
-        load: float,
-        pose: Array,
-        guess: ContactResult,
-        like: tuple[ContactResult, ContactResult] | None = None,
-    ) -> ContactResult:
-        """Return the forces under a load; see `Probe`."""
-        here, *step = (result.warm_start for result in (guess, *(like or ())))
-        if (
-            here is None
-            or None in step
-            or not like
-            or _turn(like[0].pose, pose) > LARGEST_EXTRAPOLATION
-        ):
-            return self._sketches.press(self._state, load, pose, guess, sketch=True)
-        guess = replace(guess, warm_start=here.going_as(*step, pose))
-        return self._rough.press(self._state, load, pose, guess, sketch=True)
-
-    def seen(self, result: ContactResult) -> ProbedContact:
+    def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return what a result says of the condyles, with their stiffness."""
         condyles = condyle_wrenches(result, self._state.pair.split)
         exact = self._state.problem.solid.material.is_linear
         nodes = np.flatnonzero(result.nodal_force.any(axis=1))
+        solution = lattice_start(self._state, start)
         if not len(nodes):
             return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
-        change = force_changes(self._state, result, nodes)
+        if solution is None:
+            return ProbedContact(condyles, accuracy=self._accuracy)
+        change = force_changes(self._state, result, solution.moved, nodes)
         points = result.points[nodes]
         medial = medial_points(points, result.pose, self._state.pair.split)
         for side, own in (("medial", medial), ("lateral", ~medial)):
@@ -113,17 +98,13 @@ class LatticeProbe(Probe):
         return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
 
 
-def _turn(first: Array, second: Array) -> float:
-    """Return the angle (rad) between the rotations of two poses."""
-    return float(Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).magnitude())
-
-
-def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> Array:
+def force_changes(state: LatticeState, result: ContactResult, moved: Array, nodes: Index) -> Array:
     """Return the change (m, 3, 6) of nodal forces per small displacement of the femur.
 
     Args:
         state: prepared contact.
         result: a contact that converged.
+        moved: (c, 3) m, displacement of the contact nodes there.
         nodes: (m,) the contact nodes that carry.
 
     Returns:
@@ -133,7 +114,7 @@ def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> A
     force = result.nodal_force[nodes]
     size = np.linalg.norm(force, axis=1)
     normals = force / size[:, None]
-    where = problem.surface_points[nodes] + result.warm_start.moved[nodes]
+    where = problem.surface_points[nodes] + moved[nodes]
     response = state.compliance.among(nodes, nodes)
     femoral = np.zeros((len(nodes), 3, 6))
     femoral[:, :, :3] = np.eye(3)
@@ -144,9 +125,9 @@ def force_changes(state: LatticeState, result: ContactResult, nodes: Index) -> A
     sliding = femoral - normals[:, :, None] * towards[:, None, :]
     turned -= _normal_gradient(problem, where, result.pose) @ sliding
     swung = size[:, None, None] * turned
-    moved = np.einsum("aibj,jbk->iak", response.compliance, swung, optimize=True)
+    yielded = np.einsum("aibj,jbk->iak", response.compliance, swung, optimize=True)
     along, _ = response.along(normals)
-    right = towards - np.einsum("ij,ijk->ik", normals, moved)
+    right = towards - np.einsum("ij,ijk->ik", normals, yielded)
     return normals[:, :, None] * np.linalg.solve(along, right)[:, None, :] + swung
 
 

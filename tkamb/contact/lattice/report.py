@@ -32,9 +32,9 @@ def result_of(
         pose: (4, 4) at approach 0 of the solution.
         load: N, or None when the pose was given.
         gaps: (c,) vertical gaps at that pose, m.
-        solution: what the solver found.
+        solution: solution of the lattice.
         rule: how a nodal force becomes a pressure.
-        forces_only: no areas within nodes, no gaps beside the contact and no flags are computed.
+        forces_only: the residual and the field are those of the region: nothing is flagged.
     """
     # `evaluate` gets the final pose, `press` the pose of first touch, from which the solver's
     # approach is taken off.
@@ -42,21 +42,19 @@ def result_of(
     pose = pose.copy()
     pose[1, 3] -= depth
     if solution.field is not None and not np.isfinite(solution.field).all():
-        return ContactResult.failed(state, pose, "the solver left the range of numbers")
+        return ContactResult.failed(state, pose, "the solver diverged: its forces are not finite")
     force, pressure, area = _pressures(state, gaps - depth, solution, rule)
     with_fields = partial(
         ContactResult.of,
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
-        residual=solution.residual,
+        residual=solution.residual.reported,
     )
-    flags: tuple[str, ...] = ()
-    if solution.seen:  # a sketch close by knows the strains of its region alone
-        flags, collapsed = strain_flags(state, solution)
-        if collapsed:
-            return ContactResult.failed(state, pose, *flags)
     if forces_only:
         return with_fields(state, pose, pressure, gaps - depth, force, area, area)
+    flags, collapsed = strain_flags(state, solution)
+    if collapsed:
+        return ContactResult.failed(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, unsettled_flag(solution))
     gap = _gaps(state, pose, gaps - depth, force, solution)
@@ -73,7 +71,7 @@ def result_of(
 def _pressures(
     state: LatticeState, gaps: Array, solution: Solution, rule: PressureRule
 ) -> tuple[Array, Array, Array]:
-    """Return nodal forces (c, 3), pressures (c,) and the areas (c,) they stand on.
+    """Return nodal forces (c, 3), pressures (c,) and the areas (c,) that they act on.
 
     Args:
         state: prepared contact.
@@ -95,8 +93,8 @@ def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution:
     """Return the gaps (c,), m: of the deformed insert in and beside the contact and where the
     undeformed bodies overlap, of the undeformed one elsewhere.
 
-    Which nodes are candidates depends on how the solution began, so that a node beside the
-    contact may be none; the edge of contact lies by its gap all the same.
+    Which nodes are candidates depends on the initial guess. A node beside the contact may be
+    none, but its gap is needed to place the edge of contact.
 
     Args:
         state: prepared contact.
@@ -135,7 +133,7 @@ def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Sol
 
 
 def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
-    """Return the area (c,) that each node's force stands on, m².
+    """Return the area (c,) that each node's force acts on, m².
 
     Sharma's rule: area that overlaps the undeformed insert, shared evenly by the nodes in
     contact; the pressure is then the force along the insert's normal over it.

@@ -20,7 +20,8 @@ from tkamb.io.opensim.model import Coordinate, Joint, OpenSimModel
 
 OTHER = {"right": "left", "left": "right"}
 SEGMENT_LENGTH = (0.15, 0.75)
-"""m; thigh and shank of a child of six (about 0.25) to the tallest (about 0.6), with room."""
+"""m: range of thigh and shank lengths that are accepted, from a child of six (about 0.25) to the
+tallest adult (about 0.6), with a margin."""
 SUFFIX = {"right": ("_r", "_R", ".r"), "left": ("_l", "_L", ".l")}
 
 
@@ -100,7 +101,7 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     try:
         joint, hip, ankle, femur, tibia = _joints(model, side, knee)
     except InputError as error:
-        # what is missing may be what could not be read
+        # The missing part may be one that could not be read.
         raise _unread_joint(model) or error from None
     patellas = [
         body
@@ -156,10 +157,10 @@ def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError
         model: the model.
         bodies: of the joint; none: of any joint.
     """
-    there = {joint.name for joint in model.joints}
+    names = {joint.name for joint in model.joints}
     for one in model.unread:
         of_these = not bodies or one.concerns & {*bodies}
-        if one.kind.endswith("Joint") and one.name not in there and of_these:
+        if one.kind.endswith("Joint") and one.name not in names and of_these:
             return InputError(one.reason)
     return None
 
@@ -205,11 +206,11 @@ def _check_lengths(leg: Leg) -> None:
 
 
 def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
-    there = {j.name: j for j in model.joints}
+    joints = {j.name: j for j in model.joints}
     if name is not None:
-        if name not in there:
-            raise InputError(f"has no joint '{name}'", model.name, f"it has {', '.join(there)}")
-        return there[name]
+        if name not in joints:
+            raise InputError(f"has no joint '{name}'", model.name, f"it has {', '.join(joints)}")
+        return joints[name]
     named = [
         j for j in _moving(model) if "knee" in j.name.lower() or "femorotibial" in j.name.lower()
     ]
@@ -218,7 +219,7 @@ def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
         own = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
     if len(own) != 1:
         result = f"{len(own)} joints" if own else "no joint"
-        listed = ", ".join(j.name for j in named) or ", ".join(there)
+        listed = ", ".join(j.name for j in named) or ", ".join(joints)
         raise InputError(
             f"has {result} that could be the {side} knee", model.name, f"give --knee, of {listed}"
         )
@@ -259,7 +260,7 @@ def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]
 
 
 def _carried(model: OpenSimModel, body: str) -> list[str]:
-    """Return a body and all that hang on it outwards."""
+    """Return a body and all bodies that it carries."""
     result = [body]
     for joint in model.joints:  # from ground outwards
         if joint.inboard in result:
@@ -282,7 +283,7 @@ def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[
         raise InputError(
             f"has not one joint {where} ({', '.join(bodies)}), but {result}",
             model.name,
-            "is the right joint taken for the knee? give --knee",
+            "give the femorotibial joint with --knee",
         )
     return joints[0]
 

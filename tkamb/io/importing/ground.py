@@ -34,17 +34,17 @@ from tkamb.io.recordings.tables import Table, read_table
 
 @dataclass(frozen=True)
 class ImportedForceSettings:
-    """What an imported scene says about its measured ground reaction."""
+    """Settings of the ground reaction in an imported scene."""
 
     hold_below: float = 40.0
-    """N; vertical force below which the imported scene holds the centre of pressure. The shipped
-    imports use it: below 40 N the quotient of moment and force is noise."""
+    """N; vertical force below which the imported scene holds the centre of pressure. Chosen: the
+    shipped imports use it: below 40 N the quotient of moment and force is noise."""
 
 
 IMPORTED_FORCE = ImportedForceSettings()
 
 COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
-"""Of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
+"""Columns of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
 Interval = tuple[float, float]
 
 
@@ -53,10 +53,10 @@ class FoundGround:
     """A foot's ground reaction.
 
     Args:
-        ground: where it stands; None: none is modelled.
-        interval: s, in which all that the foot stands on was measured; None: nobody knows.
+        ground: file and columns; None: no ground reaction is modelled.
+        interval: s, in which every surface under the foot was measured; None: unknown.
         span: s, first and last sample of a table; None: the recording's own.
-        said: lines on it.
+        said: lines for the report.
     """
 
     ground: GroundFile | None
@@ -72,10 +72,10 @@ def find_ground(request: ImportRequest, side: str, axes: str, feet: Feet | None)
         request: recording, table, plates and interval.
         side: of the knee.
         axes: the recording's and the table's that point forward, up and right.
-        feet: where the feet are; None: nobody knows.
+        feet: where the feet are; None: unknown.
 
     Raises:
-        InputError: plates or columns that cannot be used, or that bear both feet.
+        InputError: plates or columns that cannot be used, or that carry both feet.
     """
     if request.grf is not None:
         return _from_table(request, request.grf, side, axes, feet)
@@ -139,8 +139,8 @@ def _from_table(
         ground = _table_file(path, axes, chosen, recorded)
         lines = [_columns_line(path, side, chosen, why), *notices]
         return FoundGround(ground, request.interval, span, lines)
-    placed = all(force.has("point") or force.has("moment") for force in forces)
-    if feet is None or not forces or not placed:
+    has_places = all(force.has("point") or force.has("moment") for force in forces)
+    if feet is None or not forces or not has_places:
         raise _which_foot(forces, side, table)
     recorded = [_recorded(table, one, axes) for one in forces]
     loads = feet_loads(recorded, feet)
@@ -165,27 +165,27 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     size = np.nansum(np.abs(np.array(columns)), axis=(0, 2))
     if int(np.argmax(size)) != 1:
         return axes
-    turned = {"x": "+x", "z": "+y", "y": "-z"}
+    forceplate_axes = {"x": "+x", "z": "+y", "y": "-z"}
     result = []
     for axis in axes.split(","):
-        own = turned[axis[-1]]
+        own = forceplate_axes[axis[-1]]
         result.append(("+" if own[0] == axis[0] else "-") + own[1])
     return ",".join(result)
 
 
 def _named(
-    forces: list[TableForce], side: str, given: str | None, table: Table
+    forces: list[TableForce], side: str, source_name: str | None, table: Table
 ) -> list[TableForce]:
     """Return the forces that are given, or the one that is named after the foot; else none."""
-    there = ", ".join(force.name for force in forces) or "none"
-    if given is not None:
+    names = ", ".join(force.name for force in forces) or "none"
+    if source_name is not None:
         chosen = []
-        for name in given.split(","):
+        for name in source_name.split(","):
             plain = name.strip().removesuffix("_v").rstrip("_")
             own = [force for force in forces if force.name == plain]
             if len(own) != 1:
                 raise InputError(
-                    f"has no force '{name.strip()}' (it has {there})", table.path, "--grf-force"
+                    f"has no force '{name.strip()}' (it has {names})", table.path, "--grf-force"
                 )
             chosen += own
         return chosen
@@ -194,9 +194,9 @@ def _named(
 
 
 def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError:
-    there = ", ".join(force.name for force in forces) or "none"
+    names = ", ".join(force.name for force in forces) or "none"
     return InputError(
-        f"does not say which force is the {side} foot's (it has {there})",
+        f"does not say which force is the {side} foot's (it has {names})",
         table.path,
         f"give --grf-force, or name its columns after the foot: ground_force_{side[0]}_vx",
     )
@@ -312,14 +312,14 @@ def _unmeasured_line(
         return []
     return [
         f"ATTENTION: off its plates the foot is nearly still in {len(times)} frames, first at "
-        f"{times[0]:.3f} s: does it stand on something that was not measured?"
+        f"{times[0]:.3f} s: it may stand on something that was not measured"
     ]
 
 
 def _drift_lines(forces: list[RecordedForce], plates: tuple[int | str, ...]) -> list[str]:
     return [
         f"ATTENTION: {one.title} reads {one.drift:.1f} N while nobody stands on it: it drifts, and "
-        "bears as much too much under the foot"
+        "its force under the foot is too large by as much"
         for one in forces
         if one.key in plates and abs(one.drift) > PLATE_LOAD.drift_N
     ]

@@ -13,11 +13,11 @@ from tkamb.units import DEGREE
 
 @dataclass(frozen=True)
 class LinkFitSettings:
-    """How the links of the URDF are laid into the bodies of an OpenSim model."""
+    """How the links of the URDF are placed in the bodies of an OpenSim model."""
 
     max_implant_rotation: float = 35.0 * DEGREE
-    """rad; largest rotation between the implant's axes and the bone's. A wrong axis is off by 90
-    deg, a real implantation by a few degrees."""
+    """rad; largest rotation between the implant's axes and the bone's. Chosen: a wrong axis is off
+    by 90 deg, a real implantation by a few degrees."""
 
 
 LINK_FIT = LinkFitSettings()
@@ -29,8 +29,8 @@ class MeshFrame:
 
     Args:
         body: the body.
-        pose: (4, 4) in it; None: at its origin, with the axes that anatomy says.
-        why: how it was found, for the reader.
+        pose: (4, 4) in it; None: at its origin, with anatomical axes.
+        why: how it was found, for the report.
     """
 
     body: str
@@ -45,13 +45,13 @@ _STEMS = {
 }
 
 
-def mesh_frame(leg: Leg, part: str, given: str | None) -> MeshFrame:
+def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
     """Return where a part's mesh frame stands: as given, or by the name of a frame or body.
 
     Args:
         leg: the leg.
         part: "femoral component", "insert" or "patellar button".
-        given: name of an offset frame or body; None: look for one.
+        wished_name: name of an offset frame or body; None: look for one.
 
     Raises:
         InputError: no such frame, or none that is named after the part.
@@ -62,40 +62,40 @@ def mesh_frame(leg: Leg, part: str, given: str | None) -> MeshFrame:
         "insert": leg.tibia,
         "patellar button": (leg.patella,),
     }[part]
-    there = {name: (body, at) for name, (body, at) in model.offset_frames.items() if body in group}
-    there |= {body: (body, np.eye(4)) for body in group if body}
-    if given is not None:
-        if given not in there:
+    frames = {name: (body, at) for name, (body, at) in model.offset_frames.items() if body in group}
+    frames |= {body: (body, np.eye(4)) for body in group if body}
+    if wished_name is not None:
+        if wished_name not in frames:
             raise InputError(
-                f"has no frame '{given}' on {', '.join(filter(None, group))}",
+                f"has no frame '{wished_name}' on {', '.join(filter(None, group))}",
                 model.name,
-                f"it has {', '.join(there)}",
+                f"it has {', '.join(frames)}",
             )
-        return MeshFrame(*there[given], f"frame '{given}', as given")
+        return MeshFrame(*frames[wished_name], f"frame '{wished_name}', as given")
     for stem in _STEMS[part]:
-        for name in there:
+        for name in frames:
             if stem in name.lower():
-                return MeshFrame(*there[name], f"'{name}', by its name")
+                return MeshFrame(*frames[name], f"'{name}', by its name")
     if part == "patellar button" and leg.patella:
-        return MeshFrame(leg.patella, None, "the patella's origin, for want of a frame")
+        return MeshFrame(leg.patella, None, "the patella's origin, because there is no frame")
     option = {"femoral component": "--femoral-frame", "insert": "--insert-frame"}.get(
         part, "--patella-frame"
     )
     raise InputError(
-        f"says nowhere how the {part}'s mesh stands on the bone",
+        f"does not say how the {part}'s mesh is placed on the bone",
         model.name,
-        f"give {option}, one of {', '.join(there)}",
+        f"give {option}, one of {', '.join(frames)}",
     )
 
 
 def quarter_turn(rotation: Array) -> tuple[Array, float]:
     """Return the nearest rotation (3, 3) by quarter turns, and how far (rad) it is."""
     best = np.zeros((3, 3))
-    left = np.abs(rotation).copy()
+    rest = np.abs(rotation).copy()
     for _ in range(3):
-        i, j = np.unravel_index(int(np.argmax(left)), (3, 3))
+        i, j = np.unravel_index(int(np.argmax(rest)), (3, 3))
         best[i, j] = np.sign(rotation[i, j])
-        left[i, :], left[:, j] = -1.0, -1.0
+        rest[i, :], rest[:, j] = -1.0, -1.0
     angle = np.arccos(np.clip((np.trace(best.T @ rotation) - 1.0) / 2.0, -1.0, 1.0))
     return best, float(angle)
 
@@ -139,12 +139,12 @@ class Links:
         ):
             if body in bodies and own is not None:
                 return link, inverse(own) @ leg.in_body(body, str(bodies[0]))
-        raise InputError(f"body '{body}' moves with no link of the leg", leg.model.name)
+        raise InputError(f"body '{body}' is not part of any link of the leg", leg.model.name)
 
     def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
         """Return the link that a body moves with, and a point (3,) of the body in it."""
-        link, there = self.body_in_link(body)
-        return link, transform(there, point)
+        link, offset = self.body_in_link(body)
+        return link, transform(offset, point)
 
     @property
     def neutral(self) -> Array:
@@ -212,13 +212,13 @@ def find_links(
 
 
 def _anatomical(
-    leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, said: list[str]
+    leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, remarks: list[str]
 ) -> Array:
     """Return the part's frame (4, 4) in a body, turned to anatomical axes, checked against it."""
     assert frame.pose is not None
-    there = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
-    nearest, _ = quarter_turn(there[:3, :3])
-    angle = np.arccos(np.clip((np.trace(there[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+    pose = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
+    nearest, _ = quarter_turn(pose[:3, :3])
+    angle = np.arccos(np.clip((np.trace(pose[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
     if not np.allclose(nearest, np.eye(3)) or angle > LINK_FIT.max_implant_rotation:
         raise InputError(
             f"the {part} stands turned by {angle / DEGREE:.0f} deg on '{body}' with these axes "
@@ -226,11 +226,11 @@ def _anatomical(
             "--mesh-axes",
             "name the mesh's axes that point anterior, superior and right, like -x,+y,-z",
         )
-    place = ", ".join(f"{v * 1e3:.1f}" for v in there[:3, 3])
-    said.append(
+    place = ", ".join(f"{v * 1e3:.1f}" for v in pose[:3, 3])
+    remarks.append(
         f"{part} on '{body}' at ({place}) mm, turned by {angle / DEGREE:.1f} deg ({frame.why})"
     )
-    return there
+    return pose
 
 
 def _patella(
@@ -239,7 +239,7 @@ def _patella(
     turn: Array,
     frames: dict[str, str | None],
     with_button: bool,
-    said: list[str],
+    remarks: list[str],
 ) -> tuple[Array | None, Array | None, float]:
     """Return the patella link in its body, the button in the link, and the axes' error (rad)."""
     if leg.patella is None:
@@ -253,5 +253,5 @@ def _patella(
     mesh = patella @ turn if result.pose is None else result.pose
     button = inverse(patella) @ mesh @ inverse(turn)
     place = ", ".join(f"{v * 1e3:.1f}" for v in button[:3, 3])
-    said.append(f"patellar button on the patella at ({place}) mm ({result.why})")
+    remarks.append(f"patellar button on the patella at ({place}) mm ({result.why})")
     return patella, button, error

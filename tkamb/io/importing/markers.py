@@ -1,4 +1,5 @@
-"""The leg's markers in a recording: matched to the model's, and what they say of the laboratory."""
+"""The leg's markers in a recording: matched to the model's, and used to find the laboratory
+axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -89,7 +90,7 @@ def seen_segments(
     in_foot = transform(leg.in_body(body, foot), ankle)
     hip_body, hip = leg.hip_centre
     in_pelvis = transform(leg.in_body(hip_body, leg.pelvis), hip)
-    wanted = [
+    needed = [
         ("shank", leg.tibia, "", None, None),
         ("thigh", leg.femur, "", None, None),
         ("foot", (foot,), "shank", np.zeros(3), in_foot),
@@ -97,7 +98,7 @@ def seen_segments(
     ]
     labels, dropped = _seen_labels(recorded, without)
     result = {}
-    for name, bodies, joined_to, joint, centre in wanted:
+    for name, bodies, joined_to, joint, centre in needed:
         own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
         match = matched_labels(own, labels)
         points = {
@@ -115,17 +116,17 @@ def seen_segments(
 
 def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the labels of the markers that were ever seen, and those that are left out."""
-    there = recorded_labels(recorded)
-    dropped = matched_labels(without, there)
+    labels = recorded_labels(recorded)
+    dropped = matched_labels(without, labels)
     if unknown := [name for name in without if name not in dropped]:
         raise InputError(
             f"holds no marker '{unknown[0]}', which is to be left out",
             recorded.path,
-            f"it has {', '.join(there[:12])}, …",
+            f"it has {', '.join(labels[:12])}, …",
         )
     left_out = list(dropped.values())
-    seen = [name for name in there if np.isfinite(recorded.columns[f"{name}_x"]).any()]
-    return [name for name in seen if name not in left_out], left_out
+    visible = [name for name in labels if np.isfinite(recorded.columns[f"{name}_x"]).any()]
+    return [name for name in visible if name not in left_out], left_out
 
 
 def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
@@ -145,9 +146,9 @@ def _equal_line(recorded: Table) -> str:
     return f"; it has two markers {', '.join(names)}: rename one of each" if names else ""
 
 
-def _clashing_prefixes(labels: list[str], wanted: Sequence[str]) -> list[str]:
+def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
     """Return the prefixes under which a wanted marker stands more than once."""
-    plain = {plain_label(name) for name in wanted}
+    plain = {plain_label(name) for name in needed}
     result: dict[str, list[str]] = {}
     for label in labels:
         if plain_label(label) in plain:
@@ -162,15 +163,15 @@ def with_prefix(recorded: Table, prefix: str) -> Table:
     Raises:
         InputError: no label begins with it.
     """
-    wanted = prefix.rstrip(":")
+    wished_prefix = prefix.rstrip(":")
     labels = recorded_labels(recorded)
-    there = list(dict.fromkeys(label.rpartition(":")[0] for label in labels))
-    if wanted not in there:
-        listed = ", ".join(name or "none" for name in there[:8])
+    prefixes = list(dict.fromkeys(label.rpartition(":")[0] for label in labels))
+    if wished_prefix not in prefixes:
+        listed = ", ".join(name or "none" for name in prefixes[:8])
         raise InputError(
             f"has no marker with the prefix '{prefix}'", recorded.path, f"its prefixes: {listed}"
         )
-    other = {label for label in labels if label.rpartition(":")[0] != wanted}
+    other = {label for label in labels if label.rpartition(":")[0] != wished_prefix}
     columns = {k: v for k, v in recorded.columns.items() if k[:-2] not in other}
     return replace(recorded, columns=columns)
 
@@ -190,9 +191,9 @@ class Facing:
     """Which of a recording's axes point where, and how far the subject is from them.
 
     Args:
-        axes: those that point forward, up and to the right, like "-x,+z,+y".
-        up_deg: between the mean upward axis of shank, thigh and pelvis and the file's.
-        forward_deg: between the mean forward axis and the file's, in the horizontal plane.
+        axes: axes of the file that point forward, up and to the right, like "-x,+z,+y".
+        up_deg: angle between the mean upward axis of shank, thigh and pelvis and the file's axis.
+        forward_deg: angle between the mean forward axis and the file's, in the horizontal plane.
     """
 
     axes: str
@@ -216,9 +217,9 @@ def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
         reference = np.array(list(segment.points.values()))
         scale = recorded.unit_scale(None, "length_unit")
         poses, _ = fit_seen(points * scale, reference, np.ones(len(reference)), segment.name)
-        known = np.isfinite(poses[:, 0, 3])
-        if known.any():
-            turns.append(poses[known][:, :3, :3].mean(axis=0))
+        finite = np.isfinite(poses[:, 0, 3])
+        if finite.any():
+            turns.append(poses[finite][:, :3, :3].mean(axis=0))
     mean = np.mean(turns, axis=0) if turns else np.zeros((3, 3))
     up, up_angle = _nearest_axis(mean[:, 1])
     level = mean[:, 0] * (np.abs(up) < 0.5)

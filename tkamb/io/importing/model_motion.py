@@ -90,9 +90,9 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
     tibia = poses[:, kinematics.bodies[leg.tibia[0]]] @ links.tibia
     femur = poses[:, kinematics.bodies[leg.femur[0]]] @ links.femur
     knee_pose = inverse(tibia @ links.insert_in_tibia) @ femur
-    left = leg.side == "left"
-    knee = knee_coordinates(mirrored_pose(knee_pose) if left else knee_pose)
-    knee[:, 2] *= -1.0 if left else 1.0  # the file's ML points to the right on both sides
+    is_left = leg.side == "left"
+    knee = knee_coordinates(mirrored_pose(knee_pose) if is_left else knee_pose)
+    knee[:, 2] *= -1.0 if is_left else 1.0  # the file's ML points to the right on both sides
     turns = np.unwrap(Rotation.from_matrix(tibia[:, :3, :3]).as_euler("XYZ"), axis=0)
     values = np.concatenate(
         [
@@ -129,9 +129,9 @@ def model_feet(links: Links, recorded: Table) -> Feet:
 def motion_tables(flexion_alone: bool) -> list[str]:
     """Return the scene's [motion] columns, of flexion or all six, and [tibia] for `motion.csv`."""
     columns = dict(zip(KNEE_COORDINATES, COLUMNS, strict=False))
-    taken = ("flexion",) if flexion_alone else KNEE_COORDINATES
+    names = ("flexion",) if flexion_alone else KNEE_COORDINATES
     lines = ["[motion.columns]", 'time = "time_s"']
-    lines += [f'{role} = "{columns[role]}"' for role in taken]
+    lines += [f'{role} = "{columns[role]}"' for role in names]
     lines += [
         "",
         "[tibia]",

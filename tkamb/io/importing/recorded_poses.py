@@ -64,15 +64,15 @@ class PoseRecording:
 
 @dataclass(frozen=True, eq=False)
 class RecordedPoses:
-    """Poses that were read.
+    """Poses after reading.
 
     Args:
-        given: where they come from.
+        given: the table of poses and its units.
         interval: s, the part that is computed; None: all of it.
         time: (n,) s, on the recording's clock.
         femur: (n, 4, 4) m, the femur's body in the tibia link.
         in_stance: (n,) whether the foot is loaded.
-        said: lines on them.
+        said: lines for the report.
     """
 
     given: PoseRecording
@@ -97,7 +97,7 @@ class RecordedPoses:
 
 
 def read_poses(
-    given: PoseRecording,
+    recording: PoseRecording,
     links: Links,
     insert: Surface,
     axes: str,
@@ -110,7 +110,7 @@ def read_poses(
     T_femur_in_tibia = T_insert_in_tibia T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
 
     Args:
-        given: where they come from.
+        recording: the table of poses and its units.
         links: of the leg.
         insert: its mesh about its own origin, in anatomical axes.
         axes: the meshes' axes that point anterior, superior and right.
@@ -123,27 +123,31 @@ def read_poses(
     turn = pose(axes_rotation(axes), np.zeros(3))
     placement = insert_placement(insert, axes_rotation(axes)) @ turn
     side: Literal["right", "left"] = "left" if links.leg.side == "left" else "right"
-    motion = load_motion(_motion_table(given, cutoff_Hz, interval), side, placement, turn)
+    motion = load_motion(_motion_table(recording, cutoff_Hz, interval), side, placement, turn)
     knee = knee_pose(motion.raw_coordinates)
     own_side = mirrored_pose(knee) if side == "left" else knee  # the motion is a right knee's
     femur = links.insert_in_tibia @ own_side @ inverse(links.femur)
-    stance = _in_stance(given, motion)
-    return RecordedPoses(given, interval, motion.time, femur, stance, _said(given, motion))
+    stance = _in_stance(recording, motion)
+    return RecordedPoses(recording, interval, motion.time, femur, stance, _said(recording, motion))
 
 
 def _motion_table(
-    given: PoseRecording, cutoff_Hz: float, interval: tuple[float, float] | None
+    recording: PoseRecording, cutoff_Hz: float, interval: tuple[float, float] | None
 ) -> Any:
-    keys = given.keys() | {"file": given.file, "cutoff_Hz": cutoff_Hz, "interval_s": interval}
-    keys["columns"] = dict(zip(ROLES, given.columns, strict=True))
+    keys = recording.keys() | {
+        "file": recording.file,
+        "cutoff_Hz": cutoff_Hz,
+        "interval_s": interval,
+    }
+    keys["columns"] = dict(zip(ROLES, recording.columns, strict=True))
     return in_si(MotionTable.model_validate(keys))
 
 
-def _in_stance(given: PoseRecording, motion: KneeMotion) -> Array:
+def _in_stance(recording: PoseRecording, motion: KneeMotion) -> Array:
     clock = motion.time if motion.cycle_percent is None else motion.cycle_percent
-    if given.stance is None:
+    if recording.stance is None:
         return np.ones(len(clock), bool)
-    start, end = given.stance
+    start, end = recording.stance
     inside = (clock >= start - 1e-9) & (clock <= end + 1e-9)
     if not inside.any():
         raise InputError(
@@ -154,22 +158,22 @@ def _in_stance(given: PoseRecording, motion: KneeMotion) -> Array:
     return np.asarray(inside)
 
 
-def _said(given: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
+def _said(recording: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
     flexion = motion.raw_coordinates[:, 5] / DEGREE
-    angles, places = ", ".join(given.columns[:3]), ", ".join(given.columns[3:])
+    angles, places = ", ".join(recording.columns[:3]), ", ".join(recording.columns[3:])
     text = [
         f"knee: {len(flexion)} poses of the femoral mesh in the insert mesh from "
-        f"{given.file.name}, rotations {given.sequence} = {angles} in {given.angle_unit}, x, y, z "
-        f"= {places} in {given.length_unit}: flexion {flexion.min():.1f} to {flexion.max():.1f} "
-        f"deg; all six coordinates as recorded"
+        f"{recording.file.name}, rotations {recording.sequence} = {angles} in "
+        f"{recording.angle_unit}, x, y, z = {places} in {recording.length_unit}: flexion "
+        f"{flexion.min():.1f} to {flexion.max():.1f} deg; all six coordinates as recorded"
     ]
-    if given.turned:
-        text.append(f"read with the other sign, as given: {', '.join(given.turned)}")
-    if given.stride:
+    if recording.turned:
+        text.append(f"read with the other sign, as given: {', '.join(recording.turned)}")
+    if recording.stride:
         closed = "a closed cycle" if motion.closed_cycle else "not closed"
         text.append(
-            f"phase: its 0 and 100 % are laid on {given.stride[0]:g} and {given.stride[1]:g} s of "
-            f"the recording, as given: an assumption ({closed})"
+            f"phase: its 0 and 100 % are laid on {recording.stride[0]:g} and "
+            f"{recording.stride[1]:g} s of the recording, as given: an assumption ({closed})"
         )
     return tuple(text)
 

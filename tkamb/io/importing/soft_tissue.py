@@ -1,4 +1,4 @@
-"""What of a model's muscles and ligaments the scene can take over, and why the rest is left out."""
+"""The muscles and ligaments of a model that a scene can hold, and why others are left out."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from tkamb.io.opensim.lines import Ligament, Path, PathPoint
 
 @dataclass(frozen=True)
 class ImportedLigamentSettings:
-    """What an imported ligament has that an OpenSim model does not state."""
+    """Properties of imported ligaments that an OpenSim model does not state."""
 
     toe_strain: float = 0.06
     """Strain at which the toe of law \"quadratic-toe\" ends: twice eps1 = 0.03 (Blankevoort
@@ -43,14 +43,14 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class SoftTissue:
-    """What is taken over.
+    """Muscles and ligaments that are imported.
 
     Args:
         quadriceps: origin and insertion; None without a patella or a vastus intermedius.
         patellar_ligament: ends on patella and tibia; None without.
         ligament_length: m, of the patellar ligament.
         bundles: femorotibial ligaments.
-        said: lines on what was taken and what was left out, and why.
+        said: lines on what is imported, what is left out, and why.
     """
 
     quadriceps: tuple[End, End] | None
@@ -79,26 +79,26 @@ def _fixed(path: Path, bodies: tuple[str, ...]) -> list[PathPoint]:
     return [p for p in path.points if type(p) is PathPoint and p.body in bodies]
 
 
-def _quadriceps(links: Links, said: list[str]) -> tuple[End, End] | None:
+def _quadriceps(links: Links, remarks: list[str]) -> tuple[End, End] | None:
     leg = links.leg
     if leg.patella is None:
-        said.append("no patella in the model: no quadriceps")
+        remarks.append("no patella in the model: no quadriceps")
         return None
     for muscle in leg.model.muscles.values():
         femur, patella = _fixed(muscle.path, leg.femur), _fixed(muscle.path, (leg.patella,))
         plain = muscle.name.lower().replace("_", "")
         if "vasint" in plain and "real" not in plain and femur and patella:
-            said.append(
+            remarks.append(
                 f"quadriceps: one line along {muscle.name}, from its last point on the femur to "
                 "its first on the patella"
             )
             return _end(femur[-1]), _end(patella[0])
-    said.append("no vastus intermedius from femur to patella: no quadriceps")
-    said += [one.reason for one in leg.model.unread if "vasint" in one.name.lower()]
+    remarks.append("no vastus intermedius from femur to patella: no quadriceps")
+    remarks += [one.reason for one in leg.model.unread if "vasint" in one.name.lower()]
     return None
 
 
-def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] | None, float]:
+def _patellar_ligament(links: Links, remarks: list[str]) -> tuple[tuple[End, End] | None, float]:
     leg = links.leg
     if leg.patella is None:
         return None, np.nan
@@ -107,7 +107,7 @@ def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] |
         on_tibia = [body for body in constraint.bodies if body in leg.tibia]
         if leg.patella in points and on_tibia:
             length = constraint.distance
-            said.append(
+            remarks.append(
                 f"patellar ligament: {length * 1e3:.1f} mm long, by the constraint "
                 f"'{constraint.name}'; resting lengths of its strands are not used"
             )
@@ -121,10 +121,10 @@ def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] |
         and not _fixed(ligament.path, leg.femur)
     ]
     if not strands:
-        said.append("no patellar ligament in the model: no quadriceps")
+        remarks.append("no patellar ligament in the model: no quadriceps")
         return None, np.nan
     length = float(np.mean([ligament.slack_length_m for *_, ligament in strands]))
-    said.append(
+    remarks.append(
         f"patellar ligament: {length * 1e3:.1f} mm long, mean slack length of {len(strands)} "
         "strands, between their mean ends"
     )
@@ -135,9 +135,9 @@ def _patellar_ligament(links: Links, said: list[str]) -> tuple[tuple[End, End] |
     return (ends[0], ends[1]), length
 
 
-def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
+def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
     leg = links.leg
-    taken: list[Bundle] = []
+    bundles: list[Bundle] = []
     out: dict[str, list[str]] = {}
     for ligament in leg.model.ligaments.values():
         femur, tibia = _fixed(ligament.path, leg.femur), _fixed(ligament.path, leg.tibia)
@@ -147,7 +147,7 @@ def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
         if reason or ligament.stiffness_N is None:
             out.setdefault(reason, []).append(ligament.name)
             continue
-        taken.append(
+        bundles.append(
             Bundle(
                 ligament.name,
                 _end(femur[0]),
@@ -156,21 +156,21 @@ def _bundles(links: Links, said: list[str]) -> tuple[Bundle, ...]:
                 ligament.slack_length_m,
             )
         )
-    if taken:
-        said.append(
-            f"{len(taken)} femorotibial ligament strands taken, straight from end to end "
+    if bundles:
+        remarks.append(
+            f"{len(bundles)} femorotibial ligament strands taken, straight from end to end "
             "(wraps on bone are left out)"
         )
     for reason, names in out.items():
-        said.append(f"ligaments left out, {reason}: {some_names(names)}")
-    return tuple(taken)
+        remarks.append(f"ligaments left out, {reason}: {some_names(names)}")
+    return tuple(bundles)
 
 
 def _reason_against(ligament: Ligament, fixed: int) -> str:
     if not ligament.enabled:
         return "switched off in the model"
     if fixed != 2 or len(ligament.path.points) != 2:
-        return "which run by more than two points"
+        return "which have more than two path points"
     if ligament.stiffness_N is None:
         return f"of class {ligament.kind}, whose law the scene does not have"
     if (
@@ -181,7 +181,7 @@ def _reason_against(ligament: Ligament, fixed: int) -> str:
     return ""
 
 
-def _name_muscles(links: Links, said: list[str]) -> None:
+def _name_muscles(links: Links, remarks: list[str]) -> None:
     """Say which muscles cross the knee and do not act without [muscles]."""
     leg = links.leg
     across = [
@@ -191,9 +191,9 @@ def _name_muscles(links: Links, said: list[str]) -> None:
         and {p.body for p in muscle.path.points} & {*leg.femur, leg.pelvis}
     ]
     if across:
-        said.append(
-            f"{len(across)} muscles run from thigh or pelvis to the shank; without --muscles none "
-            f"but the quadriceps line acts: {some_names(across)}"
+        remarks.append(
+            f"{len(across)} muscles run from thigh or pelvis to the shank; they act with "
+            f"--muscles, without it the quadriceps line alone: {some_names(across)}"
         )
 
 

@@ -1,4 +1,4 @@
-"""Markers put where a standing trial has them."""
+"""Marker positions calibrated by a standing trial."""
 
 import tomllib
 from dataclasses import replace
@@ -27,24 +27,24 @@ def with_static_markers(
     `length_unit` is the trial's, where its own word is not understood.
     """
     assert scene.markers is not None
-    known = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
-    assert known is not None
+    stated = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
+    assert stated is not None
     recorded = with_unit(read_table(static), length_unit)
     own = facing(segments_of(recorded, segments), recorded).axes
-    known = known.model_copy(update={"laboratory_axes": own})
+    stated = stated.model_copy(update={"laboratory_axes": own})
     side: Literal["right", "left"] = "left" if scene.side == "left" else "right"
     insert = scene.links.insert_in_tibia
     if side == "left":
         insert = mirrored_pose(insert)
-    places = calibrated_markers(known, recorded, side, insert)
-    moved, farthest = [], 0.0
+    places = calibrated_markers(stated, recorded, side, insert)
+    changed_segments, farthest = [], 0.0
     for segment in segments:
-        there = {plain_label(k): v for k, v in places[segment.name].items()}
-        points = {k: there.get(plain_label(k), v) for k, v in segment.points.items()}
+        by_label = {plain_label(k): v for k, v in places[segment.name].items()}
+        points = {k: by_label.get(plain_label(k), v) for k, v in segment.points.items()}
         shifts = [np.linalg.norm(points[k] - v) for k, v in segment.points.items()]
         farthest = max(farthest, float(np.max(shifts)))
-        moved.append(replace(segment, points=points))
-    markers = replace(scene.markers, segments=tuple(moved))
+        changed_segments.append(replace(segment, points=points))
+    markers = replace(scene.markers, segments=tuple(changed_segments))
     line = (
         f"markers' places are those of the standing trial {static.name}, at most "
         f"{farthest * 1e3:.1f} mm from the model's"
@@ -62,8 +62,8 @@ def calibrated_markers(
     """Return where the markers sit on a subject who stands: segment -> marker -> (3,) m.
 
     The chain is fitted to the standing trial with the markers as the table has them; each
-    marker's mean place in its fitted segment is its calibrated one. So the chain decides how
-    the bones stand, and the markers follow.
+    marker's mean position in its fitted segment is its calibrated one. So the chain decides the
+    pose of the bones, and the markers follow.
 
     Args:
         table: markers and joints; those that the trial does not hold are left as they are.
@@ -75,7 +75,7 @@ def calibrated_markers(
         InputError: the trial cannot be read, or its markers do not fit.
     """
     labels = [column[:-2] for column in recorded.columns if column.endswith("_x")]
-    there = [
+    points = [
         own.model_copy(
             update={
                 "markers_mm": {
@@ -85,7 +85,7 @@ def calibrated_markers(
         )
         for own in table.segment
     ]
-    markers = in_si(table.model_copy(update={"segment": tuple(there)}))
+    markers = in_si(table.model_copy(update={"segment": tuple(points)}))
     segments, measured = leg_segments(markers, recorded, None, side)
     chain = LegChain(segments, pose_insert_in_tibia, markers.knee == "free")
     neutral = neutral_coordinates(markers, side)

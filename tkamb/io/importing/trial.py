@@ -1,4 +1,4 @@
-"""A trial: markers or coordinates, which way the subject faces, which plates bear the foot."""
+"""A trial: markers or coordinates, the direction the subject faces, the plates under the foot."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -33,8 +33,8 @@ class TrialFrameSettings:
     """How many frames of a trial an imported scene holds."""
 
     frames_per_period: float = 5.0
-    """Frames per period of the cut-off frequency. A low-pass-filtered motion has no content between
-    them."""
+    """Frames per period of the cut-off frequency. Chosen: a low-pass-filtered motion has no content
+    between them."""
 
 
 TRIAL_FRAMES = TrialFrameSettings()
@@ -59,9 +59,9 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
         InputError: markers, plates or interval that cannot be used.
     """
     segments = model_segments(links, recorded, request.without)
-    seen = _facing(request, segments, recorded)
-    feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(request, leg.side, seen.axes, feet_there)
+    facing = _facing(request, segments, recorded)
+    feet_there = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
+    result = find_ground(request, leg.side, facing.axes, feet_there)
     time = recorded.time()
     if request.interval is not None:
         _check_within(time, *request.interval)
@@ -69,7 +69,7 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     interval, frames, thinned = _thinned(time, interval, request.cutoff_Hz)
     markers = MarkerFile(
         request.recording,
-        seen.axes,
+        facing.axes,
         tuple(segments),
         request.method,
         "hinge",
@@ -79,7 +79,7 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
         request.prefix is not None,
     )
     matched = [*_notices(request, recorded), *_segment_lines(segments, request.without)]
-    text = (*matched, _facing_line(request, seen), *result.said, *joined, thinned)
+    text = (*matched, _facing_line(request, facing), *result.said, *joined, thinned)
     return Trial(result.ground, text, markers)
 
 
@@ -92,14 +92,14 @@ def from_poses(
         InputError: markers or plates that cannot be used.
     """
     segments = seen_segments(links, recorded, request.without)
-    seen = _facing(request, [s for s in segments.values() if len(s.points) >= 3], recorded)
+    facing = _facing(request, [s for s in segments.values() if len(s.points) >= 3], recorded)
     stance = poses.femur[poses.in_stance]
-    shank = shank_markers(links, segments, stance, request.recording, seen.axes)
+    shank = shank_markers(links, segments, stance, request.recording, facing.axes)
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
-    feet_there = marked_feet(recorded, seen.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(covered, leg.side, seen.axes, feet_there)
+    feet_there = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
+    result = find_ground(covered, leg.side, facing.axes, feet_there)
     matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
-    text = (*poses.said, *matched, _facing_line(request, seen), *shank.said, *result.said)
+    text = (*poses.said, *matched, _facing_line(request, facing), *shank.said, *result.said)
     return Trial(result.ground, text, poses=poses, shank=shank)
 
 
@@ -117,8 +117,8 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     if motion.missing:
         text.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
     text += [*_notices(request, recorded), *motion.said]
-    there = model_feet(links, recorded) if request.grf is not None else None
-    result = find_ground(request, leg.side, "+x,+y,+z", there)
+    feet = model_feet(links, recorded) if request.grf is not None else None
+    result = find_ground(request, leg.side, "+x,+y,+z", feet)
     text += result.said
     if result.ground is not None:
         text.append("laboratory: the model's ground, x forward, y up")
@@ -131,7 +131,7 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
 
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
-    """Return lines on what of the recording is not used or was read otherwise than stated."""
+    """Return lines on parts of the recording that are not used, or not read as stated."""
     notices = recorded.notices
     if recorded.path.suffix.lower() == ".c3d":
         notices = read_c3d(recorded.path, request.units).all_notices
@@ -144,13 +144,13 @@ def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Tabl
     return facing(segments, recorded)
 
 
-def _facing_line(request: ImportRequest, seen: Facing) -> str:
-    line = f"laboratory: forward, up, right are the file's {seen.axes}"
+def _facing_line(request: ImportRequest, facing: Facing) -> str:
+    line = f"laboratory: forward, up, right are the file's {facing.axes}"
     if request.laboratory_axes is not None:
         return line + ", as given"
     return line + (
-        f" (the subject faces {seen.forward_deg:.0f} deg off that axis and leans by "
-        f"{seen.up_deg:.0f} deg, on average)"
+        f" (the subject faces {facing.forward_deg:.0f} deg off that axis and leans by "
+        f"{facing.up_deg:.0f} deg, on average)"
     )
 
 

@@ -42,10 +42,10 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
 
 def _seen_from(links: Links, body: str, base: str, own: Array, scale: float) -> RigidInertia:
     """Return the inertia of a body in a link that stands at `own` in the body `base`."""
-    there = np.linalg.inv(own) @ links.leg.in_body(body, base)
-    inertia, turn = links.leg.model.bodies[body], there[:3, :3]
+    pose = np.linalg.inv(own) @ links.leg.in_body(body, base)
+    inertia, turn = links.leg.model.bodies[body], pose[:3, :3]
     tensor = scale * turn @ inertia.inertia @ turn.T
-    return RigidInertia(scale * inertia.mass_kg, transform(there, inertia.centre), tensor)
+    return RigidInertia(scale * inertia.mass_kg, transform(pose, inertia.centre), tensor)
 
 
 def patient_urdf(links: Links, scale: float, comment: str) -> str:
@@ -90,8 +90,8 @@ def _chain(
     lines, parent = [], start
     for number, (name, (kind, axis)) in enumerate(joints.items(), 1):
         # a left knee turns the other way about y and x: docs/patient.md
-        turned = side == "left" and kind == "revolute" and axis[2] == 0
-        own = tuple(-v for v in axis) if turned else axis
+        reversed_axis = side == "left" and kind == "revolute" and axis[2] == 0
+        own = tuple(-v for v in axis) if reversed_axis else axis
         child = end if number == len(joints) else f"{name}_link"
         lines += [f'  <link name="{child}"/>'] if child != end else []
         place = first if parent == start else np.eye(4)

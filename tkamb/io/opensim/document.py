@@ -19,7 +19,7 @@ WHAT = "OpenSim model"
 
 @dataclass(frozen=True)
 class DocumentSettings:
-    """What is read of an OpenSim file."""
+    """Limits of reading an OpenSim file."""
 
     max_nested_files: int = 5
     """Files that name files in turn; OpenSim's own models nest one deep."""
@@ -28,7 +28,7 @@ class DocumentSettings:
 DOCUMENT = DocumentSettings()
 
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
-"""Sets of which tkamb reads nothing but the names: their file may be absent."""
+"""Sets of which tkamb reads only the names; their file may be absent."""
 
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[0-9]+|#x[0-9a-fA-F]+);)")
 _COMMENT = re.compile(r"<!--(.*?)-->", re.S)
@@ -38,7 +38,7 @@ _END = re.compile(r"</OpenSimDocument\s*>")
 
 
 def open_document(path: Path) -> tuple[Element, list[str]]:
-    """Return the root of an OpenSim file, what it names put in its place, and notices.
+    """Return the root of an OpenSim file with its included files, and notices.
 
     Args:
         path: the file.
@@ -124,28 +124,28 @@ def _replace(
             f"names a file that is not there ({other})", where, "put it beside the model"
         )
     root = _read(other, notices)
-    held = root
+    target = root
     if root.tag == "OpenSimDocument":
         of_tag = [child for child in root if child.tag == element.tag]
         if not of_tag:
             raise InputError(f"names a file that holds no <{element.tag}> ({other})", where)
-        held = of_tag[0]
-    if held.tag != element.tag:
-        raise InputError(f"names a file that holds no <{element.tag}> but <{held.tag}>", where)
-    for source in (held, root):
-        _apply_defaults(held, source.find("defaults"))
-    element[:] = [child for child in held if child.tag != "defaults"]
-    element.text = held.text
-    for key, value in held.attrib.items():
+        target = of_tag[0]
+    if target.tag != element.tag:
+        raise InputError(f"names a file that holds no <{element.tag}> but <{target.tag}>", where)
+    for source in (target, root):
+        _apply_defaults(target, source.find("defaults"))
+    element[:] = [child for child in target if child.tag != "defaults"]
+    element.text = target.text
+    for key, value in target.attrib.items():
         element.attrib.setdefault(key, value)
     notices.append(f"{element.tag} read from {name}")
     return other, (*opened, other.resolve())
 
 
-def _apply_defaults(held: Element, defaults: Element | None) -> None:
-    """Write a file's own defaults into its elements: they hold for no other file's."""
+def _apply_defaults(target: Element, defaults: Element | None) -> None:
+    """Write a file's own defaults into its elements; they do not apply to other files."""
     by_tag = {} if defaults is None else {entry.tag: entry for entry in defaults}
     inside = set() if defaults is None else set(defaults.iter())
-    for element in [e for e in held.iter() if e.tag in by_tag and e not in inside]:
-        there = {child.tag for child in element}
-        element.extend(copy.deepcopy(c) for c in by_tag[element.tag] if c.tag not in there)
+    for element in [e for e in target.iter() if e.tag in by_tag and e not in inside]:
+        tags = {child.tag for child in element}
+        element.extend(copy.deepcopy(c) for c in by_tag[element.tag] if c.tag not in tags)

@@ -26,7 +26,7 @@ Element = ElementTree.Element
 class Document:
     """An OpenSim document: where it lies, and what its <defaults> say for each class.
 
-    OpenSim leaves out what equals the defaults, so that a missing element is looked up there.
+    OpenSim omits values that equal the defaults, so that a missing element is looked up there.
 
     Args:
         path: the file.
@@ -118,9 +118,9 @@ class Document:
         except ValueError:
             values = np.array([np.nan])
         if not np.isfinite(values).all() or count not in (None, len(values)):
-            wanted = "numbers" if count is None else f"{count} number{'s' * (count > 1)}"
+            needed = "numbers" if count is None else f"{count} number{'s' * (count > 1)}"
             raise InputError(
-                f"<{tags[0]}>{text[:60]}</{tags[0]}> is not {wanted}", self.where(element)
+                f"<{tags[0]}>{text[:60]}</{tags[0]}> is not {needed}", self.where(element)
             )
         return values
 
@@ -150,7 +150,7 @@ class Document:
         return name
 
     def objects(self, owner: Element, set_tag: str) -> Iterator[Element]:
-        """Yield what stands in <set_tag><objects>."""
+        """Yield the elements in <set_tag><objects>."""
         for holder in owner.findall(f"{set_tag}/objects"):
             yield from holder
 

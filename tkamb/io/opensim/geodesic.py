@@ -34,11 +34,14 @@ class GeodesicSettings:
     """The Newton iteration for a geodesic between two points."""
 
     max_iterations: int = 30
-    """Newton steps, after which a string without convergence fails."""
+    """Newton steps, after which a string without convergence fails. Chosen: strings that converge
+    need fewer."""
     tolerance: float = 1e-11
-    """rad; error of the direction in which the string arrives."""
+    """rad; error of the direction in which the string arrives. Chosen: far below what moves a point
+    of contact."""
     overshoot_below: float = 0.05
-    """rad; at a smaller error, a string that arrives backwards has gone too far."""
+    """rad: if the error is smaller than this, a string that arrives backwards has overshot. Chosen:
+    farther away the derivative may turn its sign."""
 
 
 GEODESIC = GeodesicSettings()
@@ -121,15 +124,16 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
             turned, arc[waiting, None] * shares[waiting]
         )
         small = np.abs(residual).max(axis=1)
-        done = (small < GEODESIC.tolerance) & (ahead > 0.0)
-        converged[waiting[done]] = True
-        if done.all():
+        is_converged = (small < GEODESIC.tolerance) & (ahead > 0.0)
+        converged[waiting[is_converged]] = True
+        if is_converged.all():
             break
-        step = -np.linalg.solve(jacobian[~done], residual[~done][..., None])[..., 0]
-        # a string that would turn back has gone past where it leaves, by as far as it must return
-        past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~done]
-        step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~done][past]])
-        waiting = waiting[~done]
+        step = -np.linalg.solve(jacobian[~is_converged], residual[~is_converged][..., None])[..., 0]
+        # A string that would turn back has overshot the point where it leaves the surface, by the
+        # distance that it has to return.
+        past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~is_converged]
+        step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~is_converged][past]])
+        waiting = waiting[~is_converged]
         # A long step is cut short: far from the solution the derivatives mislead.
         share = np.minimum(1.0, 0.4 / np.maximum(np.abs(step[:, 0]), 1e-300))
         share = np.minimum(share, limit / np.maximum(np.abs(step[:, 1]), 1e-300))
@@ -212,7 +216,7 @@ def _follow_geodesics(
         last_weights: (s,) of all stages in a step.
     """
     count = len(last_weights)
-    stages, here, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)
+    stages, point, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)
     inverse_squares = 1.0 / axes**2
     curvature = inverse_squares[0] * inverse_squares[1] * inverse_squares[2]
     for n in range(len(states)):
@@ -220,21 +224,21 @@ def _follow_geodesics(
         for step in pieces[n]:
             for k in range(count):
                 for i in range(8):
-                    here[i] = state[i]
+                    point[i] = state[i]
                 for before in range(k):
                     share = step * weights[k, before]
                     for i in range(8):
-                        here[i] += share * stages[before, i]
+                        point[i] += share * stages[before, i]
                 squared = bend = 0.0
                 for i in range(3):
-                    gradient[i] = here[i] * inverse_squares[i]
+                    gradient[i] = point[i] * inverse_squares[i]
                     squared += gradient[i] * gradient[i]
-                    bend += here[3 + i] * here[3 + i] * inverse_squares[i]
+                    bend += point[3 + i] * point[3 + i] * inverse_squares[i]
                 for i in range(3):
-                    stages[k, i] = here[3 + i]
+                    stages[k, i] = point[3 + i]
                     stages[k, 3 + i] = -bend / squared * gradient[i]
-                stages[k, 6] = here[7]
-                stages[k, 7] = -curvature / (squared * squared) * here[6]
+                stages[k, 6] = point[7]
+                stages[k, 7] = -curvature / (squared * squared) * point[6]
             for k in range(count):
                 for i in range(8):
                     state[i] += step * last_weights[k] * stages[k, i]

@@ -1,7 +1,7 @@
 """Lengths and moment arms of muscles and ligaments, by the virtual work of a taut string.
 
-A unit tension pulls each point that the string passes by the change of its direction there,
-and so it does the wrap objects at the places where it meets and leaves them. With the wrench
+A unit tension acts on each point that the string passes with the change of its direction there, and
+on the wrap objects at the points where it meets and leaves them. With the wrench
 w_b of all these on body b and its twist J_b per unit of the coordinates,
 
     -dL/dq = Σ_b w_b · J_b,
@@ -35,8 +35,8 @@ class PathSettings:
     condition_tolerance: float = 1e-5
     """rad or m; OpenSim widens the range of a conditional point by as much."""
     block_frames: int = 256
-    """Frames that are evaluated in one call; keeps arrays to some tens of megabytes and changes no
-    result."""
+    """Frames that are evaluated in one call. Chosen: keeps arrays to some tens of megabytes and
+    changes no result."""
 
 
 PATH = PathSettings()
@@ -152,18 +152,18 @@ class LineSet:
         poses = motion.poses[:, self._body]
         points = np.einsum("fkij,fkj->fki", poses[..., :3, :3], locations) + poses[..., :3, 3]
         follower = self._followers(q)
-        rows, here = np.nonzero(follower >= 0)
-        there = follower[rows, here]
+        rows, point = np.nonzero(follower >= 0)
+        next_point = follower[rows, point]
         wrapped = np.zeros(len(rows), bool)
         count = len(self.names), len(self.kinematics.bodies)
         work = Tension(points, self._owner, self._body, count)
         for path, first in zip(self._paths, self._first, strict=True):
             for k in range(first, first + len(path.points) - 1) if path.wraps else ():
-                chosen = here == k
+                chosen = point == k
                 wrapped |= chosen
-                self._wrap(path, first, k, rows[chosen], there[chosen], motion, work)
+                self._wrap(path, first, k, rows[chosen], next_point[chosen], motion, work)
         straight = ~wrapped
-        work.pull(rows[straight], here[straight], there[straight])
+        work.pull(rows[straight], point[straight], next_point[straight])
         work.press_points()
         shape = len(q), len(self.names), -1
         twists = motion.twists.reshape(len(q), -1, q.shape[1])

@@ -114,8 +114,8 @@ def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
     for child in element:
         if child.tag in FRAMES:
             yield owner, child
-        held = child.tag in ("Body", "Ground", *FRAMES) or child.tag.endswith("Joint")
-        yield from _held_frames(child, child.get("name", "") if held else owner)
+        is_body = child.tag in ("Body", "Ground", *FRAMES) or child.tag.endswith("Joint")
+        yield from _held_frames(child, child.get("name", "") if is_body else owner)
 
 
 def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
@@ -142,8 +142,8 @@ def _station_defined(
     where, points, parents = document.where(element), [], set()
     for name in ("point_a", "point_b", "point_c", "origin_point"):
         socket = document.socket(element, name)
-        there = stations.get(socket.rstrip("/").split("/")[-1], [])
-        own = [s for s in there if s in element.iter()] or there
+        known_frames = stations.get(socket.rstrip("/").split("/")[-1], [])
+        own = [s for s in known_frames if s in element.iter()] or known_frames
         if len(own) != 1:
             raise InputError(f"names a station '{socket}' that is there {len(own)} times", where)
         points.append(document.numbers(own[0], "location", count=3))
@@ -195,7 +195,7 @@ def read_joints(
 def _joint(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[Joint, dict[str, Coordinate]]:
-    """Return a joint and its coordinates; in a partial reading one that holds still, if need be."""
+    """Return a joint and its coordinates; a partial reading locks a joint that it cannot read."""
     (parent, in_parent), (body, in_child) = _joint_frames(document, element, frames, child)
     entries = [*document.objects(element, "CoordinateSet"), *element.findall("coordinates/*")]
     names = [document.name(entry) for entry in entries]
@@ -206,13 +206,15 @@ def _joint(
         axes = (_custom_axes if custom else _standard_axes)(document, element, names)
     unread = "; ".join(reason for _, reason in document.unread[read_before:])
     name = document.name(element)
-    moved = {axis.coordinate for kind in axes for axis in kind}
+    coordinates = {axis.coordinate for kind in axes for axis in kind}
     own = {}
     for entry in entries:
         coordinate = _coordinate(document, entry, name, axes[0])
         if coordinate.name in own:
             raise InputError("is there twice", document.where(entry), "rename one")
-        still = coordinate.name not in moved  # it moves nothing: none that a motion could find
+        still = (
+            coordinate.name not in coordinates
+        )  # it moves nothing, so that no motion can change it
         own[coordinate.name] = replace(coordinate, locked=True) if still else coordinate
     return Joint(name, element.tag, parent, body, in_parent, in_child, *axes, unread=unread), own
 
@@ -257,13 +259,13 @@ def _standard_axes(
         )
     rotations, translations = axes
     if len(names) != len(rotations) + len(translations):
-        wanted = len(rotations) + len(translations)
-        raise InputError(f"has {len(names)} coordinates, not {wanted}", document.where(element))
-    made = [
+        count = len(rotations) + len(translations)
+        raise InputError(f"has {len(names)} coordinates, not {count}", document.where(element))
+    functions = [
         JointAxis(axis, name, Linear(1.0, 0.0))
         for axis, name in zip((*rotations, *translations), names, strict=True)
     ]
-    return tuple(made[: len(rotations)]), tuple(made[len(rotations) :])
+    return tuple(functions[: len(rotations)]), tuple(functions[len(rotations) :])
 
 
 def _custom_axes(
@@ -322,7 +324,7 @@ def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
 
 
 def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
-    """Return the joints in an order that leads out from ground, each the way it is passed.
+    """Return the joints in an order that leads outwards from ground, each with its direction.
 
     In a partial reading a joint that closes a loop is left out, and a body that nothing joins to
     ground stands still in it, held by a joint that is marked as unread.

@@ -1,4 +1,4 @@
-"""What strings of unit tension do to the bodies that they pass, summed up part by part."""
+"""Loads of strings of unit tension on the bodies that they pass, summed part by part."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,14 +60,14 @@ class Tension:
         self.lengths = np.zeros(points.shape[:2])
         self._parts: list[tuple[Index, Index, Index, Index, Array, Array]] = []
 
-    def pull(self, rows: Index, here: Index, there: Index) -> None:
+    def pull(self, rows: Index, first: Index, second: Index) -> None:
         """Add straight strings between points of some rows."""
-        start, end = self.points[rows, here], self.points[rows, there]
+        start, end = self.points[rows, first], self.points[rows, second]
         u, distance = _direction(start, end)
-        self.lengths[rows, here] += distance
-        self.pulls[rows, here] += u
-        self.pulls[rows, there] -= u
-        self._keep(rows, self.lines[here], self.bodies[here], self.bodies[there], start, end)
+        self.lengths[rows, first] += distance
+        self.pulls[rows, first] += u
+        self.pulls[rows, second] -= u
+        self._keep(rows, self.lines[first], self.bodies[first], self.bodies[second], start, end)
 
     def pull_wrapped(
         self, rows: Index, k: int, there: Index, strings: WrappedStrings, bodies: Index

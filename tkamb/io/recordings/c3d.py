@@ -4,8 +4,8 @@ The clock is the recording's own: frame k of the file is at (first frame + k)/ra
 first frame counted from zero, so that a trial cut out of a longer one keeps its times. A sample
 with a negative residual, or at exactly (0, 0, 0), was not seen: a gap.
 
-A recording is read for what a job needs. Markers, channels and each plate are read by
-themselves; what is wrong with one of them is kept, and raised by who asks for it.
+Markers, channels and each plate are read separately. A fault in one of them is stored, and raised
+only when that part is used.
 
 Format: C3D user guide, https://www.c3d.org.
 """
@@ -113,9 +113,11 @@ class Recording:
                 return plate
         if number in self.unread_plates:
             raise self.unread_plates[number]
-        there = ", ".join(str(plate.number) for plate in self.plates) or "none"
+        numbers = ", ".join(str(plate.number) for plate in self.plates) or "none"
         raise InputError(
-            f"has no force plate {number}", self.path, f"give [ground_reaction] plates, of {there}"
+            f"has no force plate {number}",
+            self.path,
+            f"give [ground_reaction] plates, of {numbers}",
         )
 
     def channel(self, name: str) -> Array:
@@ -160,7 +162,7 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
 @lru_cache(maxsize=2)
 def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
-    """Read the file as it was at `changed`; markers and plates of one trial are asked apart."""
+    """Read the file as it was at `changed`; cached, because several parts of a run need it."""
     with np.errstate(all="ignore"):  # damaged numbers overflow; they are gaps below
         file = parse_c3d(read_bytes(path, FILE_LIMITS.table_bytes), path)
         return _Reader(path, file, units).recording()
@@ -235,16 +237,16 @@ class _Reader:
         """Return metres per unit of length; None where the file's word is not understood."""
         words = self._parameters.texts("POINT:UNITS")
         word = words[0] if words else ""
-        own, given = metres(word), self.units.length
-        if given is None:
+        own, unit = metres(word), self.units.length
+        if unit is None:
             return own
-        if own is not None and own != metres(given):
+        if own is not None and own != metres(unit):
             raise InputError(
-                f"is in {word} by its own header, but length_unit says {given}",
+                f"is in {word} by its own header, but length_unit says {unit}",
                 self.path,
                 "correct length_unit",
             )
-        return metres(given)
+        return metres(unit)
 
     def _analog(self, rate: float) -> tuple[float, list[str], Array, list[str]]:
         """Return rate (Hz), and names, samples (c, k) and units of the analog channels."""
@@ -311,16 +313,19 @@ class _Reader:
             self._per_plate(key, rows)
             for key, rows in (("CORNERS", (3, 4)), ("ORIGIN", (3,)), ("CHANNEL", None))
         )
-        there = (len(kinds), *(0 if v is None else v.shape[-1] for v in (corners, origin, channel)))
-        if min(there) < number:
+        counts = (
+            len(kinds),
+            *(0 if v is None else v.shape[-1] for v in (corners, origin, channel)),
+        )
+        if min(counts) < number:
             raise InputError("is not described in full", where, EXPORT)
         assert corners is not None and origin is not None and channel is not None
-        wanted = channel[: CHANNELS.get(kinds[k], 6), k]
-        if not np.isfinite(wanted).all() or len(set(wanted)) < len(wanted):
+        used = channel[: CHANNELS.get(kinds[k], 6), k]
+        if not np.isfinite(used).all() or len(set(used)) < len(used):
             raise InputError("names one channel twice", where, EXPORT)
-        if len(wanted) and (wanted.min() < 1 or wanted.max() > len(names)):
-            raise InputError(f"asks for channel {wanted.max():g} of {len(names)}", where, EXPORT)
-        rows = [int(one) - 1 for one in wanted]
+        if len(used) and (used.min() < 1 or used.max() > len(names)):
+            raise InputError(f"asks for channel {used.max():g} of {len(names)}", where, EXPORT)
+        rows = [int(one) - 1 for one in used]
         force = self._parameters.texts("FORCE_PLATFORM:UNITS")
         return PlateRecord(
             number,
@@ -363,7 +368,7 @@ class _Reader:
         return matrix if matrix.any() else None
 
     def _zero(self) -> slice | None:
-        """Return the samples that FORCE_PLATFORM:ZERO calls unloaded; None if it names none.
+        """Return the samples that FORCE_PLATFORM:ZERO states as unloaded; None if it states none.
 
         Its frames are those of the recording's own count. In a recording cut out of a longer
         one they may lie before its first frame; they are then counted from that.
@@ -382,7 +387,7 @@ class _Reader:
 
 
 def no_length_unit(word: str, path: Path) -> InputError:
-    """Return the refusal of a recording whose unit of length is not understood."""
+    """Return the error for a recording whose unit of length is not understood."""
     stated = f"the unit '{word}'" if word else "no unit"
     return InputError(
         f"states {stated} for its markers (POINT:UNITS)",
@@ -394,7 +399,7 @@ def no_length_unit(word: str, path: Path) -> InputError:
 def _check_rates(analog_rate: float | None, rate: float, samples: int, path: Path) -> None:
     """Raise unless the rates that a file states are those of the samples that it holds."""
     if analog_rate is None or analog_rate == 0:
-        return  # the samples a frame say it
+        return  # the number of samples per frame gives the rate
     ratio = analog_rate / rate
     if not ratio >= 1 or abs(ratio - round(ratio)) > 1e-4:
         raise InputError(

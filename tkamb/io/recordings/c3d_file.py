@@ -313,8 +313,8 @@ class _Data:
             raise InputError("holds neither markers nor analog channels", self.path, EXPORT)
         notices: list[str] = []
         start = self._start(notices)
-        held = max(len(self.content) - start, 0) // self._frame
-        count = self._count(held, notices)
+        stored = max(len(self.content) - start, 0) // self._frame
+        count = self._count(stored, notices)
         words = self._words(self.content[start : start + count * self._frame]).reshape(count, -1)
         markers = 4 * self.header.markers
         points, residual = self._points(words[:, :markers].reshape(count, markers // 4, 4))
@@ -382,7 +382,7 @@ class _Data:
                 return int(longer)
         return header
 
-    def _count(self, held: int, notices: list[str]) -> int:
+    def _count(self, stored: int, notices: list[str]) -> int:
         """Return how many of `held` frames are read.
 
         Raises:
@@ -391,20 +391,20 @@ class _Data:
         stated = self._stated()
         other = self.parameters.integers("POINT:FRAMES")
         spare = math.ceil(BLOCK / self._frame)
-        if other and other[0] != stated and held - spare <= other[0] <= held != stated:
+        if other and other[0] != stated and stored - spare <= other[0] <= stored != stated:
             notices.append(f"it holds {other[0]} frames, as POINT:FRAMES says, not {stated}")
             stated = other[0]
-        uncounted = self.header.last >= LARGEST_16_BIT or held > stated + LARGEST_16_BIT
-        if uncounted and held > stated + spare:
+        uncounted = self.header.last >= LARGEST_16_BIT or stored > stated + LARGEST_16_BIT
+        if uncounted and stored > stated + spare:
             raise InputError(
-                f"states {stated} frames, which 16 bits can count, and is long enough for {held}",
+                f"states {stated} frames, which 16 bits can count, and is long enough for {stored}",
                 self.path,
                 "export it with TRIAL:ACTUAL_END_FIELD, or cut the trial",
             )
         if stated < 1:
             raise InputError(f"states {stated} frames", self.path, EXPORT)
-        if held < stated:
-            share = 100.0 * held / stated
+        if stored < stated:
+            share = 100.0 * stored / stated
             raise InputError(
                 f"is cut short: it holds {share:.0f} % of its {stated} frames",
                 self.path,
@@ -431,8 +431,8 @@ class _Data:
         scale = abs(self.header.scale)
         places = words[:, :, :3] * (1.0 if self._word == 4 else scale)
         fourth = words[:, :, 3]
-        known = np.isfinite(fourth) & (np.abs(fourth) < 2**31)
-        low_byte = np.where(known, fourth, 0.0).astype(np.int64) & 0xFF
+        readable = np.isfinite(fourth) & (np.abs(fourth) < 2**31)
+        low_byte = np.where(readable, fourth, 0.0).astype(np.int64) & 0xFF
         residual = np.asarray(low_byte * scale, float)
         gap = ~np.isfinite(places).all(axis=2) | (fourth < 0) | (places == 0).all(axis=2)
         places[gap], residual[gap] = np.nan, np.nan

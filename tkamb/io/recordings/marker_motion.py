@@ -1,14 +1,14 @@
 """Knee and shank from skin markers: rigid fits and a chain, side by side.
 
-Two readings of the same markers, both computed, one of them used:
+The same markers are fitted in two ways. Both are computed, and one of them is used:
 
 - segments: shank and thigh are each fitted rigidly, by themselves. The joint between them may
-  come apart, and by how much says how far the skin has moved.
+  come apart, and the distance shows how far the skin has moved.
 - chain: shank, knee, thigh and their neighbours are fitted at once, held together by their
   joints. Nothing comes apart; the skin's movement is spread over the segments instead.
 
-The neighbour's knee centre as the thigh carries it against the same as the shank carries it is
-their disagreement: it acts on the knee's moments as a lever of that length.
+The distance of the knee centre of the thigh's markers from that of the shank's markers measures
+the disagreement: it acts on the knee's moments as a lever of that length.
 """
 
 from dataclasses import dataclass
@@ -43,8 +43,8 @@ class MarkerMotionSettings:
     """The motion of a leg from markers."""
 
     max_joint_gap: float = 0.1
-    """m; largest distance of a joint from where the markers show it. Skin moves by a third of this
-    at the hip; the other foot is farther."""
+    """m: largest distance of a joint from where the markers show it. Chosen: at the hip, skin moves
+    by a third of this; the other foot is farther away."""
 
 
 MARKER_MOTION = MarkerMotionSettings()
@@ -52,13 +52,13 @@ MARKER_MOTION = MarkerMotionSettings()
 
 @dataclass(frozen=True, eq=False)
 class MarkerKinematics:
-    """What skin markers say of a leg, as a right one's, SI.
+    """Kinematics of a leg from skin markers, as a right leg, SI.
 
     Args:
         time: (n,) s, frames that `method` could place without a break.
-        method: the reading that is used.
-        tibia: (n, 4, 4) pose_tibia_in_laboratory by it.
-        coordinates: (n, 6) knee coordinates by it.
+        method: the fit that is used.
+        tibia: (n, 4, 4) pose_tibia_in_laboratory by this fit.
+        coordinates: (n, 6) knee coordinates by this fit.
         flexion: method -> (n,) rad; NaN where the segments could not be fitted.
         rms: method -> (n,) m, of the markers: those of shank and thigh, or all of the chain.
         centre_distance: (n,) m, between the knee centre of the shank's and of the thigh's
@@ -111,9 +111,10 @@ def load_marker_motion(
     fits, whole = both_fits(chain, segments, measured, neutral, recorded)
     if not whole.solved.all():
         raise InputError(
-            f"the chain of segments does not settle at {time[int(np.argmin(whole.solved))]:.4f} s",
+            f"the chain of segments does not converge at {time[int(np.argmin(whole.solved))]:.4f} "
+            f"s",
             recorded.path,
-            "are labels swapped? check labels and joints in [motion.markers]",
+            "check labels and joints in [motion.markers]; two labels may be swapped",
         )
     blind = np.isnan(whole.rms)[:, None, None]
     readings: dict[Method, tuple[Array, Array]] = {
@@ -158,8 +159,8 @@ def leg_segments(
     segments, measured = [], {}
     for own in markers.segment:
         labels = tuple(own.markers)
-        seen = marker_trajectories(recorded, list(labels), scale) @ rotation.T
-        measured[own.name] = seen @ mirror
+        points = marker_trajectories(recorded, list(labels), scale) @ rotation.T
+        measured[own.name] = points @ mirror
         ends = [None if end is None else mirror @ end for end in (own.joint, own.centre)]
         segments.append(
             Segment(
@@ -183,16 +184,16 @@ def neutral_coordinates(markers: MarkerSet, side: str) -> Array:
 
 def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
     for name, values in rms.items():
-        known = values[np.isfinite(values)]
-        if not len(known) and name in ("shank", "thigh"):
+        finite = values[np.isfinite(values)]
+        if not len(finite) and name in ("shank", "thigh"):
             raise InputError(
                 f"fewer than three markers of the {name} are seen together",
                 recorded.path,
                 "check the labels in [motion.markers], or use another trial",
             )
-        if len(known) and np.median(known) > MARKER_FIT.max_median_residual:
+        if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
             raise InputError(
-                f"markers of the {name} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
+                f"markers of the {name} fit only to {np.median(finite) / MILLIMETRE:.0f} mm",
                 recorded.path,
                 "check names and positions in [motion.markers], and length_unit",
             )
@@ -210,7 +211,7 @@ def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Ta
                 f"markers of the {own.name} put its joint with the {own.joined_to} "
                 f"{np.nanmedian(apart) / MILLIMETRE:.0f} mm from where the {own.joined_to}'s do",
                 recorded.path,
-                "are left and right labels swapped? check the labels in [motion.markers]",
+                "check the labels in [motion.markers]; left and right may be swapped",
             )
 
 
@@ -224,11 +225,13 @@ def _compare_readings(
     measured: dict[str, Array],
     neutral: Array,
 ) -> MarkerKinematics:
-    """Return both readings, (shank, thigh) in the laboratory, where the one in use is whole."""
+    """Return both fits, (shank, thigh) in the laboratory, in the frames of the one in use."""
     assert source.markers is not None
     used = source.markers.method
     knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
-    gone = np.concatenate([np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1)
+    missing = np.concatenate(
+        [np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1
+    )
     run = _run(time, np.isnan(knees[used][:, 0]), source.interval, recorded)
     return MarkerKinematics(
         time[run],
@@ -238,7 +241,7 @@ def _compare_readings(
         {name: knee[run, FLEXION] for name, knee in knees.items()},
         {name: values[run] for name, values in rms.items()},
         np.linalg.norm(knees["segments"][run, :3] - neutral[:3], axis=1),
-        gone.sum(axis=1)[run],
+        missing.sum(axis=1)[run],
     )
 
 
@@ -251,15 +254,15 @@ def _joint_rms(fits: dict[str, tuple[Array, Array]], measured: dict[str, Array])
 
 def _knee(insert: Array, femur: Array) -> Array:
     """Return knee coordinates (n, 6) of frames that are known, NaN elsewhere."""
-    known = np.isfinite(insert[:, 0, 3]) & np.isfinite(femur[:, 0, 3])
+    finite = np.isfinite(insert[:, 0, 3]) & np.isfinite(femur[:, 0, 3])
     result = np.full((len(insert), 6), np.nan)
-    if known.any():
-        result[known] = knee_coordinates(inverse(insert[known]) @ femur[known])
+    if finite.any():
+        result[finite] = knee_coordinates(inverse(insert[finite]) @ femur[finite])
     return result
 
 
 def _run(
-    time: Array, lost: np.ndarray, interval: tuple[float, float] | None, recorded: Table
+    time: Array, missing: np.ndarray, interval: tuple[float, float] | None, recorded: Table
 ) -> slice:
     """Return the longest run of frames around the interval in which none is lost.
 
@@ -273,15 +276,15 @@ def _run(
             "choose [motion] interval_s inside the recording",
         )
     inside = (time >= start - 1e-9) & (time <= end + 1e-9)
-    if (inside & lost).any():
-        k = int(np.argmax(inside & lost))
+    if (inside & missing).any():
+        k = int(np.argmax(inside & missing))
         raise InputError(
             f"too few markers of shank and thigh are seen at {time[k]:.4f} s",
             recorded.path,
             "choose [motion] interval_s between the gaps, or method = 'chain'",
         )
     first, last = int(np.argmax(inside)), len(time) - int(np.argmax(inside[::-1]))
-    before, after = np.flatnonzero(lost[:first]), np.flatnonzero(lost[last:])
+    before, after = np.flatnonzero(missing[:first]), np.flatnonzero(missing[last:])
     return slice(
         int(before[-1]) + 1 if len(before) else 0, last + int(after[0]) if len(after) else None
     )

@@ -1,4 +1,4 @@
-"""Skin markers: found by their labels, and the rigid fit that says where their body stands.
+"""Skin markers: found by their labels, and rigid fits of bodies to them.
 
 The same marker is `R.Thigh.Superior`, `RThighSuperior`, `JW:RThighSuperior`.
 """
@@ -21,7 +21,8 @@ class MarkerFitSettings:
     """When fitted markers are refused."""
 
     max_median_residual: float = 0.05
-    """m; a larger median residual shows a wrong marker, unit or set, not soft tissue."""
+    """m: largest median residual. Chosen: a larger one is due to a wrong marker, unit or set, not
+    to soft tissue."""
 
 
 MARKER_FIT = MarkerFitSettings()
@@ -60,18 +61,18 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
         InputError: a marker is not in the file; the message lists the nearest names.
     """
     labels = [column[:-2] for column in table.columns if column.endswith("_x")]
-    known = matched_labels(names, labels)
+    matched = matched_labels(names, labels)
     for name in names:
-        if name not in known:
+        if name not in matched:
             table.column(f"{name}_x")
-    columns = [[table.column(f"{known[name]}_{axis}") for axis in "xyz"] for name in names]
+    columns = [[table.column(f"{matched[name]}_{axis}") for axis in "xyz"] for name in names]
     return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
 
 
 def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, measured and in the tibia link.
 
-    A joint centre is carried by a rigid fit of the neighbouring segment's markers.
+    A joint centre comes from a rigid fit of the neighbouring segment's markers.
 
     Returns:
         Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.
@@ -94,10 +95,10 @@ def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]
 
 def check_fit(residual: Array, what: str, recorded: Table) -> None:
     """Raise InputError if a fit is so poor that markers or units must be wrong."""
-    known = residual[np.isfinite(residual)]
-    if len(known) and np.median(known) > MARKER_FIT.max_median_residual:
+    finite = residual[np.isfinite(residual)]
+    if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
         raise InputError(
-            f"{what} fit only to {np.median(known) / MILLIMETRE:.0f} mm",
+            f"{what} fit only to {np.median(finite) / MILLIMETRE:.0f} mm",
             recorded.path,
             "check names and positions in [tibia], and length_unit",
         )
@@ -154,26 +155,26 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
     Raises:
         InputError: the reference markers fix no orientation.
     """
-    seen = np.isfinite(points).all(axis=2)
+    visible = np.isfinite(points).all(axis=2)
     if not _spans(reference[weights > 0]):
         raise InputError(
             f"markers of {name} fix no orientation: fewer than three, or all on one line",
             "[motion.markers]",
             "name three or more that span a triangle",
         )
-    w = np.where(seen, weights, 0.0)
+    w = np.where(visible, weights, 0.0)
     patterns, of_frame = np.unique(w > 0, axis=0, return_inverse=True)
     usable = np.array([_spans(reference[row]) for row in patterns])[of_frame.ravel()]
     total = np.where(usable, w.sum(axis=1), 1.0)[:, None]
-    there = np.nan_to_num(points)
-    mean = np.einsum("nm,nmi->ni", w, there) / total
+    filled = np.nan_to_num(points)
+    mean = np.einsum("nm,nmi->ni", w, filled) / total
     own = w @ reference / total
-    h = np.einsum("nm,nmi,nmj->nij", w, reference - own[:, None], there - mean[:, None])
+    h = np.einsum("nm,nmi,nmj->nij", w, reference - own[:, None], filled - mean[:, None])
     rotation = _nearest_rotation(h)
     poses = pose(rotation, mean - np.einsum("nij,nj->ni", rotation, own))
     fitted = transform(poses, np.broadcast_to(reference, points.shape))
-    square = np.where(seen, np.sum((fitted - there) ** 2, axis=2), 0.0)
-    rms = np.sqrt(square.sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
+    square = np.where(visible, np.sum((fitted - filled) ** 2, axis=2), 0.0)
+    rms = np.sqrt(square.sum(axis=1) / np.maximum(visible.sum(axis=1), 1))
     poses[~usable], rms[~usable] = np.nan, np.nan
     return poses, rms
 

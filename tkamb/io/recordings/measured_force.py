@@ -17,10 +17,10 @@ FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
 
 @dataclass(frozen=True)
 class ForceSampleSettings:
-    """Between which samples of a measured force is interpolated."""
+    """Interpolation between the samples of a measured force."""
 
     max_gap: float = 2.5
-    """Times the median step; in a wider gap nothing is interpolated."""
+    """Multiple of the median step: a wider gap is not interpolated. Chosen: one lost sample is."""
 
 
 FORCE_SAMPLES = ForceSampleSettings()
@@ -50,10 +50,10 @@ class MeasuredForce:
         """
         step = np.diff(self.time)
         right = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
-        known = (time >= self.time[0]) & (time <= self.time[-1])
-        known &= step[right - 1] <= FORCE_SAMPLES.max_gap * np.median(step)
+        inside = (time >= self.time[0]) & (time <= self.time[-1])
+        inside &= step[right - 1] <= FORCE_SAMPLES.max_gap * np.median(step)
         return {
-            name: np.where(known, np.interp(time, self.time, values), np.nan)
+            name: np.where(inside, np.interp(time, self.time, values), np.nan)
             for name, values in self.force.items()
         }
 

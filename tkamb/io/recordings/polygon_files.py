@@ -154,8 +154,8 @@ def _ply_text(
     """Yield the name of each element of a text file, its values and where each one's end."""
     lines = iter(content[start:].decode("latin-1").splitlines())
     for element in elements:
-        wanted, values, ends = _wanted(element), list[float](), list[int]()
-        if element.name == "vertex" and len(wanted) < 3:
+        columns, values, ends = _wanted(element), list[float](), list[int]()
+        if element.name == "vertex" and len(columns) < 3:
             raise ValueError("its vertices lack x, y or z")
         for row in range(element.count):
             words = next((w for w in (line.split() for line in lines) if w), None)
@@ -169,7 +169,7 @@ def _ply_text(
                 if len(own[-1]) < count:
                     raise ValueError(f"{element.name} {row} is cut short")
                 place += count
-            for n in wanted:
+            for n in columns:
                 values.extend(float(word) for word in own[n])
             ends.append(len(values))
         yield element.name, (np.array(values), np.array(ends, np.int64))
@@ -180,19 +180,19 @@ def _ply_binary(
 ) -> Iterator[tuple[str, tuple[Array, Index]]]:
     """Yield the name of each element of a binary file, its values and where each one's end."""
     for element in elements:
-        wanted, place = _wanted(element), start
-        if element.name == "vertex" and len(wanted) < 3:
+        columns, place = _wanted(element), start
+        if element.name == "vertex" and len(columns) < 3:
             raise ValueError("its vertices lack x, y or z")
         rows, start = _equal_rows(content, start, element, order)
         if rows is not None:
-            parts = [rows[f"p{n}"].reshape(element.count, -1) for n in wanted]
+            parts = [rows[f"p{n}"].reshape(element.count, -1) for n in columns]
             table = np.concatenate([part.astype(float) for part in parts], axis=1) if parts else (
                 np.zeros((element.count, 0))
             )  # fmt: skip
             ends = table.shape[1] * np.arange(1, element.count + 1)
             yield element.name, (table.ravel(), ends)
             continue
-        values, ends_, start = _uneven_rows(content, place, element, order, wanted)
+        values, ends_, start = _uneven_rows(content, place, element, order, columns)
         yield element.name, (values, ends_)
 
 
@@ -226,7 +226,7 @@ def _equal_rows(
 
 
 def _uneven_rows(
-    content: bytes, start: int, element: _Element, order: str, wanted: list[int]
+    content: bytes, start: int, element: _Element, order: str, columns: list[int]
 ) -> tuple[Array, Index, int]:
     """Return an element's values, where each one's end, and where the rows end, row by row."""
     kinds = [
@@ -242,7 +242,7 @@ def _uneven_rows(
                 start += header.itemsize
             if count < 0 or len(content) < start + count * dtype.itemsize:
                 raise ValueError(f"it is cut short: {row} of {element.count} of {element.name}")
-            if n in wanted:
+            if n in columns:
                 values.append(np.frombuffer(content, dtype, count, start).astype(float))
                 total += count
             start += count * dtype.itemsize

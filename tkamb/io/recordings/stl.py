@@ -1,4 +1,4 @@
-"""Triangles from binary STL files, whatever programs write after the last one."""
+"""Triangles from binary STL files, also with extra bytes at the end."""
 
 import logging
 from pathlib import Path
@@ -22,8 +22,8 @@ def read_binary_stl(path: Path) -> Array | None:
 
     80 bytes of anything, the number of triangles, then for each a normal, three corners and two
     bytes (little-endian). Several solids one after the other are read as one. Bytes after the last
-    triangle are left out, with a notice on the logger "tkamb"; so is a number of triangles of 0 or
-    of the largest that there is, which programs write that do not go back to the beginning.
+    triangle are left out, with a notice on the logger "tkamb". A number of triangles of 0 or of the
+    largest integer is ignored, too: programs write it if they do not return to the header.
 
     Raises:
         InputError: it is cut short.
@@ -74,13 +74,13 @@ def _goes_on(content: bytes, place: int) -> bool:
 def _refuse_cut_short(content: bytes, path: Path) -> None:
     """Refuse a file that announces more triangles than it has, where the others are plausible."""
     count = int.from_bytes(content[80:_HEADER], "little")
-    there = (len(content) - _HEADER) // _TRIANGLE.itemsize
-    if not 0 < there < count:
+    stored = (len(content) - _HEADER) // _TRIANGLE.itemsize
+    if not 0 < stored < count:
         return
-    corners = np.frombuffer(content, _TRIANGLE, there, _HEADER)["corners"]
+    corners = np.frombuffer(content, _TRIANGLE, stored, _HEADER)["corners"]
     if np.isfinite(corners).all() and 0.0 < np.abs(corners).max() < 1e7:
         raise InputError(
-            f"cannot be read as a mesh (cut short: {there} of {count} triangles)",
+            f"cannot be read as a mesh (cut short: {stored} of {count} triangles)",
             path,
             "copy or export it again",
         )

@@ -1,7 +1,7 @@
-"""What a patient's URDF must be: parsed numbers, one tree, the exact knee chain, real bodies.
+"""Checks of a patient's URDF: numbers, one tree, the exact knee chain, physical inertias.
 
-Parsers of URDF drop what they do not know and fill in what is missing, silently: a misspelt
-attribute becomes zero, a joint without limits another type. Here each is an error.
+Parsers of URDF silently ignore unknown attributes and fill in missing ones: a misspelt attribute
+becomes zero, a joint without limits another type. Here each of these is an error.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -69,7 +69,7 @@ class UrdfAngleSettings:
     """Which angles of a URDF are in radians."""
 
     max_angle: float = 8.0 * np.pi
-    """rad; a larger number is in degrees: angles in a URDF are below one turn."""
+    """rad; a larger number is in degrees. Chosen: four turns, as angles in a URDF are below one."""
 
 
 URDF_ANGLE = UrdfAngleSettings()
@@ -106,22 +106,22 @@ _HEAVIEST = 1000.0
 
 def _check_attributes(element: ElementTree.Element, where: str) -> None:
     """Raise where a place, an axis or an inertia is misspelt or not numbers."""
-    known = _ATTRIBUTES[element.tag]
+    attributes = _ATTRIBUTES[element.tag]
     for key, text in element.attrib.items():
-        if key not in known:
+        if key not in attributes:
             raise InputError(
-                f"unknown attribute {key} of <{element.tag}>", where, names_near(key, known)
+                f"unknown attribute {key} of <{element.tag}>", where, names_near(key, attributes)
             )
-        if not _finite(text, known[key]):
-            numbers = "a number" if known[key] == 1 else f"{known[key]} numbers"
+        if not _finite(text, attributes[key]):
+            numbers = "a number" if attributes[key] == 1 else f"{attributes[key]} numbers"
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
         place = element.tag == "origin" and key == "xyz"
         if place and np.abs(numbers_of(element, key)).max() > _FARTHEST:
-            hint = "xyz is in metres: is it in millimetres?"
+            hint = "give xyz in metres, not in millimetres"
             raise InputError(f'<origin xyz="{text}"> is beyond {_FARTHEST:g} m', where, hint)
         if key in ("value", *_INERTIA) and abs(float(text)) > _HEAVIEST:
             hint = f"give at most {_HEAVIEST:g} (kg, kg·m²)"
-            raise InputError(f'<{element.tag} {key}="{text}"> is of no body', where, hint)
+            raise InputError(f'<{element.tag} {key}="{text}"> is too large for a body', where, hint)
         if key == "rpy" and np.abs(numbers_of(element, key)).max() > URDF_ANGLE.max_angle:
             hint = "give rpy in radians, not in degrees"
             raise InputError(f'<origin rpy="{text}"> turns by several turns', where, hint)
@@ -163,7 +163,7 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
                 hint = f"add it, or {names_near(end, links)}"
                 raise InputError(f"names a link '{end}' that is not there", where, hint)
         if child in parents:
-            raise InputError(f"link '{child}' hangs on a second joint", where, "keep one")
+            raise InputError(f"link '{child}' is the child of a second joint", where, "keep one")
         parents[child] = parent
     if repeated := sorted({name for name in links if links.count(name) > 1}):
         raise InputError(f"has two links '{repeated[0]}'", path, "rename one")
@@ -180,7 +180,9 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
         while place in parents and steps <= len(links):
             place, steps = parents[place], steps + 1
         if place != roots[0]:
-            raise InputError(f"link '{name}' hangs in a loop", path, "a leg is one tree")
+            raise InputError(
+                f"link '{name}' is part of a loop", path, "connect the links to one tree"
+            )
 
 
 def ends_of(joint: ElementTree.Element) -> tuple[str, str]:
@@ -207,38 +209,38 @@ def check_chain(
         with_patella: whether the patella is needed; if not, it is checked where it is there.
     """
     joints = {str(joint.get("name")): joint for joint in robot.findall("joint")}
-    for start, wanted, end in CHAINS:
-        if end == "patella" and not with_patella and not set(wanted) & set(joints):
+    for start, chain_joints, end in CHAINS:
+        if end == "patella" and not with_patella and not set(chain_joints) & set(joints):
             continue
-        for name in wanted:
+        for name in chain_joints:
             if name not in joints:
                 near = f"add it, or rename one: {names_near(name, joints)}"
                 raise InputError(f"has no joint '{name}'", path, near)
-        _check_axes(joints, wanted, path, side)
-        _check_order(robot, joints, list(wanted), (start, end), path)
-    known = [_ANKLE_JOINT, *KNEE_JOINTS, *PATELLA_JOINTS]
+        _check_axes(joints, chain_joints, path, side)
+        _check_order(robot, joints, list(chain_joints), (start, end), path)
+    names = [_ANKLE_JOINT, *KNEE_JOINTS, *PATELLA_JOINTS]
     for name, joint in joints.items():
         if joint.get("type") in ("revolute", "prismatic"):
             _check_limit(joint, path)
-        if name not in known and joint.get("type") != "fixed":
+        if name not in names and joint.get("type") != "fixed":
             raise InputError(
                 f"joint '{name}' is {joint.get('type')}",
                 path,
-                f"only ankle and knee move: make it fixed, or {names_near(name, known)}",
+                f"only ankle and knee move: make it fixed, or {names_near(name, names)}",
             )
 
 
 def _check_axes(
     joints: dict[str, ElementTree.Element],
-    wanted: dict[str, tuple[str, Axis]],
+    expected: dict[str, tuple[str, Axis]],
     path: Path,
     side: str,
 ) -> None:
     """Raise unless each joint has its type, its axis and limits."""
-    axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in wanted}
+    axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in expected}
     turned = [
         name
-        for name, (kind, axis) in wanted.items()
+        for name, (kind, axis) in expected.items()
         if kind == "revolute" and np.allclose(axes[name], -np.array(axis), atol=1e-9)
     ]
     if {"knee_axial_rotation", "knee_adduction"} <= set(turned) and len(turned) == 2:
@@ -248,7 +250,7 @@ def _check_axes(
             path,
             f"correct [patient] side, which is '{side}', or the axes",
         )
-    for name, (kind, axis) in wanted.items():
+    for name, (kind, axis) in expected.items():
         joint = joints[name]
         if joint.get("type") != kind or not np.allclose(axes[name], axis, atol=1e-9):
             about = " ".join(f"{value:g}" for value in axes[name])
@@ -287,14 +289,14 @@ def _check_order(
     for name in names:
         parent, child = ends_of(joints[name])
         if parent != place:
-            raise InputError(f"joint '{name}' hangs on '{parent}', not '{place}'", path, order)
+            raise InputError(f"joint '{name}' has parent '{parent}', not '{place}'", path, order)
         place = child
         origin = joints[name].find("origin")
-        moved = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
-        if name != names[0] and moved.any():
-            shown = " ".join(f"{value:g}" for value in moved)
+        numbers = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
+        if name != names[0] and numbers.any():
+            words = " ".join(f"{value:g}" for value in numbers)
             hint = f"only '{names[0]}' is placed: give it the identity"
-            raise InputError(f"joint '{name}' has an origin {shown} in the chain", path, hint)
+            raise InputError(f"joint '{name}' has an origin {words} in the chain", path, hint)
         mass = masses.get(child)
         if name != names[-1] and mass is not None and numbers_of(mass, "value", "0").any():
             hint = "links inside the chain have none: put it on tibia or femur"

@@ -159,7 +159,7 @@ class _PolyData:
         if count == 0:
             return b""
         if whole * (count - 1) + (last or whole) > FILE_LIMITS.mesh_bytes:
-            raise ValueError("it unpacks to more than is read")
+            raise ValueError("a block unpacks to more bytes than it states")
         packed, _ = self._taken(rest, sum(sizes), raw)
         blocks, start = [], 0
         for number, length in enumerate(sizes):
@@ -183,7 +183,7 @@ class _PolyData:
         """Return the first `count` bytes of a raw or base64 text, and what comes after."""
         length = count if raw else 4 * -(-count // 3)
         piece = source[:length]
-        taken = piece if raw else base64.b64decode(piece, validate=True)
-        if len(taken) < count:
+        packed = piece if raw else base64.b64decode(piece, validate=True)
+        if len(packed) < count:
             raise ValueError("it is cut short")
-        return taken[:count], source[length:]
+        return packed[:count], source[length:]

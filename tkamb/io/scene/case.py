@@ -3,6 +3,7 @@
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +34,7 @@ logger = logging.getLogger("tkamb")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What a run works on. Absent in the scene: None.
+    """The input of a run. Parts that the scene does not have are None.
 
     Args:
         scene: the scene, as its file has it.
@@ -51,7 +52,7 @@ class Case:
         emg: envelopes of the muscles' surface EMG.
         post: the insert's post, insert frame, where the scene asks for its contact.
         insert_placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin and
-            not mirrored, in the insert frame; None where nothing needs it.
+        not mirrored, in the insert frame; None if not needed.
     """
 
     scene: Scene
@@ -155,10 +156,10 @@ def _recordings(
 
 
 def _common_part(scene: Scene) -> "MotionRecording | None":
-    """Return the motion on the part that the ground reaction covers; None if that is no remedy.
+    """Return the part of the motion that the ground reaction covers; None if there is none.
 
-    A scene that states no interval means all that was recorded, and clocks of two files begin
-    and end a little apart.
+    A scene without an interval asks for the whole recording, but the clocks of two files may
+    begin and end at slightly different times.
     """
     if scene.ground_reaction is None or scene.motion.interval_s or scene.motion.cycle_s:
         return None
@@ -189,7 +190,7 @@ def load_case(scene: Scene) -> Case:
     """
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
-    # tables before meshes, which take longer: a mistake in them is told at once
+    # Tables before meshes, which take longer: a mistake in a table is reported at once.
     parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
     try:
         motion, tibia, ground = _recordings(scene, in_si(scene.motion), chain, parts)
@@ -230,8 +231,29 @@ def load_case(scene: Scene) -> Case:
     return scaled_case(case)
 
 
+def with_insert(case: Case, mesh: Path) -> Case:
+    """Return a case with the insert of another mesh file of the same unit and axes.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    implant = case.scene.implant
+    assert implant.insert is not None
+    insert = implant.insert.model_copy(update={"mesh": mesh})
+    implant = implant.model_copy(update={"insert": insert})
+    scene = case.scene.model_copy(update={"implant": implant})
+    parts = _Parts(scene, insert_alone=True)
+    return replace(
+        case,
+        scene=scene,
+        insert=parts.insert,
+        post=parts.post,
+        insert_placement=parts.insert_placement,
+    )
+
+
 def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
-    """Return the motion with what follows from the surfaces: a seat, a roll with slip."""
+    """Return the motion with coordinates that follow from the surfaces (seat, roll and slip)."""
     table = scene.motion
     if motion.unrecorded or table.motion == "roll-slip":
         check_frames(motion.time, table.cutoff_Hz, table.frames)
@@ -279,15 +301,15 @@ def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, 
         from tkamb.knee.generic_ligaments import generic_ligaments
 
         assert parts.femoral is not None and parts.insert is not None
-        wanted = scene.generic_ligaments.ligaments
-        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, wanted)
+        names = scene.generic_ligaments.ligaments
+        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, names)
     return bundles
 
 
 class _Parts:
     """The implant's surfaces in their own frames, and where their meshes' axes lie."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, insert_alone: bool = False) -> None:
         implant, self._left = scene.implant, scene.patient.side == "left"
         wants_insert = (
             scene.contact is not None
@@ -316,9 +338,11 @@ class _Parts:
                 self.insert, self.post = divide_insert(self.insert)
         elif implant.insert and scene.muscles is not None:  # where the model's insert lies
             self._place_insert(scene)
+        if insert_alone:
+            return
         if wants_femoral:
             if not implant.femoral:
-                raise InputError("is missing", "[implant.femoral]", "the patella rides on it")
+                raise InputError("is missing", "[implant.femoral]", "the patella slides on it")
             self.femoral, self.femoral_mesh_in_femur = self._place(
                 "femoral component", implant.femoral
             )
@@ -328,7 +352,7 @@ class _Parts:
             self.patella, _ = self._place("patellar button", implant.patella)
 
     def _place_insert(self, scene: Scene) -> "Surface":
-        """Read the insert, keep where its mesh lies in its frame, and return it there."""
+        """Read the insert, store its mesh's place in the insert frame, and return it there."""
         from tkamb.geometry.flat_bottom import insert_placement
         from tkamb.io.recordings.meshes import axes_rotation, load_surface
 

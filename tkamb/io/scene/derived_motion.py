@@ -1,4 +1,4 @@
-"""Motions that nobody recorded as they are computed: seated on the insert, or rolled over it."""
+"""Motions that are partly computed: seated on the insert, or rolling and slipping over it."""
 
 from dataclasses import replace
 
@@ -17,12 +17,12 @@ from tkamb.knee.slip import condyle_slip, roll_slip_motion
 def seated_motion(
     motion: KneeMotion, femoral: Surface, insert: Surface, cutoff: Cutoff
 ) -> KneeMotion:
-    """Return the motion with a first guess for the coordinates that were not recorded.
+    """Return the motion with an initial guess of the coordinates that were not recorded.
 
     Rotations stay at zero. AP and ML bring the mean of the condyles' lowest points over the
     insert's origin, SI brings the femur down to first touch, all at the other coordinates.
-    They are where the search for the released coordinates begins in each frame; their rates,
-    which enter inertia and the direction of sliding, are those of this guess.
+    The search for the released coordinates begins there in each frame. Their rates, which enter
+    inertia and the direction of sliding, are those of this guess.
 
     Args:
         motion: as recorded; `motion.unrecorded` names what is missing.
@@ -44,10 +44,10 @@ def seated_motion(
                 place[index] -= np.mean(points, axis=0)[axis]
         if "si" in motion.unrecorded:
             place[KNEE_COORDINATES.index("si")] -= touch.travel(knee_pose(place))
-    lost = _first_lost(places, motion.time)
-    if lost is not None:
+    gap = _first_lost(places, motion.time)
+    if gap is not None:
         raise InputError(
-            f"the femur does not lie over the insert at {lost:.3g} s",
+            f"the femur does not lie over the insert at {gap:.3g} s",
             "[motion]",
             "record ap and ml, or check the meshes' units, axes and origins",
         )
@@ -79,10 +79,10 @@ def rolling_motion(
     recorded = condyle_slip(femoral, insert, split, motion.coordinates)
     slip = np.mean([side.slip for side in recorded if side is not None], axis=0)
     rolled = roll_slip_motion(femoral, insert, split, motion.coordinates, slip_share * slip)
-    lost = _first_lost(rolled, motion.time)
-    if lost is not None:
+    gap = _first_lost(rolled, motion.time)
+    if gap is not None:
         raise InputError(
-            f"the femur rolls off the insert at {lost:.3g} s",
+            f"the femur rolls off the insert at {gap:.3g} s",
             "[motion] motion = 'roll-slip'",
             "give it more of the recorded slip (slip_share) or take motion = 'recorded'",
         )
@@ -91,8 +91,8 @@ def rolling_motion(
 
 def _first_lost(places: Array, time: Array) -> float | None:
     """Return the first time (s) at which coordinates (f, 6) are not known."""
-    lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
-    return float(time[lost[0]]) if len(lost) else None
+    missing = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    return float(time[missing[0]]) if len(missing) else None
 
 
 def _with_coordinates(

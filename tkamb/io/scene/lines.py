@@ -42,12 +42,12 @@ def muscles(scene: Scene, chain: Chain) -> "tuple[Muscle, ...]":
     """
     from tkamb.knee.muscles import Muscle, check_muscles
 
-    left = scene.patient.side == "left"
+    is_left = scene.patient.side == "left"
     result = tuple(
         Muscle(
             table.name,
-            tuple(_point(end, left) for end in table.path),
-            _wrap(table.wrap, _bone(table.wrap.bone, chain, left)) if table.wrap else None,
+            tuple(_point(end, is_left) for end in table.path),
+            _wrap(table.wrap, _bone(table.wrap.bone, chain, is_left)) if table.wrap else None,
             NAN if table.force_N is None else table.force_N,
             table.group,
         )
@@ -61,14 +61,16 @@ def patellar_ligament(scene: Scene) -> "PatellarLigament | None":
     """Return the patellar ligament; None where the scene has none."""
     from tkamb.knee.muscles import PatellarLigament, SagittalWrap
 
-    table, left = scene.patellar_ligament, scene.patient.side == "left"
+    table, is_left = scene.patellar_ligament, scene.patient.side == "left"
     if table is None:
         return None
     wrap = None
     if table.wrap:
         wrap = SagittalWrap(table.band_mm * MILLIMETRE, table.half_thickness_mm * MILLIMETRE)
     length = NAN if table.length_mm is None else table.length_mm * MILLIMETRE
-    return PatellarLigament(_point(table.proximal, left), _point(table.distal, left), wrap, length)
+    return PatellarLigament(
+        _point(table.proximal, is_left), _point(table.distal, is_left), wrap, length
+    )
 
 
 def ligaments(scene: Scene) -> "tuple[Ligament, ...]":

@@ -21,7 +21,7 @@ from tkamb.io.scene.table import (
 
 
 class MarkerSegmentTable(SceneTable):
-    """A segment with skin markers: the shank, the thigh, or what hangs on one of them."""
+    """A segment with skin markers: the shank, the thigh, or a neighbour of one of them."""
 
     name: str = Field(description="'shank' and 'thigh' are the knee's; others are neighbours")
     markers_mm: dict[str, Vector] = Field(
@@ -41,8 +41,8 @@ class MarkerSegmentTable(SceneTable):
     @model_validator(mode="after")
     def _hangs_somewhere(self) -> Self:
         knee = self.name in ("shank", "thigh")
-        given = [v is not None for v in (self.joined_to, self.joint_mm, self.centre_mm)]
-        if any(given) if knee else not all(given):
+        present = [v is not None for v in (self.joined_to, self.joint_mm, self.centre_mm)]
+        if any(present) if knee else not all(present):
             raise ValueError(
                 "'joined_to', 'joint_mm' and 'centre_mm' go together, on every segment but "
                 "shank and thigh"

@@ -29,16 +29,16 @@ def scaled_case(case: "Case") -> "Case":
     """Return the case with its scene's `[patient] scale`.
 
     Raises:
-        InputError: the scene has [muscles] or markers, which have models of their own size, or
-            [measured], which is another subject's.
+        InputError: the scene has [muscles] or markers, whose models have their own size, or
+        [measured], which belongs to the unscaled subject.
     """
     s = case.scene.patient.scale
-    for there, table in (
+    for place, table in (
         (case.scene.muscles, "[muscles]"),
         (case.motion.markers, "[motion.markers]"),
         (case.scene.measured, "[measured]"),
     ):
-        if there is not None:
+        if place is not None:
             what, hint = f"cannot scale a scene with {table}", "scale its models, or leave it out"
             raise InputError(what, "[patient] scale", hint)
     return replace(

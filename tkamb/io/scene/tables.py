@@ -141,9 +141,11 @@ class LigamentTable(SceneTable):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        wanted = self.stiffness_N_per_mm if self.law == "two-line" else self.stiffness_N_per_strain
+        stiffness = (
+            self.stiffness_N_per_mm if self.law == "two-line" else self.stiffness_N_per_strain
+        )
         other = self.stiffness_N_per_strain if self.law == "two-line" else self.stiffness_N_per_mm
-        if wanted is None or other is not None:
+        if stiffness is None or other is not None:
             unit = "N_per_mm" if self.law == "two-line" else "N_per_strain"
             raise ValueError(f"law '{self.law}' takes stiffness_{unit}, and only that")
         if (self.slack_length_mm is None) == (self.reference_strain is None):

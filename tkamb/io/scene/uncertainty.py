@@ -1,4 +1,4 @@
-"""The scene's table [uncertainty]: by how much each input errs, as a standard deviation.
+"""The scene's table [uncertainty]: the standard deviation of the error of each input.
 
 Every key is one standard deviation of a normal distribution in the key's unit; those called
 relative are of a positive factor of mean 1 (lognormal). Zero: that input does not vary.
@@ -68,9 +68,10 @@ class SkinMarkerErrorSettings:
     axial_rotation_deg: float = 2.2
     """deg; an assumption: half the largest error of Benoit et al."""
     adduction_deg: float = 2.2
-    """deg; likewise."""
+    """deg; an assumption: half the largest error of Benoit et al."""
     flexion_deg: float = 2.2
-    """deg; likewise. A run of bands has it from the markers, if the scene takes it from them."""
+    """deg; an assumption: half the largest error of Benoit et al. Not used if flexion comes from
+    markers: their own deviation then counts."""
     thigh_mm: float = 10.0
     """mm, of each thigh marker in each direction; an assumption: a rigid fit of three markers
     240 mm apart is then off by 3 deg and 6 mm, a third of the largest errors in PMC8631460."""
@@ -140,7 +141,9 @@ class UncertaintyTable(SceneTable):
     )
     ground_reaction: Share = Field(0.02, description="relative, force and free moment" + _ASSUMED)
     centre_of_pressure_ap_mm: Length = Field(
-        3.0, description="laboratory x; default: Exell et al. 2012, 3 ± 2 mm"
+        3.0,
+        description="laboratory x; default: Exell et al. 2012 (PMID 23259242), 3 ± 2 mm for a "
+        "wheel that rolled from one force plate to the next, against markers",
     )
     centre_of_pressure_ml_mm: Length = Field(3.0, description="laboratory z; likewise")
     segment_mass: Share = Field(0.1, description="relative, all segments together" + _ASSUMED)
@@ -170,7 +173,8 @@ class UncertaintyTable(SceneTable):
     friction: Annotated[Number, Field(ge=0, le=0.5)] = Field(
         0.017,
         description="of the coefficient, which stays at or above 0; default: as wide as a "
-        "uniform distribution over 0.039 to 0.099, measured for CoCr on UHMWPE",
+        "uniform distribution over 0.039 to 0.099, measured for CoCr on UHMWPE at 3 to 9 MPa "
+        "(doi:10.1155/2015/185142, table 5)",
     )
     young_modulus: Share = Field(
         0.0,

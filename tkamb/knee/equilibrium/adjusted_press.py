@@ -20,6 +20,7 @@ from typing import Any
 
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, touches
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.units import MILLIMETRE
@@ -31,8 +32,8 @@ def press_adjusted(
     load: float,
     adjustment: Adjustment,
     query: ClosestPointQuery,
-    guess: ContactResult | None = None,
-) -> tuple[ContactResult, Adjustment]:
+    start: Guess | None = None,
+) -> tuple[ContactResult, Adjustment, WarmStart]:
     """Press the adjusted femur in, check the adjustment, undo its rotation if it must be.
 
     Args:
@@ -41,28 +42,28 @@ def press_adjusted(
         load: N, superior-inferior.
         adjustment: of the recorded pose, by `tkamb.geometry.adjustment.adjust`.
         query: closest points of the same pair.
-        guess: an earlier result, to save time.
+        start: an earlier result or warm start, to save time.
 
     Returns:
-        The contact, whose flags hold those of the adjustment, and the adjustment as it
-        was checked.
+        The contact, whose flags hold those of the adjustment, the adjustment as it was checked,
+        and the start of the next press.
 
     Raises:
         ComputationError: the femoral component does not lie over the insert.
     """
-    result = model.press(state, load, adjustment.pose, guess)
+    result, start = model.press_from(state, load, adjustment.pose, start)
     final = adjustment.coronal_angle == 0.0 or adjustment.restored
     if result.status is not ContactStatus.OK or final:
         adjustment = replace(adjustment, penetration=float(result.approach))
-        return _flagged(result, adjustment), adjustment
+        return _flagged(result, adjustment), adjustment, start
     checked, restore, doubts = _check(query, adjustment, result)
     if restore:
-        # At the recorded rotation the limit of the turn decides nothing any more.
+        # At the recorded rotation the limit of the turn has no effect.
         pose, translation, flags = moved_to_touch(query, checked.recorded, checked.settings)
         checked = replace(checked, pose=pose, translation=translation, restored=True, flags=flags)
-        result = model.press(state, load, pose, result)
+        result, start = model.press_from(state, load, pose, start)
     checked = replace(checked, flags=(*checked.flags, *doubts))
-    return _flagged(result, checked), checked
+    return _flagged(result, checked), checked, start
 
 
 def _flagged(result: ContactResult, adjustment: Adjustment) -> ContactResult:
@@ -82,8 +83,8 @@ def _check(
     deeper = penetration - abs(adjustment.translation)
     angle_excess = (abs(angle) - abs(adjustment.coronal_angle)) * distance
     margin = settings.input_change
-    # Where the angle passes the turn, the turn is as small as the angle: if the mesh calls that
-    # level, restoring changes nothing.
+    # Where the final angle is about as large as the turn and both are below what a mesh resolves,
+    # restoring the rotation changes nothing.
     tilted = abs(angle) * distance > settings.level_difference
     outcomes = {
         _restored(settings.restore_when, *exceeded)
@@ -94,8 +95,9 @@ def _check(
     doubts: tuple[str, ...] = ()
     if len(outcomes) > 1:
         doubts = (
-            f"femoral adjustment: {margin / MILLIMETRE:g} mm of the recorded pose decides whether "
-            "the recorded rotation is restored, and the split with it",
+            f"femoral adjustment: a change of the recorded pose by {margin / MILLIMETRE:g} mm "
+            f"decides "
+            "whether the recorded rotation is restored; the medial-lateral split depends on it",
         )
     restore = _restored(settings.restore_when, deeper > 0, angle_excess > 0)
     checked = replace(adjustment, penetration=penetration, final_angle=angle)

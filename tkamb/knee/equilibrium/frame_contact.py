@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tkamb.contact.area import area_above
 from tkamb.contact.result import ContactResult
+from tkamb.contact.warm_start import WarmStart
 from tkamb.geometry.adjustment import Adjustment
 
 if TYPE_CHECKING:
@@ -28,13 +29,13 @@ class FrameContact:
         seconds: computing time.
         problem: why there is no result, or empty.
         flags: plain words that a reader must know.
-        iterations: of body and contact, until they agreed; 0 if not coupled.
-        load_change: N, by the last of them.
-        point_change: m, likewise, of the centres of pressure.
+        iterations: iterations between body and contact until convergence; 0 if not coupled.
+        load_change: N, change of the load in the last iteration.
+        point_change: m, change of the centres of pressure in the last iteration.
         equilibrium: the search for the released coordinates, if there are any.
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
-        turned: the contact with a little more adduction from which that was found, if one was.
+        start: where a contact of the next frame may begin; None where there is no result.
         triangles: (k, 3) of the map.
         post: cam and post, where the scene asks for their contact.
     """
@@ -50,7 +51,7 @@ class FrameContact:
     point_change: float = NAN
     equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
-    turned: ContactResult | None = None
+    start: WarmStart | None = None
     triangles: NDArray[np.int64] | None = None
     post: "PostContact | None" = None
 

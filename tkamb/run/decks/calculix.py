@@ -25,7 +25,7 @@ class CalculixDeckSettings:
     """What a deck for CalculiX states."""
 
     penalty: float = 1e5
-    """N/mm³; contact stiffness. At 30 MPa surfaces overlap by 0.3 µm."""
+    """N/mm³; contact stiffness. Chosen: at 30 MPa surfaces overlap by 0.3 µm."""
 
 
 CALCULIX_DECK = CalculixDeckSettings()
@@ -67,8 +67,10 @@ class Deck:
         Raises:
             InputError: the material's law or the bearing is not one of CalculiX's here.
         """
-        said = [f"** {line}" for line in self.comments]
-        return "\n".join([*said, *self._mesh(), *self._sets(), *self._solids(), *self._step(), ""])
+        comments = [f"** {line}" for line in self.comments]
+        return "\n".join(
+            [*comments, *self._mesh(), *self._sets(), *self._solids(), *self._step(), ""]
+        )
 
     @property
     def _centre(self) -> int:

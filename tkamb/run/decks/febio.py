@@ -29,7 +29,8 @@ class FebioDeckSettings:
     """What a deck for FEBio states."""
 
     load_steps: int = 10
-    """Steps in which the displacement is applied; FEBio halves them by itself where one fails."""
+    """Steps in which the displacement is applied. Chosen: FEBio halves them by itself where one
+    fails."""
 
 
 FEBIO_DECK = FebioDeckSettings()
@@ -192,10 +193,10 @@ def _course_and_output(root: Element) -> None:
 
 def _filled(parent: Element, tag: str, **values: object) -> Element:
     """Return a new child with one leaf per value."""
-    made = SubElement(parent, tag)
+    element = SubElement(parent, tag)
     for name, value in values.items():
-        SubElement(made, name).text = str(value)
-    return made
+        SubElement(element, name).text = str(value)
+    return element
 
 
 def _members(parent: Element, tag: str, first: int, members: Index) -> None:

@@ -27,9 +27,11 @@ class DeckSettings:
     """Which nodes of a deck may touch."""
 
     touchable_depths: float = 2.0
-    """Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
+    """Multiple of the guessed depth: nodes whose gap at first touch is smaller can be touched.
+    Chosen: the guess is off by less."""
     largest_normal_y: float = -0.3
-    """Largest y of a femoral normal that takes part."""
+    """Largest y of a femoral normal that takes part. Chosen: faces that look farther sideways do
+    not press on the insert."""
 
 
 DECK = DeckSettings()
@@ -88,10 +90,12 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
         raise ComputationError("needs a load that presses the bodies together", "deck")
     places, _ = floor.over(surface.points, pair.pose_at_approach(pose, 0.0))
     near = places[:, 1] - surface.points[:, 1] < DECK.touchable_depths * depth
-    placed = pair.pose_at_approach(pose, depth)
-    patch = _patch(pair.femoral.moved(placed), surface.points[near], grid_mm * MILLIMETRE)
+    pressed_pose = pair.pose_at_approach(pose, depth)
+    patch = _patch(pair.femoral.moved(pressed_pose), surface.points[near], grid_mm * MILLIMETRE)
     lattice = replace(lattice, nodes=smooth)
-    return PressProblem(pair, lattice, nodes, surface, floor, placed, depth, near, patch, load)
+    return PressProblem(
+        pair, lattice, nodes, surface, floor, pressed_pose, depth, near, patch, load
+    )
 
 
 def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:

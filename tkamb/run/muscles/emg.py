@@ -32,9 +32,9 @@ class EmgGuide:
 
     def applied(self, problem: LoadSharing, k: int) -> LoadSharing:
         """Return the problem of frame k with its envelopes in it."""
-        known, expected = np.isfinite(self.envelope[k]), np.nan_to_num(self.envelope[k])
+        finite, expected = np.isfinite(self.envelope[k]), np.nan_to_num(self.envelope[k])
         if self.use == "target":
-            spread = np.where(known, self.size**-0.5, np.inf)
+            spread = np.where(finite, self.size**-0.5, np.inf)
             return replace(problem, expected=expected, spread=spread)
         low, high = (
             np.clip(expected + sign * self.size, problem.lowest, problem.highest)
@@ -42,6 +42,6 @@ class EmgGuide:
         )
         return replace(
             problem,
-            lowest=np.where(known, low, problem.lowest),
-            highest=np.where(known, high, problem.highest),
+            lowest=np.where(finite, low, problem.lowest),
+            highest=np.where(finite, high, problem.highest),
         )

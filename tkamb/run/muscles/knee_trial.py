@@ -92,8 +92,8 @@ class KneeTrial:
         row = np.where(self.extensor, extensor_arm, 0.0)
         row[self.crossing] = arms
         # a muscle without a taut path keeps its NaN, so that the frame fails by its name
-        lost = np.isnan(table[0]).any(axis=1)
-        table[0, :, self.flexion] = np.where(lost, np.nan, row)
+        missing = np.isnan(table[0]).any(axis=1)
+        table[0, :, self.flexion] = np.where(missing, np.nan, row)
         guide = None if whole.guide is None else whole.guide.only(k)
         frame = replace(
             whole,
@@ -173,8 +173,8 @@ def _crossing_lines(
         (0, first, "tibia", links.tibia),
         (1, 1 - first, "femur", links.femur),
     ):
-        here = bones.poses[part.frame, bones.index(bone)] @ own
-        ends[side, part.frame, column] = transform(inverse(here), part.ends[rows, end][:, None])[
+        pose = bones.poses[part.frame, bones.index(bone)] @ own
+        ends[side, part.frame, column] = transform(inverse(pose), part.ends[rows, end][:, None])[
             :, 0
         ]
     return crossing, ends[0], ends[1]

@@ -31,7 +31,8 @@ class ModelMatchSettings:
     """When two muscle lines are the same."""
 
     tolerance: float = 1e-6
-    """Relative, or m; strengths, lengths and points that differ by less are the same."""
+    """Relative, or m: strengths, lengths and points that differ by less are the same. Chosen: above
+    the rounding of files."""
 
 
 MODEL_MATCH = ModelMatchSettings()
@@ -57,8 +58,8 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
     followers = {coupler.dependent for coupler in leg.model.couplers}
 
     def own(joint: Joint) -> list[str]:
-        there = leg.model.coordinates.values()
-        result = [c for c in there if c.joint == joint.name]
+        coordinates = leg.model.coordinates.values()
+        result = [c for c in coordinates if c.joint == joint.name]
         return [c.name for c in result if not c.locked and c.name not in followers]
 
     below = [joint for joint in leg.model.joints if joint.inboard == leg.ankle.outboard]

@@ -29,10 +29,11 @@ class SharedMuscleSettings:
     """Muscles shared between the joints of a leg."""
 
     max_offset: float = 0.5 * MILLIMETRE
-    """m; how far the insert and the hip of the URDF may lie from those of the muscle model."""
+    """m; how far the insert and the hip of the URDF may lie from those of the muscle model. Chosen:
+    rounding of the two files is smaller."""
     max_iterations: int = 8
     """Iterations between muscle forces and the lines that they turn; what is open afterwards is
-    reported."""
+    reported. Chosen: frames that converge need fewer."""
 
 
 SHARED_MUSCLES = SharedMuscleSettings()
@@ -43,18 +44,18 @@ class SharedMuscles:
 
     Args:
         trial: the muscles over the frames.
-        left: a left leg's, whose knee is computed as its mirror image.
+        is_left: whether it is a left leg, whose knee is computed as its mirror image.
 
     Attributes:
         trial: as given.
     """
 
-    def __init__(self, trial: KneeTrial, left: bool = False) -> None:
-        flip = MIRROR if left else np.eye(3)
-        self.trial, self._left, self._names = trial, left, trial.muscles
+    def __init__(self, trial: KneeTrial, is_left: bool = False) -> None:
+        flip = MIRROR if is_left else np.eye(3)
+        self.trial, self._left, self._names = trial, is_left, trial.muscles
         self._shank, self._thigh = trial.shank @ flip, trial.thigh @ flip
         self._knee = trial.knee
-        if left and trial.knee is not None:
+        if is_left and trial.knee is not None:
             self._knee = mirrored_pose(trial.knee)
 
     @property
@@ -266,15 +267,15 @@ def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
 
 def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
     """Raise unless the model's insert and hip lie where the URDF has them."""
-    left, table = case.scene.patient.side == "left", case.scene.muscles
+    is_left, table = case.scene.patient.side == "left", case.scene.muscles
     assert table is not None
-    insert = mirrored_pose(insert_in_tibia) if left else insert_in_tibia
-    centre = MIRROR @ hip if left else hip
-    for name, here, there in (
+    insert = mirrored_pose(insert_in_tibia) if is_left else insert_in_tibia
+    centre = MIRROR @ hip if is_left else hip
+    for name, ours, theirs in (
         ("insert", insert[:3, 3], case.chain.insert_in_tibia[:3, 3]),
         ("hip", centre, case.chain.link_in("hip", "femur")[:3, 3]),
     ):
-        apart = float(np.linalg.norm(here - there))
+        apart = float(np.linalg.norm(ours - theirs))
         if apart > SHARED_MUSCLES.max_offset:
             raise InputError(
                 f"has its {name} {apart / MILLIMETRE:.1f} mm from where the URDF has it",

@@ -19,8 +19,8 @@ class SharingSettings:
     """When a solution of the static optimisation is accepted."""
 
     kkt_tolerance: float = 1e-8
-    """Relative; largest violation of the optimality conditions (Karush, Kuhn and Tucker) with which
-    a frame is kept."""
+    """Relative: largest violation of the optimality conditions (Karush, Kuhn and Tucker) with which
+    a frame is kept. Chosen: above what the solver leaves."""
 
 
 SHARING = SharingSettings()
@@ -108,15 +108,15 @@ class FrameProblems:
         """Return why frame k cannot be asked for, None if it can."""
         if not np.isfinite(self.moment[k]).all():
             return "an external load is not known"
-        for lost, why in (
+        for missing, why in (
             (~np.isfinite(self.arms[k]).all(axis=1), "no taut path of"),
             (
                 ~np.isfinite(self.active[k]),
                 f"fibres beyond {HILL.longest_fibre_ratio:g} optimal lengths in",
             ),
         ):
-            if lost.any():
-                names = [self.muscles[i].name for i in np.flatnonzero(lost)]
+            if missing.any():
+                names = [self.muscles[i].name for i in np.flatnonzero(missing)]
                 return f"{why} {', '.join(names)}"
         return None
 
@@ -124,13 +124,13 @@ class FrameProblems:
         """Return the problem of frame k."""
         count, reserve = len(self.muscles), self.sharing.reserves(self.coordinates)
         none = reserve == 0.0
-        turned = self.arms[k].T
+        transposed = self.arms[k].T
         problem = LoadSharing(
             weight=_weights(self.muscles, self.sharing),
             lowest=np.full(count, self.sharing.lowest),
             highest=np.full(count, self.sharing.highest),
-            offset=self.moment[k] - turned @ self.passive[k],
-            gain=-turned * self.active[k],
+            offset=self.moment[k] - transposed @ self.passive[k],
+            gain=-transposed * self.active[k],
             lower=np.where(none, 0.0, -np.inf),
             upper=np.where(none, 0.0, np.inf),
             reserve=np.where(none, np.inf, reserve),

@@ -90,8 +90,10 @@ class MuscleTrial:
         if "patella" in self.bones.names:
             patella = self.bones.attachments("patella", "tibia").points
             other = [None, "femur"]
-            held = [self.bones.attachments("patella", bone).points for bone in other]
-            ends = np.isfinite(held).any(axis=(0, 1, 3)) & ~np.isfinite(patella).any(axis=(0, 2))
+            attachments = [self.bones.attachments("patella", bone).points for bone in other]
+            ends = np.isfinite(attachments).any(axis=(0, 1, 3)) & ~np.isfinite(patella).any(
+                axis=(0, 2)
+            )
             if ends.any():
                 names = [self.muscles[k] for k in np.flatnonzero(ends)]
                 raise InputError(
@@ -167,25 +169,25 @@ def trial_problems(
     balanced = leg_coordinates(leg) if sharing.coordinates is None else sharing.coordinates
     _check(kinematics, motion, loads, names, balanced, sharing)
     q, groups = motion.q, leg_bones(leg)
-    placed = kinematics.motion(q)
-    needed = required_wrenches(kinematics, placed, q, motion.rates, motion.accelerations, loads)
+    bones = kinematics.motion(q)
+    needed = required_wrenches(kinematics, bones, q, motion.rates, motion.accelerations, loads)
     own = kinematics.coupling(q)[:, :, [kinematics.coordinates[name] for name in balanced]]
-    moment = np.einsum("fbin,fbi,fnc->fc", placed.twists, needed, own, optimize=True)
+    moment = np.einsum("fbin,fbi,fnc->fc", bones.twists, needed, own, optimize=True)
     pulls = LineSet(kinematics, names).pulls(q, list(groups.values()))
     arms = pulls.moment_arms @ own
     active, passive = _strength(kinematics, motion, sharing, pulls)
     muscles = [model.muscles[name] for name in names]
     problem = FrameProblems(muscles, balanced, sharing, moment, arms, active, passive)
-    return problem, _bones(groups, placed, needed, pulls)
+    return problem, _bones(groups, bones, needed, pulls)
 
 
 def _bones(
-    groups: Mapping[str, Sequence[str]], placed: Motion, needed: Array, pulls: Pulls
+    groups: Mapping[str, Sequence[str]], bones: Motion, needed: Array, pulls: Pulls
 ) -> Bones:
     """Return the bones, of what each body needs (f, bodies, 6) and the muscles' pulls on groups."""
-    places = [[placed.bodies[name] for name in bodies] for bodies in groups.values()]
+    places = [[bones.bodies[name] for name in bodies] for bodies in groups.values()]
     demand = np.stack([needed[:, place].sum(axis=1) for place in places], axis=1)
-    poses = placed.poses[:, [place[0] for place in places]]
+    poses = bones.poses[:, [place[0] for place in places]]
     return Bones(tuple(groups), pulls.names, poses, pulls.wrenches, demand, pulls.crossings)
 
 
@@ -218,14 +220,14 @@ def _check(
 ) -> None:
     """Raise an InputError for what is not there or out of range."""
     where, model = kinematics.model.name, kinematics.model
-    for what, asked, known in (
+    for what, names, available in (
         ("body", loads, model.bodies),
         ("muscle", muscles, model.muscles),
         ("coordinate", coordinates, model.coordinates),
     ):
-        for name in asked:
-            if name not in known:
-                raise InputError(f"has no {what} '{name}'", where, names_near(name, known))
+        for name in names:
+            if name not in available:
+                raise InputError(f"has no {what} '{name}'", where, names_near(name, available))
     if not muscles or not coordinates or len(set(coordinates)) < len(coordinates):
         raise InputError("needs muscles and coordinates, each once", where)
     for name in coordinates:

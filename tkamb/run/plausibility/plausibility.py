@@ -98,26 +98,28 @@ class Plausibility:
 
 
 def _answered(
-    asked: Sequence[Question], answers: Mapping[str, str]
+    questions: Sequence[Question], answers: Mapping[str, str]
 ) -> tuple[tuple[Question, ...], tuple[str, ...]]:
     """Return the questions without an answer, and those with one in words.
 
     Args:
-        asked: all of them.
+        questions: all questions of the scene.
         answers: words of a question's text -> its answer.
     """
-    left, text = list(asked), []
+    unanswered, text = list(questions), []
     for words, answer in answers.items():
-        own = [question for question in left if words and words.lower() in question.text.lower()]
+        own = [
+            question for question in unanswered if words and words.lower() in question.text.lower()
+        ]
         if not own:
-            texts = "; ".join(question.text for question in left) or "there is none"
+            texts = "; ".join(question.text for question in unanswered) or "there is none"
             hint = f"leave it out, or take words of one that is asked: {texts}"
             raise InputError(f"no question holds '{words}'", ANSWERS, hint)
         if not answer.strip():
             raise InputError(f"'{words}' has no answer", ANSWERS, "say why the input is right")
         text += [f"Answered: {question.text} {answer}" for question in own]
-        left = [question for question in left if question not in own]
-    return tuple(left), tuple(text)
+        unanswered = [question for question in unanswered if question not in own]
+    return tuple(unanswered), tuple(text)
 
 
 def _line_questions(mechanics: "Mechanics") -> list[Question]:

@@ -23,11 +23,11 @@ class SegmentLimitSettings:
     max_patella_offset: float = 0.05
     """m; of the patella's centre of mass from its origin."""
     max_insert_rotation: float = 20.0 * DEGREE
-    """rad; from the tibia's axes. The slope is up to 10 deg, and the axis of a shank may be laid
-    through other points."""
+    """rad; from the tibia's axes. Chosen: the slope is up to 10 deg, and the axis of a shank may be
+    laid through other points."""
     max_centre_offset: float = 0.12
-    """Share of a segment's length by which its centre of mass may lie beside its axis; with the
-    foot, which points forward, twice as much."""
+    """Share of a segment's length by which its centre of mass may lie beside its axis. Chosen: with
+    the foot, which points forward, twice as much."""
 
 
 SEGMENT_LIMITS = SegmentLimitSettings()
@@ -100,18 +100,18 @@ def _of_patella(case: Case) -> Iterator[Question]:
     mass, centre, tensor = case.chain.segment("patella")
     radii = np.sqrt(np.linalg.eigvalsh(tensor) / mass)
     if radii[0] < PATELLA_RADII[0] or radii[-1] > PATELLA_RADII[1]:
-        shown = " to ".join(f"{radius / MILLIMETRE:.3g}" for radius in radii[[0, -1]])
+        words = " to ".join(f"{radius / MILLIMETRE:.3g}" for radius in radii[[0, -1]])
         yield Question(
-            f"the radii of gyration of 'patella' are {shown} mm: is its <inertia> in kg·m²?",
+            f"the radii of gyration of 'patella' are {words} mm: is its <inertia> in kg·m²?",
             "inertia of patella unlike a patella's",
         )
     if (
         not PATELLA_MASS[0] <= mass <= PATELLA_MASS[1]
         or np.linalg.norm(centre) > SEGMENT_LIMITS.max_patella_offset
     ):
-        shown = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
+        words = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
         yield Question(
-            f"'patella' of the URDF weighs {mass:.3g} kg, its centre of mass at ({shown}) mm: is "
+            f"'patella' of the URDF weighs {mass:.3g} kg, its centre of mass at ({words}) mm: is "
             "its <inertial> in kilograms and metres?",
             "mass or centre of patella unlike a patella's",
         )
@@ -127,9 +127,9 @@ def _of_inertia(case: Case, link: str, end: Array) -> Iterator[Question]:
     if not CENTRE[0] <= share <= CENTRE[1] or aside > SEGMENT_LIMITS.max_centre_offset * (
         2 if link == "tibia" else 1
     ):
-        shown = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
+        words = ", ".join(f"{value / MILLIMETRE:.0f}" for value in centre)
         yield Question(
-            f"the centre of mass of '{link}' is at ({shown}) mm, off its segment: is the origin "
+            f"the centre of mass of '{link}' is at ({words}) mm, off its segment: is the origin "
             "of its <inertial> right, sign and unit?",
             f"centre of mass of {link} off its segment",
         )

@@ -26,15 +26,15 @@ class SignSettings:
     """When a sign is asked about."""
 
     frames: int = 15
-    """Looked at, evenly over the motion; more change the spreads by some per cent."""
+    """Looked at, evenly over the motion. Chosen: more change the spreads by some per cent."""
     ap_spread: float = 0.6 * MILLIMETRE
     """M, of the mean gap, below which AP is not asked about. Fluoroscopy of subject DM has 0.3 mm,
     and 1.3 mm with the sign turned."""
     ap_share: float = 0.5
     """Of that spread, what is left with the sign turned: 0.25 for DM."""
     turn_spread: float = 0.1 * MILLIMETRE
-    """M, of the difference between the condyles' gaps, below which rotation is not asked about: a
-    mesh of 1 mm facets makes 0.05 mm."""
+    """m: spread of the difference between the condyles' gaps below which rotation is not asked
+    about. Chosen: a mesh of 1 mm facets makes 0.05 mm."""
     turn_share: float = 0.7
     """Of that spread, what is left with the sign turned: 0.43 to 0.62 for the two readings of DM;
     1.6 and more where the signs are right."""
@@ -67,11 +67,11 @@ def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator
         return
     rides = float(recorded.mean(axis=1).std())
     if not free & {"ap", "si"} and rides > settings.ap_spread:
-        turned = float(_turned_gaps(clearance, coordinates[rows], "ap").mean(axis=1).std())
-        if turned < settings.ap_share * rides:
+        flipped = float(_turned_gaps(clearance, coordinates[rows], "ap").mean(axis=1).std())
+        if flipped < settings.ap_share * rides:
             yield Question(
                 f"the femur rides up and down by {rides / MILLIMETRE:.1f} mm (rms) over the "
-                f"insert, by {turned / MILLIMETRE:.1f} mm with the sign of AP turned: is "
+                f"insert, by {flipped / MILLIMETRE:.1f} mm with the sign of AP turned: is "
                 'anterior negative in the file? then [motion] signs_turned = ["ap"], or that of '
                 "its translation",
                 "sign of AP may be turned",
@@ -80,14 +80,14 @@ def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator
     tilts = _difference(recorded)
     if free & {"axial_rotation", "adduction"} or tilts < settings.turn_spread:
         return
-    turned = min(
+    flipped = min(
         _difference(_turned_gaps(clearance, coordinates[rows], name))
         for name in ("axial_rotation", "adduction")
     )
-    if turned < settings.turn_share * tilts:
+    if flipped < settings.turn_share * tilts:
         yield Question(
             f"the condyles' gaps differ by {tilts / MILLIMETRE:.2f} mm (rms about their mean), "
-            f"by {turned / MILLIMETRE:.2f} mm with the sign of axial rotation, or of adduction, "
+            f"by {flipped / MILLIMETRE:.2f} mm with the sign of axial rotation, or of adduction, "
             "turned: is one of them another way round in the file? then [motion] signs_turned = "
             '["axial_rotation"], or that of its rotation',
             "sign of axial rotation or adduction may be turned",
@@ -108,9 +108,9 @@ def _gaps(clearance: "FirstTouch", coordinates: Array) -> Array:
 
 def _turned_gaps(clearance: "FirstTouch", coordinates: Array, name: str) -> Array:
     """Return the clearances with the sign of one coordinate turned."""
-    turned = coordinates.copy()
-    turned[:, KNEE_COORDINATES.index(name)] *= -1.0
-    return _gaps(clearance, turned)
+    flipped = coordinates.copy()
+    flipped[:, KNEE_COORDINATES.index(name)] *= -1.0
+    return _gaps(clearance, flipped)
 
 
 def _difference(gaps: Array) -> float:

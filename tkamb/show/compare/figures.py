@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 5.4, 2.7
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
-"""So that runs that lie on each other, and readers who see no colour, tell them apart."""
+"""Line styles, so that runs can be distinguished without colour and where they coincide."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class CompareFigureSettings:
     """Pictures of compared runs."""
 
     failed_row_height: float = 0.03
-    """Share of a picture's height; of the crosses of failed frames above the bottom, and from one
-    run to the next."""
+    """1: height of the crosses of failed frames above the bottom, and their distance from run to
+    run, as a share of the picture's height. Chosen by looks."""
 
 
 COMPARE_FIGURE = CompareFigureSettings()
@@ -38,7 +38,7 @@ COMPARE_FIGURE = CompareFigureSettings()
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """What one picture shows of every run.
+    """Quantity of one picture.
 
     Args:
         title: what it is.
@@ -111,10 +111,10 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
     colour, dashes = run_colour(number), DASHES[number % len(DASHES)]
     marker = "o" if len(values) == 1 else ""  # a line of one point would not be seen
     axes.plot(x, y, color=colour, linestyle=dashes, gid=f"run-{number}", marker=marker)
-    lost = failed(run.results)
-    height = np.full(int(lost.sum()), COMPARE_FIGURE.failed_row_height * (1 + number))
+    failures = failed(run.results)
+    height = np.full(int(failures.sum()), COMPARE_FIGURE.failed_row_height * (1 + number))
     axes.plot(
-        run.axis.values[lost], height, "x", color=colour, markersize=5,
+        run.axis.values[failures], height, "x", color=colour, markersize=5,
         transform=axes.get_xaxis_transform(), gid=f"failed-{number}",
     )  # fmt: skip
 
@@ -125,11 +125,11 @@ def shown_frame(comparison: Comparison) -> int:
     0 where no frame has a force.
     """
     force = comparison.runs[0].results["force_total_BW"]
-    known = np.isfinite(force)
-    if not known.any():
+    finite = np.isfinite(force)
+    if not finite.any():
         return 0
     maps = np.sum([_mapped(run, len(force)) for run in comparison.runs], axis=0)
-    return int(np.nanargmax(np.where(maps == maps[known].max(), force, np.nan)))
+    return int(np.nanargmax(np.where(maps == maps[finite].max(), force, np.nan)))
 
 
 def _mapped(run: Run, frames: int) -> Index:

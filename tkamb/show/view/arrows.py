@@ -24,7 +24,7 @@ class ArrowSettings:
     """Arrows of the viewer."""
 
     contact_point_radius: float = 0.6 * MILLIMETRE
-    """m; radius of the sphere at a centre of pressure."""
+    """m; radius of the sphere at a centre of pressure. Chosen: it is seen and hides little."""
 
 
 ARROW = ArrowSettings()
@@ -106,8 +106,8 @@ def _hip(geometry: KneeGeometry) -> Array:
 
 
 def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Arrow]:
-    """Return the tendons' pulls, and what the femur presses on the patella."""
-    made = []
+    """Return the forces of the tendons, and the force of the femur on the patella."""
+    arrows = []
     for name, column, meaning in (
         ("quadriceps", "quadriceps_N", "on the patella"),
         ("patellar ligament", "patellar_ligament_N", "on the tibia"),
@@ -115,7 +115,7 @@ def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Ar
         ends = [_distal_end(one, name) for one in geometries]
         points = np.stack([point for point, _ in ends])
         forces = results[column][:, None] * np.stack([pull for _, pull in ends])
-        made.append(Arrow(name, FORCE_COLOURS[name], points, forces, False, meaning))
+        arrows.append(Arrow(name, FORCE_COLOURS[name], points, forces, False, meaning))
     normal, across, points = (
         np.stack(rows) for rows in zip(*map(_patella, geometries), strict=True)
     )
@@ -124,8 +124,8 @@ def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Ar
         + results["patellofemoral_tangential_N"][:, None] * across
     )
     name = "patellofemoral"
-    made.append(Arrow(name, FORCE_COLOURS[name], points, -forces, True, "on the femur"))
-    return made
+    arrows.append(Arrow(name, FORCE_COLOURS[name], points, -forces, True, "on the femur"))
+    return arrows
 
 
 def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
@@ -161,7 +161,7 @@ def _condyles(
         )
         points = np.stack([one.state.pose("femur")[:3, 3] for one in geometries])
         return [Arrow("knee", FORCE_COLOURS["knee"], points, forces, True, "on the tibia")]
-    made = []
+    arrows = []
     for side in ("medial", "lateral"):
         points = np.stack([_condyle_point(one, side) for one in geometries])
         ways = np.stack(
@@ -172,8 +172,8 @@ def _condyles(
         )
         forces = -results[f"{side}_force_equilibrium_N"][:, None] * ways
         name = f"{side} condyle"
-        made.append(Arrow(name, FORCE_COLOURS[name], points, forces, True, "on the insert"))
-    return made
+        arrows.append(Arrow(name, FORCE_COLOURS[name], points, forces, True, "on the insert"))
+    return arrows
 
 
 def _condyle_point(geometry: KneeGeometry, side: str) -> Array:

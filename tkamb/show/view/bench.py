@@ -1,16 +1,14 @@
 """A knee on a bench: one pose, an axial load, placement and ligaments changed by hand.
 
 What `tkamb live` computes. A `BenchRequest` is turned into a case that stands still: no muscles,
-no patella; the axial load presses along the tibia's long axis through the insert's origin. It is
-computed by the same code as a frame of a run, so that the scene which `write_bench` writes gives
-the same numbers by `tkamb run`.
+no patella; the axial load presses along the tibia's long axis through the place of the insert's
+origin as recorded. It is computed by the same code as a frame of a run, so that the scene which
+`bench_scene.write_bench` writes gives the same numbers by `tkamb run`.
 """
 
-import csv
-import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from pathlib import Path
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +18,7 @@ from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
     Array,
+    cross,
     inverse,
     knee_coordinates,
     knee_pose,
@@ -31,6 +30,7 @@ from tkamb.io.recordings.motion import KneeMotion
 from tkamb.io.recordings.tibia import BodyMotion
 from tkamb.io.scene.case import Case
 from tkamb.knee.load import LinkPoint
+from tkamb.show.view.bench_scene import STILL
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -38,30 +38,43 @@ if TYPE_CHECKING:
 
 ROWS = 6
 """Equal rows of the tables: accelerations need as many."""
-ANGLES = ("flexion_deg", "adduction_deg", "axial_rotation_deg")
-LENGTHS = ("ap_mm", "ml_mm")
 
 
 @dataclass(frozen=True)
 class BenchLimitSettings:
     """How far the sliders of `tkamb live` go."""
 
-    angle_deg: float = 180.0
-    """deg; largest angle of the knee that is accepted."""
+    flexion_deg: tuple[float, float] = (-20.0, 160.0)
+    """deg; least and largest flexion. With a component turned by `placement_deg` it stays within
+    what a scene accepts, so that every state can be saved."""
+    adduction_deg: float = 20.0
+    """deg; largest varus or valgus, likewise."""
+    axial_rotation_deg: float = 60.0
+    """deg; largest axial rotation either way, likewise."""
     length_mm: float = 60.0
-    """mm; largest translation of the knee that is accepted."""
+    """mm; largest translation of the knee that is accepted. Chosen: the femur is then beside the
+    insert."""
     placement_deg: float = 20.0
-    """deg; largest change of a component's orientation."""
+    """deg; largest change of a component's orientation. Chosen: no component is placed as far
+    off."""
     placement_mm: float = 20.0
     """mm; largest change of a component's position."""
-    load_N: float = 20_000.0
-    """N; largest axial load."""
+    load_N: float = 15_000.0
+    """N; largest axial load. With the shank's weight it stays below what a force plate may read."""
     slack_percent: float = 20.0
-    """%; largest change of the ligaments' slack length, either way."""
+    """%; largest change of the ligaments' slack length, either way. Chosen: ligaments of the knee
+    rupture at 12 to 20 %."""
     finest_mm: float = 0.5
     """mm; finest map."""
+    coarsest_mm: float = 10.0
+    """mm; coarsest map, as `MapGridSettings`."""
+    thickness_mm: tuple[float, float] = (4.0, 25.0)
+    """mm; thinnest and thickest insert of a parametric design. Inserts are sold from 6 to 20 mm."""
+    kept_models: int = 8
+    """Prepared contact models that are kept: of a lattice each takes 0.1 to 0.5 GB."""
     first_penetration: float = 5e-5
-    """m; penetration at which a search for released coordinates begins."""
+    """m; penetration at which a search for released coordinates begins. Chosen: as in
+    `initial_pose.first_penetration`."""
 
 
 BENCH_LIMIT = BenchLimitSettings()
@@ -102,13 +115,13 @@ class BenchRequest:
         flexion_deg: Grood and Suntay's, as `adduction_deg` (varus) and `axial_rotation_deg`
             (femur external).
         ap_mm: of the femoral component in the insert frame, as `ml_mm`.
-        load_N: axial, along the tibia, through the insert's origin.
+        load_N: axial, along the tibia, through the insert's origin as recorded.
         femoral: placement of the femoral component on the femur.
         tibial: placement of the insert on the tibia.
         slack_percent: change of all ligaments' slack lengths.
         released: coordinates that find their equilibrium.
         contact: name of the contact model; resolution_mm its spacing.
-        frame: of the recorded motion, whose height is where a search begins.
+        thickness_mm: of the insert at its thinnest, where its design is parametric; None: as it is.
     """
 
     flexion_deg: float = 0.0
@@ -123,6 +136,7 @@ class BenchRequest:
     released: tuple[str, ...] = ()
     contact: str = "foundation"
     resolution_mm: float = 2.0
+    thickness_mm: float | None = None
 
     @staticmethod
     def read(values: Mapping[str, Any]) -> "BenchRequest":
@@ -143,6 +157,8 @@ class BenchRequest:
                 made[key] = _released(value)
             elif key == "contact":
                 made[key] = str(value)
+            elif key == "thickness_mm" and value is None:
+                made[key] = None
             else:
                 made[key] = _number(key, value, *_range(key))
         return BenchRequest(**made)
@@ -161,21 +177,23 @@ class BenchRequest:
 
 def _range(key: str) -> tuple[float, float]:
     limits = BENCH_LIMIT
-    if key in ANGLES:
-        return -limits.angle_deg, limits.angle_deg
-    if key in LENGTHS:
-        return -limits.length_mm, limits.length_mm
-    if key == "load_N":
-        return 0.0, limits.load_N
-    if key == "slack_percent":
-        return -limits.slack_percent, limits.slack_percent
-    return limits.finest_mm, 10.0
+    return {
+        "flexion_deg": limits.flexion_deg,
+        "adduction_deg": (-limits.adduction_deg, limits.adduction_deg),
+        "axial_rotation_deg": (-limits.axial_rotation_deg, limits.axial_rotation_deg),
+        "ap_mm": (-limits.length_mm, limits.length_mm),
+        "ml_mm": (-limits.length_mm, limits.length_mm),
+        "load_N": (0.0, limits.load_N),
+        "slack_percent": (-limits.slack_percent, limits.slack_percent),
+        "resolution_mm": (limits.finest_mm, limits.coarsest_mm),
+        "thickness_mm": limits.thickness_mm,
+    }[key]
 
 
 def _number(key: str, value: Any, low: float, high: float) -> float:
     good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or not low <= value <= high:
-        raise InputError(f"{key} = {value!r}", "bench", f"give {low:g} to {high:g}")
+    if not good or not low <= value <= high:  # not a number is in no range
+        raise InputError(f"{key} = {value!r:.60}", "bench", f"give {low:g} to {high:g}")
     return float(value)
 
 
@@ -202,7 +220,7 @@ def _placement(name: str, values: Any) -> Placement:
 
 def _released(values: Any) -> tuple[str, ...]:
     known = [name for name in KNEE_COORDINATES if name != "flexion"]
-    if not isinstance(values, list | tuple) or not set(values) <= set(known):
+    if not isinstance(values, list | tuple) or any(name not in known for name in values):
         raise InputError("released names no coordinates", "bench", f"of {', '.join(known)}")
     chosen = set(values) | ({"si"} if values else set())
     return tuple(name for name in known if name in chosen)
@@ -214,31 +232,40 @@ class Bench:
 
     Args:
         case: with [contact]; as a run reads it.
-        bundles: its ligaments with their slack lengths.
+        ligaments: its ligaments with their slack lengths.
     """
 
     case: Case
-    bundles: "tuple[Ligament, ...]"
+    ligaments: "tuple[Ligament, ...]"
 
-    @property
-    def shank_weight(self) -> float:
-        """Weight (N) of what the axial load carries beside the load itself."""
-        mass = self.case.chain.segment("tibia")[0]
-        return mass * -float(self.case.chain.model.gravity.linear[1])
+    @cached_property
+    def bundles(self) -> "tuple[Ligament, ...]":
+        """The ligaments, with both ends on femur or tibia itself."""
+        return tuple(
+            replace(one, proximal=self._carried(one.proximal), distal=self._carried(one.distal))
+            for one in self.ligaments
+        )
 
-    def case_of(self, request: BenchRequest, height: Any = None) -> Case:
+    def _carried(self, end: LinkPoint) -> LinkPoint:
+        chain = self.case.chain
+        link = chain.carrier(end.link)
+        return LinkPoint(link, transform(chain.link_in(end.link, link), end.position))
+
+    def case_of(self, request: BenchRequest, height: Any = None, like: Case | None = None) -> Case:
         """Return the case that stands still as a request says.
 
         Args:
             request: the state of the bench.
             height: y (m) of the femoral origin as a function of the pose; None: 0.
+            like: the case with another insert; None: as recorded.
         """
+        like = like or self.case
         placed = inverse(request.tibial.matrix()) @ knee_pose(request.coordinates())
         placed = placed @ request.femoral.matrix()
         if height is not None:
             placed[1, 3] = height(placed) - BENCH_LIMIT.first_penetration
         coordinates = knee_coordinates(placed)
-        scene = self.case.scene
+        scene = like.scene
         assert scene.contact is not None
         table = scene.contact.model_copy(
             update={
@@ -261,12 +288,13 @@ class Bench:
                 "measured": None,
                 "ligament": (),
                 "generic_ligaments": None,
+                **STILL,
             }
         )
         return replace(
-            self.case,
+            like,
             scene=scene,
-            motion=_still_motion(coordinates),
+            motion=still_motion(np.tile(coordinates, (ROWS, 1))),
             tibia=_upright(),
             ground=self._ground(request),
             patella=None,
@@ -278,15 +306,30 @@ class Bench:
         )
 
     def _ground(self, request: BenchRequest) -> GroundReaction:
-        """Return a vertical force through the insert's origin that leaves the axial load."""
-        force = np.array([0.0, request.load_N + self.shank_weight, 0.0])
-        point = self.case.chain.insert_in_tibia[:3, 3] * [1.0, 0.0, 1.0]
-        return GroundReaction(
-            np.tile(force, (ROWS, 1)),
-            np.tile(point, (ROWS, 1)),
-            np.zeros((ROWS, 3)),
-            np.ones(ROWS, bool),
-        )
+        """Return the ground reaction that leaves the axial load at the knee.
+
+        Lab and tibia have the same axes and origin. The load stays with the bone where the insert
+        is moved; a second force carries the shank. Their sum is given at its centre of pressure,
+        y = 0, where a moment about y is left over.
+        """
+        chain, moved = self.case.chain, self._bone(request)
+        axial = moved[:3, 1] * request.load_N
+        mass, centre, _ = chain.segment("tibia")
+        weight = -mass * np.array(chain.model.gravity.linear)
+        force = axial + weight
+        about = cross(transform(moved, chain.insert_in_tibia[:3, 3]), axial) + cross(centre, weight)
+        point = np.array([about[2], 0.0, -about[0]]) / force[1]
+        moment = about - cross(point, force)
+        forces, points, moments = (np.tile(values, (ROWS, 1)) for values in (force, point, moment))
+        return GroundReaction(forces, points, moments, np.ones(ROWS, bool))
+
+    def _bone(self, request: BenchRequest) -> Array:
+        """Return the pose (4, 4) of the tibia as recorded in the tibia of the moved insert.
+
+        The case keeps the insert where it is on the link "tibia"; all else moves the other way.
+        """
+        insert = self.case.chain.insert_in_tibia
+        return insert @ inverse(request.tibial.matrix()) @ inverse(insert)
 
     def _bundle(self, bundle: "Ligament", request: BenchRequest) -> "Ligament":
         """Return a bundle whose ends stayed on the bones while the components moved."""
@@ -299,23 +342,21 @@ class Bench:
         )
 
     def _end(self, end: LinkPoint, request: BenchRequest) -> LinkPoint:
-        chain = self.case.chain
-        link = chain.carrier(end.link)
-        position = transform(chain.link_in(end.link, link), end.position)
-        if link == "femur":
-            position = transform(inverse(request.femoral.matrix()), position)
-        elif link == "tibia":
-            insert = chain.insert_in_tibia
-            moved = insert @ inverse(request.tibial.matrix()) @ inverse(insert)
-            position = transform(moved, position)
-        return LinkPoint(link, position)
+        if end.link == "femur":
+            position = transform(inverse(request.femoral.matrix()), end.position)
+        elif end.link == "tibia":
+            position = transform(self._bone(request), end.position)
+        else:
+            return end
+        return LinkPoint(end.link, position)
 
 
-def _still_motion(coordinates: Array) -> KneeMotion:
-    places, nothing = np.tile(coordinates, (ROWS, 1)), np.zeros((ROWS, 6))
-    still = np.zeros(ROWS)
-    time = np.arange(ROWS, dtype=float)
-    return KneeMotion(time, places, nothing, nothing, places, still, still)
+def still_motion(coordinates: Array) -> KneeMotion:
+    """Return poses (f, 6) m and rad of a right knee as a motion without velocity."""
+    frames = len(coordinates)
+    nothing, still = np.zeros((frames, 6)), np.zeros(frames)
+    time = np.arange(frames, dtype=float)
+    return KneeMotion(time, coordinates, nothing, nothing, coordinates, still, still)
 
 
 def _upright() -> BodyMotion:
@@ -323,135 +364,3 @@ def _upright() -> BodyMotion:
     return BodyMotion(
         np.arange(ROWS, dtype=float), np.tile(np.eye(4), (ROWS, 1, 1)), nothing, nothing
     )
-
-
-def write_bench(case: Case, folder: Path) -> Path:
-    """Write a case of `Bench.case_of` as a scene that `tkamb run` reads; return the scene file.
-
-    The URDF is copied; meshes are named where they are.
-
-    Args:
-        case: a case that stands still.
-        folder: an existing folder; its files of these names are replaced.
-    """
-    scene, side = case.scene, -1.0 if case.scene.patient.side == "left" else 1.0
-    places = case.motion.coordinates[0].copy()
-    places[KNEE_COORDINATES.index("ml")] *= side
-    header = ["time_s", *(f"{name}_m" for name in KNEE_COORDINATES[:3])]
-    header += [f"{name}_rad" for name in KNEE_COORDINATES[3:]]
-    times = case.motion.time
-    _write_table(folder / "motion.csv", header, [[t, *places] for t in times])
-    _write_table(folder / "tibia.csv", ["time_s", "lean_rad"], [[t, 0.0] for t in times])
-    assert case.ground is not None
-    force, point = case.ground.force[0], case.ground.point[0] * [1.0, 1.0, side]
-    names = ["time_s", "fx_N", "fy_N", "fz_N", "px_m", "py_m", "pz_m"]
-    _write_table(folder / "force.csv", names, [[t, *force, *point] for t in times])
-    urdf = scene.patient.urdf.read_text(encoding="utf-8")
-    (folder / "patient.urdf").write_text(urdf, encoding="utf-8")
-    text = _scene_text(case, side)
-    (folder / "scene.toml").write_text(text, encoding="utf-8")
-    return folder / "scene.toml"
-
-
-def _write_table(path: Path, header: list[str], rows: list[list[float]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows([[repr(float(value)) for value in row] for row in rows])
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str | Path):
-        text = str(value).replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{text}"'
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_toml(one) for one in value)}]"
-    if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{key} = {_toml(one)}' for key, one in value.items())} }}"
-    return repr(value)
-
-
-def _table(name: str, values: Mapping[str, Any]) -> list[str]:
-    return [name, *(f"{key} = {_toml(value)}" for key, value in values.items()), ""]
-
-
-def _scene_text(case: Case, side: float) -> str:
-    scene = case.scene
-    patient = scene.patient.model_dump(exclude_none=True) | {"urdf": "patient.urdf"}
-    lines = ["# Written by `tkamb live`: one pose that stands still under an axial load.", ""]
-    lines += _table("[patient]", patient)
-    columns = {"time": "time_s"}
-    columns |= {name: f"{name}_m" for name in KNEE_COORDINATES[:3]}
-    columns |= {name: f"{name}_rad" for name in KNEE_COORDINATES[3:]}
-    lines += _table(
-        "[motion]",
-        {
-            "file": "motion.csv",
-            "interpretation": "coordinates",
-            "angle_unit": "rad",
-            "length_unit": "m",
-            "cutoff_Hz": "none",
-            "columns": columns,
-        },
-    )
-    lines += _table(
-        "[tibia]",
-        {
-            "kind": "sagittal",
-            "file": "tibia.csv",
-            "columns": {"time": "time_s", "angle": "lean_rad"},
-            "angle_unit": "rad",
-            "ankle_mm": [0.0, 0.0, 0.0],
-        },
-    )
-    forces = {f"force_{k}": f"f{axis}_N" for k, axis in enumerate("xyz", 1)}
-    points = {f"point_{k}": f"p{axis}_m" for k, axis in enumerate("xyz", 1)}
-    lines += _table(
-        "[ground_reaction]",
-        {
-            "file": "force.csv",
-            "length_unit": "m",
-            "cutoff_Hz": "none",
-            "columns": {"time": "time_s", **forces, **points},
-        },
-    )
-    for name in ("femoral", "insert"):
-        lines += _table(
-            f"[implant.{name}]", getattr(scene.implant, name).model_dump(exclude_none=True)
-        )
-    for bundle in case.ligaments:
-        lines += _table("[[ligament]]", _ligament(bundle, side))
-    assert scene.contact is not None
-    contact = scene.contact.model_dump(exclude_none=True)
-    contact = {key: value for key, value in contact.items() if value not in ((), {}, [])}
-    lines += _table("[contact]", contact)
-    notes = ["One pose that stands still under an axial load, set by hand in `tkamb live`."]
-    lines += _table("[output]", {"axis": "time", "notes": notes})
-    return "\n".join(lines)
-
-
-def _ligament(bundle: "Ligament", side: float) -> dict[str, Any]:
-    def end(point: LinkPoint) -> dict[str, Any]:
-        x, y, z = (float(value) / MILLIMETRE for value in point.position)
-        return {"link": point.link, "point_mm": [x, y, side * z]}
-
-    stiffness = (
-        {"stiffness_N_per_mm": float(bundle.stiffness) / 1000.0}
-        if bundle.law == "two-line"
-        else {"stiffness_N_per_strain": float(bundle.stiffness)}
-    )
-    return {
-        "name": bundle.name,
-        "proximal": end(bundle.proximal),
-        "distal": end(bundle.distal),
-        "law": bundle.law,
-        **stiffness,
-        "slack_length_mm": float(bundle.slack_length) / MILLIMETRE,
-    }
-
-
-def as_values(request: BenchRequest) -> dict[str, Any]:
-    """Return a request as a JSON object, as `BenchRequest.read` takes it."""
-    return asdict(request)

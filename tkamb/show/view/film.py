@@ -29,7 +29,7 @@ class FilmSettings:
     """The film of the viewer."""
 
     max_frame_rate: float = 50.0
-    """Frames per second; screens show 60."""
+    """Frames per second. Chosen: screens show 60."""
 
 
 FILM = FilmSettings()
@@ -123,9 +123,9 @@ def _write_mp4(pictures: Iterator[bytes], path: Path, rate: float) -> None:
         "-c:v", "png", "-i", "-", "-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p",
         "-movflags", "+faststart", "-f", "mp4", str(path),
     ]  # fmt: skip
-    done = subprocess.run(command, input=b"".join(pictures), capture_output=True)
-    if done.returncode:
-        raise ComputationError(f"ffmpeg failed ({done.stderr.decode(errors='replace').strip()})")
+    process = subprocess.run(command, input=b"".join(pictures), capture_output=True)
+    if process.returncode:
+        raise ComputationError(f"ffmpeg failed ({process.stderr.decode(errors='replace').strip()})")
 
 
 def _playwright() -> Any:

@@ -1,6 +1,9 @@
-"""The knee live: what `tkamb live` computes and answers, apart from its page."""
+"""The computations of `tkamb live`, apart from its page."""
 
+import argparse
+import shutil
 import tempfile
+import weakref
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock, Thread
@@ -17,11 +20,22 @@ from tkamb.io.scene.si import in_si
 from tkamb.knee.chain import Chain
 from tkamb.knee.equilibrium.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
+from tkamb.run.guard import unforeseen_words
 from tkamb.run.known import SharedState
 from tkamb.run.known_errors import as_json, known_error
 from tkamb.run.mechanics import FrameLoads, Mechanics
-from tkamb.show.view.bench import ROWS, Bench, BenchRequest, write_bench
+from tkamb.show.view.bench import BENCH_LIMIT, ROWS, Bench, BenchRequest
+from tkamb.show.view.bench_scene import write_bench
+from tkamb.show.view.parametric_insert import parametric_insert, with_thickness
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+
+Setting = tuple[str, float, float | None]
+"""What a contact model is prepared for: its name, spacing (mm) and the insert's thickness (mm)."""
+
+
+def setting(request: BenchRequest) -> Setting:
+    """Return what a request needs prepared."""
+    return request.contact, request.resolution_mm, request.thickness_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,20 +78,32 @@ class LiveKnee:
 
     Args:
         case: a scene with [contact], its files read.
+        own: a folder of this session, whose files a saved scene takes along; None: a new one.
+            It is removed with this object.
+
+    Attributes:
+        design: of a parametric insert; None where its mesh was not made from one.
+
+    Raises:
+        InputError: the scene has no [contact], or is scaled.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, own: Path | None = None) -> None:
         if case.scene.contact is None:
             raise InputError("has no [contact]", "scene", "tkamb live shows contact: add the table")
         if case.scene.patient.scale != 1.0:
             raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
         self.case = _without_muscles(case)
         self.bench = Bench(self.case, Mechanics(self.case, near=True).ligaments)
-        self._sides: dict[tuple[str, float], ContactSide] = {}
-        self._known: SharedState | None = None
-        self._threads: dict[tuple[str, float], Thread] = {}
-        self._refused: dict[tuple[str, float], TkambError] = {}
-        self._before: dict[tuple[str, float], FrameContact] = {}
+        self._own = own or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
+        weakref.finalize(self, shutil.rmtree, self._own, True)
+        self.design = parametric_insert(case, self._own)
+        self._cases: dict[float | None, Case] = {}
+        self._known: dict[float | None, SharedState] = {}
+        self._sides: dict[Setting, ContactSide] = {}
+        self._threads: dict[Setting, Thread] = {}
+        self._refused: dict[Setting, TkambError] = {}
+        self._before: dict[Setting, FrameContact] = {}
         self._computing, self._counting, self._latest = Lock(), Lock(), 0
 
     def models(self) -> tuple[str, ...]:
@@ -106,6 +132,7 @@ class LiveKnee:
             load_N=self.case.body_weight,
             contact=table.model,
             resolution_mm=table.resolution_mm,
+            thickness_mm=None if self.design is None else self.design.thickness,
         )
 
     def overtake(self) -> int:
@@ -123,10 +150,10 @@ class LiveKnee:
         Raises:
             InputError: the model cannot be prepared.
         """
-        key = (request.contact, request.resolution_mm)
-        if key in self._sides:
-            return ""
+        key = setting(request)
         with self._counting:
+            if key in self._sides:
+                return ""
             if key in self._refused:
                 raise self._refused.pop(key)
             if key not in self._threads:
@@ -135,20 +162,28 @@ class LiveKnee:
                 thread.start()
         return f"preparing {request.contact} at {request.resolution_mm:g} mm"
 
-    def _prepare(self, request: BenchRequest, key: tuple[str, float]) -> None:
+    def _prepare(self, request: BenchRequest, key: Setting) -> None:
         try:
             self._side(request)
         except TkambError as error:
             self._refused[key] = error
+        except Exception as error:  # the last handler of this thread: the page says it
+            self._refused[key] = TkambError(unforeseen_words(error, argparse.Namespace()))
         finally:
             del self._threads[key]
 
-    def answer(self, request: BenchRequest, number: int | None = None) -> LiveAnswer:
+    def answer(
+        self, request: BenchRequest, number: int | None = None, from_rest: bool = False
+    ) -> LiveAnswer:
         """Return what the bench shows.
+
+        The state before is the initial guess: a lattice's answer differs by it within the solver's
+        tolerance.
 
         Args:
             request: the state of the bench.
             number: from `overtake`; None: whatever comes after, this is wanted.
+            from_rest: without that guess, as `tkamb run` computes its first frame.
 
         Raises:
             TkambError: a newer request came.
@@ -157,6 +192,8 @@ class LiveKnee:
         with self._computing:
             if number is not None and number != self._latest:
                 raise TkambError("overtaken")
+            if from_rest:
+                self._before.pop(setting(request), None)
             return self._compute(request)
 
     def save(self, request: BenchRequest, folder: Path) -> Path:
@@ -170,30 +207,55 @@ class LiveKnee:
             InputError: the folder holds something, or cannot be written.
         """
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError("is there already and not empty", folder, "give a new folder")
+            raise InputError("exists already and is not empty", folder, "give a new folder")
         try:
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".tkamb-live-") as beside:
                 whole = Path(beside) / folder.name
                 whole.mkdir()
-                write_bench(self._still_case(request), whole)
+                write_bench(self._still_case(request), whole, self._own)
                 whole.replace(folder)
         except OSError as error:
             raise InputError(f"cannot be written ({error.strerror})", folder) from None
         return folder / "scene.toml"
 
     def _still_case(self, request: BenchRequest) -> Case:
-        return self.bench.case_of(request, self._side(request).state.pair.first_touch_height)
+        height = self._side(request).state.pair.first_touch_height
+        return self.bench.case_of(request, height, self._case_with(request.thickness_mm))
+
+    def _case_with(self, thickness_mm: float | None) -> Case:
+        """Return the case with an insert of a thickness.
+
+        Raises:
+            InputError: the insert's design is not parametric.
+        """
+        if thickness_mm is None or (self.design and thickness_mm == self.design.thickness):
+            return self.case
+        if self.design is None:
+            raise InputError("of no parametric design", "thickness_mm", "leave it out")
+        if thickness_mm not in self._cases:
+            self._cases[thickness_mm] = with_thickness(
+                self.case, self.design, thickness_mm, self._own
+            )
+        return self._cases[thickness_mm]
 
     def _side(self, request: BenchRequest) -> ContactSide:
         """Return a contact side whose model and prepared state every request shares."""
-        key = (request.contact, request.resolution_mm)
-        if key not in self._sides:
-            case = self.bench.case_of(request)
-            mechanics = Mechanics(case, self._known, near=True)
-            self._sides[key] = ContactSide(case, mechanics)
-            self._known = SharedState(mechanics.query, None, None, range(ROWS))
-        return self._sides[key]
+        key, insert = setting(request), request.thickness_mm
+        with self._counting:
+            side = self._sides.get(key)
+        if side is None:
+            case = self.bench.case_of(request, like=self._case_with(insert))
+            mechanics = Mechanics(case, self._known.get(insert), near=True)
+            side = ContactSide(case, mechanics)
+            self._known[insert] = SharedState(mechanics.query, None, None, range(ROWS))
+        with self._counting:
+            self._sides.pop(key, None)
+            self._sides[key] = side  # the latest is last
+            for old in [*self._sides][: -BENCH_LIMIT.kept_models]:
+                del self._sides[old]
+                self._before.pop(old, None)
+        return side
 
     def _compute(self, request: BenchRequest) -> LiveAnswer:
         prepared = self._side(request)
@@ -207,9 +269,9 @@ class LiveKnee:
         if not np.isfinite(case.motion.coordinates).all():
             words = "failed: the femoral component does not lie over the insert"
             return replace(empty, status=words)
-        key = (request.contact, request.resolution_mm)
+        key = setting(request)
         try:
-            mechanics = Mechanics(case, self._known, near=True)
+            mechanics = Mechanics(case, self._known[request.thickness_mm], near=True)
             side = ContactSide(case, mechanics, state, sensitivity=False, model=prepared.model)
             before = [self._before[key]] if key in self._before and not request.released else []
             body, contact = side.frame(0, before)
@@ -228,7 +290,7 @@ class LiveKnee:
         flags = [*contact.flags]
         return LiveAnswer(
             request,
-            _numbers(body, contact, mechanics),
+            _numbers(body, contact, mechanics, ends),
             "; ".join(flags) or "ok",
             result.pose,
             state.points,
@@ -245,13 +307,20 @@ class LiveKnee:
 
     def known_error(self, request: BenchRequest) -> Any:
         """Return how far the chosen contact model is known to be off, or "not measured"."""
-        assert self.case.scene.contact is not None
-        material = self.case.scene.contact.material
-        return as_json(known_error(request.contact, request.resolution_mm, material))
+        scene = self.case.scene
+        assert scene.contact is not None
+        if scene.material is not None:
+            return as_json(None)
+        own = request.contact == scene.contact.model
+        options = scene.contact.options if own else {}
+        material = scene.contact.material
+        return as_json(known_error(request.contact, request.resolution_mm, material, options))
 
 
-def _numbers(body: FrameLoads, contact: FrameContact, mechanics: Mechanics) -> dict[str, float]:
-    """Return the numbers of results.csv that the bench shows, under the same names."""
+def _numbers(
+    body: FrameLoads, contact: FrameContact, mechanics: Mechanics, ends: dict[str, Array]
+) -> dict[str, float]:
+    """Return the numbers that the bench shows; those of results.csv under the same names."""
     result = contact.result
     assert result is not None
     numbers = {
@@ -272,6 +341,10 @@ def _numbers(body: FrameLoads, contact: FrameContact, mechanics: Mechanics) -> d
         }
     for name, tension in body.geometry.tensions.items():
         numbers[f"ligament_{name}_N"] = tension
+    for bundle in mechanics.ligaments:
+        proximal, distal = ends[bundle.name]
+        strain = bundle.strain(np.linalg.norm(distal - proximal))
+        numbers[f"ligament_{bundle.name}_strain_percent"] = 100.0 * float(strain)
     if contact.equilibrium is not None:
         places = contact.equilibrium.coordinates
         for name, value in zip(KNEE_COORDINATES, places, strict=True):

@@ -1,4 +1,4 @@
-"""The window of `tkamb live`: its page, its server and what they say to each other."""
+"""The window of `tkamb live`: its page, its server and the messages between them."""
 
 import json
 import math
@@ -14,9 +14,9 @@ from tkamb.io.scene.case import Case
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import SIDE_COLOURS
 from tkamb.show.view.bench import BenchRequest
-from tkamb.show.view.colours import INSERT, METAL, RECORDED, SLACK, rgb
+from tkamb.show.view.colours import INSERT, METAL, RECORDED, SLACK, rgb, strain_colours
 from tkamb.show.view.drawing import Drawing, Marker, PressureMap, Solid, Strand
-from tkamb.show.view.live import LiveAnswer, LiveKnee
+from tkamb.show.view.live import LiveAnswer, LiveKnee, setting
 from tkamb.show.view.page import PACKAGE, POLICY, meshcat_script
 from tkamb.show.view.payload import pack, packed_map
 from tkamb.show.view.server import NotYet, ViewServer
@@ -25,6 +25,8 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
 COARSE = ("foundation", 2.0)
 """Contact model and spacing (mm) while a slider moves."""
+STRAIN_LIMIT = 0.1
+"""Top of the colour scale of the ligaments' strain."""
 SCALES_MPA = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0, 120.0, 200.0, 500.0, 1000.0)
 """Tops of the colour scale: the least that holds the peak is taken."""
 
@@ -62,7 +64,7 @@ class LiveWindow:
         """Answer one question of the page.
 
         Args:
-            name: "live" computes a state, "save" writes it as a scene.
+            name: "live" computes a state; "save" computes it from rest and writes it as a scene.
             content: a `BenchRequest` as JSON object.
 
         Raises:
@@ -70,11 +72,12 @@ class LiveWindow:
         """
         if name == "live":
             request, number = BenchRequest.read(content), self.knee.overtake()
-            if words := self.knee.preparing(request):
+            coarse = (request.contact, request.resolution_mm) == COARSE
+            if not coarse and (words := self.knee.preparing(request)):
                 raise NotYet(words)
             return self._packed(self.knee.answer(request, number))
         if name == "save":
-            return str(self.knee.save(BenchRequest.read(content), self._next_folder())).encode()
+            return self._keep(BenchRequest.read(content))
         raise TkambError("no such question")
 
     def page(self) -> str:
@@ -113,12 +116,14 @@ class LiveWindow:
             "frames": len(frames),
             "start": asdict(self.start),
             "models": list(self.knee.models()),
+            "thickness_mm": None if self.knee.design is None else self.knee.design.thickness,
+            "most_load_N": max(4000.0, 5.0 * self.knee.case.body_weight),
             "coarse": list(COARSE),
             "recorded": [{key: float(places[key][k]) for key in places} for k in frames],
             "ghosts": [poses[k].T.ravel().tolist() for k in frames],
         }
 
-    def _packed(self, answer: LiveAnswer) -> bytes:
+    def _packed(self, answer: LiveAnswer, saved: str | None = None) -> bytes:
         peak = float(answer.pressure.max(initial=0.0)) / MEGAPASCAL
         scale = next((top for top in SCALES_MPA if peak <= top), SCALES_MPA[-1])
         shown = PressureMap(
@@ -127,7 +132,8 @@ class LiveWindow:
             answer.pressure[None] / MEGAPASCAL,
             answer.gap[None],
         )
-        return packed_map(shown, scale, json.dumps(self._words(answer, scale), allow_nan=False))
+        words = self._words(answer, scale) | {"saved": saved}
+        return packed_map(shown, scale, json.dumps(words, allow_nan=False))
 
     def _words(self, answer: LiveAnswer, scale: float) -> dict[str, Any]:
         numbers = {name: x for name, x in answer.numbers.items() if math.isfinite(x)}
@@ -139,12 +145,19 @@ class LiveWindow:
             "status": answer.status,
             "request": asdict(answer.request),
             "label": f"{answer.request.contact} at {answer.request.resolution_mm:g} mm",
+            "map": "/".join(map(str, setting(answer.request))),
             "error": self._error_words(answer.request),
             "scale_MPa": scale,
             "numbers": numbers,
             "pose": answer.pose.T.ravel().tolist() if finite else None,
             "ligaments": {
-                name.replace("/", "-"): ends.tolist() for name, ends in answer.ligaments.items()
+                name.replace("/", "-"): {
+                    "ends": ends.tolist(),
+                    "colour": strain_colours(
+                        answer.numbers[f"ligament_{name}_strain_percent"] / 100.0, STRAIN_LIMIT
+                    ).tolist(),
+                }
+                for name, ends in answer.ligaments.items()
             },
             "centres": {
                 f"{side} centre": centre.tolist() for side, centre in answer.centres.items()
@@ -154,11 +167,23 @@ class LiveWindow:
     def _error_words(self, request: BenchRequest) -> str:
         error = self.knee.known_error(request)
         if isinstance(error, str):
-            return f"how far it is off was {error} at this spacing"
+            return f"its error is {error} at this spacing"
         return (
-            f"on the studied cases off by at most {100 * error['peak_pressure']:.2g} % in peak "
+            f"on the studied cases its error is at most {100 * error['peak_pressure']:.2g} % in "
+            f"peak "
             f"pressure, {100 * error['area']:.2g} % in area"
         )
+
+    def _keep(self, request: BenchRequest) -> bytes:
+        """Return the answer that a run of the saved scene gives, with the scene's file.
+
+        Raises:
+            TkambError: the state has no answer, or cannot be written.
+        """
+        answer = self.knee.answer(request, from_rest=True)
+        if answer.failed:
+            raise TkambError(f"not saved: {answer.status.removeprefix('failed: ')}")
+        return self._packed(answer, str(self.knee.save(request, self._next_folder())))
 
     def _next_folder(self) -> Path:
         """Return a folder that is not there yet."""
@@ -203,7 +228,7 @@ class LiveWindow:
                 for side in SIDES
             ),
             map=PressureMap(answer.points, answer.triangles, nothing, nothing + 1.0),
-            strain_limit=0.0,
+            strain_limit=STRAIN_LIMIT,
         )
 
 

@@ -40,7 +40,7 @@ class PageSettings:
     """Pictures that a browser takes of the viewer page."""
 
     timeout: float = 120.0
-    """s; a browser that takes longer has failed."""
+    """s; a browser that takes longer has failed. Chosen: a usual page takes some seconds."""
 
 
 PAGE = PageSettings()
@@ -133,9 +133,9 @@ def screenshot(html: str, size: tuple[int, int]) -> bytes:
             f"{page.as_uri()}#figure=1",
         ]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=PAGE.timeout)
+            process = subprocess.run(command, capture_output=True, timeout=PAGE.timeout)
         except subprocess.TimeoutExpired:
             raise ComputationError(f"no picture of the page in {PAGE.timeout:g} s") from None
-        if b'data-ready="yes"' not in done.stdout or not picture.exists():
+        if b'data-ready="yes"' not in process.stdout or not picture.exists():
             raise ComputationError("the page could not be drawn", str(browser))
         return picture.read_bytes()

@@ -47,14 +47,15 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class ViewPayloadSettings:
-    """What the viewer's page is given."""
+    """Settings of the data for the viewer's page."""
 
     arrow_metres_per_body_weight: float = 0.03
-    """Length of an arrow of one body weight."""
+    """m per body weight: length of an arrow. Chosen: it fits beside the knee."""
     pressure_levels: int = 32767
-    """Steps from no pressure to the largest."""
+    """Number of steps from no pressure to the largest. Chosen: no steps are seen."""
     most_coloured_triangles: int = 100_000
-    """Triangles of a surface that its colours divide: merged ones would blur them."""
+    """Largest number of triangles of a surface that shows wear. Chosen: merged triangles would
+    blur its colours."""
 
 
 VIEW_PAYLOAD = ViewPayloadSettings()
@@ -64,7 +65,7 @@ WHITE = "#ffffff"
 """Of a material whose vertices have colours of their own."""
 
 FRONT = 0
-"""three.js: triangles are seen from outside only, which spares half of them."""
+"""three.js: only the outer side of triangles is drawn, which saves half of them."""
 
 TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": np.uint32}
 
@@ -92,12 +93,12 @@ class Block:
         self._size += len(padded)
         return span
 
-    def compress(self, header: dict[str, Any]) -> bytes:
-        """Return header and arrays, compressed."""
+    def compress(self, header: dict[str, Any], level: int = 6) -> bytes:
+        """Return header and arrays, compressed at a level of gzip's."""
         text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         return gzip.compress(
-            struct.pack("<I", len(text)) + text + b"".join(self._parts), 6, mtime=0
+            struct.pack("<I", len(text)) + text + b"".join(self._parts), level, mtime=0
         )
 
 
@@ -130,10 +131,11 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
     return max((one.map.peak for one in drawings if one.map), default=0.0)
 
 
-def packed_map(found: PressureMap, peak: float, words: str) -> bytes:
+def packed_map(pressure_map: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
-    return block.compress({"map": _map(block, found, peak), "words": words})
+    # On one machine the fastest level is the fastest way.
+    return block.compress({"map": _map(block, pressure_map, peak), "words": words}, 1)
 
 
 def packed_lattice(lines: Array) -> bytes:
@@ -215,23 +217,23 @@ def _marker(block: Block, root: str, marker: Marker) -> dict[str, Any]:
     }
 
 
-def _map(block: Block, found: PressureMap, peak: float) -> dict[str, Any]:
+def _map(block: Block, pressure_map: PressureMap, peak: float) -> dict[str, Any]:
     return {
-        "count": len(found.points),
-        "points": block.put(found.points, "float32"),
-        "triangles": block.put(found.triangles, "uint32"),
-        "levels": block.put(map_levels(found, peak), "int16"),
+        "count": len(pressure_map.points),
+        "points": block.put(pressure_map.points, "float32"),
+        "triangles": block.put(pressure_map.triangles, "uint32"),
+        "levels": block.put(map_levels(pressure_map, peak), "int16"),
     }
 
 
-def map_levels(found: PressureMap, peak: float) -> NDArray[np.int16]:
+def map_levels(pressure_map: PressureMap, peak: float) -> NDArray[np.int16]:
     """Return `pressure_levels` (f, n) of the map as integers: a loaded point's is at least 1.
 
     Args:
-        found: the map.
+        pressure_map: the map.
         peak: MPa, top of the scale; a higher pressure has the top level.
     """
-    level = pressure_levels(found.pressure, found.gap, found.triangles, peak)
+    level = pressure_levels(pressure_map.pressure, pressure_map.gap, pressure_map.triangles, peak)
     whole = np.maximum(np.round(np.abs(level) * VIEW_PAYLOAD.pressure_levels), 1.0)
     return np.where(level > 0, whole, -whole).astype(np.int16)
 
@@ -245,7 +247,7 @@ def _insert_transform(root: str, side: str) -> SetTransform:
 
 
 def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[Any]:
-    """Return what hangs a solid into the scene; wear colours it on a scale up to `deepest` mm."""
+    """Return the commands that add a solid; wear colours it on a scale up to `deepest` mm."""
     colours, colour = None, solid.colour
     if solid.wear is not None:
         nearest = cKDTree(solid.surface.vertices).query(shape.vertices)[1]
@@ -256,10 +258,10 @@ def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[An
         side=FRONT,
         vertexColors=colours is not None,
     )
-    made = [SetObject(_Mesh(shape, colours), material, _node(path))]
+    commands = [SetObject(_Mesh(shape, colours), material, _node(path))]
     if len(solid.poses) == 1:
-        made.append(SetTransform(solid.poses[0], _node(path)))
-    return made
+        commands.append(SetTransform(solid.poses[0], _node(path)))
+    return commands
 
 
 def _node_name(root: str, layer: str, name: str) -> str:

@@ -1,4 +1,4 @@
-"""The live window: its server, and another contact model on one frame while one looks at it.
+"""The server of the live window, and contact of one frame by another model on request.
 
 The server is for this machine only, and gives nothing but the page and its data. Other
 users of the machine reach the port too: every address starts with a random token, which only the
@@ -37,11 +37,14 @@ class ViewServerSettings:
     """Limits of the viewer's local server."""
 
     most_request_bytes: int = 10_000
-    """Bytes of a request; a longer one is refused."""
+    """Bytes of a request; a longer one is refused. Chosen: the page's own requests are far
+    shorter."""
     idle_seconds: float = 15.0
     """s: without a byte from a client that is connected, before it is cut off."""
+    longest_line: int = 2000
+    """Characters of an answer in words; a longer one is cut."""
     token_bytes: int = 18
-    """Random bytes of the token in the address."""
+    """Random bytes of the token in the address. Chosen: it cannot be guessed."""
 
 
 VIEW_SERVER = ViewServerSettings()
@@ -69,7 +72,7 @@ class ContactSwitch:
         peak: MPa, top of the colour scale of the page.
 
     Attributes:
-        stage: what is being done, in words; empty when nothing is.
+        stage: the current step, in words; empty when idle.
     """
 
     def __init__(self, run: CaseResults, peak: float) -> None:
@@ -106,7 +109,7 @@ class ContactSwitch:
                 self.stage = ""
 
     def cancel(self) -> int:
-        """End what was asked before; return the number of the next question."""
+        """Cancel earlier questions; return the number of the next question."""
         with self._counting:
             self._latest += 1
             return self._latest
@@ -132,7 +135,9 @@ class ContactSwitch:
         if result is None:
             nothing = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
             return packed_map(nothing, self.peak, f"{model}: {contact.problem}")
-        found = PressureMap(points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None])
+        pressure_map = PressureMap(
+            points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None]
+        )
         parts = []
         for name in SIDE_COLOURS:
             condyle = getattr(result, name)
@@ -142,9 +147,9 @@ class ContactSwitch:
                     f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
                 )
         words = [f"{model}: {'; '.join(parts)}", f"{contact.seconds:.2f} s", *contact.flags]
-        if found.peak > self.peak:
+        if pressure_map.peak > self.peak:
             words.append(f"the map exceeds the colour scale ({self.peak:.1f} MPa)")
-        return packed_map(found, self.peak, "; ".join(words))
+        return packed_map(pressure_map, self.peak, "; ".join(words))
 
     def _side(self, model: str) -> ContactSide:
         if model not in self._sides:
@@ -159,7 +164,7 @@ class ContactSwitch:
 
 
 class NotYet(TkambError):
-    """What is asked for is being prepared; ask again."""
+    """The result is still being prepared; the page asks again."""
 
 
 class ViewServer:
@@ -212,6 +217,10 @@ class ViewServer:
         """Address of the page, token included."""
         return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
 
+    def _repr_html_(self) -> str:
+        """Return a link, which a notebook shows."""
+        return f'<a href="{self.url}" target="_blank" rel="noopener">{self.url}</a>'
+
     def serve(self) -> None:
         """Answer until `close`, or until the user interrupts."""
         self._server.serve_forever(poll_interval=0.2)
@@ -226,7 +235,7 @@ class _QuietServer(ThreadingHTTPServer):
     """A server whose clients may leave at any moment: a browser that is closed is no error."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say in one line what nobody foresaw; nothing of a client that has gone."""
+        """Report an unexpected error in one line; ignore clients that have disconnected."""
         error = sys.exception()
         if isinstance(error, Exception) and not isinstance(error, ConnectionError | TimeoutError):
             say(unforeseen_words(error, argparse.Namespace()))
@@ -240,6 +249,21 @@ class _Handler(BaseHTTPRequestHandler):
     root: str
 
     timeout = VIEW_SERVER.idle_seconds
+
+    def parse_request(self) -> bool:
+        """Refuse requests of HTTP/0.9, whose answers have no headers."""
+        good = super().parse_request()
+        if good and self.request_version == "HTTP/0.9":
+            self.send_error(HTTPStatus.HTTP_VERSION_NOT_SUPPORTED)
+            return False
+        return good
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer what the library refuses as everything else: one line, with all headers."""
+        self.request_version = "HTTP/1.0"
+        self.close_connection = True
+        status = HTTPStatus(code)
+        self._send_line(status, status.phrase)
 
     def do_GET(self) -> None:
         if not self._is_allowed():
@@ -303,11 +327,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_allowed(self) -> bool:
         origin = self.headers.get("Origin")
-        given = self.path[: len(self.root)].encode(errors="replace")
+        path_start = self.path[: len(self.root)].encode(errors="replace")
         return (
             self.headers.get("Host") in self.names
-            and (origin is None or origin.removeprefix("http://") in self.names)
-            and secrets.compare_digest(given, self.root.encode())
+            and (origin is None or origin in {f"http://{name}" for name in self.names})
+            and secrets.compare_digest(path_start, self.root.encode())
         )
 
     def _refuse(self) -> None:
@@ -317,7 +341,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_line(self, status: HTTPStatus, words: str) -> None:
         """Send one line of text."""
-        self._send(status, "text/plain; charset=utf-8", " ".join(words.split()).encode())
+        line = " ".join(words.split())[: VIEW_SERVER.longest_line]
+        # a name from the question may hold what UTF-8 does not have
+        self._send(status, "text/plain; charset=utf-8", line.encode(errors="backslashreplace"))
 
     def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
         self.send_response(status)

@@ -1,9 +1,9 @@
 """The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-A scene holds no bone meshes but one that a muscle may wrap, which is drawn; the other
-bones are stand-ins of about the right size between the joint centres: they orient the eye and
-carry no load. Nobody measured the foot: it hangs at the ankle, level with the floor and pointing
-where the shank does, so that the arrow of the ground reaction does not hang in the air.
+A scene has no bone meshes except one that a muscle may wrap, which is drawn. The other bones are
+stand-ins of about the right size between the joint centres, for orientation only; they carry no
+load. The pose of the foot is not measured: it is drawn level with the floor and pointing forward
+with the shank, so that the arrow of the ground reaction starts at a foot.
 """
 
 from collections.abc import Sequence
@@ -63,9 +63,10 @@ class ViewSolidSettings:
     """Sizes of what the viewer draws beside the implant."""
 
     ankle_radius_mm: float = 20.0
-    """mm."""
+    """mm: radius of the ball that is drawn at the ankle. Chosen: it looks like an ankle."""
     plate_centre: float = 60.0 * MILLIMETRE
-    """m, anterior of the ankle."""
+    """m: distance of the floor's centre in front of the ankle. Chosen: the middle of a foot lies in
+    front of the ankle."""
 
 
 VIEW_SOLID = ViewSolidSettings()
@@ -143,8 +144,8 @@ def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
     depth = read_vtp_values(path, "wear_depth_mm")
     if side == "left":
         points, faces = points @ MIRROR, faces[:, ::-1]
-    worn = Surface(points, faces, "worn insert")
-    return (Solid(worn.name, "worn insert", worn, INSERT, 1.0, np.eye(4)[None], depth),)
+    surface = Surface(points, faces, "worn insert")
+    return (Solid(surface.name, "worn insert", surface, INSERT, 1.0, np.eye(4)[None], depth),)
 
 
 def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
@@ -188,9 +189,9 @@ def _patella(case: Case) -> Surface:
     ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
     top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
     radii = np.array([PATELLA_DEPTH, 0.5 * float(np.linalg.norm(top - bottom)), PATELLA_WIDTH])
-    placed = _turned([0.0, 1.0, 0.0], top - bottom)
-    placed[:3, 3] = 0.5 * (top + bottom)
-    return hull(sphere_points() * radii, "patella").moved(placed)
+    rotation = _turned([0.0, 1.0, 0.0], top - bottom)
+    rotation[:3, 3] = 0.5 * (top + bottom)
+    return hull(sphere_points() * radii, "patella").moved(rotation)
 
 
 def _turned(axis: ArrayLike, towards: Array) -> Array:

@@ -39,13 +39,16 @@ class ViewStrandSettings:
     """How muscles and ligaments are drawn."""
 
     muscle_radius: float = 2.0 * MILLIMETRE
-    """m; radius of a muscle's tube."""
+    """m; radius of a muscle's tube. Chosen: it is seen well in the view."""
     slack_force: float = 1.0
-    """N."""
+    """N: a tendon or muscle with a smaller force is drawn grey. Chosen: far below forces that
+    matter."""
     least_activation: float = 0.1
-    """Upper end of the colour scale, where no muscle is more active."""
+    """1: smallest upper end of the colour scale of activations. Chosen: small activations then look
+    small."""
     many_bundles: int = 20
-    """Ligament bundles from which on they are drawn thinner."""
+    """Ligament bundles from which on they are drawn thinner. Chosen: thick ones would cover each
+    other."""
 
 
 VIEW_STRAND = ViewStrandSettings()
@@ -63,8 +66,8 @@ def ligament_strands(
         return (), 0.0
     links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
     poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
-    lost = failed(results)
-    strains = [np.where(lost, np.nan, one.strain(one.length(poses))) for one in bundles]
+    failures = failed(results)
+    strains = [np.where(failures, np.nan, one.strain(one.length(poses))) for one in bundles]
     limit = float(np.nanmax(strains, initial=0.01))
     radius = BUNDLE * (0.5 if len(bundles) > VIEW_STRAND.many_bundles else 1.0)
     strands = []
@@ -169,10 +172,10 @@ def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]
     for side in SIDE_COLOURS:
         x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))
         points = np.column_stack([x, np.full(len(x), top), z])
-        known = np.isfinite(points).all(axis=1)
-        points[~known] = np.nan
-        down, _ = rays.first(points[known], np.array([0.0, -1.0, 0.0]))
-        points[known, 1] -= np.where(np.isfinite(down), down, np.nan)
+        finite = np.isfinite(points).all(axis=1)
+        points[~finite] = np.nan
+        down, _ = rays.first(points[finite], np.array([0.0, -1.0, 0.0]))
+        points[finite, 1] -= np.where(np.isfinite(down), down, np.nan)
         result[side] = points
     return result
 

@@ -1,4 +1,4 @@
-"""What a cohort writes: one table, its runs, its groups, its provenance and its report."""
+"""Output of a cohort: table of frames, runs, groups, provenance and report."""
 
 import json
 import sys
@@ -69,7 +69,7 @@ def write_cohort(
 def frame_table(
     cohort: Cohort, outcomes: Mapping[int, Outcome], identity: Mapping[str, Any]
 ) -> pa.Table:
-    """Return a row per frame of every run that gave results: who, what of which, and numbers.
+    """Return a row per frame of every run with results: labels, provenance and numbers.
 
     The columns are those of results.csv that any run has, null where a run has none; before them
     stand the labels, and the scene's SHA-256, overrides, contact model and resolution.
@@ -118,15 +118,15 @@ def _repeated(values: Sequence[Any], counts: Sequence[int], kind: Any = None) ->
 def run_rows(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[list[str]]:
     """Return runs.csv: a header, then a row per run."""
     head = ["run", *LABELS, *PROVENANCE, "frames", "failed_frames", "peak_force_total_BW", "failed"]
-    worn = list(dict.fromkeys(name for one in outcomes.values() for name in one.wear))
+    names = list(dict.fromkeys(name for one in outcomes.values() for name in one.wear))
     if cohort.table.wear is not None:
-        head = [*head, *(f"wear_{name}" for name in worn), "wear_failed"]
+        head = [*head, *(f"wear_{name}" for name in names), "wear_failed"]
     rows = [head]
     for n, one in outcomes.items():
-        wear = [repr(float(one.wear[name])) if name in one.wear else "" for name in worn]
+        wear = [repr(float(one.wear[name])) if name in one.wear else "" for name in names]
         run = cohort.runs[n]
         peak = one.columns.get("force_total_BW")
-        known = peak is not None and bool(np.isfinite(peak).any())
+        has_peak = peak is not None and bool(np.isfinite(peak).any())
         rows.append(
             [
                 str(n),
@@ -134,7 +134,7 @@ def run_rows(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[list[str]]
                 *(of(run) for of in PROVENANCE.values()),
                 str(len(one.status)),
                 str(one.failed_frames),
-                repr(float(np.nanmax(peak))) if known and peak is not None else "",
+                repr(float(np.nanmax(peak))) if has_peak and peak is not None else "",
                 one.reason,
                 *([] if cohort.table.wear is None else [*wear, one.wear_problem]),
             ]

@@ -1,4 +1,4 @@
-"""One run of a cohort: through the whole pipeline, and what of it is kept."""
+"""One run of a cohort: through the whole pipeline, reduced to the results that are kept."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ from tkamb.run.status import FAILED
 from tkamb.studies.cohort.plan import CohortRun, CohortWearTable
 
 TIMES = "_seconds"
-"""Ending of computing times: the only columns that another computer finds otherwise."""
+"""Ending of the columns of computing times, which differ between computers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class PressureMap:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one run gave.
+    """Results of one run.
 
     Args:
         reason: why the run failed as a whole; "" if it did not.
@@ -123,7 +123,7 @@ class CohortWorker:
         self._frames, self._map_flexion, self._wear = frames, map_flexion, wear
 
     def __call__(self, number: int, run: CohortRun) -> Outcome:
-        """Return what a run gives: what `tkamb run` would, or why it cannot."""
+        """Return the results of a run, as `tkamb run` would compute them, or why there are none."""
         try:
             return self._outcome(run)
         finally:
@@ -147,7 +147,7 @@ class CohortWorker:
         return result if self._wear is None else self._worn(run, results, result, self._wear)
 
     def _worn(
-        self, run: CohortRun, results: Results, found: Outcome, wear: CohortWearTable
+        self, run: CohortRun, results: Results, outcome: Outcome, wear: CohortWearTable
     ) -> Outcome:
         """Return an outcome with the wear of its insert, or why there is none."""
         from tkamb.studies.wear.run import wear_of_results
@@ -162,7 +162,7 @@ class CohortWorker:
                 frames=wear.frames_per_cycle,
             ).as_dict()
         except TkambError as error:
-            return replace(found, wear_problem=str(error))
+            return replace(outcome, wear_problem=str(error))
         low, high = report["volume_mm3_per_Mc_range"]
         values = {
             "volume_mm3_per_Mc": report["volume_mm3_per_Mc"],
@@ -173,7 +173,7 @@ class CohortWorker:
         }
         for one in report["laws_side_by_side"]:
             values[f"first_{one['law']}_mm3_per_Mc"] = one["first_volume_mm3_per_Mc"]
-        return replace(found, wear={k: v for k, v in values.items() if v is not None})
+        return replace(outcome, wear={k: v for k, v in values.items() if v is not None})
 
 
 def chosen_map(results: Results, flexion: float | None) -> PressureMap | None:

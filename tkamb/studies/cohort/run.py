@@ -1,4 +1,4 @@
-"""All runs of a cohort: over workers, kept as they are finished, then made one table."""
+"""All runs of a cohort: computed by workers, stored when finished, then combined in one table."""
 
 import os
 from collections.abc import Iterator
@@ -41,7 +41,7 @@ class Part:
     def __post_init__(self) -> None:
         if not 1 <= self.index <= self.count <= MOST_SHARDS:
             raise InputError(
-                f"{self.index}/{self.count} is no part",
+                f"{self.index}/{self.count} is not a part",
                 "--shard",
                 "give 1/n to n/n, n at most 10000",
             )
@@ -99,25 +99,25 @@ def run_cohort(
     with claimed_directory(folder, force, "cohort"), _parts(directory, part, resume) as parts:
         shards = Shards(folder, identity, resume)
         others = [Shards(one, identity, True) for one in parts]
-        wanted = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
-        done = _kept([shards, *others], wanted)
-        left = [(n, cohort.runs[n]) for n in wanted if n not in done]
+        numbers = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
+        outcomes = _kept([shards, *others], numbers)
+        remaining = [(n, cohort.runs[n]) for n in numbers if n not in outcomes]
         task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg, cohort.table.wear))
-        answers = crew.answers(task, left)
+        answers = crew.answers(task, remaining)
         try:
             with interrupt_as_such():
-                for number, outcome in progress(answers, len(left)):
+                for number, outcome in progress(answers, len(remaining)):
                     shards.put(number, outcome.shard())
-                    done[number] = outcome
+                    outcomes[number] = outcome
         except KeyboardInterrupt:
-            kept = f"{len(done)} of {len(wanted)} runs are kept; go on with --resume"
-            raise KeyboardInterrupt(kept) from None
-        done = {number: done[number] for number in wanted}
+            words = f"{len(outcomes)} of {len(numbers)} runs are kept; go on with --resume"
+            raise KeyboardInterrupt(words) from None
+        outcomes = {number: outcomes[number] for number in numbers}
         if part is None:
-            write_cohort(cohort, done, identity, folder)
+            write_cohort(cohort, outcomes, identity, folder)
             for one in (folder, *parts):
                 remove_shards(one)
-    return done
+    return outcomes
 
 
 def _identity(cohort: Cohort) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def _identity(cohort: Cohort) -> dict[str, Any]:
 
 @contextmanager
 def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Path]]:
-    """Hold the folders of all parts, whose runs are gathered; none while one computes."""
+    """Lock the folders of all parts and yield them, to gather runs; none while one computes."""
     with ExitStack() as stack:
         result = []
         if part is None and resume:
@@ -146,11 +146,11 @@ def _holds_parts_alone(directory: Path) -> bool:
     return bool(entries) and named and all(is_ours(entry) for entry in entries)
 
 
-def _kept(places: list[Shards], wanted: list[int]) -> dict[int, Outcome]:
+def _kept(places: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
     """Return the runs that are finished already."""
     result: dict[int, Outcome] = {}
     for shards in places:
-        for number in wanted if shards.resumed else ():
+        for number in numbers if shards.resumed else ():
             shard = shards.get(number)
             if shard is not None:
                 result[number] = Outcome.of(shard)

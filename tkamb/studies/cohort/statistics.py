@@ -30,7 +30,8 @@ class CohortStatisticsSettings:
     """Statistics over the runs of a cohort."""
 
     bin_tolerance: float = 1e-9
-    """Share of a bin; 60 deg, which radians make 59.99999999999999, begins the bin from 60 on."""
+    """Share of a bin. Chosen: 60 deg, which radians make 59.99999999999999, begins the bin from 60
+    on."""
 
 
 COHORT_STATISTICS = CohortStatisticsSettings()
@@ -38,13 +39,13 @@ COHORT_STATISTICS = CohortStatisticsSettings()
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Runs that differ in nothing that makes groups.
+    """Runs with the same labels of grouping.
 
     Args:
         labels: what they have in common.
         numbers: of the runs that gave results.
         failed: how many gave none.
-        axis: what its bins divide: "flexion_deg", or "cycle_percent" of a cycle.
+        axis: quantity that its bins divide: "flexion_deg", or "cycle_percent" of a cycle.
         edges: (b + 1,) of the bins, in the axis's unit.
         bins: column -> (r, b) mean of each run in each bin; NaN where it has none there.
         peaks: column -> (r,) the largest of each run.
@@ -91,7 +92,7 @@ class Spread:
 
 
 def spread(values: Array) -> Spread:
-    """Return what runs (r, ...) have in common; NaN where a run has no number."""
+    """Return mean, standard deviation and range over runs (r, ...), without their NaN."""
     count = np.isfinite(values).sum(axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # bins that no run reaches: NaN, as wanted
@@ -121,8 +122,8 @@ def _group(
     columns = [_computed(outcomes[n]) for n in good]
     cycle = bool(columns) and all(CYCLE in one for one in columns)
     axis, width = (CYCLE, CYCLE_BIN) if cycle else ("flexion_deg", width)
-    there = [np.isfinite(one[axis]) for one in columns]  # frames outside the gait cycle are not
-    places = [_places(one[axis][on], axis, width) for one, on in zip(columns, there, strict=True)]
+    finite = [np.isfinite(one[axis]) for one in columns]  # frames outside the gait cycle are not
+    places = [_places(one[axis][on], axis, width) for one, on in zip(columns, finite, strict=True)]
     first, last = (
         (min(p.min() for p in places), max(p.max() for p in places)) if places else (0, -1)
     )
@@ -131,7 +132,7 @@ def _group(
     bins, peaks = {}, {}
     for name in names:
         missing = [one.get(name, np.full(len(one["time_s"]), np.nan)) for one in columns]
-        parts = zip(missing, there, places, strict=True)
+        parts = zip(missing, finite, places, strict=True)
         bins[name] = np.array([_means(v[on], p - first, len(edges) - 1) for v, on, p in parts])
         peaks[name] = np.array([np.nanmax(v) if np.isfinite(v).any() else np.nan for v in missing])
     worn = dict.fromkeys(name for n in good for name in outcomes[n].wear)
@@ -144,11 +145,11 @@ def _group(
 def _computed(outcome: Outcome) -> dict[str, Array]:
     """Return a run's columns; NaN in frames that failed, but for the bins' axes.
 
-    Such a frame holds its motion as it was recorded, where that of the others may be solved.
+    A failed frame has only its recorded motion, while that of other frames may be solved.
     """
-    lost = np.array([status.startswith(FAILED) for status in outcome.status], bool)
+    failures = np.array([status.startswith(FAILED) for status in outcome.status], bool)
     return {
-        name: values if name in ("time_s", *AXES) else np.where(lost, np.nan, values)
+        name: values if name in ("time_s", *AXES) else np.where(failures, np.nan, values)
         for name, values in outcome.columns.items()
     }
 
@@ -164,9 +165,9 @@ def _places(values: Array, axis: str, width: float) -> NDArray[np.int64]:
 
 def _means(values: Array, place: Array, count: int) -> Array:
     """Return the mean (count,) of what falls into each bin; NaN where nothing does."""
-    there = np.isfinite(values)
-    total = np.bincount(place[there], values[there], minlength=count)
-    number = np.bincount(place[there], minlength=count)
+    finite = np.isfinite(values)
+    total = np.bincount(place[finite], values[finite], minlength=count)
+    number = np.bincount(place[finite], minlength=count)
     return np.divide(total, number, out=np.full(count, np.nan), where=number > 0)
 
 
@@ -185,8 +186,8 @@ def group_rows(groups: Sequence[Group], group_by: Sequence[str]) -> list[list[st
             over = spread(group.peaks[name][:, None])
             if over.runs[0]:
                 rows.append([*labels, PEAK, "", "", name, *_cells(over, 0)])
-        for name, worn in group.wear.items():
-            rows.append([*labels, WEAR, "", "", name, *_cells(spread(worn[:, None]), 0)])
+        for name, wear in group.wear.items():
+            rows.append([*labels, WEAR, "", "", name, *_cells(spread(wear[:, None]), 0)])
     return rows
 
 

@@ -100,14 +100,14 @@ UNITS = ("_deg_mm", "_deg", "_mm")
 
 def _part(kind: type[_Part], given: Mapping[str, Any], file: Path) -> _Part:
     """Build a part from its table: the unit is cut off each key."""
-    known = {field.name for field in fields(kind)}
+    names = {field.name for field in fields(kind)}
     values = {}
     for key, value in given.items():
         unit = next((u for u in UNITS if key.endswith(u)), "")
         name = key.removesuffix(unit)
-        if name not in known or (not unit and name not in ("cam", "post")):
+        if name not in names or (not unit and name not in ("cam", "post")):
             raise InputError(
-                f"unknown key '{key}'", file, f"known, with _mm or _deg: {', '.join(sorted(known))}"
+                f"unknown key '{key}'", file, f"known, with _mm or _deg: {', '.join(sorted(names))}"
             )
         values[name] = _tuples(value)
     if "medial_arcs" in values:

@@ -146,8 +146,10 @@ class FemoralComponent:
         bridge = int(np.searchsorted(rows, np.radians(self.notch_phi[0]) + 1e-9)) - 1
         middle = z.shape[1] // 2
         columns = {0, *range(0, middle, 5), middle - 1, middle, *range(middle, 2 * middle, 5)}
-        kept = sorted({*range(0, len(rows), 4), bridge, len(rows) - 1})
-        return solids.close_sheets(outer, inner, kept, sorted({*columns, 2 * middle - 1}), bridge)
+        sections = sorted({*range(0, len(rows), 4), bridge, len(rows) - 1})
+        return solids.close_sheets(
+            outer, inner, sections, sorted({*columns, 2 * middle - 1}), bridge
+        )
 
     def mesh_with_cam(self) -> tuple[Array, NDArray[np.int64]]:
         """Return the closed triangulation of `mesh` with the cam across its box.

@@ -64,9 +64,9 @@ def _ids(rows: int, columns: int, fork: int | None, start: int) -> Ids:
 def _sheet(ids: Ids, rows: Ids, columns: Ids, middle: int | None) -> Ids:
     """Triangles of the grid, none between the two middle columns."""
     pairs = [(a, b) for a, b in pairwise(columns) if a != middle]
-    left, right = np.array(pairs).T
+    first, right = np.array(pairs).T
     up, down = rows[:-1, None], rows[1:, None]
-    a, b, c, e = ids[up, left], ids[down, left], ids[down, right], ids[up, right]
+    a, b, c, e = ids[up, first], ids[down, first], ids[down, right], ids[up, right]
     triangles = [np.stack([a, b, c], axis=-1), np.stack([a, c, e], axis=-1)]
     return np.concatenate([t.reshape(-1, 3) for t in triangles])
 
@@ -78,19 +78,19 @@ def _loop(rows: list[int], columns: list[int], fork: int | None) -> list[Node]:
     if fork is None:
         path += [(last, c) for c in columns[-2::-1]]
     else:
-        left = columns[len(columns) // 2 - 1]
+        middle = columns[len(columns) // 2 - 1]
         behind = [r for r in rows if r >= fork]
-        path += [(last, c) for c in columns[::-1] if left < c < columns[-1]]
-        path += [(r, left + 1) for r in behind[-2::-1]]
-        path += [(r, left) for r in behind[1:]]
-        path += [(last, c) for c in columns[::-1] if c < left]
+        path += [(last, c) for c in columns[::-1] if middle < c < columns[-1]]
+        path += [(r, middle + 1) for r in behind[-2::-1]]
+        path += [(r, middle) for r in behind[1:]]
+        path += [(last, c) for c in columns[::-1] if c < middle]
     return path + [(r, columns[0]) for r in rows[-2::-1]]
 
 
-def _wall(top: Ids, bottom: Ids, kept: tuple[Ids, Ids], fork: int | None) -> Ids:
+def _wall(top: Ids, bottom: Ids, wall: tuple[Ids, Ids], fork: int | None) -> Ids:
     """Triangles between the whole edge of one sheet and the thinned edge of the other."""
     whole = _loop(list(range(top.shape[0])), list(range(top.shape[1])), fork)
-    thin = set(_loop(kept[0].tolist(), kept[1].tolist(), fork))
+    thin = set(_loop(wall[0].tolist(), wall[1].tolist(), fork))
     stations = [i for i, node in enumerate(whole) if node in thin]
     triangles = []
     for start, end in pairwise(stations):

@@ -22,9 +22,10 @@ class DesignTouchSettings:
     """Search for the pose at which a design's condyles touch."""
 
     halvings: int = 18
-    """Halvings of the bracket around the adduction; 18 leave 3e-7 rad."""
+    """Halvings of the bracket around the adduction. Chosen: 18 leave 3e-7 rad."""
     largest_adduction: float = 0.04
-    """rad, about a guess."""
+    """rad: largest distance of the adduction from the initial guess. Chosen: both condyles touch
+    within it."""
 
 
 DESIGN_TOUCH = DesignTouchSettings()
@@ -82,12 +83,12 @@ class Articulation:
             return knee_pose([ap, 0.0, ml, axial_rotation, adduction, flexion])
 
         def difference(adduction: float) -> float:
-            placed = pose(adduction)
-            gaps = [self.lowest(placed, flexion, side)[0] for side in (LATERAL, MEDIAL)]
+            femoral = pose(adduction)
+            gaps = [self.lowest(femoral, flexion, side)[0] for side in (LATERAL, MEDIAL)]
             return gaps[0] - gaps[1]
 
         bounds = guess - DESIGN_TOUCH.largest_adduction, guess + DESIGN_TOUCH.largest_adduction
         adduction = brentq(difference, *bounds, xtol=1e-12)
-        placed = pose(adduction)
-        medial, lateral = (self.lowest(placed, flexion, side) for side in (MEDIAL, LATERAL))
+        femoral = pose(adduction)
+        medial, lateral = (self.lowest(femoral, flexion, side) for side in (MEDIAL, LATERAL))
         return Touch(-(medial[0] + lateral[0]) / 2.0, adduction, np.stack([medial[1], lateral[1]]))

@@ -1,4 +1,4 @@
-"""From samples to bands and to which input moves what."""
+"""From samples to bands, and to each input's share in the variance of each result."""
 
 import re
 import warnings
@@ -10,14 +10,23 @@ from typing import Any
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.run.discrepancy import COLUMNS, band_with_discrepancy, coverage, discrepancy_of
+from tkamb.run.discrepancy import (
+    COLUMNS,
+    QUANTILE_METHOD,
+    band_with_discrepancy,
+    coverage,
+    discrepancy_of,
+    load_of,
+)
 from tkamb.run.results import PERCENTILES, STATISTICS_LIMITS
 
 ENDS = ("p05", "p95")
+TOTALS_N = ("force_si_N", "force_total_N")
+"""Columns of results.csv with the total force, of which the first that is there is taken."""
 ROUND_OFF = 1e-9
-"""Standard deviation over magnitude: a result that varies less does not vary."""
+"""1: a result with a smaller standard deviation over magnitude counts as constant."""
 SAMPLES_PER_INPUT = 6
-"""Fewer per input leave a regression undetermined: its shares would be those of chance."""
+"""Smallest number of samples per input for a regression; with fewer its shares would be random."""
 NUMBER = re.compile(r"[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 MOST_CAUSES = 3
 
@@ -30,46 +39,54 @@ def varies(variance: float, square: float) -> bool:
 def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Array]:
     """Return p05, p50 and p95 over samples, each of the shape of one sample.
 
-    Of the samples that have a number (linear between order statistics); NaN where fewer than
-    `STATISTICS_LIMITS.min_samples` have one, or where more than
+    Of the n samples that have a number the p quantile is at place p (n + 1) of the ordered ones,
+    linear between them: a value that is drawn like the samples then lies between p05 and p95 with
+    a probability of 0.90 whatever n is. At place 1 + p (n - 1), which is usual for describing a
+    sample, it would be 0.81 of 20 samples and 0.87 of 60. NaN where fewer than
+    `STATISTICS_LIMITS.min_samples` have a number, or where more than
     `STATISTICS_LIMITS.max_failed_share` of all failed.
 
     Args:
         values: (n, ...) NaN where a sample has no number.
         failed: (n, ...) of the last axes of `values`, which samples failed; None: none.
+
+    Reference: Hyndman & Fan, Am Stat 50:361 (1996), doi:10.1080/00031305.1996.10473566, their
+    sixth definition.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN, hidden below
-        found = np.nanpercentile(values, list(PERCENTILES.values()), axis=0)
+        limits = np.nanpercentile(
+            values, list(PERCENTILES.values()), axis=0, method=QUANTILE_METHOD
+        )
     hidden = np.isfinite(values).sum(axis=0) < STATISTICS_LIMITS.min_samples
     if failed is not None:
         hidden = hidden | (failed.mean(axis=0) > STATISTICS_LIMITS.max_failed_share)
-    found[:, hidden] = np.nan
-    return dict(zip(PERCENTILES, found, strict=True))
+    limits[:, hidden] = np.nan
+    return dict(zip(PERCENTILES, limits, strict=True))
 
 
 def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, Any] | None:
     """Return how the nominal peak lies among its samples; None: no frame has a number.
 
     Args:
-        nominal: (f,) of the run as its inputs stand; its largest value's frame is looked at.
+        nominal: (f,) of the run with the inputs as given; the frame of its largest value counts.
         values: (n, f) of the samples, NaN where one has none.
         failed: (n, f) which frames of which samples failed.
 
     Returns:
-        frame, nominal, samples, failed_samples (of them, there), median, p05, p95 (None: no
-        band), nominal_percentile: per cent of the samples below the nominal value, those equal to
-        it by half; and all that in words.
+        frame, nominal, samples, failed_samples (at that frame), median, p05, p95 (None: no band),
+        nominal_percentile (per cent of the samples below the nominal value; equal ones count half),
+        and the same in words.
     """
     if not np.isfinite(nominal).any():
         return None
     frame = int(np.nanargmax(nominal))
     there, level = values[:, frame], float(nominal[frame])
-    known = there[np.isfinite(there)]
+    finite = there[np.isfinite(there)]
     bands = percentiles(values[:, frame : frame + 1], failed[:, frame : frame + 1])
     low, middle, high = (float(bands[name][0]) for name in ("p05", "p50", "p95"))
-    below = (known < level).sum() + 0.5 * (known == level).sum()
-    found = {
+    below = (finite < level).sum() + 0.5 * (finite == level).sum()
+    limits = {
         "frame": frame,
         "nominal": level,
         "samples": len(there),
@@ -77,9 +94,9 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
         "median": middle if np.isfinite(middle) else None,
         "p05": low if np.isfinite(low) else None,
         "p95": high if np.isfinite(high) else None,
-        "nominal_percentile": 100.0 * float(below) / len(known) if len(known) else None,
+        "nominal_percentile": 100.0 * float(below) / len(finite) if len(finite) else None,
     }
-    return found | {"words": _peak_words(found)}
+    return limits | {"words": _peak_words(limits)}
 
 
 def _peak_words(peak: Mapping[str, Any]) -> str:
@@ -90,7 +107,8 @@ def _peak_words(peak: Mapping[str, Any]) -> str:
         return failed
     outside = not peak["p05"] <= peak["nominal"] <= peak["p95"]
     return (
-        f"{peak['nominal']:.2f} BW as the inputs stand, at the {peak['nominal_percentile']:.0f}th "
+        f"{peak['nominal']:.2f} BW with the inputs as given, at the "
+        f"{peak['nominal_percentile']:.0f}th "
         f"percentile of the samples{', outside the band' if outside else ''}; {failed}"
     )
 
@@ -113,8 +131,8 @@ def band_columns(
             force = values[:, list(names).index(f"{side}_force_N")]
             columns[f"{side}_unloaded_share"] = (force == 0.0).sum(axis=0) / solved
     for index, name in enumerate(names):
-        for ending, found in percentiles(values[:, index], failed).items():
-            columns[f"{name}_{ending}"] = found
+        for ending, limits in percentiles(values[:, index], failed).items():
+            columns[f"{name}_{ending}"] = limits
     return columns
 
 
@@ -123,7 +141,8 @@ def discrepancy_columns(
 ) -> dict[str, Array]:
     """Return the columns `<name>_discrepancy_p05`, `_p95`: band of inputs and discrepancy.
 
-    Empty where nothing is known of the run's discrepancy; NaN where a force has no band.
+    Empty where nothing is known of the run's discrepancy; NaN where a force, or the total force of
+    which the discrepancy is a share, has no band.
 
     Args:
         names: (m,) columns of results.csv.
@@ -131,14 +150,18 @@ def discrepancy_columns(
         summary: of the run.
         body_weight: N.
     """
-    known = discrepancy_of(summary)
+    discrepancy = discrepancy_of(summary)
+    totals = [name for name in TOTALS_N if name in names]
+    if not totals:
+        return {}
+    load = load_of(values[:, list(names).index(totals[0])], body_weight)
     columns: dict[str, Array] = {}
     for index, name in enumerate(names):
-        found = known.get(COLUMNS.get(name, ""))
-        if found is None:
+        spread = discrepancy.get(COLUMNS.get(name, ""))
+        if spread is None:
             continue
-        unit = 1.0 if name.endswith("_BW") else body_weight
-        ends = band_with_discrepancy(values[:, index], found, unit)
+        unit = body_weight if name.endswith("_BW") else 1.0
+        ends = band_with_discrepancy(values[:, index], spread, load / unit)
         ends[:, np.isnan(percentiles(values[:, index])["p50"])] = np.nan
         columns |= {f"{name}_discrepancy_{end}": one for end, one in zip(ENDS, ends, strict=True)}
     return columns
@@ -162,7 +185,7 @@ def peak_bands(
         Force -> frame, nominal, median, p05, p95, discrepancy_p05, discrepancy_p95, of which
         those are None that have no band.
     """
-    found: dict[str, dict[str, Any]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for force, name in compared.items():
         if not np.isfinite(columns[name]).any():
             continue
@@ -172,18 +195,18 @@ def peak_bands(
         ends |= {f"discrepancy_{end}": f"discrepancy_{end}" for end in ENDS}
         for key, ending in ends.items():
             band = bands.get(f"{name}_{ending}")
-            known = band is not None and np.isfinite(band[frame])
-            row[key] = float(band[frame]) / body_weight if known and band is not None else None
-        found[force] = row
-    return found
+            has_band = band is not None and np.isfinite(band[frame])
+            row[key] = float(band[frame]) / body_weight if has_band and band is not None else None
+        rows[force] = row
+    return rows
 
 
 def causes(problems: np.ndarray) -> dict[str, float]:
     """Return why frames failed: cause -> its share of those that did, the most frequent first.
 
     Args:
-        problems: text, why a frame failed; empty where it did not. The last of its clauses says
-            most; numbers in it differ from frame to frame and are left out.
+        problems: text, why a frame failed; empty where it did not. Only the last clause of a text
+        is used, without the numbers in it, which differ from frame to frame.
     """
     last = [text.rsplit("; ", 1)[-1] for text in problems.ravel() if text]
     count = Counter(NUMBER.sub("…", text) for text in last)
@@ -193,38 +216,38 @@ def causes(problems: np.ndarray) -> dict[str, float]:
 def measured_inside(
     columns: Mapping[str, Any], bands: Mapping[str, Array], compared: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Return of each force that was measured in how many frames it lies from p05 to p95.
+    """Return, for each measured force, the share of frames in which it lies within the band.
 
     Args:
         columns: of results.csv, `measured_<name>_N` among them.
         bands: of bands.csv.
-        compared: force -> what it is held against, as in the summary's `measured`.
+        compared: force -> what it is compared with, as in the summary's `measured`.
 
     Returns:
         Force -> frames that have both, and the share of them inside, NaN of none: in the band of
         inputs, and, where there is one, in that of inputs and discrepancy.
     """
-    found: dict[str, dict[str, Any]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for name, one in compared.items():
         measured, column = columns[f"measured_{name}_N"], one["predicted"]
         missing = np.full(len(measured), np.nan)
         low, high = (bands.get(f"{column}_{end}", missing) for end in ENDS)
         frames, share = coverage(low, high, measured)
-        found[name] = {"frames": frames, "share": share}
+        rows[name] = {"frames": frames, "share": share}
         low, high = (bands.get(f"{column}_discrepancy_{end}", missing) for end in ENDS)
         frames, share = coverage(low, high, measured)
         if frames:
-            found[name]["share_with_discrepancy"] = share
-    return found
+            rows[name]["share_with_discrepancy"] = share
+    return rows
 
 
 @dataclass(frozen=True)
 class Influence:
-    """What one input does to one result.
+    """Influence of one input on one result.
 
     Args:
         result: column of results.csv.
-        name: of the input; "rest" for what no function of one input explains.
+        name: of the input; "rest" for the variance that no function of one input explains.
         share: of the result's variance over samples, all frames together.
         change: of the result per standard deviation of the input, its linear part, where the
             result's median is largest; NaN for the rest.
@@ -242,14 +265,14 @@ def influences(
     """Return the tornado table: each input's share in each result's variance, largest first.
 
     Regression: at each frame y = a + sum_i (b_i x_i + c_i x_i²) + e by least squares, x_i the
-    errors in standard deviations; the square is for what rises either way, as a force does up
-    either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), for independent inputs
-    b_i² var(x_i) + c_i² var(x_i²); that of an input which errs with others has what it does with
-    them in it, and may be negative (Li et al. 2010). Parts and variances are summed
-    over the frames. What is left is the rest: kinks, interactions and chance. A result that does
-    not vary beyond round-off has no rows. With fewer than `SAMPLES_PER_INPUT` samples per input
-    each input is regressed on alone, and of its part is taken off what chance explains of n
-    samples, 2/(n - 1) of the variance.
+    errors in standard deviations. The square covers results that rise in both directions, as a
+    force does on either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), which for
+    independent inputs is b_i² var(x_i) + c_i² var(x_i²). For correlated inputs it includes their
+    joint effect and may be negative (Li et al. 2010). Parts and variances are summed over the
+    frames. The rest is due to kinks, interactions and chance. A result that varies by round-off
+    only has no rows. With fewer than `SAMPLES_PER_INPUT` samples per input, each input is
+    regressed alone, and the share that chance explains in n samples, 2/(n - 1) of the variance, is
+    subtracted from its part.
 
     Args:
         results: (m,) names.
@@ -259,7 +282,7 @@ def influences(
 
     Reference: Li et al., J Phys Chem A 114:6022 (2010), doi:10.1021/jp9096919.
     """
-    found: list[Influence] = []
+    influences: list[Influence] = []
     for index, result in enumerate(results):
         of_frames = [_regression(values[:, index, k], errors[:, k]) for k in range(errors.shape[1])]
         frames = [(k, *one) for k, one in enumerate(of_frames) if one is not None]
@@ -275,16 +298,16 @@ def influences(
             for name, share, slope in zip(inputs, explained, slopes, strict=True)
         ]
         rows.sort(key=lambda one: -one.share)
-        found += [*rows, Influence(result, "rest", float(1.0 - explained.sum()), float("nan"))]
-    return found
+        influences += [*rows, Influence(result, "rest", float(1.0 - explained.sum()), float("nan"))]
+    return influences
 
 
 def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
     """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
-    there, count = np.isfinite(y), errors.shape[1]
-    if there.sum() < STATISTICS_LIMITS.min_samples:
+    finite, count = np.isfinite(y), errors.shape[1]
+    if finite.sum() < STATISTICS_LIMITS.min_samples:
         return None
-    y, x = y[there], errors[there]
+    y, x = y[finite], errors[finite]
     variance = float(y.var())
     if len(y) < SAMPLES_PER_INPUT * count:
         return _one_by_one(y, x)
@@ -296,7 +319,7 @@ def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
 
 
 def _one_by_one(y: Array, x: Array) -> tuple[Array, Array, float]:
-    """Return the same of each input by itself: too few samples to regress on all of them."""
+    """Return the same for each input alone, if there are too few samples for a joint regression."""
     variance, slopes, parts = float(y.var()), np.zeros(x.shape[1]), np.zeros(x.shape[1])
     for i, column in enumerate(x.T):
         terms: Any = np.column_stack([column, column**2])

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tkamb.studies.uncertainty.run import Uncertainty
 
 
-def write_uncertainty(found: "Uncertainty", folder: Path) -> None:
+def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
     """Write the nominal results and, beside them, bands, tornado, samples and indices together.
 
     Raises:
@@ -31,26 +31,26 @@ def write_uncertainty(found: "Uncertainty", folder: Path) -> None:
 
     def write_samples(path: Path) -> None:
         with new_hdf5(path) as file:
-            file["result_names"] = found.names
-            file["input_names"] = [one.name for one in found.inputs]
-            file["input_units"] = [one.unit for one in found.inputs]
-            file["input_standard_deviations"] = [one.deviation for one in found.inputs]
-            file["time_s"] = found.results["time_s"]
+            file["result_names"] = uncertainty.names
+            file["input_names"] = [one.name for one in uncertainty.inputs]
+            file["input_units"] = [one.unit for one in uncertainty.inputs]
+            file["input_standard_deviations"] = [one.deviation for one in uncertainty.inputs]
+            file["time_s"] = uncertainty.results["time_s"]
             for name, dtype in (("values", float), ("failed", bool), ("errors", float)):
-                content = np.array([getattr(one, name) for one in found.samples], dtype)
+                content = np.array([getattr(one, name) for one in uncertainty.samples], dtype)
                 file.create_dataset(name, data=content, compression="gzip")
-            problems = [one.problems.tolist() for one in found.samples]
+            problems = [one.problems.tolist() for one in uncertainty.samples]
             text = h5py.string_dtype()
             file.create_dataset("problems", data=problems, dtype=text, compression="gzip")
 
     more = {
-        BANDS_NAME: lambda path: write_rows(path, _band_rows(found.bands)),
-        TORNADO_NAME: lambda path: write_rows(path, _tornado_rows(found)),
+        BANDS_NAME: lambda path: write_rows(path, _band_rows(uncertainty.bands)),
+        TORNADO_NAME: lambda path: write_rows(path, _tornado_rows(uncertainty)),
         SAMPLES_NAME: write_samples,
     }
-    if found.indices:
-        more[INDICES_NAME] = lambda path: write_rows(path, _index_rows(found.indices))
-    write_results(found.results, folder, more=more)
+    if uncertainty.indices:
+        more[INDICES_NAME] = lambda path: write_rows(path, _index_rows(uncertainty.indices))
+    write_results(uncertainty.results, folder, more=more)
 
 
 def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[str]]:
@@ -58,14 +58,14 @@ def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[str]]:
     return [list(columns), *rows]
 
 
-def _tornado_rows(found: "Uncertainty") -> list[Sequence[str]]:
-    known = {one.name: one for one in found.inputs}
+def _tornado_rows(uncertainty: "Uncertainty") -> list[Sequence[str]]:
+    by_name = {one.name: one for one in uncertainty.inputs}
     rows: list[Sequence[str]] = [
         ("result", "input", "standard_deviation", "unit", "variance_share", "change_per_sd")
     ]
-    for one in found.tornado:
-        given = known.get(one.name)
-        deviation, unit = (_cell(given.deviation), given.unit) if given else ("", "")
+    for one in uncertainty.tornado:
+        varied = by_name.get(one.name)
+        deviation, unit = (_cell(varied.deviation), varied.unit) if varied else ("", "")
         rows.append((one.result, one.name, deviation, unit, _cell(one.share), _cell(one.change)))
     return rows
 

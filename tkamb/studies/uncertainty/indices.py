@@ -15,7 +15,7 @@ RESAMPLED = 200
 
 @dataclass(frozen=True)
 class SobolIndex:
-    """What share of a result's variance an input has.
+    """Share of an input in a result's variance.
 
     Args:
         result: column of results.csv.
@@ -66,7 +66,7 @@ def sobol_indices(
         Jansen, Comput Phys Commun 117:35 (1999), doi:10.1016/S0010-4655(98)00154-4;
         Gamboa, Janon, Klein & Lagnoux, Electron J Stat 8:575 (2014), doi:10.1214/14-EJS895.
     """
-    found: list[SobolIndex] = []
+    indices: list[SobolIndex] = []
     picks = np.random.default_rng([seed, count]).integers(0, count, (RESAMPLED, count))
     weights = np.stack([np.bincount(pick, minlength=count) for pick in picks]).astype(float)
     weights = np.vstack([np.ones(count), weights])
@@ -77,22 +77,24 @@ def sobol_indices(
             for i, name in enumerate(inputs)
             if (row := _index(result, name, blocks[0], blocks[1], blocks[2 + i], weights))
         ]
-        found += sorted(rows, key=lambda one: -one.total)
-    return found
+        indices += sorted(rows, key=lambda one: -one.total)
+    return indices
 
 
 def _index(
     result: str, name: str, a: Array, b: Array, crossed: Array, weights: Array
 ) -> SobolIndex | None:
     """Return one input's indices from (n, f) values; None where nothing can be said."""
-    there = np.isfinite(a) & np.isfinite(b) & np.isfinite(crossed)
-    kept = there.sum(axis=0) >= STATISTICS_LIMITS.min_samples
-    if not kept.any():
+    finite = np.isfinite(a) & np.isfinite(b) & np.isfinite(crossed)
+    enough = finite.sum(axis=0) >= STATISTICS_LIMITS.min_samples
+    if not enough.any():
         return None
-    there = there[:, kept]
-    square = np.where(there, 0.5 * (a[:, kept] ** 2 + b[:, kept] ** 2), 0.0).sum()
-    middle = np.where(there, a[:, kept] + b[:, kept], 0.0).sum(axis=0) / (2 * there.sum(axis=0))
-    a, b, crossed = (np.where(there, one[:, kept] - middle, 0.0) for one in (a, b, crossed))
+    finite = finite[:, enough]
+    square = np.where(finite, 0.5 * (a[:, enough] ** 2 + b[:, enough] ** 2), 0.0).sum()
+    middle = np.where(finite, a[:, enough] + b[:, enough], 0.0).sum(axis=0) / (
+        2 * finite.sum(axis=0)
+    )
+    a, b, crossed = (np.where(finite, one[:, enough] - middle, 0.0) for one in (a, b, crossed))
     variance = weights @ (0.5 * (a**2 + b**2)).sum(axis=1)
     if not varies(variance[0], square):
         return None
@@ -105,5 +107,5 @@ def _index(
         float(first[1:].std(ddof=1)),
         float(total[0]),
         float(total[1:].std(ddof=1)),
-        int(there.any(axis=1).sum()),
+        int(finite.any(axis=1).sum()),
     )

@@ -1,4 +1,4 @@
-"""Which inputs of a case vary, by how much, and what one sample makes of them."""
+"""The inputs of a case that vary, their standard deviations, and their errors in one sample."""
 
 from dataclasses import dataclass
 
@@ -58,8 +58,10 @@ def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
 
 def held_inputs(case: Case) -> tuple[str, ...]:
     """Return the names of inputs that the case has and that do not vary: deviation 0."""
-    held = [one for one in _all_inputs(case) if one.deviation == 0]
-    names = (f"{one.name.partition('.')[0]}{'_angles' * ('.about_' in one.name)}" for one in held)
+    constants = [one for one in _all_inputs(case) if one.deviation == 0]
+    names = (
+        f"{one.name.partition('.')[0]}{'_angles' * ('.about_' in one.name)}" for one in constants
+    )
     return tuple(dict.fromkeys(names))
 
 
@@ -88,16 +90,16 @@ def pose_names(inputs: tuple[VariedInput, ...]) -> list[str]:
 def _pose_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
     contact, markers = case.scene.contact, case.scene.motion.markers
     free = (*contact.released, "si") if contact and contact.released else ()  # found with them
-    given = (case.scene.uncertainty or UncertaintyTable()).model_fields_set
-    found = []
+    stated = (case.scene.uncertainty or UncertaintyTable()).model_fields_set
+    inputs = []
     for name in KNEE_COORDINATES:
         unit = "mm" if name in AXES else "deg"
         key = f"{name}_{unit}"
         # a coordinate that is taken from the markers varies with them
-        with_markers = markers is not None and name in markers.coordinates and key not in given
+        with_markers = markers is not None and name in markers.coordinates and key not in stated
         if name not in free and not with_markers:
-            found.append(VariedInput(name, getattr(table, key), unit))
-    return found
+            inputs.append(VariedInput(name, getattr(table, key), unit))
+    return inputs
 
 
 def _marker_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
@@ -115,25 +117,25 @@ def _marker_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
 
 
 def _load_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
-    found = [VariedInput("segment_mass", table.segment_mass, "relative")]
+    inputs = [VariedInput("segment_mass", table.segment_mass, "relative")]
     if case.scene.ground_reaction is not None:
-        found.append(VariedInput("ground_reaction", table.ground_reaction, "relative"))
+        inputs.append(VariedInput("ground_reaction", table.ground_reaction, "relative"))
         if case.scene.ground_reaction.applied == "cop":
             for axis in COP_AXES:
                 name = f"centre_of_pressure_{axis}"
-                found.append(VariedInput(name, getattr(table, f"{name}_mm"), "mm"))
+                inputs.append(VariedInput(name, getattr(table, f"{name}_mm"), "mm"))
             if case.tibia is not None:
-                found += _places("knee_centre", AXES, table.knee_centre_mm)
+                inputs += _places("knee_centre", AXES, table.knee_centre_mm)
     if case.scene.contact is not None:
-        found.append(VariedInput("friction", table.friction, "1"))
-        found.append(VariedInput("young_modulus", table.young_modulus, "relative"))
-        found.append(VariedInput("yield_stress", table.yield_stress, "relative"))
-    return found
+        inputs.append(VariedInput("friction", table.friction, "1"))
+        inputs.append(VariedInput("young_modulus", table.young_modulus, "relative"))
+        inputs.append(VariedInput("yield_stress", table.yield_stress, "relative"))
+    return inputs
 
 
 def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
     """Return strengths by group, and attachments by line or group."""
-    found: list[VariedInput] = []
+    inputs: list[VariedInput] = []
     groups: tuple[str, ...] = ()
     if case.scene.muscles is not None:
         groups = ("",)
@@ -141,51 +143,51 @@ def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
             from tkamb.run.muscles.shared_muscles import groups_of
 
             groups = groups_of(case)
-        found = [
+        inputs = [
             VariedInput(f"muscle_strength.{group}", table.muscle_strength, "relative")
             for group in groups
         ]
     ends = [(one.name, end) for one in case.muscles for end in LINE_ENDS]
     ends += [(group, end) for group in groups if group in ACROSS_KNEE for end in GROUP_ENDS]
-    found += [
+    inputs += [
         VariedInput(f"tendon_band.{name}", table.tendon_band_mm, "mm")
         for name in _wrapped_tendons(case)
     ]
     for name, end in ends:
         place = f"muscle_attachment.{name}.{end}"
-        found += _places(place, AXES, table.muscle_attachment_mm)
-    return found
+        inputs += _places(place, AXES, table.muscle_attachment_mm)
+    return inputs
 
 
 def _wrapped_tendons(case: Case) -> list[str]:
     """Return the names of the tendons that wrap a part by sections of a band."""
-    found = [one.name for one in case.muscles if one.wrap and one.wrap.band > 0]
+    names = [one.name for one in case.muscles if one.wrap and one.wrap.band > 0]
     ligament = case.patellar_ligament
     if ligament is not None and ligament.wrap and ligament.wrap.band > 0:
-        found.append(PATELLAR_LIGAMENT)
-    return found
+        names.append(PATELLAR_LIGAMENT)
+    return names
 
 
 def _tissue_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
-    found = []
+    inputs = []
     for bundle in case.ligaments:
         stiffness = f"ligament_stiffness.{bundle.name}"
-        found.append(VariedInput(stiffness, table.ligament_stiffness, "relative"))
+        inputs.append(VariedInput(stiffness, table.ligament_stiffness, "relative"))
         strain = f"ligament_strain.{bundle.name}"
-        found.append(VariedInput(strain, table.ligament_strain, "1"))
-    found += _places("insert_placement", AXES, table.insert_placement_mm)
-    found += [
+        inputs.append(VariedInput(strain, table.ligament_strain, "1"))
+    inputs += _places("insert_placement", AXES, table.insert_placement_mm)
+    inputs += [
         VariedInput(f"insert_placement.about_{axis}", table.insert_placement_deg, "deg")
         for axis in AXES
     ]
     if case.ligaments or case.muscles:
-        found += _places("femoral_placement", AXES, table.femoral_placement_mm)
+        inputs += _places("femoral_placement", AXES, table.femoral_placement_mm)
     if case.patellar_ligament is not None:
-        found += _places("tuberosity", AXES, table.tuberosity_mm)
+        inputs += _places("tuberosity", AXES, table.tuberosity_mm)
     patella = case.scene.patella
     if patella is not None and patella.motion == "recorded":
-        found += _places("dome", ("ap", "si"), table.dome_mm)
-    return found
+        inputs += _places("dome", ("ap", "si"), table.dome_mm)
+    return inputs
 
 
 def _places(name: str, axes: tuple[str, ...], deviation: float) -> list[VariedInput]:
@@ -194,7 +196,7 @@ def _places(name: str, axes: tuple[str, ...], deviation: float) -> list[VariedIn
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """What one sample makes of the inputs.
+    """The errors of the inputs in one sample.
 
     Args:
         inputs: those that vary.
@@ -210,12 +212,12 @@ class Draw:
 
     def standardised(self) -> Array:
         """Return (f, d): each input's error at each frame in its standard deviations."""
-        found = np.tile(self.normal, (len(self.noise), 1))
+        values = np.tile(self.normal, (len(self.noise), 1))
         poses = [i for i, one in enumerate(self.inputs) if one.name in KNEE_COORDINATES]
         share = self.constant_share
-        found[:, poses] *= np.sqrt(share)
-        found[:, poses] += np.sqrt(1.0 - share) * self.noise
-        return found
+        values[:, poses] *= np.sqrt(share)
+        values[:, poses] += np.sqrt(1.0 - share) * self.noise
+        return values
 
     def error(self, name: str) -> float:
         """Return an input's error in SI, or 0 if it does not vary; not for poses."""

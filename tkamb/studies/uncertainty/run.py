@@ -1,4 +1,4 @@
-"""All samples of a scene: over worker processes, kept as they are finished, then made bands."""
+"""All samples of a scene: computed by workers, stored when finished, then turned into bands."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -44,27 +44,27 @@ TORNADO_RESULTS = (
     *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
 )
 PEAK = "force_total_BW"
-"""Whose peak is the headline."""
+"""Column whose peak is the headline."""
 NO_BAND = (
     *("time_s", "cycle_percent", "iterations", "coupling_iterations", "coupling_change_N"),
     *("coupling_change_mm", "contact_trials", "split_determined", "condition_number"),
     *("medial_force_per_adduction_N_per_deg", "adjust_restored"),
 )
-"""What is no result of the knee, or is not computed for a sample."""
+"""Columns that are not results of the knee, or are not computed for a sample."""
 NOT_SAMPLED = ("_seconds", "_slip_mm", "_velocity_mm_per_s")
-"""Endings: computing time, and what adds up over frames that a sample does not compute."""
+"""Endings of columns without a band: computing times, and sums over frames that a sample skips."""
 RECORDED = ("measured_", "envelope_")
 """Beginnings: what was recorded beside the run."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What `estimate_uncertainty` found.
+    """Result of `estimate_uncertainty`.
 
     Args:
-        results: of the scene as it stands; its summary says what varied.
+        results: of the scene as given; its summary says what varied.
         bands: columns of bands.csv.
-        tornado: which input moves what.
+        tornado: influence of each input on each result.
         names: columns of results.csv that have a band.
         inputs: those that varied.
         samples: in the order of their numbers; those of Saltelli's design after the others.
@@ -189,7 +189,7 @@ class _Job:
 
     @property
     def design(self) -> str:
-        """Return what makes sample n the same: not how many there are, but for a design."""
+        """Return what identifies sample n: the method and, for a design, the number of samples."""
         return (
             f"{self.method}, Saltelli's design of {self.crossed}" if self.crossed else self.method
         )
@@ -198,31 +198,31 @@ class _Job:
         """Compute the samples that are not there yet and return all with their bands."""
         names = banded_names(self.nominal)
         count = len(self.points)
-        done = _kept(shards, count)
-        left = [n for n in range(count) if n not in done]
-        new = self.team.answers([(n, (self.points[n], names)) for n in left])
+        samples = _kept(shards, count)
+        remaining = [n for n in range(count) if n not in samples]
+        new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
         try:
             with interrupt_as_such():
-                for number, sample in self.progress(new, len(left)):
-                    done[number] = sample
+                for number, sample in self.progress(new, len(remaining)):
+                    samples[number] = sample
                     if shards is not None:
                         shards.put(number, Shard({}, dict(vars(sample))))
         except KeyboardInterrupt:
-            if shards is None or not done:
+            if shards is None or not samples:
                 raise
-            kept = f"{len(done)} of {count} samples are kept; go on with --resume"
-            raise KeyboardInterrupt(kept) from None
-        return self._found(names, [done[n] for n in range(count)])
+            words = f"{len(samples)} of {count} samples are kept; go on with --resume"
+            raise KeyboardInterrupt(words) from None
+        return self._found(names, [samples[n] for n in range(count)])
 
     def _found(self, names: list[str], samples: list[Sample]) -> Uncertainty:
         wanted = [name for name in TORNADO_RESULTS if name in names]
         rows = [names.index(name) for name in wanted]
         input_names = [one.name for one in self.inputs]
-        found: list[SobolIndex] = []
+        indices: list[SobolIndex] = []
         if self.crossed:
             every = np.array([one.values[rows] for one in samples])
             seed = uncertainty_of(self.case).seed
-            found = sobol_indices(wanted, input_names, every, self.crossed, seed)
+            indices = sobol_indices(wanted, input_names, every, self.crossed, seed)
         plain = samples[: 2 * self.crossed or len(samples)]  # those that are independent
         values = np.array([one.values for one in plain])
         problems = np.array([one.problems for one in plain])
@@ -243,7 +243,7 @@ class _Job:
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside
         results = replace(self.nominal, bands=bands)
-        return Uncertainty(results, bands, tornado, names, self.inputs, samples, found)
+        return Uncertainty(results, bands, tornado, names, self.inputs, samples, indices)
 
     def _summary(self, problems: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
         failed = problems != ""
@@ -262,10 +262,10 @@ class _Job:
 
 def shares_of_variance(tornado: Sequence[Influence]) -> dict[str, dict[str, float]]:
     """Return result -> input -> its share of the result's variance, largest first."""
-    found: dict[str, dict[str, float]] = {}
+    rows: dict[str, dict[str, float]] = {}
     for one in tornado:
-        found.setdefault(one.result, {})[one.name] = one.share
-    return found
+        rows.setdefault(one.result, {})[one.name] = one.share
+    return rows
 
 
 def banded_names(results: Results) -> list[str]:
@@ -282,9 +282,9 @@ def banded_names(results: Results) -> list[str]:
 
 def _kept(shards: Shards | None, count: int) -> dict[int, Sample]:
     """Return the samples that an earlier run left."""
-    found: dict[int, Sample] = {}
+    samples: dict[int, Sample] = {}
     for number in range(count) if shards is not None and shards.resumed else ():
         shard = shards.get(number) if shards is not None else None
         if shard is not None and shard.contact is not None:
-            found[number] = Sample(**shard.contact)
-    return found
+            samples[number] = Sample(**shard.contact)
+    return samples

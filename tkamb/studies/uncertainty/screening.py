@@ -1,4 +1,4 @@
-"""A quick look at which input moves what: one input at a time, by one deviation either way."""
+"""Screening of the inputs: one input at a time, changed by one standard deviation either way."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +21,19 @@ SCREENED = (
 
 
 @dataclass(frozen=True)
+class ScreeningSettings:
+    """What a screening prints."""
+
+    least_share: float = 0.01
+    """Share of the largest change of a result; inputs that change it less are only counted."""
+
+
+SCREENING = ScreeningSettings()
+
+
+@dataclass(frozen=True)
 class Screened:
-    """What one input does to one result where the result is largest.
+    """Effect of one input on one result at the frame where the result is largest.
 
     Args:
         result: column of results.csv.
@@ -55,8 +66,8 @@ def screen(
 ) -> list[Screened]:
     """Move one input at a time by one standard deviation and return what that changes.
 
-    2 d + 1 samples of d inputs. A pose is moved as a whole, without noise per frame. What two
-    inputs do together does not show; `estimate_uncertainty` has that.
+    2 d + 1 samples of d inputs. A pose is moved as a whole, without noise per frame. Interactions
+    of inputs do not show; `estimate_uncertainty` includes them.
 
     Args:
         scene: the scene.
@@ -82,12 +93,12 @@ def screen(
     answers = crew.answers(task, points)
     samples: dict[int, Sample] = dict(progress(answers, len(points)))
     values = np.array([samples[n].values for n in range(len(points))])
-    found: list[Screened] = []
+    screened: list[Screened] = []
     for m, result in enumerate(SCREENED, start=1):
         if np.isfinite(values[0, m]).any():
             frame = int(np.nanargmax(values[0, m]))
-            found += _of_result(result, values[:, m, frame], values[0, 0, frame], inputs)
-    return found
+            screened += _of_result(result, values[:, m, frame], values[0, 0, frame], inputs)
+    return screened
 
 
 def _of_result(
@@ -99,31 +110,51 @@ def _of_result(
         Screened(result, float(values[0]), float(flexion), one, float(minus), float(plus))
         for one, (minus, plus) in zip(inputs, changes.reshape(-1, 2), strict=True)
     ]
-    # an input that makes the frame fail moves it the most
+    # An input that makes the frame fail counts as the largest change.
     return sorted(
         rows, key=lambda row: -max(np.nan_to_num(abs(np.array([row.minus, row.plus])), nan=np.inf))
     )
 
 
 def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
-    """Return the tornado as text: a bar either way per input."""
+    """Return the tornado as text: a bar either way per input that moves the result notably.
+
+    Inputs that move it by less than `SCREENING.least_share` of the largest change are counted.
+
+    Args:
+        rows: of `screen`.
+        width: of a bar, characters.
+    """
     lines: list[str] = []
+    names = max((len(_named(row)) for row in rows), default=0)
     for result in dict.fromkeys(row.result for row in rows):
         own = [row for row in rows if row.result == result]
         lines.append(f"{result}: {own[0].nominal:.4g} at {own[0].flexion:.0f} deg")
         sizes = np.abs([[row.minus, row.plus] for row in own])
         largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
-        for row in own:
-            unit = "" if row.varied.unit == "1" else f" {row.varied.unit}"
-            name = f"{row.varied.name} ± {row.varied.deviation:g}{unit}"
+        # an input whose frame failed is NaN here, and not below
+        small = (sizes < SCREENING.least_share * largest).all(axis=1) | (sizes == 0.0).all(axis=1)
+        for row in (row for row, hidden in zip(own, small, strict=True) if not hidden):
             bar = _bar(row, largest, width)
-            lines.append(f"  {name:<34} {_change(row.minus)} {_change(row.plus)}  {bar}")
+            lines.append(
+                f"  {_named(row):<{names}} {_change(row.minus)} {_change(row.plus)}  {bar}"
+            )
+        if small.any():
+            share = f"{SCREENING.least_share:.0%}"
+            lines.append(
+                f"  {small.sum()} more inputs: each less than {share} of the largest change"
+            )
     if any(not np.isfinite([row.minus, row.plus]).all() for row in rows):
         lines.append(
-            "failed: with the input so far off the frame has no result, often a pose that no load "
-            "balances; what it would change is not known, so it stands first"
+            "failed: with this error of the input the frame has no result, often because no load "
+            "balances the pose; the change is not known, so the input is listed first"
         )
     return lines
+
+
+def _named(row: Screened) -> str:
+    unit = "" if row.varied.unit == "1" else f" {row.varied.unit}"
+    return f"{row.varied.name} ± {row.varied.deviation:g}{unit}"
 
 
 def _change(value: float) -> str:
@@ -131,7 +162,7 @@ def _change(value: float) -> str:
 
 
 def _bar(row: Screened, largest: float, width: int) -> str:
-    """Return the reach to both sides of the nominal value."""
+    """Return the bar to both sides of the nominal value."""
     changes = [one for one in (row.minus, row.plus) if np.isfinite(one)]
     scale = width / largest if largest > 0 else 0.0
     below, above = (round(scale * max([0.0, *(sign * c for c in changes)])) for sign in (-1, 1))

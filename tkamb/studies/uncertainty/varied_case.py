@@ -1,11 +1,11 @@
-"""A case with its inputs moved as one sample has them, errors of its skin markers among them.
+"""A case with the errors of one sample in its inputs, including those of its skin markers.
 
-All of it happens on what was read, in SI and as a right knee's: no file is read again.
+The errors are applied to the case in SI, as a right knee's: no file is read again.
 
-A skin marker sits off where its segment has it by an error that is the same in all frames. The
-rigid fit of the segment's markers is then off by the pose that best carries their places to the
-places with the errors: the reading `method = "segments"`. A chain's joints spread the same errors
-over more segments.
+A skin marker is displaced from its place on its segment by an error that is the same in all frames.
+The rigid fit of the segment's markers is then off by the pose that best maps their true places to
+the displaced ones (`method = "segments"`). A chain's joints spread the same errors over more
+segments.
 """
 
 from dataclasses import fields, replace
@@ -48,14 +48,14 @@ if TYPE_CHECKING:
 
 
 def varied_case(case: Case, draw: Draw) -> Case:
-    """Return the case with its inputs moved; rates and accelerations stay as recorded.
+    """Return the case with varied inputs; rates and accelerations stay as recorded.
 
     The insert's modulus and the shared muscles are not in a case:
     `tkamb.studies.uncertainty.sample` varies them.
     """
     tibia, coordinates = displaced_by_markers(case, draw)
-    moved = replace(case, tibia=tibia, motion=replace(case.motion, coordinates=coordinates))
-    changes: dict[str, Any] = {"motion": _motion(moved, draw), "scene": _scene(case, draw)}
+    varied = replace(case, tibia=tibia, motion=replace(case.motion, coordinates=coordinates))
+    changes: dict[str, Any] = {"motion": _motion(varied, draw), "scene": _scene(case, draw)}
     if tibia is not None:
         place = tibia.pose.copy()
         place[:, :3, 3] += tibia.pose[:, :3, :3] @ draw.place("knee_centre")
@@ -167,30 +167,31 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
     shift = draw.place("femoral_placement")
     if not shift.any() or case.chain.carrier(end.link) != "femur":
         return end
-    turned = case.chain.link_in(end.link, "femur")[:3, :3].T @ shift
-    return LinkPoint(end.link, end.position + turned)
+    shift_in_femur = case.chain.link_in(end.link, "femur")[:3, :3].T @ shift
+    return LinkPoint(end.link, end.position + shift_in_femur)
 
 
 def thinnable(case: Case) -> bool:
     """Say whether a frame needs no other frame of the motion.
 
-    A solved patella is differentiated in time, and a reference strain looks for its pose.
+    It needs others if a solved patella is differentiated in time, or if a reference strain refers
+    to another frame.
     """
     solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
     return not solved and all(np.isfinite(one.slack_length) for one in case.ligaments)
 
 
 def thinned(case: Case, frames: range) -> Case:
-    """Return the case with these frames of its motion alone."""
+    """Return the case with only these frames of its motion."""
     count, chosen = len(case.motion.time), list(frames)
 
     def at_frames(recording: Any) -> Any:
         if recording is None:
             return None
-        found = {one.name: getattr(recording, one.name) for one in fields(recording)}
+        values = {one.name: getattr(recording, one.name) for one in fields(recording)}
         series = {
             name: value[chosen]
-            for name, value in found.items()
+            for name, value in values.items()
             if isinstance(value, np.ndarray) and len(value) == count
         }
         return replace(recording, **series)
@@ -206,7 +207,7 @@ def thinned(case: Case, frames: range) -> Case:
 def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Array]":
     """Return the shank, and the knee coordinates (f, 6), with the markers' errors in them.
 
-    Of the coordinates those change that are taken from the markers.
+    Only coordinates that are taken from the markers change.
 
     Args:
         case: the case.
@@ -219,22 +220,22 @@ def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Ar
         or not any(one.name.startswith("marker.") for one in draw.inputs)
     ):
         return tibia, coordinates
-    known = {one.name: one for one in markers.segment}
-    left = case.scene.patient.side == "left"
-    shank, thigh = (_misfit(known[name], draw, left) for name in MARKED)
+    tables = {one.name: one for one in markers.segment}
+    is_left = case.scene.patient.side == "left"
+    shank, thigh = (_misfit(tables[name], draw, is_left) for name in MARKED)
     insert, knee = case.chain.insert_in_tibia, knee_pose(coordinates)
-    there = inverse(shank @ insert) @ insert @ knee @ thigh
-    change = knee_coordinates(there) - knee_coordinates(knee)
-    moved = coordinates.copy()
-    taken = [KNEE_COORDINATES.index(name) for name in markers.coordinates]
-    moved[:, taken] += change[:, taken]
-    return replace(tibia, pose=tibia.pose @ shank), moved
+    thigh_pose = inverse(shank @ insert) @ insert @ knee @ thigh
+    change = knee_coordinates(thigh_pose) - knee_coordinates(knee)
+    varied = coordinates.copy()
+    columns = [KNEE_COORDINATES.index(name) for name in markers.coordinates]
+    varied[:, columns] += change[:, columns]
+    return replace(tibia, pose=tibia.pose @ shank), varied
 
 
-def _misfit(segment: MarkerSegmentTable, draw: Draw, left: bool) -> Array:
+def _misfit(segment: MarkerSegmentTable, draw: Draw, is_left: bool) -> Array:
     """Return the pose (4, 4) of the fitted segment in the true one, as a right leg's."""
     points = np.array(list(segment.markers_mm.values())) * MILLIMETRE
-    points = points @ MIRROR if left else points
+    points = points @ MIRROR if is_left else points
     errors = np.array([draw.place(f"marker.{label}") for label in segment.markers_mm])
     weights = np.array([segment.weights.get(label, 1.0) for label in segment.markers_mm])
     poses, _ = fit_seen((points + errors)[None], points, weights, segment.name)

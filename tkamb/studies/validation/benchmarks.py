@@ -36,7 +36,7 @@ class BenchmarkSettings:
     sensel: float = 1.27 * MILLIMETRE
     """m; edge of a sensel of the pressure film in the publications."""
     resolution_mm: float = 2.0
-    """mm; resolution of every press on an implant, so that the whole page takes minutes."""
+    """mm: resolution of every press on an implant. Chosen: the whole page takes minutes."""
 
 
 BENCHMARK = BenchmarkSettings()
@@ -48,10 +48,10 @@ def _model(name: str, resolution_mm: float, **options: Any) -> Any:
 
 
 def _only(result: ContactResult) -> CondyleContact:
-    carried = result.medial or result.lateral
-    if result.status is not ContactStatus.OK or carried is None:
+    condyle = result.medial or result.lateral
+    if result.status is not ContactStatus.OK or condyle is None:
         raise ComputationError(f"a benchmark cannot be pressed: {', '.join(result.flags)}")
-    return carried
+    return condyle
 
 
 def spheres() -> Values:
@@ -65,17 +65,17 @@ def spheres() -> Values:
     pair = ContactPair(balls(radius, 0.0), block(flat(thickness), (20e-3, 20e-3)), linear)
     model = _model("lattice-linear", 0.8)
     result = model.press(model.prepare(pair), load, UPRIGHT)
-    carried = _only(result)
-    found = {
+    condyle = _only(result)
+    values = {
         "layer_approach": result.approach / exact.approach,
-        "layer_peak": carried.peak_pressure / exact.pressure.max(),
-        "layer_radius": np.sqrt(carried.area / np.pi) / exact.contact_radius,
+        "layer_peak": condyle.peak_pressure / exact.pressure.max(),
+        "layer_radius": np.sqrt(condyle.area / np.pi) / exact.contact_radius,
     }
     for name, key in (("hertz", "hertz"), ("foundation-linear", "foundation")):
         model = _model(name, 0.25)
         state = model.prepare(pair)
-        found[f"doubled_depth_{key}"] = _doubled(model, state)
-    return found
+        values[f"doubled_depth_{key}"] = _doubled(model, state)
+    return values
 
 
 def _doubled(model: Any, state: Any, depth: float = 5e-5) -> float:
@@ -188,11 +188,11 @@ def _pressed(
     """Return approach (m) and medial condyle of one contact model at flexions (deg)."""
     pressed = PressedDesign(design, size_mm)
     pressed.model = _model(name, size_mm, **options)
-    found = []
+    rows = []
     for flexion in flexions:
         result = pressed.press_alone("medial", flexion * DEGREE, load)
-        found.append((result.approach, _only(result)))
-    return found
+        rows.append((result.approach, _only(result)))
+    return rows
 
 
 def foundation(designs: Path) -> Values:
@@ -302,7 +302,7 @@ def conformity(designs: Path) -> Values:
 
 
 def thickness_and_plane(designs: Path) -> Values:
-    """Return how peak pressure answers to thickness and to the plane of conformity, 60 deg.
+    """Return how peak pressure depends on thickness and on the plane of conformity, 60 deg.
 
     Conformity r/R is raised by a tenth, across from 0.85 and along from 0.5.
     """

@@ -39,7 +39,7 @@ class DesignTableSettings:
     """Tables of designs."""
 
     samples: int = 6
-    """Samples besides the nominal case."""
+    """Number of samples besides the nominal case. Chosen: the table takes hours, not days."""
 
 
 DESIGN_TABLE = DesignTableSettings()
@@ -81,7 +81,7 @@ def press_tables(
     folder: Path,
     rows: Iterable[int] = range(11),
     resolution_mm: float = 2.0,
-    said: Callable[[str], None] = lambda words: None,
+    announce: Callable[[str], None] = lambda words: None,
 ) -> list[dict[str, Any]]:
     """Press every design, condyle and percentage; see `pressed_row`.
 
@@ -89,13 +89,13 @@ def press_tables(
         folder: models/designs.
         rows: of the tables, 0 for the start of the bend.
         resolution_mm: of the lattice.
-        said: is told each design when it is done.
+        announce: called with a line on each design that is done.
     """
     result = []
     for name in dissertation.designs():
         pressed = PressedDesign(load_design(folder / FOLDERS[name]), resolution_mm)
         result += [pressed_row(pressed, name, c, row) for c in CONDYLES for row in rows]
-        said(name)
+        announce(name)
     return result
 
 

@@ -1,8 +1,8 @@
 """The dissertation's tables D-1 to D-12 (Sharma 2008), and what was found wrong in them.
 
 The tables are kept as printed. `corrected` gives table D-12 with the two NKII columns exchanged,
-which is the one change that any comparison needs. What else was found is data beside the tables
-(`dissertation_findings.toml`) and can be computed anew from them by the functions here.
+which is the one change that a comparison needs. Other findings are data beside the tables
+(`dissertation_findings.toml`); the functions here compute them from the tables.
 """
 
 import tomllib
@@ -117,12 +117,12 @@ def implied_mass() -> Array:
     force over area, so this is the mass by which the forces in BW were multiplied, up to the
     difference between a mean of ratios and a ratio of means.
     """
-    carried = sum(
+    force = sum(
         table(area).mean * table(pressure).mean
         for area, pressure in ((MEDIAL_AREA, MEDIAL_PRESSURE), (LATERAL_AREA, LATERAL_PRESSURE))
     )
     weights = table(MEDIAL_FORCE).mean + table(LATERAL_FORCE).mean
-    return np.asarray(carried / weights / GRAVITY)
+    return np.asarray(force / weights / GRAVITY)
 
 
 def si_surplus(corrected_columns: bool) -> Array:

@@ -69,8 +69,8 @@ def badge(values: dict[str, float]) -> str:
     within = sum(hit(row, values[row["id"]]) for row in rows)
     line = f"**{within} of {len(rows)} published values within their band**"
     line += " (the source's own where it states one, else the one beside the value)."
-    left = len(published()["value"]) - len(rows)
-    return line if not left else f"{line} {left} more are not computed yet."
+    missing = len(published()["value"]) - len(rows)
+    return line if not missing else f"{line} {missing} more are not computed yet."
 
 
 def page(stored: dict[str, Any]) -> str:

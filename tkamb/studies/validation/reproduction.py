@@ -55,7 +55,7 @@ def lattice(model: Path) -> Values:
     pair, pose = load_pair(*_meshes(model), "mm", (-6.9, 30.7, 0, 0, 0, 0), "fixed",
                            "polyethylene", "+x,+y,+z", "right")  # fmt: skip
     contact = SourceLattice(CELLS, loops="source", pressure_rule="source", cache=False)
-    begun = time.process_time()
+    start = time.process_time()
     state = contact.prepare(pair)
     prepared = time.process_time()
     contact.press(state, LOAD / 10, pose)  # compiles what is not on disk yet
@@ -79,7 +79,7 @@ def lattice(model: Path) -> Values:
         "load_error": -float(result.wrench_on_insert[1]) / LOAD - 1.0,
         "pressure_sum": float((result.pressure * result.area).sum()) / LOAD,
         "linear_loops": linear.press(linear.prepare(pair), LOAD, pose).iterations,
-        "prepare_seconds": prepared - begun,
+        "prepare_seconds": prepared - start,
         "press_seconds": ended - pressed,
     }
 

@@ -1,4 +1,4 @@
-"""How sure a worn volume is: samples of the simulation, and bands beside its rows.
+"""Uncertainty of a worn volume: samples of the simulation, and bands of its rows.
 
 Sampling, inputs and percentiles are those of `tkamb uncertainty`.
 """
@@ -31,9 +31,10 @@ class WearBandSettings:
     """Bands of wear from samples."""
 
     samples: int = 32
-    """Samples unless the user asks for another number."""
+    """Number of samples unless the user asks for another. Chosen: the 5th and 95th percentiles are
+    then inside the sample."""
     max_samples: int = 10_000
-    """Largest number of samples that is accepted."""
+    """Largest number of samples that is accepted. Chosen: more take too long."""
 
 
 WEAR_BAND = WearBandSettings()
@@ -94,20 +95,20 @@ class WearBands:
 
     def questions(self) -> list[str]:
         """Return what a reader must know before using the bands."""
-        asked = []
+        questions = []
         if self.failed:
-            asked.append(f"{self.failed} of {self.samples} samples have no contact: in no band")
+            questions.append(f"{self.failed} of {self.samples} samples have no contact: in no band")
         if self.ended:
-            asked.append(
+            questions.append(
                 f"{self.ended} of {self.samples} samples wore through or lost their contact: from "
                 "there on the bands are those of the others"
             )
-        return asked
+        return questions
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """What samples there are: sample n is the same however many, and whoever computes it.
+    """The samples of a simulation; sample n does not depend on their number or on the worker.
 
     Args:
         inputs: that vary.
@@ -146,10 +147,10 @@ class Sampling:
         shards: Shards | None = None,
         progress: Progress = lambda samples, count: samples,
     ) -> WearBands:
-        """Simulate with moved inputs and return bands at the rows of a table.
+        """Simulate with varied inputs and return bands at the rows of a table.
 
         Args:
-            simulation: the case as it stands, cycles, and updates of the geometry.
+            simulation: the case as given, cycles, and updates of the geometry.
             rows: of that case.
             crew: who computes; default: this process.
             shards: where samples are kept.
@@ -160,14 +161,14 @@ class Sampling:
         """
         count = self.samples
         normal = normal_samples("lhs", count, len(self.inputs), self.seed) @ self.root.T
-        kept = {n: shards.get(n) for n in range(count)} if shards and shards.resumed else {}
-        done: dict[int, Rows] = {n: shard.contact or {} for n, shard in kept.items() if shard}
-        left = [(n, normal[n]) for n in range(count) if n not in done]
+        shard_of = {n: shards.get(n) for n in range(count)} if shards and shards.resumed else {}
+        done: dict[int, Rows] = {n: shard.contact or {} for n, shard in shard_of.items() if shard}
+        remaining = [(n, normal[n]) for n in range(count) if n not in done]
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
         try:
             with interrupt_as_such():
                 for number, sample in progress(
-                    (crew or PoolOptions()).answers(task, left), len(left)
+                    (crew or PoolOptions()).answers(task, remaining), len(remaining)
                 ):
                     done[number] = sample
                     if shards is not None:

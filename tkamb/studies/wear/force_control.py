@@ -1,7 +1,8 @@
-"""Force control of the virtual simulator: poses at which applied forces, springs and contact rest.
+"""Force control of the virtual simulator: equilibrium of applied forces, springs and contact.
 
-Of the knee coordinates q (`tkamb.geometry.frames`) flexion and whatever the profile prescribes are
-given. The others, the superior-inferior one always among them, are where nothing drives them:
+Of the knee coordinates q (`tkamb.geometry.frames`), flexion and the ones that the profile
+prescribes are given. The others, always including the superior-inferior one, follow from
+equilibrium:
 
     r_i(q) = F_i - S_i(q_i) - J_i(q) . w_contact(q) = 0
 
@@ -18,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.model import ContactModel
-from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.result import ContactStatus
+from tkamb.contact.warm_start import Guess
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_coordinates, knee_pose
 from tkamb.knee.equilibrium.balance import BalanceStatus
 from tkamb.knee.equilibrium.released_forces import FreeForces
@@ -38,13 +40,13 @@ UNITS = {
 
 @dataclass(frozen=True, eq=False)
 class ForceDrive:
-    """What a force-controlled machine does to the knee, profile row by row.
+    """Loads of a force-controlled machine on the knee, for each row of the profile.
 
     Args:
         coordinates: (f, 6) m and rad; the free ones are where the first search begins.
         applied: (f, 6) N and N·m on the femoral component, along each free coordinate.
         free: indices of the free coordinates, the superior-inferior one among them.
-        zero: (6,) m and rad, from where AP, ML and the springs count.
+        zero: (6,) m and rad, origin of AP, ML and the springs.
         springs: of the machine; None: it has none.
         percent: (f,) of the cycle at each row; None: the rows are evenly spaced.
     """
@@ -77,12 +79,12 @@ class ForceDrive:
             failed: row -> why it has none; they are counted.
         """
         counted = self._counted(poses)
-        known = [k for k in range(len(poses)) if k not in failed]
+        good = [k for k in range(len(poses)) if k not in failed]
         ranges: dict[str, float] = {"failed_rows": len(failed)}
         for name in self.names:
             unit = UNITS[name][0]
-            ranges[f"{name}_low_{unit}"] = float(counted[f"{name}_{unit}"][known].min())
-            ranges[f"{name}_high_{unit}"] = float(counted[f"{name}_{unit}"][known].max())
+            ranges[f"{name}_low_{unit}"] = float(counted[f"{name}_{unit}"][good].min())
+            ranges[f"{name}_high_{unit}"] = float(counted[f"{name}_{unit}"][good].max())
         return ranges
 
     def rows(self, poses: Array, failed: Mapping[int, str]) -> list[dict[str, Any]]:
@@ -108,7 +110,7 @@ class ForceDrive:
 
 @dataclass(frozen=True, eq=False)
 class MachineJoint:
-    """What pushes the free coordinates at one row beside the contact; see the module.
+    """Loads on the free coordinates at one row, beside the contact; see the module.
 
     Args:
         released: indices of the n free coordinates.
@@ -150,24 +152,24 @@ class RestingPoses:
         self._found: Array | None = None
         self._stiffness: Array | None = None
 
-    def at(self, k: int, load: float, guess: ContactResult | None) -> tuple[Array, str]:
+    def at(self, k: int, load: float, start: Guess | None) -> tuple[Array, str]:
         """Return the pose (4, 4) of row k at rest, and why it is none; empty: it is one.
 
         Args:
             k: row.
             load: N, axial.
-            guess: an earlier contact.
+            start: an earlier contact, or its warm start.
         """
         place = self._drive.coordinates[k].copy()
         if self._found is not None:
             free = list(self._drive.free)
             place[free] = self._found[free]
-        first = self._model.press(self._state, load, knee_pose(place), guess)
+        first, start = self._model.press_from(self._state, load, knee_pose(place), start)
         if first.status is not ContactStatus.OK:
             why = "; ".join(first.flags) or first.status.value
             return knee_pose(place), f"where the search begins: {why}"
         place[SI] = first.pose[1, 3]
-        forces = FreeForces(self._drive.joint(k), self._model.probe(self._state, first), place)
+        forces = FreeForces(self._drive.joint(k), self._model.probe(self._state, start), place)
         balance = forces.balance(self._stiffness)
         if balance.status is not BalanceStatus.OK:
             return knee_pose(place), f"no equilibrium: {balance.status.value}"

@@ -1,4 +1,4 @@
-"""What the insert is made of as far as wear goes: laws with parameters, density, creep."""
+"""Wear properties of the insert's material: laws with parameters, density, creep."""
 
 import math
 import tomllib
@@ -25,10 +25,10 @@ class WearMaterial:
     """A wear material with where its numbers come from.
 
     Args:
-        name: what to call it.
+        name: name in messages.
         text: in words.
         density_kg_per_m3: turns volume into mass.
-        law: the law that is taken unless another is asked for.
+        law: the default law.
         laws: law -> its parameters.
         sources: one line per number.
         caution: what a reader must know before using the numbers; may be empty.
@@ -79,7 +79,7 @@ class WearMaterial:
                 )
             parameters[key] = wear_factor
         elif name not in self.laws:
-            law_class(name)  # a name that there is not is another mistake
+            law_class(name)  # an unknown name is another mistake, with its own message
             raise InputError(
                 f"material '{self.name}' has no parameters for the law '{name}'",
                 hint=f"it has: {', '.join(self.laws)}; give the others in a material file",
@@ -98,11 +98,11 @@ def wear_material(name: str | Path) -> WearMaterial:
     Raises:
         InputError: no such name or file, an unknown key, or a bad value.
     """
-    known = _built_in()
-    if str(name) in known:
-        return _material(str(name), known[str(name)], f"wear material '{name}'")
+    built_in = _built_in()
+    if str(name) in built_in:
+        return _material(str(name), built_in[str(name)], f"wear material '{name}'")
     if Path(name).suffix != ".toml":
-        hint = f"{names_near(str(name), known)}; or give a material file (.toml)"
+        hint = f"{names_near(str(name), built_in)}; or give a material file (.toml)"
         raise InputError(f"no wear material '{name}'", hint=hint)
     content = read_toml(name, what="wear material")
     return _material(str(content.pop("name", Path(name).stem)), content, name)
@@ -130,7 +130,7 @@ def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial
             f"density_kg_per_m3 cannot be {density}", where, f"give {low:g} to {high:g}"
         )
     if not (isinstance(laws, dict) and all(isinstance(table, dict) for table in laws.values())):
-        raise InputError("laws are no tables", where, "write [laws.archard] and its parameters")
+        raise InputError("laws are not tables", where, "write [laws.archard] and its parameters")
     for law, parameters in laws.items():
         wear_law(law, parameters, where)
     if content["law"] not in laws:
@@ -150,27 +150,29 @@ def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial
 
 
 def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]:
-    given = content.get("factor_range")
-    if given is None:
+    limits = content.get("factor_range")
+    if limits is None:
         return TWO_EITHER_WAY
     sound = (
-        isinstance(given, list)
-        and len(given) == 2
-        and all(isinstance(one, int | float) and math.isfinite(one) for one in given)
-        and 0 < given[0] <= 1 <= given[1]
+        isinstance(limits, list)
+        and len(limits) == 2
+        and all(isinstance(one, int | float) and math.isfinite(one) for one in limits)
+        and 0 < limits[0] <= 1 <= limits[1]
     )
     if not sound:
         hint = "give two factors, at most 1 and at least 1, e.g. [0.5, 2.0]"
-        raise InputError(f"cannot be {given}", f"{where}: factor_range", hint)
+        raise InputError(f"cannot be {limits}", f"{where}: factor_range", hint)
     if "range_source" not in content:
         raise InputError("'range_source' is missing", where, "say where the range comes from")
-    return float(given[0]), float(given[1])
+    return float(limits[0]), float(limits[1])
 
 
-def _sources(given: Any, where: object) -> tuple[str, ...]:
-    if not (isinstance(given, list) and given and all(isinstance(line, str) for line in given)):
-        raise InputError("sources is no list of texts", where, "say where each number comes from")
-    return tuple(given)
+def _sources(value: Any, where: object) -> tuple[str, ...]:
+    if not (isinstance(value, list) and value and all(isinstance(line, str) for line in value)):
+        raise InputError(
+            "sources is not a list of texts", where, "say where each number comes from"
+        )
+    return tuple(value)
 
 
 def _creep(table: Any, where: object) -> LogarithmicCreep | None:

@@ -1,4 +1,4 @@
-"""From a scene, a folder of results or a simulator's profile to what is worn by what."""
+"""From a scene, a folder of results or a simulator's profile to the inputs of a wear simulation."""
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,7 +33,7 @@ from tkamb.units import MILLIMETRE
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 AFTER_A_RUN = ("wear",)
-"""Tables of a scene that no run reads: a folder of results takes other keys of them."""
+"""Tables of a scene that a run does not read; they may be changed for a folder of results."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def wear_setup(
     check: Callable[[WearTable, Path], None] = lambda table, path: None,
     progress: Progress = lambda indices: indices,
 ) -> WearSetup:
-    """Return what is worn.
+    """Return the bodies, the motion and the contact of a wear simulation.
 
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
@@ -93,8 +93,8 @@ def wear_setup(
         springs: a file of its springs (`tkamb.studies.wear.springs`), for force control.
         contact: contact model, in place of the scene's.
         resolution_mm: in place of the scene's.
-        frames: most frames of a recorded cycle, fewest of a simulator's; they never change what
-            the cycle is.
+        frames: largest number of frames of a recorded cycle, smallest of a simulator's; the cycle
+        itself does not depend on it.
         period: s of a simulator's cycle.
         close: how recorded frames become a cycle (`tkamb.studies.wear.motion`), in place of the
             scene's [wear] close.
@@ -110,7 +110,7 @@ def wear_setup(
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
     path = Path(path)
     if springs is not None and simulator is None:
-        raise InputError("springs without a simulator", "--springs", "give --simulator too")
+        raise InputError("springs without a simulator", "--springs", "also give --simulator")
     given_keys = dict(overrides or {})
     if close is not None:
         if simulator is not None:
@@ -130,17 +130,17 @@ def wear_setup(
             preset = preset_of_run(summary)
             path, of_run = _scene_of(summary, path), overrides_of_run(summary)
         scene_path = path
-        given = load_scene(path, of_run | given_keys, preset)
-        case = load_case(_with_contact(given, contact, resolution_mm, path))
-        hashes = _hashes(case, given)
+        scene = load_scene(path, of_run | given_keys, preset)
+        case = load_case(_with_contact(scene, contact, resolution_mm, path))
+        hashes = _hashes(case, scene)
     check(_wear_table(case.scene), scene_path)
     table = _with_contact(case.scene, contact, resolution_mm, path).contact
     assert table is not None and case.femoral is not None and case.insert is not None
     _refuse_post(case)
     engine = _engine(case, table)
     if simulator is not None:
-        held = None if springs is None else read_springs(springs)
-        motion = _of_profile(read_profile(simulator, frames), held, engine, case, period)
+        spring_table = None if springs is None else read_springs(springs)
+        motion = _of_profile(read_profile(simulator, frames), spring_table, engine, case, period)
     elif motion is None:
         motion = _of_scene(case.scene, path, frames, progress)
     return WearSetup(
@@ -207,9 +207,9 @@ def _wear_table(scene: Scene) -> WearTable:
     return scene.wear or WearTable()
 
 
-def _hashes(case: Case, given: Scene) -> tuple[str, ...]:
+def _hashes(case: Case, scene: Scene) -> tuple[str, ...]:
     """Return the hashes that a run of the scene has: as given, and with the contact asked for."""
-    scenes = (given, case.scene)
+    scenes = (scene, case.scene)
     return tuple(dict.fromkeys(scene_hash(replace(case, scene=one)) for one in scenes))
 
 
@@ -243,8 +243,8 @@ def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleM
     track = _Track(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
     contact = scene.contact
     assert contact is not None
-    moved = contact.released or contact.adjust  # other poses than the recorded ones
-    whole = None if moved else (recorded, knee_pose(case.motion.coordinates))
+    changed = contact.released or contact.adjust  # other poses than the recorded ones
+    whole = None if changed else (recorded, knee_pose(case.motion.coordinates))
     return _cycle_of(track, range(len(track.time)), scene, recorded, whole)
 
 

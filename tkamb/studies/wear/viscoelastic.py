@@ -18,9 +18,9 @@ class ViscoelasticBedSettings:
     """The press into a viscoelastic bed."""
 
     max_approach: float = 5e-3
-    """m; farthest that a load may press the femoral component into the bed in one step."""
+    """m: largest approach in one step. Chosen: half a usual insert's thickness."""
     approach_tolerance: float = 1e-9
-    """m; tolerance of the approach that carries a load."""
+    """m; tolerance of the approach that carries a load. Chosen: far below what changes a force."""
 
 
 VISCOELASTIC_BED = ViscoelasticBedSettings()
@@ -73,8 +73,8 @@ class PronySeries:
         """
         ratio = step / np.array(self.times)
         decay = np.exp(-ratio)
-        kept = np.array(self.fractions) * -np.expm1(-ratio) / ratio
-        return self.equilibrium + float(kept.sum()), decay, kept
+        weights = np.array(self.fractions) * -np.expm1(-ratio) / ratio
+        return self.equilibrium + float(weights.sum()), decay, weights
 
     def stress(self, time: Array, strain: Array) -> Array:
         """Return the stress relative to M_0 (f, ...) of strains (f, ...), linear between times.
@@ -89,8 +89,8 @@ class PronySeries:
         memory = np.multiply.outer(np.array(self.fractions), strain[0])
         result = [self.equilibrium * strain[0] + memory.sum(axis=0)]
         for step, before, after in zip(np.diff(time), strain[:-1], strain[1:], strict=True):
-            _, decay, kept = self.response(float(step))
-            memory = (memory.T * decay).T + np.multiply.outer(kept, after - before)
+            _, decay, weights = self.response(float(step))
+            memory = (memory.T * decay).T + np.multiply.outer(weights, after - before)
             result.append(self.equilibrium * after + memory.sum(axis=0))
         return np.array(result)
 
@@ -100,7 +100,7 @@ class ViscoelasticBed:
 
     Each column of the bed (`tkamb.contact.samples`) has the linear foundation's pressure p = M d/h
     with M relaxing as a Prony series. A column that the femur leaves carries nothing and creeps
-    back: its strain is then what makes its stress zero. The load acts along -y.
+    back: its strain is then the one at which its stress is zero. The load acts along -y.
 
     Limits: as the linear elastic foundation; one modulus, relaxing in volume and shape alike.
 
@@ -142,19 +142,19 @@ class ViscoelasticBed:
             xtol=VISCOELASTIC_BED.approach_tolerance,
         )
         strain, pressure = self._pressed(pose, fall, step)
-        _, decay, kept = self._series.response(step)
-        self._memory = decay[:, None] * self._memory + kept[:, None] * (strain - self._strain)
+        _, decay, weights = self._series.response(step)
+        self._memory = decay[:, None] * self._memory + weights[:, None] * (strain - self._strain)
         self._strain = strain
         return pressure
 
     def _pressed(self, pose: Array, fall: float, step: float) -> tuple[Array, Array]:
         """Return strains and pressures (n,) with the femur `fall` below its pose."""
-        moved = np.array(pose, float)
-        moved[1, 3] -= fall
-        gap = gaps_along_normals(self._bed, self._femoral, moved)
+        pressed_pose = np.array(pose, float)
+        pressed_pose[1, 3] -= fall
+        gap = gaps_along_normals(self._bed, self._femoral, pressed_pose)
         asked = -gap / np.maximum(self._bed.thickness, FOUNDATION.least_thickness)
-        slope, decay, kept = self._series.response(step)
-        carried = decay @ self._memory - kept.sum() * self._strain
-        free = -carried / slope  # strain at which the stress is zero
+        slope, decay, weights = self._series.response(step)
+        relaxed = decay @ self._memory - weights.sum() * self._strain
+        free = -relaxed / slope  # strain at which the stress is zero
         strain = np.maximum(asked, free)
-        return strain, self._modulus * np.maximum(slope * strain + carried, 0.0)
+        return strain, self._modulus * np.maximum(slope * strain + relaxed, 0.0)

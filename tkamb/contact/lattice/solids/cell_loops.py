@@ -6,7 +6,7 @@ from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
 NOTHING = 1e-300
-"""m², so that nothing is divided by zero."""
+"""m²: smallest divisor, which avoids a division by zero."""
 
 
 @compiled
@@ -57,10 +57,10 @@ def deviatoric_matrices(
 def _parted(
     x: Array, g: Array, nodes: Index, displacement: Array, u: Array, rest: Array
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Part a cell's displacement into G x, G = sum u_i g_iᵀ, and a rest; return G, row by row.
+    """Split a cell's displacement into G x, G = sum u_i g_iᵀ, and a rest; return G, row by row.
 
-    One axis after the other, each with its eight corners side by side: so they fill the
-    processor's vectors. G is held in nine registers. The arguments are those of `_shear_force`.
+    The eight corners of an axis lie side by side, so that they fill the processor's vector
+    registers. G is held in nine registers. The arguments are those of `_shear_force`.
     """
     first = nodes[0]
     for i in range(8):
@@ -82,93 +82,11 @@ def _parted(
 
 @compiled
 def _along(one: Array, other: Array) -> float:
-    """Return the product of eight numbers with eight others."""
+    """Return the scalar product of two vectors of eight numbers."""
     total = 0.0
     for i in range(8):
         total += one[i] * other[i]
     return total
-
-
-@compiled
-def largest_pull(corners: Array, gradients: Array, volumes: Array, stiffest: float) -> float:
-    """Return a bound of (3 V lambda)^½ of all cells, m², lambda the largest eigenvalue of K_d.
-
-    lambda <= 2 V |g|² + `stiffest` |P|²; P = I - x gᵀ is a projection as x gᵀ is, whose norms are
-    the same and no larger than |x| |g|. See `strained_cells` for the arguments.
-    """
-    largest = 0.0
-    for cell in range(len(corners)):
-        shape = _square_norm(gradients[cell])
-        lambda_ = 2 * volumes[cell] * shape + stiffest * _square_norm(corners[cell]) * shape
-        largest = max(largest, 3 * volumes[cell] * lambda_)
-    return np.sqrt(largest)
-
-
-@compiled
-def _square_norm(matrix: Array) -> float:
-    """Return a bound of the squared spectral norm of a matrix (3, 8) less its rows' means."""
-    mean, largest = np.zeros(3), 0.0
-    for a in range(3):
-        for i in range(8):
-            mean[a] += matrix[a, i] / 8
-    for a in range(3):
-        row = 0.0
-        for b in range(3):
-            row += abs(_along(matrix[a], matrix[b]) - 8 * mean[a] * mean[b])
-        largest = max(largest, row)
-    return largest
-
-
-@compiled
-def strained_cells(
-    corners: Array,
-    gradients: Array,
-    volumes: Array,
-    stiffest: float,
-    nodes: Index,
-    displacement: Array,
-    strain: float,
-    dilatation: float,
-) -> tuple[Index, Array]:
-    """Return the cells whose strain or dilatation may exceed its limit; of the others none does.
-
-    And the norm of the mean strain sym G of each that is returned.
-
-    With the parts G x and r of the displacement, uᵀ K_d u is 2 V |dev sym G|² and what the springs
-    store of r. That is no more than `stiffest` |r|²: K_spr is no larger than the Laplacian of the
-    same springs without directions, and that no larger than twice its largest diagonal entry.
-
-    Args:
-        corners: (c, 3, 8) m.
-        gradients: (c, 3, 8) 1/m.
-        volumes: (c,) m³.
-        stiffest: m, twice the largest sum of the springs of one node.
-        nodes: (c, 8) of the cells.
-        displacement: (n, 3) m.
-        strain: limit of the equivalent strain e, e² = uᵀ K_d u / (3 V).
-        dilatation: limit of |tr G|.
-    """
-    numbers, norms, count = np.empty(len(nodes), np.int64), np.empty(len(nodes)), 0
-    u, rest = np.empty((3, 8)), np.empty((3, 8))
-    for cell in range(len(nodes)):
-        xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(
-            corners[cell], gradients[cell], nodes[cell], displacement, u, rest
-        )
-        mean = (xx + yy + zz) / 3
-        shear = ((xy + yx) ** 2 + (xz + zx) ** 2 + (yz + zy) ** 2) / 2
-        shear += (xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2
-        size = 0.0
-        for a in range(3):
-            square = total = 0.0
-            for i in range(8):
-                square += rest[a, i] * rest[a, i]
-                total += rest[a, i]
-            size += square - total * total / 8
-        small = 2 * volumes[cell] * shear + stiffest * size <= 3 * volumes[cell] * strain**2
-        if not (small and abs(3 * mean) <= dilatation):  # NaN is not small
-            numbers[count], norms[count] = cell, np.sqrt(shear + 3 * mean**2)
-            count += 1
-    return numbers[:count].copy(), norms[:count].copy()
 
 
 @compiled
@@ -185,9 +103,9 @@ def _shear_force(
 ) -> float:
     """Put K_d u of a cell into force (3, 8); return uᵀ K_d u.
 
-    K_d is never made: from G = sum u_i g_iᵀ follow the rests u_i - G x_i, from these the springs'
-    forces t_i, and with D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces t_i + D g_i. D is held
-    in nine registers as G is.
+    The matrix K_d is never assembled. G = sum u_i g_iᵀ gives the rests u_i - G x_i, and these the
+    springs' forces t_i. With D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces are t_i + D g_i.
+    D is held in nine registers, as G is.
 
     Args:
         x: (3, 8) m, corners.
@@ -275,11 +193,8 @@ def softened_forces(
     chosen: Index,
     displacement: Array,
     forces: Array,
-    lost: Array,
 ) -> None:
-    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`, 1 - mu_t/mu (k,) into `lost`.
-
-    See `shear_forces`.
+    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`; see `shear_forces`.
 
     Args:
         corners: (c, 3, 8) m.
@@ -289,12 +204,11 @@ def softened_forces(
         shear_modulus: mu, Pa.
         knots: (q,) e between which 3 mu_s e is cubic.
         cubic: (4, q - 1) its coefficients, the highest power first.
-        least: the smallest e that is told from none.
+        least: smallest e that is distinguished from zero.
         nodes: (c, 8) of the cells.
         chosen: (k,) cells.
         displacement: (n, 3) m.
         forces: (k, 24).
-        lost: (k,).
     """
     u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
     for k in range(len(chosen)):
@@ -306,8 +220,6 @@ def softened_forces(
         y = strain - knots[part]
         stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
         softened = shear_modulus - stress / (3 * strain)
-        slope = (3 * cubic[0, part] * y + 2 * cubic[1, part]) * y + cubic[2, part]
-        lost[k] = 1 - slope / (3 * shear_modulus)
         for i in range(8):
             for a in range(3):
                 forces[k, 3 * i + a] = softened * force[a, i]
@@ -332,8 +244,8 @@ def cell_forces(
     """Add mu_s K_d u + K V g (g · u), N, of cells to the nodes' `internal` (n, 3).
 
     Return uᵀ K_T u, N·m, K_T the tangent stiffness: V q'(e) e² + K V (g · u)² of each cell,
-    q = 3 mu_s e. And put (mu - mu_s) K_d u of each cell, N, into `residuals` (c, 24). One pass over
-    the cells gives the true force of the solid and what the linear solid carries beyond it.
+    q = 3 mu_s e. Also write (mu - mu_s) K_d u of each cell, N, into `residuals` (c, 24). One pass
+    over the cells gives the true force of the solid and how much more the linear solid carries.
 
     Args:
         corners: (c, 3, 8) m.
@@ -344,7 +256,7 @@ def cell_forces(
         bulk_modulus: K, Pa.
         knots: (q,) equivalent strains between which 3 mu_s e is cubic.
         cubic: (4, q - 1) its coefficients, the highest power first.
-        least: the smallest equivalent strain that is told from none.
+        least: smallest equivalent strain that is distinguished from zero.
         nodes: (c, 8) of the cells.
         displacement: (n, 3) m.
         residuals: (c, 24), written.

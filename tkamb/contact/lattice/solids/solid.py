@@ -1,4 +1,4 @@
-"""A solid made of cells: linear stiffness, what nonlinearity takes away, tangent."""
+"""A solid made of cells: linear stiffness, nonlinear residual, tangent."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
@@ -23,8 +23,6 @@ class SolidSettings:
 
     cells_at_once: int = 2000
     """Cells whose matrices are in memory at once, 9 MB."""
-    always_checked_strain: float = 0.1
-    """1: elements strained more are always checked for yield, whatever their law says."""
 
 
 SOLID = SolidSettings()
@@ -125,7 +123,7 @@ class Scatter:
         return total
 
     def mean(self, values: Array, forces: Array, chosen: Index) -> Array:
-        """Return at nodes (n,) the mean of what elements have, by their forces; 0 where none is.
+        """Return the force-weighted mean of elements' values at nodes (n,); 0 without elements.
 
         Args:
             values: (k,) of the chosen elements.
@@ -142,7 +140,7 @@ def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
 
 @compiled
 def _add_up(parts: Array, elements: Index, chosen: Index, which: Index, total: Array) -> None:
-    """Add vectors (k, p, 3) of chosen elements (k,), some of them, to those of nodes (n, 3)."""
+    """Add vectors (k, p, 3) of some of the chosen elements (k,) to nodal vectors (n, 3)."""
     for k in which:
         element = chosen[k]
         for corner in range(parts.shape[1]):
@@ -186,19 +184,6 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: I
             for b in range(3):
                 strains[k, a, b] = (gradient[a, b] + gradient[b, a]) / 2
     return strains
-
-
-@dataclass(frozen=True, eq=False)
-class ScreenedElements:
-    """Elements that a bound does not pass over.
-
-    Args:
-        elements: (k,) increasing.
-        strain: (k,) norms of their mean strains.
-    """
-
-    elements: Index
-    strain: Array
 
 
 class Solid(ABC):
@@ -247,21 +232,18 @@ class Solid(ABC):
         """Linear stiffness (3n, 3n), N/m; assembled anew, it is as large as half of the factor."""
 
     @abstractmethod
-    def nonlinear_residual(
-        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
 
         Args:
-            displacement: (n, 3) m; only the chosen elements' nodes are looked at.
+            displacement: (n, 3) m; only the chosen elements' nodes are used.
             chosen: (k,) elements; all by default.
-            lost: (k,) to be written: what elements have lost of their tangent stiffness, 0 to 1.
         """
 
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
-        """Return what a displacement (n, 3), m, asks of the solid, element by element.
+        """Return the forces that hold a displacement (n, 3), m, summed element by element.
 
-        No factor is involved: this is what a solution is measured by.
+        No stored factor is involved, so that they measure the error of a solution.
 
         Returns:
             Internal forces f(u) (n, 3), N; h = K u - f(u) of each element (k, 3p), N; and
@@ -274,19 +256,6 @@ class Solid(ABC):
         beyond = self.linear_force(further) - self.residual_force(further)
         work = float(np.vdot(displacement, beyond - internal)) / DIFFERENCE
         return internal, residuals, work
-
-    def noticeable(self, displacement: Array, share: float) -> ScreenedElements | None:
-        """Return the elements whose share of h may matter; None: all may.
-
-        Of no other is the norm of `nonlinear_residual` above `share`, N, or a principal strain of
-        the mean gradient outside of ±2 `SOLID.always_checked_strain`.
-
-        Args:
-            displacement: (n, 3) m.
-            share: N.
-        """
-        del displacement, share
-        return None
 
     def residual_force(self, displacement: Array) -> Array:
         """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
@@ -307,27 +276,20 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def least_principal_strain(
-        self, displacement: Array, some: ScreenedElements | None = None
-    ) -> float:
-        """Return the smallest principal strain of the mean gradients of cells, by default of all.
+    def least_principal_strain(self, displacement: Array) -> float:
+        """Return the smallest principal strain of the mean gradients of all cells.
 
-        It is no smaller than minus the norm of its tensor: where the cell of largest norm is
-        compressed, only cells whose norm exceeds that compression are looked at.
+        A principal strain is no smaller than minus the norm of its tensor. Where the cell of
+        largest norm is compressed, only cells whose norm exceeds that compression are evaluated.
         """
-        if some is None:
-            strain = self.strain(displacement)
-            norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
-            some = ScreenedElements(np.arange(len(strain)), norms)
-        if not len(some.elements):
-            return 0.0
-        most = int(some.strain.argmax())
-        largest = self.strain(displacement, some.elements[[most]])
+        strain = self.strain(displacement)
+        norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
+        most = int(norms.argmax())
         # The norm of a strain bounds its principal values, so that elements with a smaller norm
         # than the compression found already cannot have more.
-        near = some.strain >= -np.linalg.eigvalsh(largest)[0, 0]
+        near = norms >= -np.linalg.eigvalsh(strain[most])[0]
         near[most] = True  # compressed along one axis its norm is its compression, but for rounding
-        return float(np.linalg.eigvalsh(self.strain(displacement, some.elements[near])).min())
+        return float(np.linalg.eigvalsh(strain[near]).min())
 
     def bulk(self, cells: slice) -> Array:
         """Return K V g gᵀ of some cells (k, 24, 24), N/m, g · u their mean dilatation."""
@@ -349,7 +311,7 @@ class Solid(ABC):
 
 
 def chunks(count: int) -> Iterator[slice]:
-    """Yield stretches of so many cells."""
+    """Yield slices of at most `SOLID.cells_at_once` cells."""
     for first in range(0, count, SOLID.cells_at_once):
         yield slice(first, min(first + SOLID.cells_at_once, count))
 

@@ -7,10 +7,10 @@ Z = L⁻¹ E the response of the held unknowns (E picks them), which `prepare` s
 
     P = L⁻ᵀ (1 − Z (ZᵀZ)⁻¹ Zᵀ) L⁻¹
 
-is the inverse of K on the free unknowns, and L⁻ᵀ Z (ZᵀZ)⁻¹ d the displacement that d of the held
-unknowns causes. The springs' tangent differs from K in the few springs that have softened: the
-conjugate gradient method, preconditioned by P, solves with it in a few iterations (Saad 2003,
-section 9.2). What the stored factor is rounded to changes the number of iterations alone.
+is the inverse of K on the free unknowns. A prescribed displacement d of the held unknowns moves
+the lattice by L⁻ᵀ Z (ZᵀZ)⁻¹ d. The springs' tangent differs from K in the few springs that have
+softened. The conjugate gradient method, preconditioned by P, solves with it in a few iterations
+(Saad 2003, section 9.2). Rounding of the stored factor changes only the number of iterations.
 """
 
 from dataclasses import dataclass
@@ -34,17 +34,17 @@ class ConjugateGradientSettings:
     """When a linear system counts as solved."""
 
     tolerance: float = 0.02
-    """Residual relative to the right-hand side. A Newton step need not be exact: its own error
-    is of the order of what the step leaves."""
+    """1: residual relative to the right-hand side. A Newton step need not be exact, because the
+    next step corrects its error."""
     max_iterations: int = 60
-    """A solution is given up to the next Newton step there."""
+    """Largest number of iterations; the next Newton step then begins with what is reached."""
 
 
 CONJUGATE_GRADIENT = ConjugateGradientSettings()
 
 
 class CandidateResponse:
-    """What vertical forces on candidate nodes do: the part of `prepare` that the loops use.
+    """Response to vertical forces on candidate nodes: the part of `prepare` that the loops use.
 
     Args:
         problem: solid and factor.
@@ -117,7 +117,7 @@ class HeldNodes:
 
         Args:
             tangent: of the springs as they are.
-            force: what acts on held unknowns does not count.
+            force: forces on held unknowns have no effect.
         """
         solid, settings = self._response.problem.solid, self._settings
         assert isinstance(solid, SourceNetwork)

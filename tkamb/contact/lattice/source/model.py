@@ -1,17 +1,17 @@
 """Sharma's own loops: displacement-driven, one linear solution per contact set.
 
-Sharma (2008), section 4.5.5. Nodes in contact are given the vertical displacement that the
-femoral component asks of them and slide freely in x and z; the others must carry no force.
+Sharma (2008), section 4.5.5. Nodes in contact get the vertical displacement that brings them
+onto the femoral component, and slide freely in x and z. All other nodes must carry no force.
 
 Linear: a unit dummy displacement of the nodes in contact gives the slope of the reaction, so
 that one correction of D reaches the load while the set stays. Nonlinear: at fixed D the free
 unknowns are iterated to zero force with the tangent springs, then D_new = D
-(F_load/F_reaction)^(1/m). Sharma (2008) has m = 1, which oscillates for ever where the reaction
-grows with the square of D or faster, as it does while nodes come in; from the second D on m is
-the growth seen between the last two.
+(F_load/F_reaction)^(1/m). Sharma (2008) has m = 1. That oscillates without end where the reaction
+grows with the square of D or faster, as it does while nodes come into contact. From the second D
+on, m is therefore the exponent between the last two.
 No step factorises a matrix: see `held`.
-Sharma (2008) leaves open what happens to nodes that would be pulled: here they are let go, and
-nodes that the femoral component would pass are caught.
+Sharma (2008) leaves open what happens to nodes that would be pulled. Here they are released, and
+nodes that the femoral component would penetrate are added.
 """
 
 from dataclasses import dataclass, replace
@@ -23,6 +23,7 @@ from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.model import CellContact
+from tkamb.contact.lattice.nonlinear_balance import Residual
 from tkamb.contact.lattice.problem import ContactProblem, Direction, TangentPlanes
 from tkamb.contact.lattice.report import PressureRule
 from tkamb.contact.lattice.settings import LatticeSolverSettings
@@ -46,13 +47,13 @@ class LoopSettings:
     """First D, as a share of the depth that the candidates cover. Candidates reach a quarter
     deeper than the depth that is expected: 1 / 1.25."""
     load: float = 0.1
-    """The load may be missed by this share of the tolerance. One more D costs little, and a
-    load that is missed by the whole tolerance moves the forces by as much."""
+    """1: error of the load, as a share of the tolerance, below which the loop ends. One more D
+    costs little, and an error of the whole tolerance changes the forces by as much."""
     balance: float = 0.01
-    """What the free nodes may be out of balance by at one D, as a share of what the load is
-    missed by (or of the tolerance, the larger one)."""
+    """1: residual of the free nodes at one D, as a share of the error of the load (or of the
+    tolerance, if that is larger)."""
     smallest_step: float = 0.05
-    """A tangent step is halved down to this share while it raises the imbalance."""
+    """1: a tangent step that raises the residual is halved, down to this share."""
 
 
 LOOP = LoopSettings()
@@ -164,7 +165,7 @@ def solve_by_loops(
             depth = _next_depth(problem, history, load, pressed.slope)
             changed = changed | (sliding.planes.gap(points + displacement) < depth) & ~active
         if not load_reached or not (changed == active).all():
-            # Another set or depth moves the nodes anew: that they do is no sign of swinging.
+            # Another set or depth moves the nodes again; that is no oscillation.
             sliding = SlidingNodes(problem, points, displacement, pose, planes)
         active = changed
 
@@ -186,7 +187,7 @@ def _next_depth(
 def _next_active(
     positions: Array, planes: TangentPlanes, active: Mask, force: Array, depth: float
 ) -> Mask:
-    """Return the set without nodes that are pulled, with nodes that would be passed."""
+    """Return the set without the nodes that are pulled, plus those that would be penetrated."""
     return (active & (force >= 0)) | (~active & (planes.gap(positions) < depth))
 
 
@@ -200,7 +201,7 @@ def _press(
     target: float,
     settings: LoopSettings,
 ) -> _Pressed:
-    """Give the active nodes their vertical displacement and bring the rest to zero force.
+    """Prescribe the active nodes' vertical displacement and bring the other nodes to zero force.
 
     The first step spreads the change with the undeformed stiffness, as in Sharma (2008); then
     tangent steps, halved while they would raise the unbalanced force, until that is below
@@ -232,7 +233,7 @@ def _press(
 
 
 def _balance(solid: SourceNetwork, u: Array, active_nodes: HeldNodes) -> tuple[Array, float, Array]:
-    """Return the forces on the active nodes, the relative imbalance and internal forces."""
+    """Return the forces on the active nodes, the relative residual and the internal forces."""
     internal = solid.internal_force(u)
     force = -internal.ravel()[active_nodes.unknowns]
     size = max(float(np.abs(force).sum()), 1e-300)
@@ -255,7 +256,7 @@ def _solution(
     ended = ContactForces(
         forces.force, forces.gap, forces.approach, forces.active, forces.sets, converged
     )
-    residual = max(missed, pressed.residual)
+    residual = Residual(max(missed, pressed.residual))
     return Solution(
         guess.candidates, ended, planes, pressed.field[nodes], pressed.field, None, loops, residual
     )

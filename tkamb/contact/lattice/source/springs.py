@@ -92,9 +92,7 @@ class SourceNetwork(Solid):
         k = np.full(len(self.springs), self.material.young_modulus * self.factor)
         return self.tangent_force(Tangent(k, self._straight), displacement)
 
-    def nonlinear_residual(
-        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
         springs = slice(None) if chosen is None else chosen
         strain, direction = self._state(displacement, springs)
@@ -106,8 +104,6 @@ class SourceNetwork(Solid):
         # network.
         now = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
         softened = self.factor * (linear - now)
-        if lost is not None:
-            lost[:] = 1 - self.material.tangent(strain) / self.material.young_modulus
         return np.hstack([-softened, softened])
 
     def internal_force(self, displacement: Array) -> Array:
@@ -183,7 +179,7 @@ def _add_tangent_forces(
         direction: (s, 3) n, unit, from a to b.
         stiffness: (s,) k, N/m.
         displacement: (n, 3) u, m.
-        total: (n, 3) N, to be added to: what holds the displacement.
+        total: (n, 3) N, sum of forces that hold the displacement; added to.
     """
     for s in range(len(springs)):
         a, b = springs[s]

@@ -7,7 +7,7 @@ const SLIDERS = {
   pose: [["frame", "recorded frame", 0, 0, 1], ["flexion_deg", "flexion, deg", -10, 150, 0.5],
     ["adduction_deg", "varus, deg", -8, 8, 0.05], ["axial_rotation_deg", "rotation, deg", -25, 25, 0.1],
     ["ap_mm", "AP, mm", -20, 20, 0.1], ["ml_mm", "ML, mm", -10, 10, 0.1],
-    ["load_N", "load, N", 0, 4000, 10]],
+    ["load_N", "load, N", 0, 4000, 10], ["thickness_mm", "thickness, mm", 5, 20, 0.5]],
   femoral: [["varus_deg", "varus, deg", -8, 8, 0.1], ["rotation_deg", "rotation, deg", -10, 10, 0.1],
     ["slope_deg", "flexion, deg", -10, 10, 0.1], ["ap_mm", "AP, mm", -8, 8, 0.1],
     ["ml_mm", "ML, mm", -8, 8, 0.1]],
@@ -16,17 +16,24 @@ const SLIDERS = {
     ["ml_mm", "ML, mm", -8, 8, 0.1]],
   soft: [["slack_percent", "slack length, %", -10, 10, 0.1]],
 };
-const ROWS = [["force_si_N", "force, N", 0], ["medial_share", "medial share, %", 1],
-  ["medial_force_N", "medial force, N", 0], ["lateral_force_N", "lateral force, N", 0],
-  ["medial_peak_pressure_MPa", "medial peak, MPa", 1],
-  ["lateral_peak_pressure_MPa", "lateral peak, MPa", 1],
-  ["medial_mean_pressure_MPa", "medial mean, MPa", 1],
-  ["lateral_mean_pressure_MPa", "lateral mean, MPa", 1],
-  ["medial_area_mm2", "medial area, mm²", 0], ["lateral_area_mm2", "lateral area, mm²", 0],
+const TOTALS = [["force_si_N", "force, N", 0], ["medial_share", "medial share, %", 1],
   ["approach_mm", "approach, mm", 3]];
+const CONDYLE = [["force_N", "force, N", 0], ["peak_pressure_MPa", "peak, MPa", 1],
+  ["mean_pressure_MPa", "mean, MPa", 1], ["area_mm2", "area, mm²", 0],
+  ["cop_ap_mm", "centre AP, mm", 1], ["cop_ml_mm", "centre ML, mm", 1]];
+const KEPT = [["flexion_deg", "flexion", 1], ["load_N", "load, N", 0], ["medial_share", "M share, %", 1],
+  ["medial_peak_pressure_MPa", "M peak, MPa", 1], ["lateral_peak_pressure_MPa", "L peak, MPa", 1],
+  ["medial_area_mm2", "M area, mm²", 0], ["lateral_area_mm2", "L area, mm²", 0]];
 const SETTLE_MS = 180;
 const RETRY_MS = 700;
 const COARSE_NAME = "coarse while moving";
+
+function inWords(x, digits, signed = false) {
+  if (!Number.isFinite(x)) return "–";
+  const text = x.toFixed(digits);
+  if (Number(text) === 0) return signed ? "0" : text.replace("-", "");
+  return `${signed && x > 0 ? "+" : ""}${text}`.replace("-", "−");
+}
 
 class Bench {
   constructor(request) {
@@ -34,9 +41,11 @@ class Bench {
     this.state = structuredClone(request.start);
     this.count = {asked: 0, shown: 0, dropped: 0};
     this.inputs = {};
+    this.maps = {};
     this.addChoices();
     for (const [group, rows] of Object.entries(SLIDERS)) {
-      for (const row of rows) this.addSlider(group, row);
+      SLIDERS[group] = rows.filter(([key]) => this.applies(key));
+      for (const row of SLIDERS[group]) this.addSlider(group, row);
     }
     element("reset").addEventListener("click", () => this.toFrame(this.frame));
     element("reference").addEventListener("click", () => this.makeReference());
@@ -44,6 +53,11 @@ class Bench {
     element("picture").addEventListener("click", () => this.savePicture());
     this.frame = request.frame;
     this.showState();
+  }
+
+  // One pose has no frames; a mesh without a design has no thickness.
+  applies(key) {
+    return key === "frame" ? this.frames > 1 : key !== "thickness_mm" || this.thickness_mm !== null;
   }
 
   addChoices() {
@@ -80,7 +94,7 @@ class Bench {
     } else made("span", "", row);
     const id = `${group}-${key}`;
     made("label", words, row, {for: id});
-    const top = key === "frame" ? this.frames - 1 : high;
+    const top = {frame: this.frames - 1, load_N: this.most_load_N}[key] || high;
     const range = made("input", "", row, {id, type: "range", min: low, max: top, step});
     const exact = made("input", "", row, {type: "number", step: "any", "aria-label": words});
     range.addEventListener("input", () => this.change(group, key, Number(range.value), true));
@@ -99,6 +113,7 @@ class Bench {
       return;
     }
     this.holder(group)[key] = value;
+    if (key === "thickness_mm") this.drawInsert(value);
     this.showState();
     this.ask(moving);
   }
@@ -112,13 +127,25 @@ class Bench {
     this.ask(moving);
   }
 
+  // The dishes rise with the thickness; the bottom stays.
+  drawInsert(thickness) {
+    const mesh = tkamb.node("/tkamb/0/insert/insert/<object>").object;
+    const {position} = mesh.geometry.attributes;
+    this.insert = this.insert || position.array.slice();
+    const rise = (thickness - this.thickness_mm) / 1000, whole = this.thickness_mm / 2000;
+    for (let k = 1; k < position.array.length; k += 3) {
+      position.array[k] = this.insert[k] + rise * Math.min(1, this.insert[k] / whole);
+    }
+    position.needsUpdate = true;
+  }
+
   showState() {
     for (const [group, rows] of Object.entries(SLIDERS)) {
       for (const [key] of rows) {
         const value = key === "frame" ? this.frame : this.holder(group)[key];
         const [range, exact] = this.inputs[`${group}-${key}`];
         range.value = value;
-        exact.value = Number(value.toFixed(key === "load_N" ? 0 : 3));
+        exact.value = Number(value.toFixed(key === "load_N" ? 0 : 2));
       }
     }
     for (const [key, name] of Object.entries(RELEASABLE)) {
@@ -134,7 +161,7 @@ class Bench {
   // One request is under way at most; the newest state waits, and is asked next.
   ask(moving) {
     clearTimeout(this.timer);
-    if (moving) this.timer = setTimeout(() => this.ask(false), SETTLE_MS);
+    this.timer = moving ? setTimeout(() => this.ask(false), SETTLE_MS) : 0;
     const request = structuredClone(this.state);
     if (moving) [request.contact, request.resolution_mm] = this.coarse;
     if (this.waiting) this.count.dropped++;
@@ -183,21 +210,23 @@ class Bench {
     const mark = element("mark");
     mark.className = "failed";
     mark.textContent = words;
-    element("numbers").classList.add("old");
+    document.body.classList.add("stale");
+    this.refused = words;
   }
 
   show(packed, asked) {
     const answer = JSON.parse(packed.words), mark = element("mark");
     this.count.shown = asked.number;
     if (answer.status.startsWith("failed: ")) {
-      this.refuse(`${answer.status.slice(8)} (below: the last good state)`);
+      this.refuse(`${answer.status.slice(8)} (grey: the last good state)`);
       return;
     }
     this.answer = answer;
     mark.className = asked.coarse ? "coarse" : "";
-    mark.textContent = asked.coarse
-      ? `${asked.words ? `${asked.words} …; shown` : COARSE_NAME}: ${answer.label}` : `${answer.label}; ${answer.error}`;
-    element("numbers").classList.remove("old");
+    const how = asked.words ? `${asked.words} …; shown: ` : `${COARSE_NAME}: `;
+    mark.textContent = `${asked.coarse ? how : ""}${answer.label}; ${answer.error}`;
+    document.body.classList.remove("stale");
+    this.refused = "";
     element("status").hidden = answer.status === "ok";
     element("status").textContent = answer.status;
     this.drawMap(packed.map, answer);
@@ -205,9 +234,10 @@ class Bench {
     tkamb.viewer.set_transform(
       tkamb.split(`${root}/femoral component/femoral component`), answer.pose);
     for (const tube of tkamb.views[0].tubes) {
-      const ends = answer.ligaments[tube.strand.path.split("/").pop()];
-      if (!ends) continue;
-      tube.strand.points.set(ends.flat());
+      const line = answer.ligaments[tube.strand.path.split("/").pop()];
+      if (!line) continue;
+      tube.strand.points.set(line.ends.flat());
+      tube.strand.colours.set([...line.colour, ...line.colour]);
       tube.shown = -1;
       tube.show(0);
     }
@@ -222,13 +252,12 @@ class Bench {
   }
 
   drawMap(map, answer) {
-    const view = tkamb.views[0], key = answer.label;
-    if (this.mapKey === key) {
-      view.map.levels = map.levels;
-    } else {
-      this.mapKey = key;
-      view.runMap = map;
-      tkamb.showMap(view, map);
+    const view = tkamb.views[0], key = answer.map;
+    const known = this.maps[key] = this.maps[key] || map;
+    known.levels = map.levels;
+    if (view.map !== known) {
+      view.runMap = known;
+      tkamb.showMap(view, known);
     }
     if (tkamb.data.peak_MPa !== answer.scale_MPa) {
       tkamb.data.peak_MPa = answer.scale_MPa;
@@ -239,21 +268,36 @@ class Bench {
   }
 
   showNumbers() {
-    const table = element("numbers"), {numbers} = this.answer, reference = this.reference || {};
+    const {numbers, request} = this.answer;
+    const released = Object.entries(RELEASABLE)
+      .filter(([, name]) => request.released.includes(name))
+      .map(([key]) => [key, `${SLIDERS.pose.find((row) => row[0] === key)[1]}: found`, 2]);
+    const single = ([name, ...rest]) => [[name], ...rest];
+    this.fill("numbers", ["", "now", "± reference"], [...TOTALS, ...released].map(single));
+    this.fill("condyles", ["", "medial", "± ref.", "lateral", "± ref."],
+      CONDYLE.map(([name, ...rest]) => [[`medial_${name}`, `lateral_${name}`], ...rest]));
+    const bundles = Object.keys(numbers).filter((name) => name.endsWith("_strain_percent"))
+      .map((name) => name.slice(9, -15));
+    this.fill("ligaments", ["", "N", "± ref.", "strain, %", "± ref."], bundles.map((name) =>
+      [[`ligament_${name}_N`, `ligament_${name}_strain_percent`], name.replaceAll("_", " "), 1]));
+    element("ligament-box").hidden = !bundles.length;
+  }
+
+  // Rows of [names of numbers, words, digits]: each number, and how far it is from the reference.
+  fill(id, heads, rows) {
+    const table = element(id), {numbers} = this.answer, reference = this.reference || {};
     table.replaceChildren();
     const head = made("tr", "", table);
-    for (const word of ["", "now", "reference", "difference"]) made("th", word, head);
-    const ligaments = Object.keys(numbers).filter((name) => name.startsWith("ligament_"))
-      .map((name) => [name, `${name.slice(9, -2).replaceAll("_", " ")}, N`, 0]);
-    for (const [name, words, digits] of [...ROWS, ...ligaments]) {
-      const now = numbers[name], then = reference[name];
-      if (now === undefined && then === undefined) continue;
-      const row = made("tr", "", table, {"data-name": name});
-      made("td", words, row);
-      const text = (x) => (Number.isFinite(x) ? x.toFixed(digits).replace("-", "−") : "–");
-      made("td", text(now), row, {class: "number"});
-      made("td", text(then), row, {class: "number"});
-      made("td", Number.isFinite(now - then) ? text(now - then) : "–", row, {class: "number"});
+    for (const word of heads) made("th", word, head, {scope: "col"});
+    for (const [names, words, digits] of rows) {
+      const row = made("tr", "", table);
+      made("th", words, row, {scope: "row"});
+      for (const name of names) {
+        const now = numbers[name], then = reference[name];
+        made("td", inWords(now, digits), row, {class: "number", "data-name": name});
+        made("td", inWords(now - then, digits, true), row,
+          {class: "number", title: `reference: ${inWords(then, digits)}`});
+      }
     }
   }
 
@@ -262,26 +306,34 @@ class Bench {
     if (this.answer) this.showNumbers();
   }
 
+  // What is kept is computed from rest, as a run of the saved scene computes it.
   async keep() {
     const request = structuredClone(this.state);
+    element("saved").textContent = "saving …";
     const response = await fetch("save", {method: "POST",
       headers: {"Content-Type": "application/json"}, body: JSON.stringify(request)});
-    const words = await response.text();
-    element("saved").textContent = response.ok ? `saved: ${words}` : words;
-    if (!response.ok) return;
+    if (!response.ok) {
+      element("saved").textContent = response.status === 202 ? "" : await response.text();
+      return;
+    }
+    const packed = await tkamb.unpack(new Uint8Array(await response.arrayBuffer()));
+    this.show(packed, {request, coarse: false, number: ++this.count.asked});
+    const {saved, numbers, label, status} = JSON.parse(packed.words);
+    element("saved").textContent = `saved: ${saved}`;
     element("kept-box").hidden = false;
-    const table = element("kept"), {numbers} = this.answer;
+    const table = element("kept");
     if (!table.rows.length) {
       const head = made("tr", "", table);
-      for (const word of ["scene", "flexion", "load, N", "M peak", "L peak", "M share, %"]) {
-        made("th", word, head);
+      for (const word of ["", "model", ...KEPT.map((row) => row[1])]) {
+        made("th", word, head, {scope: "col"});
       }
     }
-    const row = made("tr", "", table), text = (x) => (Number.isFinite(x) ? x.toFixed(1) : "–");
-    made("td", words.split("/").slice(-2)[0], row);
-    for (const value of [request.flexion_deg, request.load_N, numbers.medial_peak_pressure_MPa,
-      numbers.lateral_peak_pressure_MPa, numbers.medial_share]) {
-      made("td", text(value), row, {class: "number"});
+    const row = made("tr", "", table, {title: status === "ok" ? saved : `${saved}: ${status}`});
+    made("th", saved.split("/").slice(-2)[0].replace("kept-", "") + (status === "ok" ? "" : " ⚠"), row,
+      {scope: "row"});
+    made("td", label, row);
+    for (const [name, , digits] of KEPT) {
+      made("td", inWords({...request, ...numbers}[name], digits), row, {class: "number"});
     }
   }
 
@@ -307,6 +359,7 @@ tkamb.startLive = async function () {
   addLayers(false);
   switchLayer("recorded pose", true);
   colourBar("pressure-bar", data.pressure_scale, data.peak_MPa, 1);
+  colourBar("strain-bar", data.strain_scale, 100 * data.strain_limit, 1);
   made("div", `${tkamb.views[0].title} · ${tkamb.views[0].side} knee`, element("titles"));
   tkamb.look("oblique");
   tkamb.viewer.set_3d_pane_size();
