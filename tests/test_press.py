@@ -261,6 +261,16 @@ def test_single_sphere_is_medial_and_lateral_is_null(tmp_path):
     assert found["lateral"] is None
     assert found["medial"]["force_N"] == pytest.approx(500, rel=1e-6)
     assert found["medial"]["cop_mm"] == pytest.approx([0, 10, 0], abs=0.02)
+    assert any("one condyle: its contact is called medial" in flag for flag in found["flags"])
+
+
+@pytest.mark.parametrize(("turn", "told"), [(20, False), (-45, True), (90, True), (180, True)])
+def test_a_femur_turned_farther_than_any_knee_is_remarked(meshes, turn, told):
+    """Its medial condyle then presses the lateral side of the insert, or neither."""
+    pose = [0.0, 0.0, 0.0, 0.0, turn, 0.0]
+    report = press_meshes(*meshes(), 500.0, pose=pose, contact="foundation", resolution_mm=3.0)
+    flags = report.as_dict()["flags"]
+    assert any(f"by {abs(turn)} deg on the insert" in flag for flag in flags) == told
 
 
 @pytest.mark.parametrize("model", contact_names())

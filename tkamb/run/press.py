@@ -40,10 +40,13 @@ from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class PressLimitSettings:
-    """Which loads are accepted."""
+    """Which loads are accepted, and which poses get a remark."""
 
     max_load: float = 1e5
     """N; largest load. Chosen: over a hundred body weights."""
+    max_turn: float = 30.0 * DEGREE
+    """rad; largest turn of the femoral component about the vertical without a remark. Chosen: no
+    knee turns farther. Beyond it, medial and lateral do not lie over those of the insert."""
 
 
 PRESS_LIMITS = PressLimitSettings()
@@ -169,10 +172,27 @@ class PressReport:
             "iterations": result.iterations,
             "residual": _known(result.residual),
             "status": result.status.value,
-            "flags": [*left_out(self.contact, self.pair.bearing), *result.flags],
+            "flags": [
+                *left_out(self.contact, self.pair.bearing),
+                *_naming_remarks(self.pair, result.pose),
+                *result.flags,
+            ],
             "known_error": as_json(self.known_error),
             "material": material_as_json(self.pair.material),
         } | ({} if self.adjustment is None else {"adjustment": _adjustment(self.adjustment)})
+
+
+def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
+    """Return what makes the words medial and lateral doubtful."""
+    if pair.split is None:
+        return ["the femoral component has one condyle: its contact is called medial"]
+    turn = abs(math.atan2(pose[0, 2], pose[2, 2]))
+    if turn <= PRESS_LIMITS.max_turn:
+        return []
+    return [
+        f"the pose turns the femoral component by {turn / DEGREE:.0f} deg on the insert: medial "
+        "and lateral name its own condyles, wherever they lie on the insert"
+    ]
 
 
 def _adjustment(adjustment: Adjustment) -> dict[str, Any]:

@@ -71,9 +71,9 @@ def newton_metres(word: str) -> float | None:
     Inches and feet may stand first.
     """
     plain = plain_unit(word)
-    for length in LENGTH_FIRST:
-        if plain.startswith(length) and plain[len(length) :] in FORCE_WORDS:
-            return LENGTH_WORDS[length] * FORCE_WORDS[plain[len(length) :]]
+    for first in LENGTH_FIRST:
+        if plain.startswith(first) and plain[len(first) :] in FORCE_WORDS:
+            return LENGTH_WORDS[first] * FORCE_WORDS[plain[len(first) :]]
     for cut in range(1, len(plain)):
         force_unit, length_unit = FORCE_WORDS.get(plain[:cut]), LENGTH_WORDS.get(plain[cut:])
         if force_unit is not None and length_unit is not None:
