@@ -8,7 +8,10 @@ import json
 import os
 import random
 import shutil
+import sys
+import tempfile
 import tomllib
+from functools import cache
 from pathlib import Path
 
 from forged_folders import forge
@@ -273,10 +276,147 @@ def toml(folder: Path, chance: random.Random) -> list[str]:
     )  # fmt: skip
 
 
+def options(folder: Path, chance: random.Random) -> list[str]:
+    """A sound command line with one or two of its command's options given an odd value.
+
+    The folder `precious` is somebody else's: what lies there must stay as it is.
+    """
+    from tkamb.cli import _parser
+    from tkamb.commands.option_rules import leaf_parsers
+
+    results, scene = os.environ["TKAMB_ABUSE_RESULTS"], str(MODEL / "scene.toml")
+    precious = folder / PRECIOUS
+    precious.mkdir()
+    for name in PRECIOUS_NAMES:
+        (precious / name).write_text(f"{PRECIOUS} {name}")
+    meshes, out = [str(MODEL / name) for name in MESHES], str(folder / "out")
+    bases = {
+        "run": ["run", scene, *RUN, "--contact", "hertz", "--out", out],
+        "press": ["press", *meshes, "--load", "9", "--resolution", "9", "--contact", "foundation"],
+        "check": ["check", scene],
+        "new": ["new", out],
+        "mesh check": ["mesh", "check", meshes[1]],
+        "mesh part": ["mesh", "part", meshes[1], "--out", str(folder / "part.stl")],
+        "mesh lattice": ["mesh", "lattice", meshes[1], "--resolution", "9"],
+        "export": ["export", results, "--vtp", "--out", out],
+        "view": ["view", results, "--html", str(folder / "v.html")],
+        "compare": ["compare", results, results, "--out", out],
+        "wear": ["wear", results, "--cycles", "1", "--updates", "1", "--out", out],
+        "uncertainty": ["uncertainty", scene, *RUN, "--contact", "hertz", "--screen"],
+        "import": ["import", str(folder / "leg.osim"), "--motion", str(folder / "leg.mot"),
+                   "--side", "right", "--mass-kg", "53.5", "--out", out],
+        "verify": ["verify", results],
+        "methods": ["methods", results],
+        "scene": ["scene"],
+        "settings": ["settings"],
+        "contact list": ["contact", "list"],
+    }  # fmt: skip
+    command = chance.choice(sorted(bases))
+    if command == "import":
+        shutil.copytree(opensim_leg().name, folder, dirs_exist_ok=True)
+    given = bases[command]
+    actions = [a for a in dict(leaf_parsers(_parser()))[command]._actions if a.option_strings]
+    places = [str(precious), *(str(precious / name) for name in PRECIOUS_NAMES), "/dev/full"]
+    places += [
+        str(folder / ("n" * 300)),
+        str(folder / "new" / "er"),
+        "/proc/x",
+        "/",
+        meshes[0],
+        scene,
+    ]
+    for _ in range(chance.choice([1, 1, 2])):
+        action = chance.choice(actions)
+        names = {"--help", "--workers", "--dask", "--force"} & {*action.option_strings}
+        if names:
+            continue
+        value = chance.choice([*NUMBERS, *WORDS, *places, *places, *(action.choices or ())])
+        if action.option_strings[-1] in ("--out", "--html", "--sto"):
+            value = chance.choice(places)
+        value = str(value).encode("utf-8", "surrogatepass").decode("utf-8", "replace")
+        given += [action.option_strings[-1]] + ([] if action.nargs == 0 else [value])
+    return given
+
+
+PRECIOUS = "precious"
+PRECIOUS_NAMES = ("results.csv", "summary.json", "scene.toml", "patient.urdf", "insert.stl",
+                  "made.vtu", "wear.json", "view.html", "a.sto", "a.inp", "a.json")  # fmt: skip
+
+
+def opensim(folder: Path, chance: random.Random) -> list[str]:
+    """An OpenSim model, a motion or markers with lines, words or bytes changed, imported."""
+    shutil.copytree(opensim_leg().name, folder, dirs_exist_ok=True)
+    for _ in range(chance.choice([1, 1, 2])):
+        path = folder / chance.choice(["leg.osim"] * 4 + ["leg.mot", "leg.trc"])
+        content = path.read_bytes()
+        path.write_bytes(
+            spoilt(content, chance) if chance.random() < 0.3 else reworded(content, chance)
+        )
+    moved = chance.choice([["--motion", "leg.mot"], ["--motion", "leg.mot"], ["--trc", "leg.trc"]])
+    given = ["import", str(folder / "leg.osim"), moved[0], str(folder / moved[1])]
+    given += ["--side", "right", "--mass-kg", "53.5", "--out", str(folder / "out")]
+    return given + (["--muscles"] if chance.random() < 0.3 else [])
+
+
+@cache
+def opensim_leg() -> tempfile.TemporaryDirectory:
+    """Return a folder with a small leg, its motion and its markers."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+    import numpy as np
+
+    from pendulum_leg import moving_leg, pendulum_osim
+    from tkamb.io.opensim.read import read_osim
+    from tkamb.show.storage import write_storage, write_trc
+
+    held = tempfile.TemporaryDirectory(prefix="tkamb-leg-")
+    osim = pendulum_osim(Path(held.name) / "leg.osim")
+    q, markers = moving_leg(osim)
+    time = np.arange(len(q)) / 60.0
+    names = list(read_osim(osim).coordinates)
+    columns = {"time": time} | {name: q[:, k] for k, name in enumerate(names)}
+    write_storage(osim.with_suffix(".mot"), columns, in_degrees=False)
+    write_trc(osim.with_suffix(".trc"), time, markers, 60.0)
+    return held
+
+
+def reworded(content: bytes, chance: random.Random) -> bytes:
+    """Return a text whose lines, or words between angle brackets and blanks, are changed."""
+    lines = content.decode("utf-8", "replace").splitlines() or [""]
+    for _ in range(chance.randint(1, 4)):
+        number, how = chance.randrange(len(lines)), chance.randint(0, 5)
+        if how == 0:
+            lines.pop(number)
+        elif how == 1:
+            lines.insert(number, chance.choice(lines))
+        elif how == 2:
+            lines.insert(chance.randrange(len(lines)), lines.pop(number))
+        else:
+            words = lines[number].replace("<", " <").replace(">", "> ").split(" ")
+            words[chance.randrange(len(words))] = chance.choice(
+                [
+                    *NUMBERS,
+                    *WORDS,
+                    "0 0 0",
+                    "ground",
+                    "<a>",
+                    "</a>",
+                    "<!--",
+                    "&amp;",
+                    "NaN",
+                    "knee_r",
+                ]
+            )
+            lines[number] = " ".join(words)
+        lines = lines or [""]
+    return "\n".join(lines).encode("utf-8", "replace")
+
+
 KINDS = {
     kind.__name__: kind
-    for kind in (arguments, odd_files, scenes, tables, urdfs, meshes, folders, forged, toml)
-}
+    for kind in (
+        arguments, odd_files, scenes, tables, urdfs, meshes, folders, forged, toml, opensim, options
+    )
+}  # fmt: skip
 
 
 def copied(folder: Path) -> Path:

@@ -72,6 +72,10 @@ class Page:
             self._page.click(selector)
         return Path(found.value.path()).read_bytes()
 
+    def press(self, key):
+        """Press a key on what has the focus."""
+        self._page.keyboard.press(key)
+
     def pdf(self):
         """Return the page as it is printed."""
         return self._page.pdf(prefer_css_page_size=True)

@@ -163,7 +163,7 @@ def test_time_in_milliseconds(tmp_path, capfd):
         rows[1:] = [[str(1000 * float(row[0])), *row[1:]] for row in rows[1:]]
 
     rewrite(tmp_path / "motion.csv", slower)
-    assert "is the time in seconds?" in run_refused(capfd, path)
+    assert "the time must be in seconds" in run_refused(capfd, path)
 
 
 def test_a_mesh_file_cut_short(tmp_path, capfd):

@@ -227,7 +227,7 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(file, tmp_path, capsys, o
     ("options", "words"),
     [
         (["--workers", "0"], "0 is not within 1"),
-        (["--shard", "3/2"], "3/2 is no part"),
+        (["--shard", "3/2"], "3/2 is not a part"),
         (["--shard", "1"], "'1' is not I/N"),
         (["--frames", "500:600"], "not in the motion"),
     ],

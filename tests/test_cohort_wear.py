@@ -64,6 +64,7 @@ def test_each_run_has_its_wear_and_a_run_without_says_why(cohort):
     assert float(groups["two", "volume_mm3_per_Mc"]["mean"]) == pytest.approx(volume[1])
     page = (cohort / "out" / "cohort.html").read_text(encoding="utf-8")
     assert "Worn volume" in page and "the contact area cancels" in page
+    assert "first cycle by archard" in page and "largest depth" in page
 
 
 @pytest.mark.slow

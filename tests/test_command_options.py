@@ -22,7 +22,7 @@ def test_no_cache_reaches_the_model(tmp_path, monkeypatch, capsys):
     assert main([*run, "lattice-linear", "--out", str(second)]) == 0
     assert any((tmp_path / "kept").iterdir())
     assert main([*run, "foundation", "--out", str(tmp_path / "third"), "--no-cache"]) == 2
-    assert "'foundation' keeps nothing on disk" in capsys.readouterr().err
+    assert "'foundation' has no cache on disk" in capsys.readouterr().err
     assert not (tmp_path / "third").exists()
 
 

@@ -9,6 +9,8 @@ import pytest
 from kept_runs import keep
 from synthetic_run import make_run
 from tkamb.cli import main
+from tkamb.contact.articular_edge import AT_EDGE
+from tkamb.run.metrics import peak_pressure
 from tkamb.run.results import Results
 from tkamb.show.compare import page
 from tkamb.show.compare.comparison import compare_folders
@@ -74,7 +76,7 @@ def test_fewer_frames_of_one_recording_pair_without_interpolation(folders, tmp_p
     assert found.runs[1].pairing.exact
     assert of(found, "force_total_N").frames == 6
     assert of(found, "force_total_N").max_abs == 0.0
-    assert any("15 frames of a have no partner" in note for note in found.notes)
+    assert any("15 frames of a have no matching frame" in note for note in found.notes)
 
 
 def test_other_frames_are_interpolated_to_second_order(folders, tmp_path):
@@ -106,7 +108,7 @@ def test_a_place_with_two_answers_is_not_compared(folders, tmp_path):
     there_and_back.columns["flexion_deg"][20:] = there_and_back["flexion_deg"][19:9:-1] - 0.5
     found = compare_folders([folders[0], written(tmp_path / "back", there_and_back)])
     assert found.differences == ()
-    assert any("two answers" in note for note in found.notes)
+    assert any("are not unique" in note for note in found.notes)
 
 
 def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd):
@@ -117,7 +119,7 @@ def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd)
     assert "over cycle" in said and "--axis" in said and said.count("\n") == 1
     assert not out.exists()
     notes = compare_folders([folders[0], gait], "cycle").notes
-    assert any("Not the same side. a: right; gait: left" in note for note in notes)
+    assert any("The runs differ in side. a: right; gait: left" in note for note in notes)
 
 
 def test_what_each_run_released_is_said_whole_and_in_any_order(folders, tmp_path):
@@ -174,3 +176,19 @@ def test_bad_input_is_one_line(folders, tmp_path, monkeypatch, capfd, arguments,
     said = capfd.readouterr().err
     assert words in said and said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_peak_at_the_edge_of_the_insert_is_said_beside_it(tmp_path):
+    results = make_run("bend", frames=21)
+    largest = peak_pressure(results)
+    assert largest["doubt"] == ""
+    status = list(results.status)
+    status[largest["frame"]] = f"the {largest['side']} {AT_EDGE} (within 2.5 mm)"
+    edge = Results(results.columns | {"status": status}, results.summary, results.maps)
+    folders = [written(tmp_path / "interior", results), written(tmp_path / "edge", edge)]
+    comparison = compare_folders(folders)
+    told = comparison.as_dict()["runs"]
+    assert told[0]["peak_pressure"]["doubt"] == "" and AT_EDGE in told[1]["peak_pressure"]["doubt"]
+    lines = [line for line in page.table_lines(comparison) if "peak pressure" in line]
+    assert AT_EDGE not in lines[0] and lines[1].startswith("edge: ") and AT_EDGE in lines[1]
+    assert lines[1] in page.comparison_html(comparison).replace("&#39;", "'")

@@ -198,7 +198,7 @@ def test_folders_that_hold_nothing(tmp_path, dataset, capsys):
 def test_a_changed_file_is_not_replaced(tmp_path, dataset, server, capsys):
     (tmp_path / "model.osim").write_bytes(b"mine")
     said = get(capsys, "--to", tmp_path, "--url", server.url, status=2)
-    assert "nothing of yours is replaced" in said
+    assert "does not replace your files" in said
     assert (tmp_path / "model.osim").read_bytes() == b"mine"
     assert server.asked == []
 

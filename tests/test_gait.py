@@ -84,6 +84,8 @@ def test_an_import_asks_for_muscles_and_a_cycle(tmp_path, capsys):
     arguments = recorded_leg(tmp_path)
     assert main([*arguments, "--cycle", "plates"]) == 2
     said = capsys.readouterr().err
+    assert main([*arguments, "--cycle"]) == 2  # without a word: the plates
+    assert capsys.readouterr().err == said
     assert "--cycle plates" in said and len(said.splitlines()) == 1
     out = Path(arguments[arguments.index("--out") + 1])
     assert not (out / "scene.toml").exists()

@@ -59,7 +59,7 @@ def test_a_base_keeps_what_is_not_given_and_names_its_sources():
         ({"young_modulus_MPa": 500}, "'poisson_ratio' is missing"),
         ({"young_modulus_MPa": 500, "poisson_ratio": 0.5}, "Poisson's ratio 0.5"),
         ({"young_modulus_MPa": "500", "poisson_ratio": 0.4}, "cannot be '500'"),
-        ({"young_modulus_MPa": 500, "poisson_ratio": 0.4, "alpha": 0.1}, "none of the law"),
+        ({"young_modulus_MPa": 500, "poisson_ratio": 0.4, "alpha": 0.1}, "not a key of the law"),
         ({"poisson_ratio": 0.4, "law": "tabulated", "strain": (0.0, 0.1)}, "needs 'stress_MPa'"),
         ({"poisson_ratio": 0.4, "law": "tabulated", **CURVE, "strain": (0, 1, 2, 1)}, "no stress"),
         ({"base": "polyethilene"}, "did you mean"),

@@ -1,19 +1,23 @@
 """Whatever happens, a user sees one line: streams that are gone, odd files, what nobody foresaw."""
 
+import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import tkamb.__main__
 from scenes import MODEL, write_scene
 from tkamb import files
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.files import read_bytes, read_xml
 from tkamb.io.recordings.tables import read_table
-from tkamb.run.guard import interrupt_as_such
+from tkamb.run.guard import interrupt_as_such, printable
+from tkamb.run.press import PressReport
 
 ROOT = Path(__file__).parents[1]
 MESHES = [str(MODEL / name) for name in ("femoral_component.stl", "insert.stl")]
@@ -53,6 +57,41 @@ def test_streams(tmp_path, command, status, lines):
     assert said.count("\n") == lines and "Traceback" not in said, said
     assert "\x1b" not in said
     assert not list(tmp_path.iterdir())
+
+
+def test_texts_of_others_steer_no_terminal(tmp_path):
+    """`mesh check` and all other commands printed names and titles as they were."""
+    name = tmp_path / "a\x1b[31m\x9b1m\u202e.stl"
+    shutil.copy(MESHES[1], name)
+    ended, printed, _ = shell("TKAMB mesh check *.stl", tmp_path)
+    assert ended == 0 and "a\\u001b[31m\\u009b1m\\u202e.stl" in printed
+    assert printed.replace("\n", "").isprintable()
+    assert printable("3\u00a0°\t\n") == "3\u00a0°\t\n"
+    assert json.loads(f'"{printable(chr(0x9B) + chr(0x7F))}"') == "\x9b\x7f"
+
+
+def test_a_load_that_is_not_carried_is_said_on_standard_error(capfd, monkeypatch):
+    """Status 1, and the reason stood on standard output alone."""
+    monkeypatch.setattr(PressReport, "carried", False)
+    line = ["press", *MESHES, "--load", "10", "--resolution", "9", "--contact", "foundation"]
+    assert main(line) == 1
+    printed, said = capfd.readouterr()
+    assert printed and said.count("\n") == 1 and "not carried" in said
+
+
+def test_an_interrupt_while_the_program_is_read_is_one_line(monkeypatch, capsys):
+    """Ctrl-C within the first tenth of a second gave a traceback of imports."""
+
+    class Interrupted:
+        def find_spec(self, name, path=None, target=None):
+            if name == "tkamb.cli":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "tkamb.cli")
+    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    assert tkamb.__main__.main() == 130
+    said = capsys.readouterr().err
+    assert said.startswith("tkamb: interrupted") and said.count("\n") == 1
 
 
 def refused(capfd, *arguments):

@@ -268,7 +268,7 @@ def test_a_scene_that_is_there_is_kept(tmp_path, capsys):
     assert main(arguments) == 0
     before = (tmp_path / "out" / "scene.toml").read_text()
     assert main(arguments) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert (tmp_path / "out" / "scene.toml").read_text() == before
 
 

@@ -41,8 +41,8 @@ def test_left_is_the_mirror_image(tmp_path):
     ("options", "message"),
     [
         ({"resolution_mm": 0.0}, "resolution"),
-        ({"resolution_mm": 2.0, "side": "middle"}, "no side"),
-        ({"resolution_mm": 2.0, "out": "lattice.stl"}, "no .vtu file"),
+        ({"resolution_mm": 2.0, "side": "middle"}, "not a side"),
+        ({"resolution_mm": 2.0, "out": "lattice.stl"}, "not a .vtu file"),
     ],
 )
 def test_refusals(options, message):

@@ -75,3 +75,54 @@ def test_a_light_contact_carries_the_same_after_a_heavy_one(name, depth):
     force = np.linalg.norm(cold.nodal_force, axis=1).sum()
     assert force > 5.0
     assert warm.nodal_force == pytest.approx(cold.nodal_force, abs=1e-3 * force)
+
+
+@pytest.fixture(scope="module")
+def usual():
+    """A model with the default tolerance, and two balls in a dish under 2.5 kN."""
+    model = contact_model("lattice", 1.5)
+    bodies = pair(condyles(), dished_insert(), material("polyethylene"))
+    state = model.prepare(bodies)
+    return model, state, model.press(state, 2500.0, above(y=0.03)).pose
+
+
+def residual(state, result, start):
+    """Return what is out of balance anywhere in the solid, relative to the contact forces."""
+    problem = state.problem
+    applied = np.zeros_like(problem.solid.nodes)
+    applied[problem.contact_nodes] = result.nodal_force
+    field = problem.operator.solve(applied + start.loads)
+    outside = (applied - problem.solid.internal_force(field)).ravel()[~problem.held]
+    return np.linalg.norm(outside) / np.linalg.norm(applied)
+
+
+def test_near_by_a_probe_measures_the_region_alone_and_the_rest_is_in_balance(usual, monkeypatch):
+    """Steps as of a search; farther away, or under more force, the whole solid is measured."""
+    model, state, pose = usual
+    measured, forces = [], type(state.problem.solid).forces
+    monkeypatch.setattr(
+        type(state.problem.solid), "forces", lambda *given: measured.append(1) or forces(*given)
+    )
+    probe = model.probe(state)
+    probe.at(pose)
+    for step in range(1, 6):
+        measured.clear()
+        there = moved(pose, np.array([2e-5 * step, 0.0, 0.0, 3e-4 * step, 0.0, 0.0]))
+        result, start = probe.evaluated(there)
+        assert not measured
+        assert residual(state, result, start) < 1.2 * model.settings.force_tolerance
+        whole = model.evaluate(state, there).nodal_force
+        assert np.linalg.norm(result.nodal_force - whole) < 2e-3 * np.linalg.norm(whole)
+    for twist in ([3e-3, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, -3e-5, 0.0, 0.0, 0.0, 0.0]):
+        probe = model.probe(state)
+        probe.at(pose)
+        measured.clear()
+        probe.at(moved(pose, np.array(twist)))
+        assert measured
+
+
+def test_beyond_the_bound_the_region_alone_would_not_do(usual):
+    model, state, pose = usual
+    _, start = model.evaluate_from(state, pose)
+    result, end = model.evaluate_from(state, moved(pose, np.array([3e-3, *[0.0] * 5])), start, True)
+    assert residual(state, result, end) > 2 * model.settings.force_tolerance

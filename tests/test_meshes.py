@@ -342,7 +342,7 @@ def test_two_condyles_side_by_side_are_one_part_and_a_pair_from_two_legs_is_not(
     assert len(load_surface(pair(0.046), "mm", name="femoral component").faces) == 2 * 1280
     refused("2 separate bodies", pair(0.15), "mm")
     refused("2 separate bodies", pair(0.046, 0.005), "mm")
-    refused("axes wrong", pair(0.046), "mm", axes="+z,+x,+y")
+    refused("check the axes", pair(0.046), "mm", axes="+z,+x,+y")
 
 
 def test_an_open_sheet_is_refused_with_the_reason(tmp_path):

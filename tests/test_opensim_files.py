@@ -522,4 +522,4 @@ def test_an_impossible_or_unknown_angle_unit_is_refused(tmp_path, capsys, scale,
 def test_radians_said_to_be_degrees_are_noticed(tmp_path, capsys):
     path = states(tmp_path, {"knee_r_0": BEND}, True)
     main(changed(recorded_leg(tmp_path), trc=None, motion=str(path)))
-    assert "is it in radians" in capsys.readouterr().out
+    assert "check whether the file is in radians" in capsys.readouterr().out

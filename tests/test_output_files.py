@@ -48,7 +48,7 @@ def test_import_replaces_no_file_of_somebody_else(tmp_path, capsys, name, conten
     before = contents(tmp_path / "out")
     assert main(arguments) == 2
     said = capsys.readouterr().err
-    assert f"{name}: is there already" in said and "choose another --out" in said
+    assert f"{name}: exists already" in said and "choose another --out" in said
     assert contents(tmp_path / "out") == before
 
 
@@ -57,7 +57,7 @@ def test_another_subject_in_the_same_folder_is_refused(tmp_path, capsys):
     before = contents(tmp_path / "out")
     heavier = changed(arguments, mass_kg="70", scene="other.toml")
     assert main(heavier) == 2
-    assert "patient.urdf: is there already with another content" in capsys.readouterr().err
+    assert "patient.urdf: exists already with another content" in capsys.readouterr().err
     assert contents(tmp_path / "out") == before
 
 
@@ -170,5 +170,5 @@ def test_whose_a_file_is(tmp_path, name, content, allowed):
 
 def test_a_folder_is_no_place_for_a_file(tmp_path):
     (tmp_path / "a.vtp").mkdir()
-    with pytest.raises(InputError, match="no file"):
+    with pytest.raises(InputError, match="is not a file"):
         check_output_file(tmp_path / "a.vtp", force=True)

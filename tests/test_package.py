@@ -24,7 +24,7 @@ def test_the_wheel_made_from_the_sdist_holds_the_whole_package(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         (entry,) = (name for name in names if name.endswith("entry_points.txt"))
-        assert "tkamb = tkamb.cli:main" in archive.read(entry).decode()
+        assert "tkamb = tkamb.__main__:main" in archive.read(entry).decode()
         assert any(name.endswith("licenses/LICENSE") for name in names)
     held = {name for name in names if ".dist-info/" not in name}
     assert held == {name for name in listed if (ROOT / name).is_file()}

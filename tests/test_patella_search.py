@@ -135,7 +135,7 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
     results = simulate(scene)
     status = results["status"]
     flexion = results["flexion_deg"][5]
-    assert re.match(rf"failed: patella lost at {flexion:.1f} deg of flexion: moment", status[5])
+    assert re.match(rf"failed: patella lost at {flexion:.1f} deg of flexion: the moment", status[5])
     assert np.isnan(results["force_total_N"][5])
     others = [k for k in range(11) if k != 5]
     assert not any(status[k].startswith("failed") for k in others)

@@ -112,7 +112,10 @@ def test_segment_inertia_is_that_of_its_radii():
         (lambda t: t.replace('<mass value="', '<mass value="1 ', 1), "not a number"),
         (lambda t: re.sub('xyz="[^"]*"', 'xyz="1 2"', t, count=1), "not 3 numbers"),
         (lambda t: t.replace("</robot>", '<link name="lonely"/></robot>'), "2 roots .*lonely"),
-        (lambda t: t.replace("</robot>", LOOP + "</robot>"), "'tibia' hangs on a second joint"),
+        (
+            lambda t: t.replace("</robot>", LOOP + "</robot>"),
+            "'tibia' is the child of a second joint",
+        ),
         (lambda t: t[:-20], "not a readable URDF"),
     ],
 )

@@ -60,7 +60,7 @@ def test_set_overrides_it(scene_file):
     assert scene.contact.options["law"] == "linear"
     assert scene.contact.options["loops"] == "source"
     assert set(scene.preset.overridden) == {"contact.adjust", "contact.options.law"}
-    assert any("told otherwise: contact.adjust" in words for words in scene.preset.sentences())
+    assert any("replaced it: contact.adjust" in words for words in scene.preset.sentences())
 
 
 def test_another_contact_model_does_not_get_the_lattices_options(scene_file):
@@ -82,7 +82,7 @@ def test_a_scene_that_is_read_already_takes_it_too(scene_file):
     ("drop", "words"),
     [
         (("ground_reaction",), r"needs \[ground_reaction\]: the force plate"),
-        (("tibia", "ground_reaction"), r"needs \[tibia\].*lacks \[ground_reaction\] too"),
+        (("tibia", "ground_reaction"), r"needs \[tibia\].*also needs \[ground_reaction\]"),
         (("quadriceps", "patellar_ligament", "patella"), r"needs \[quadriceps\]"),
     ],
 )

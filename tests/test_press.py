@@ -136,7 +136,7 @@ def test_the_lattice_is_the_default(meshes, capsys, tmp_path, monkeypatch):
     assert found["reaction_N"] == pytest.approx(900, rel=1e-5)
     assert not (tmp_path / "kept").exists()
     assert main([*arguments, *FOUNDATION]) == 2
-    assert "'foundation' keeps nothing on disk" in capsys.readouterr().err
+    assert "'foundation' has no cache on disk" in capsys.readouterr().err
 
 
 def test_swapping_the_model_keeps_the_load(meshes):
@@ -246,7 +246,7 @@ def test_the_other_reading_restores_where_the_height_was_right(meshes):
     assert report.adjustment is not None
     assert report.adjustment.restored
     assert report.as_dict()["medial"] is None or report.result.medial.force < 100.0
-    assert any("recorded pose decides" in line for line in report.lines())
+    assert any("whether the recorded rotation is restored" in line for line in report.lines())
     with pytest.raises(InputError, match="needs the femoral adjustment"):
         press_meshes(*bodies, 1500.0, pose=pose, restore_when="either")
     with pytest.raises(InputError, match="'neither' is no rule"):
@@ -314,7 +314,7 @@ def test_zero_load_and_too_great_a_load(meshes):
         ({"units": "inch"}, "unit"),
         ({"units": "m"}, "unit"),
         ({"axes": "+x,+x,+z"}, "axes"),
-        ({"axes": "+y,+z,+x"}, "axes wrong"),
+        ({"axes": "+y,+z,+x"}, "check the axes"),
         ({"side": "both"}, "side"),
         ({"bearing": "loose"}, "bearing"),
         ({"pose": (0, 0, 0)}, "six finite numbers"),

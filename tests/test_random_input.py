@@ -145,7 +145,7 @@ def test_a_run_with_a_random_cell_in_its_tables(capsys, name, row, column, cell)
         run_cleanly(folder, capsys, "--contact", "foundation", "--resolution", "3")
 
 
-@settings(GENTLE, max_examples=8)
+@settings(GENTLE, max_examples=4)
 @given(
     st.sampled_from(["femoral_component.stl", "insert.stl"]),
     st.sampled_from(["cut", "noise", "scale", "drop", "bytes", "turn"]),

@@ -245,7 +245,7 @@ def test_why_there_is_no_band_says_what_to_do(bend):
         lost = {f"force_total_BW_{end}": np.full(len(bend), np.nan) for end in PERCENTILES}
         bands = lost | {"failed_share": np.where(np.arange(len(bend)) == frame, share, 0.0)}
         run = replace(bend, bands=bands, summary=bend.summary | {"uncertainty": table})
-        return next(c.detail for c in cards(run, horizontal_axis(run)) if "sure" in c.title)
+        return next(c.detail for c in cards(run, horizontal_axis(run)) if "Uncertainty" in c.title)
 
     assert "fewer than 20 samples have it, take more" in told(0.15)
     assert "most often: no ellipse" in told(0.15)
@@ -586,7 +586,7 @@ def test_bands_are_drawn_at_their_percentiles_and_told_in_words(bend, page):
     assert y.max() == pytest.approx(slope * 0.8 * values.min() + offset, abs=0.01)
     assert "-band-" in re.search(r'id="figure-pressures">.*?</svg>', found, re.DOTALL).group()
     assert "-band-" not in page
-    card = next(one for one in cards(run, axis) if one.title.startswith("How sure"))
+    card = next(one for one in cards(run, axis) if one.title.startswith("Uncertainty of"))
     peak = values.max()
     assert card.value == f"{0.8 * peak:.2f}–{1.3 * peak:.2f} BW"
     for words in ("5 to 95 % of 256", "ML (61%)", "up to 12% of the samples", "segment mass"):

@@ -97,7 +97,7 @@ def test_damaged_csv_is_one_clear_line(tmp_path):
     with pytest.raises(InputError, match="time_s"):
         read_results(tmp_path)
     path.unlink()
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="holds no results"):
         read_results(tmp_path)
 
 

@@ -45,7 +45,7 @@ def jobs_of(script, content):
     return [
         (way, words, value)
         for way in script.keys(content)
-        for words, value in script.changes(script.value_at(content, way)).items()
+        for words, value in script.changes(script.value_at(content, way), way[-1]).items()
     ]
 
 

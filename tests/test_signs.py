@@ -5,6 +5,7 @@ import shutil
 import tomllib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from mistakes import DATA, DM
@@ -13,7 +14,8 @@ from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.ligament_sides import check_collateral_sides
-from tkamb.run.plausibility.ground import direction_questions, load_questions
+from tkamb.run.plausibility.ground import direction_questions, foot_questions, load_questions
+from tkamb.run.plausibility.movement import motion_questions
 from tkamb.run.plausibility.signs import sign_questions
 from tkamb.show.check.scene_check import check_scene
 
@@ -204,6 +206,16 @@ def bundles():
         ("popLCL", 0),
         ("FCL3", 1),
         ("lateral-collateral", 1),
+        ("collateral_medial", -1),
+        ("MPFL", -1),
+        ("medial_patellofemoral", -1),
+        ("medial retinaculum", -1),
+        ("LPFL_2", 1),
+        ("retinaculum_lateral", 1),
+        ("ITB", 1),
+        ("iliotibial_band", 1),
+        ("patellar_tendon", 0),
+        ("tibiofibular", 0),
         ("PCLal9", 0),
         ("PCL_posteromedial", 0),
         ("ACL", 0),
@@ -222,3 +234,39 @@ def test_which_names_have_a_side(bundles, name, sign):
         else:
             with pytest.raises(InputError):
                 check_collateral_sides(named, chain, "right")
+
+
+def test_a_length_unit_or_a_clock_that_cannot_be_is_asked_about(knee):
+    """Millimetres that are metres where the meshes still touch, and a cycle in per cent."""
+    case = load_case(load_scene(knee))
+    assert not list(motion_questions(case))
+    coordinates = case.motion.coordinates.copy()
+    coordinates[:, :3] = coordinates[0, :3] + 1e-3 * (coordinates[:, :3] - coordinates[0, :3])
+    small = replace(case, motion=replace(case.motion, coordinates=coordinates))
+    assert any("length_unit" in one.text for one in motion_questions(small))
+    coordinates = coordinates.copy()
+    coordinates[:, :3] = coordinates[0, :3]  # constants are given, not recorded
+    fixed = replace(case, motion=replace(case.motion, coordinates=coordinates))
+    assert not list(motion_questions(fixed))
+    per_cent = replace(case, motion=replace(case.motion, time=25.0 * case.motion.time))
+    assert any("per cent of a cycle" in one.text for one in motion_questions(per_cent))
+
+
+def test_a_centre_of_pressure_behind_the_ankle_is_asked_about(knee):
+    turn(knee.parent / "ground_reaction.csv", "point_x_mm")
+    asked = [one.text for one in foot_questions(load_case(load_scene(knee)))]
+    assert any("behind the ankle in the mean" in text for text in asked)
+
+
+@pytest.mark.parametrize(("cutoff", "asked"), [(6.0, False), ("none", True)])
+def test_a_spike_that_the_filter_makes_small_is_not_asked_about(knee, cutoff, asked):
+    """One sample of 20 % at 1200 Hz moves nothing behind a low-pass of 6 Hz."""
+    time = np.arange(0.0, 4.0, 1 / 1200)
+    force = 400.0 + 10.0 * np.sin(time)
+    force[2400] -= 80.0
+    rows = [[t, 0.0, f, 0.0, 40.0, 0.0, 0.0] for t, f in zip(time, force, strict=True)]
+    path = knee.parent / "ground_reaction.csv"
+    header = path.read_text().splitlines()[0]
+    path.write_text("\n".join([header, *(",".join(map(repr, map(float, r))) for r in rows)]) + "\n")
+    case = load_case(load_scene(knee, {"ground_reaction.cutoff_Hz": cutoff}))
+    assert bool(case.ground.odd) is asked

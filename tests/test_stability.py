@@ -140,8 +140,8 @@ def test_counts_add_up_and_failures_are_listed():
     assert picture(verdicts).axes
 
 
-def test_a_twentieth_of_the_matrix_has_no_failure():
-    verdicts = list(run_stability(stability_cases(quick=True)[::2]))
+def test_a_fortieth_of_the_matrix_has_no_failure():
+    verdicts = list(run_stability(stability_cases(quick=True)[::4]))
     assert not [v for v in verdicts if v.failed]
     assert all(v.reason for v in verdicts if v.kind == "flagged")
     assert Counter(v.kind for v in verdicts)["converged"] > 0.7 * len(verdicts)

@@ -95,9 +95,9 @@ def test_unit_words_of_a_trc(tmp_path, word):
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("a.csv", "time,x,y\n0,0,1,5,2,5\n0,1,1,5,2,5\n", "decimal commas"),
+        ("a.csv", "time,x,y\n0,0,1,5,2,5\n0,1,1,5,2,5\n", "not commas"),
         ("a.csv", "time,x,y\n0.0,1.5,2.5,7.5,8.5\n", "give every column a name"),
-        ("a.sto", "endheader\ntime\tx\n0,01\t2\n", "is the comma a decimal point"),
+        ("a.sto", "endheader\ntime\tx\n0,01\t2\n", "a decimal point, not a comma"),
         ("a.mot", "endheader\ntime\tx\n0.01\t2\t3\n", "give every column a name"),
     ],
 )

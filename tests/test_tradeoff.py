@@ -223,7 +223,7 @@ def test_the_quick_study_is_stopped_and_goes_on(tmp_path, capsys, monkeypatch):
     arguments = ["tradeoff", "--quick", "--json", "--out", str(tmp_path)]
     assert main(arguments) == 130
     told = capsys.readouterr()
-    assert len(json.loads(told.out)) == 2 and "--resume goes on" in told.err
+    assert len(json.loads(told.out)) == 2 and "--resume continues" in told.err
     assert (tmp_path / "tradeoff.txt").read_text().startswith("stopped: 2 of 6 rows")
     assert (tmp_path / "tradeoff.png").exists()
     assert main([*arguments, "--resume"]) == 0

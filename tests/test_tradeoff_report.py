@@ -114,7 +114,7 @@ def test_rows_survive_their_json(tmp_path):
     assert as_json(again) == path.read_text()
     assert block(again) == block(made_up_rows())
     path.write_text('[{"case": 1}]')
-    with pytest.raises(InputError, match="no table of a trade-off"):
+    with pytest.raises(InputError, match="not a table of a trade-off"):
         read_rows(path)
 
 

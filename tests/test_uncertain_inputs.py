@@ -65,7 +65,7 @@ def test_a_linear_map_of_correlated_inputs_has_the_variance_of_their_matrix(pair
 @pytest.mark.parametrize(
     ("pairs", "words"),
     [
-        ([("a", "b", 0.9), ("a", "c", 0.9), ("b", "c", -0.9)], "make no correlation matrix"),
+        ([("a", "b", 0.9), ("a", "c", 0.9), ("b", "c", -0.9)], "do not give a correlation matrix"),
         ([("a", "d", 0.5)], "'d' does not vary"),
         ([("a", "b", 0.5), ("b", "a", 0.4)], "'b' and 'a' twice"),
     ],

@@ -81,7 +81,7 @@ def test_the_headline_is_the_median_with_its_band_or_says_why_not(failed):
     else:
         middle = run.bands["force_total_BW_p50"][1]
         assert report.value.startswith(f"{middle:.2f} BW (")
-        assert "3.39 BW as the inputs stand" in report.detail
+        assert "3.39 BW with the inputs as given" in report.detail
         assert f"median {middle:.2f} BW, 5 to 95 %" in line
     assert f"{failed} of 100 samples failed" in line
 

@@ -1,6 +1,22 @@
-"""`python -m tkamb` is `tkamb`, where no command is on the path."""
+"""`tkamb` on the command line, and `python -m tkamb`."""
 
-from tkamb.cli import main
+import sys
+from collections.abc import Sequence
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status.
+
+    An interrupt while the program itself is still being read is one line too.
+    """
+    try:
+        from tkamb.cli import main as command
+
+        return command(arguments)
+    except KeyboardInterrupt:
+        print("tkamb: interrupted: nothing is kept", file=sys.stderr)
+        return 130
+
 
 if __name__ == "__main__":
     raise SystemExit(main())

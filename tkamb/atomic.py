@@ -2,8 +2,9 @@
 
 One file takes its place in one rename. Files that belong together are first all written beside
 their places; then a journal that names them makes the change certain, and they are renamed. A
-kill before the journal leaves the old files, one after it the journal, from which the next
-command that opens the folder finishes (`finish_replacement`): the old state or the new one.
+kill before the journal leaves the old files. After a kill with a journal, the next command that
+opens the folder finishes the renames (`finish_replacement`). So a folder has the old state or the
+new one.
 """
 
 import csv
@@ -21,7 +22,7 @@ from tkamb.errors import InputError
 from tkamb.files import read_json
 
 MARKER = ".tkamb"
-"""Says that a folder is tkamb's (`tkamb.io.claim`), and what its temporary files are called."""
+"""File that marks a folder as tkamb's own (`tkamb.io.claim`) and names its temporary files."""
 JOURNAL = ".tkamb-commit"
 CHOOSE_OUT = "choose another --out, or remove it"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]*")
@@ -83,7 +84,7 @@ def write_new_text(path: Path, text: str) -> None:
         write_synced(temporary, text)
         os.link(temporary, path)  # unlike a rename, it fails where the name is taken
     except FileExistsError:
-        raise InputError("is there already", path, CHOOSE_OUT) from None
+        raise InputError("exists already", path, CHOOSE_OUT) from None
     except (OSError, ValueError) as error:
         raise InputError(f"cannot be written ({_reason(error)})", path) from None
     finally:
@@ -91,7 +92,7 @@ def write_new_text(path: Path, text: str) -> None:
 
 
 def write_synced(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 and see it to the disk."""
+    """Write `text` as UTF-8 and flush it to the disk."""
     # Names of files that are not UTF-8 come as lone surrogates, which UTF-8 does not have:
     # "\udcff" is written as these six characters, in JSON a valid escape for the same name.
     with open(path, "w", encoding="utf-8", errors="backslashreplace") as file:
@@ -101,7 +102,7 @@ def write_synced(path: Path, text: str) -> None:
 
 
 def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells as CSV and see it to the disk."""
+    """Write rows of cells as CSV and flush them to the disk."""
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows(rows)
     write_synced(path, buffer.getvalue())
@@ -128,7 +129,7 @@ class Replacement:
         return self._written.get(name, self.folder / name)
 
     def remove(self, name: str) -> None:
-        """Have the file of that name gone, if there is one."""
+        """Remove the file of that name on `commit`, if there is one."""
         self._removed.append(name)
 
     def commit(self) -> None:
@@ -139,7 +140,7 @@ class Replacement:
         written = {name: path.name for name, path in self._written.items()}
         journal = {"written": written, "removed": self._removed}
         write_text(self.folder / JOURNAL, json.dumps(journal))
-        self._written.clear()  # from here on they are the journal's
+        self._written.clear()  # from here on the journal owns them
         finish_replacement(self.folder)
 
     def discard(self) -> None:
@@ -220,7 +221,7 @@ def claim_directory(path: str | Path) -> Path:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file if that can be done; what keeps it from it was said by what failed before."""
+    """Remove a file if possible; the reason of a failure was reported before."""
     with suppress(OSError, ValueError):
         path.unlink(missing_ok=True)
 

@@ -4,6 +4,7 @@ import argparse
 import gc
 import json
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,16 +28,16 @@ from tkamb.commands.view import add_view
 from tkamb.commands.wear import add_wear
 from tkamb.geometry.threads import threads
 from tkamb.io.starter import add_new
-from tkamb.run.guard import guarded, log_to_stderr, printable, say
+from tkamb.run.guard import guarded, log_to_stderr, say
 from tkamb.run.settings import add_settings
 
 if TYPE_CHECKING:
     from tkamb.io.scene import Scene
 
 COLLECTED_AT = (20_000, 100)
-"""Objects more than before at which Python looks for those that refer to each other only, and looks
-before it goes back to older ones. At its usual 700 and 10 it looks five times through all that the
-libraries made: 3 % of a run."""
+"""Thresholds of Python's garbage collector: new objects before a collection, and collections before
+older objects are included. With Python's defaults (700 and 10) the libraries' objects are searched
+five times, which takes 3 % of a run."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser = _parser()
         parser.parse_args(arguments, options)
         check_options(parser, sys.argv[1:] if arguments is None else arguments, options)
-        threads()  # is refused here where it is no number of threads
+        threads()  # refuses a bad TKAMB_THREADS here
         log_to_stderr()
         return int(options.command(options))
 
@@ -72,6 +73,8 @@ class _Parser(argparse.ArgumentParser):
     """Bad arguments are one line too, without the usage before it."""
 
     def error(self, message: str) -> NoReturn:
+        for kind, words in (("float", "is not a number"), ("int", "is not a whole number")):
+            message = re.sub(rf"invalid {kind} value: ('.*')", rf"\1 {words}", message)
         self.exit(2, f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help\n")
 
 
@@ -111,17 +114,17 @@ def _add_run(commands: Any) -> None:
     run.add_argument("--force", action="store_true", help="write into a folder that is not tkamb's")
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     run.add_argument("--workers", type=int, default=1, metavar="N", help="processes for the frames")
-    run.add_argument("--profile", action="store_true", help="what was touched, and time per part")
+    run.add_argument("--profile", action="store_true", help="files and modules used, time per part")
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
 
 
 def _add_folder_commands(commands: Any) -> None:
-    verify = commands.add_parser("verify", help="is a folder of results what was written?")
+    verify = commands.add_parser("verify", help="check that a folder of results is unchanged")
     verify.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     verify.set_defaults(command=_verify)
-    report = commands.add_parser("report", help="write report.html of a folder of results anew")
+    report = commands.add_parser("report", help="write report.html of a folder of results again")
     report.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
     report.set_defaults(command=_report)
     methods = commands.add_parser(
@@ -168,9 +171,9 @@ def _run(options: argparse.Namespace) -> int:
         write_results(results, directory, progress=stages.plots)
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
-        print(f"tkamb: frame {k}: {results.status[k]}", file=sys.stderr)
+        say(f"frame {k}: {results.status[k]}")
     for question in results.summary.get("questions", []):
-        print(f"tkamb: question: {question}", file=sys.stderr)
+        say(f"question: {question}")
     if options.json:
         print((directory / "summary.json").read_text(encoding="utf-8"), end="")
     else:
@@ -210,7 +213,7 @@ def _verify(options: argparse.Namespace) -> int:
     for line in verdict.differs:
         say(f"{options.folder}: {line}")
     for line in verdict.lines()[len(verdict.differs) :]:
-        print(printable(f"{options.folder}: {line}"))
+        print(f"{options.folder}: {line}")
     return 1 if verdict.differs else 0
 
 

@@ -1,4 +1,4 @@
-"""Which code it is that computes: the hash of the package's own source."""
+"""Identity of the computing code: the hash of the package's own source."""
 
 import hashlib
 from functools import lru_cache
@@ -6,14 +6,14 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parent
 NO_NUMBERS = ("show", "commands")
-"""Subpackages that change how results look, not what they are."""
+"""Subpackages that change the presentation of results, not their values."""
 
 
 @lru_cache(maxsize=4)
 def code_identity(part: str = "") -> str:
     """Return the SHA-256 of the source of a subpackage, by default of the whole package.
 
-    What only shows results, reads arguments or writes tables is left out.
+    Code that only shows results, reads arguments or writes tables is left out.
 
     Args:
         part: path of the subpackage below the package, like "contact/lattice".

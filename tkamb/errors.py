@@ -12,7 +12,7 @@ class MessageSettings:
     """How messages are written."""
 
     max_names: int = 8
-    """Number of names that a message lists."""
+    """Number of names that a message lists. Chosen: a message stays short."""
 
 
 MESSAGE = MessageSettings()
@@ -68,7 +68,7 @@ class ComputationError(TkambError):
 
 
 def not_installed(package: str, where: object, extra: str) -> InputError:
-    """Return the refusal of what needs a package that only an extra of tkamb brings."""
+    """Return the error for a missing package that belongs to an extra of tkamb."""
     return InputError(f"{package} is not installed", where, f"pip install 'tkamb[{extra}]'")
 
 
@@ -84,7 +84,7 @@ def names_near(name: str, names: Iterable[str], title: str = "there are") -> str
 
 
 def renamed(module: str, name: str, names: Mapping[str, Any]) -> Any:
-    """Return what a module has under a former name, with a DeprecationWarning.
+    """Return the object that a module had under a former name, with a DeprecationWarning.
 
     Args:
         module: its dotted name.

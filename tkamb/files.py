@@ -22,14 +22,15 @@ MEGABYTE = 1_000_000
 
 @dataclass(frozen=True)
 class FileLimitSettings:
-    """The largest files that are read: what is larger is not what it is called."""
+    """Sizes of the largest files that are read; a larger file is not of the stated kind."""
 
     text_bytes: float = 16 * MEGABYTE
-    """Bytes of a scene, a URDF or a summary: a thousand times the size of the shipped ones."""
+    """Bytes of a scene, a URDF or a summary. Chosen: a thousand times the size of the shipped
+    ones."""
     table_bytes: float = 512 * MEGABYTE
-    """Bytes of a recording: an hour of fifty channels at 200 Hz has 500 MB."""
+    """Bytes of a recording. Chosen: an hour of fifty channels at 200 Hz has 500 MB."""
     mesh_bytes: float = 1000 * MEGABYTE
-    """Bytes of a mesh: twenty million triangles in a binary STL."""
+    """Bytes of a mesh. Chosen: twenty million triangles in a binary STL."""
     xml_depth: int = 100
     """Nested elements of an XML file; a URDF has 5, an OpenSim model 20."""
 
@@ -175,7 +176,7 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
 
 
 def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
-    """Return what to do about what stopped the parser, from the bytes about the place."""
+    """Return a hint for an error of the parser, from the bytes around its place."""
     at = max(parser.ErrorByteIndex, 0)
     near = content[max(at - 1, 0) : at + 12]
     if re.search(rb"&(?!\w{1,8};|#)", near):
@@ -183,7 +184,7 @@ def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
     if any(byte > 127 for byte in near):
         return SAVE_AS_UTF8
     if not content.strip() or at >= len(content.rstrip()) - 1:
-        return "the file ends too early: get it anew"
+        return "the file ends too early: copy or download it again"
     return "correct that line, or open and save the file in the program that wrote it"
 
 

@@ -1,4 +1,4 @@
-"""How much memory a process has taken, and may still: the machine's, its group's, its own limit."""
+"""Memory that a process uses, and that it may still use by the machine and its limits."""
 
 import ctypes
 import gc
@@ -85,9 +85,9 @@ def _address_space() -> float:
 def give_back() -> None:
     """Free what only refers to itself, and return freed memory to the system where that is known.
 
-    A knee with its meshes refers to itself in places, and Python looks for such rings by how many
-    objects there are, not by their size: eighteen knees one after another held 0.73 GB, collected
-    after each never more than 0.38. And glibc keeps what was freed between what is in use.
+    A knee with its meshes has reference cycles. Python collects them by the number of objects, not
+    by their size: eighteen knees one after another held 0.73 GB, but at most 0.38 GB when collected
+    after each. In addition, glibc does not return freed memory that lies between used blocks.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -1,4 +1,4 @@
-"""Import paths of release 0.1: they lead to the modules' new places until release 0.3.
+"""Import paths of release 0.1, which work until release 0.3.
 
 `from tkamb.inputs.c3d import read_c3d` imports `tkamb.io.recordings.c3d`, with a
 DeprecationWarning.

@@ -27,8 +27,8 @@ class ModelCheckSettings:
     """Checks of a contact model of a plug-in."""
 
     stiffness_tolerance: float = 0.1
-    """Relative, between finite differences over 10 and 5 % of the approach; contact nodes that come
-    in one by one make small steps."""
+    """Relative, between finite differences over 10 and 5 % of the approach. Chosen: contact nodes
+    that come in one by one make small steps."""
 
 
 MODEL_CHECK = ModelCheckSettings()
@@ -40,7 +40,7 @@ class ConformanceError(TkambError):
 
 @dataclass(frozen=True, eq=False)
 class ConformanceCase:
-    """What a model is tried on.
+    """Case on which a model is tested.
 
     Args:
         pair: the two bodies.
@@ -203,7 +203,7 @@ def _check_integral(case: ConformanceCase, pressed: ContactResult) -> None:
 def _check_femoral_frame(
     model: ContactModel, case: ConformanceCase, pressed: ContactResult
 ) -> None:
-    """Describe the femoral mesh in another frame; the relative placement stays.
+    """Describe the femoral mesh in another frame, with the same relative placement.
 
     The insert frame is the contract's own, so this is what moving both bodies together
     amounts to. The other frame is turned about z, which keeps the sides.
@@ -243,7 +243,7 @@ def _check_stiffness(
     narrow = (forces[3] - forces[1]) / (steps[3] - steps[1])
     _require(
         _close(wide, narrow, MODEL_CHECK.stiffness_tolerance, narrow),
-        "the stiffness by finite differences settles as the step shrinks",
+        "the stiffness by finite differences converges as the step shrinks",
         f"{wide:.4g} and {narrow:.4g} N/m",
     )
 

@@ -23,10 +23,10 @@ POLICY = (
 
 def add_check(commands: Any) -> None:
     """Add `check` to the command line."""
-    check = commands.add_parser("check", help="read a scene's files and look at them; no run")
+    check = commands.add_parser("check", help="read and check a scene's files, without a run")
     check.add_argument("scene", type=Path, help="scene.toml")
     check.add_argument(
-        "--out", type=Path, metavar="F", help="the leg at three frames: .png, or .html with it all"
+        "--out", type=Path, metavar="F", help="picture of the leg: .png, or .html with all findings"
     )
     add_set(check)
     add_force(check)
@@ -67,7 +67,7 @@ def _write_picture(check: "SceneCheck", path: Path) -> None:
 
 
 def check_html(check: "SceneCheck", figure: "Figure") -> str:
-    """Return the page: questions first, then the picture, then what each file gave."""
+    """Return the page: questions first, then the picture, then the content of each file."""
     from tkamb.show.pages import asset, policy_sources, render
     from tkamb.show.style import svg_text
 

@@ -2,7 +2,6 @@
 
 import argparse
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,11 @@ from tkamb.run.guard import say
 
 @dataclass(frozen=True)
 class CohortOutputSettings:
-    """What `tkamb cohort` prints."""
+    """Output of `tkamb cohort`."""
 
     max_failed_runs: int = 10
-    """Failed runs that are printed; the folder has them all."""
+    """Number of failed runs that are printed; the folder has them all. Chosen: they fit on a
+    screen."""
 
 
 COHORT_OUTPUT = CohortOutputSettings()
@@ -73,12 +73,9 @@ def _cohort(options: argparse.Namespace) -> int:
     )
     failed = [n for n, one in outcomes.items() if one.reason]
     for n in failed[: COHORT_OUTPUT.max_failed_runs]:
-        print(f"tkamb: run {n} ({cohort.runs[n].words()}): {outcomes[n].reason}", file=sys.stderr)
+        say(f"run {n} ({cohort.runs[n].words()}): {outcomes[n].reason}")
     if len(failed) > COHORT_OUTPUT.max_failed_runs:
-        print(
-            f"tkamb: {len(failed) - COHORT_OUTPUT.max_failed_runs} more failed runs: see runs.csv",
-            file=sys.stderr,
-        )
+        say(f"{len(failed) - COHORT_OUTPUT.max_failed_runs} more failed runs: see runs.csv")
     print(f"{len(outcomes) - len(failed)} of {len(outcomes)} runs computed")
     if part is None:
         print(f"report: {directory / REPORT_NAME}")

@@ -5,8 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tkamb.run.guard import printable
-
 PAGE_NAME = "compare.html"
 
 
@@ -48,5 +46,5 @@ def _compare(options: argparse.Namespace) -> int:
         write_text(folder / PAGE_NAME, html)
     lines = [*table_lines(result), f"page: {folder / PAGE_NAME}"]
     text = json.dumps(result.as_dict(), indent=2) if options.json else "\n".join(lines)
-    print(printable(text))
+    print(text)
     return 0

@@ -38,7 +38,7 @@ def _get(options: argparse.Namespace) -> int:
         why = f"not in {options.source}"
     else:
         got = download(dataset, to, options.url)
-        why = "where they are published is not known; no scene needs them; --from DIR takes them"
+        why = "their address is not known; no scene needs them; --from DIR copies them"
     print(f"{to}: {dataset.says} ({dataset.licence}, {dataset.repository})")
     print(f"  {len(got.written)} files written, {len(got.kept)} were there, each by its SHA-256")
     if got.absent:

@@ -47,8 +47,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "scene": ("tkamb scene --schema", "tkamb scene --schema > scene.schema.json"),
     "import": (
-        "tkamb import model.osim --c3d walk.c3d --side right --mass-kg 67 --cycle plates "
-        "--out patient",
+        "tkamb import model.osim --c3d walk.c3d --side right --mass-kg 67 --cycle --out patient",
         "tkamb import model.osim --motion ik.mot --grf grf.mot --side left --mass-kg 80 "
         "--femoral femoral.stl --insert insert.stl --mesh-unit m --mesh-axes=-x,+y,-z "
         "--out patient",

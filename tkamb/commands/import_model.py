@@ -25,28 +25,41 @@ def add_import(commands: Any) -> None:
     p.add_argument(
         "--grf-force",
         metavar="NAME,NAME",
-        help="how the foot's columns in it begin: ground_force_2; several are summed",
+        help="how the names of the foot's columns in --grf begin, like ground_force_2; several are "
+        "summed",
     )
-    p.add_argument("--static", type=Path, metavar="F", help="standing trial: where markers sit")
+    p.add_argument(
+        "--static", type=Path, metavar="F", help="standing trial that shows where the markers sit"
+    )
     p.add_argument("--side", choices=("right", "left"), required=True, help="of the knee")
     p.add_argument("--mass-kg", type=float, required=True, metavar="KG", help="of the subject")
     for part in ("femoral", "insert", "patella"):
-        p.add_argument(f"--{part}", type=Path, metavar="F", help=f"mesh, {part} part")
-        p.add_argument(f"--{part}-frame", metavar="NAME", help="body or frame of its mesh")
-    p.add_argument("--femur-bone", type=Path, metavar="F", help="mesh that the muscle may wrap")
+        p.add_argument(f"--{part}", type=Path, metavar="F", help=f"mesh of the {part} component")
+        p.add_argument(
+            f"--{part}-frame",
+            metavar="NAME",
+            help="body or frame of the model that this mesh belongs to",
+        )
+    p.add_argument(
+        "--femur-bone",
+        type=Path,
+        metavar="F",
+        help="mesh of the femur that the quadriceps may wrap",
+    )
     p.add_argument(
         "--mesh-unit",
         "--units",
         dest="mesh_unit",
         choices=tuple(LENGTH),
-        help="of all meshes; it is never guessed",
+        help="unit of all meshes; it is never guessed",
     )
     p.add_argument(
         "--mesh-axes",
         "--axes",
         dest="mesh_axes",
         metavar="ANT,SUP,RIGHT",
-        help="mesh axes that point anterior, superior, right; write --mesh-axes=-x,+y,-z",
+        help="axes of the meshes that point anterior, superior and to the right; write "
+        "--mesh-axes=-x,+y,-z",
     )
     _add_poses(p)
     _add_inferred(p)
@@ -69,10 +82,15 @@ def add_import(commands: Any) -> None:
     p.add_argument(
         "--cycle",
         type=_cycle,
-        metavar="A:B|plates",
-        help="s, 0 and 100 %% of the gait cycle; plates: two foot strikes that they show",
+        nargs="?",
+        const="plates",
+        metavar="A:B",
+        help="plot against per cent of the gait cycle: 0 and 100 %% at these times (s); without "
+        "A:B, or with the word plates: two foot strikes on the force plates",
     )
-    p.add_argument("--note", action="append", default=[], metavar="TEXT", help="for the report")
+    p.add_argument(
+        "--note", action="append", default=[], metavar="TEXT", help="sentence for the report"
+    )
     scale = p.add_mutually_exclusive_group()
     scale.add_argument(
         "--scale-mass",
@@ -94,47 +112,76 @@ def add_import(commands: Any) -> None:
 def _add_inferred(p: argparse.ArgumentParser) -> None:
     """Add the options that stand instead of what is inferred."""
     p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
-    p.add_argument("--plates", type=_numbers, metavar="2,3", help="under the foot; or none")
-    p.add_argument("--interval", type=_interval, metavar="A:B", help="s, part of the recording")
-    p.add_argument("--laboratory-axes", metavar="FORWARD,UP,RIGHT", help="of the recording")
-    p.add_argument("--without", type=_names, default=(), metavar="A,B", help="markers not used")
     p.add_argument(
-        "--marker-prefix", metavar="NAME", help="of the labels that are used: JW of JW:RHeel"
+        "--plates", type=_numbers, metavar="2,3", help="force plates under this foot, or none"
     )
-    p.add_argument("--length-unit", choices=("m", "cm", "mm"), help="of a .c3d that lacks it")
-    p.add_argument("--force-unit", metavar="N", help="of a .c3d's force channels, likewise")
-    p.add_argument("--moment-unit", metavar="Nmm", help="of its moment channels, likewise")
+    p.add_argument(
+        "--interval", type=_interval, metavar="A:B", help="part of the recording to use, s"
+    )
+    p.add_argument(
+        "--laboratory-axes",
+        metavar="FORWARD,UP,RIGHT",
+        help="axes of the recording that point forward, up, right",
+    )
+    p.add_argument("--without", type=_names, default=(), metavar="A,B", help="markers to leave out")
+    p.add_argument(
+        "--marker-prefix", metavar="NAME", help="prefix of the marker labels to use: JW of JW:RHeel"
+    )
+    p.add_argument(
+        "--length-unit", choices=("m", "cm", "mm"), help="length unit of a .c3d that states none"
+    )
+    p.add_argument("--force-unit", metavar="N", help="force unit of a .c3d that states none")
+    p.add_argument("--moment-unit", metavar="Nmm", help="moment unit of a .c3d that states none")
     p.add_argument(
         "--method",
         choices=("segments", "chain"),
         default="segments",
-        help="markers of thigh and shank each by itself, or the whole leg; default: segments",
+        help="fit markers of thigh and shank each by itself, or the whole leg as a chain; default: "
+        "segments",
     )
     p.add_argument(
         "--cutoff-hz",
         type=float,
         default=6.0,
         metavar="HZ",
-        help="of the low-pass filter of markers and forces; default: 6",
+        help="cut-off of the low-pass filter of markers and forces; default: 6",
     )
 
 
 def _add_poses(p: argparse.ArgumentParser) -> None:
     """Add the options of recorded poses of the implant."""
-    p.add_argument("--poses", type=Path, metavar="F", help="of the femoral mesh in the insert mesh")
     p.add_argument(
-        "--pose-columns", type=_names, metavar="R1,R2,R3,X,Y,Z", help="its angles and places"
+        "--poses",
+        type=Path,
+        metavar="F",
+        help="recorded poses of the femoral mesh in the axes of the insert mesh",
     )
-    p.add_argument("--pose-sequence", metavar="XYZ", help="upper case: intrinsic (Rx Ry Rz)")
-    p.add_argument("--pose-units", type=_names, metavar="rad,m", help="of angles and places")
     p.add_argument(
-        "--pose-signs-turned", type=_names, default=(), metavar="ROLES", help="rotation_1, …"
+        "--pose-columns",
+        type=_names,
+        metavar="R1,R2,R3,X,Y,Z",
+        help="columns of --poses: three angles, three places",
+    )
+    p.add_argument(
+        "--pose-sequence",
+        metavar="XYZ",
+        help="sequence of their angles; upper case: intrinsic (Rx Ry Rz)",
+    )
+    p.add_argument(
+        "--pose-units", type=_names, metavar="rad,m", help="units of their angles and places"
+    )
+    p.add_argument(
+        "--pose-signs-turned",
+        type=_names,
+        default=(),
+        metavar="ROLES",
+        help="those whose sign is turned: rotation_1, …",
     )
     p.add_argument(
         "--stride",
         type=_interval,
         metavar="A:B",
-        help="s of the recording where 0 and 100 %% of the poses' time lie",
+        help="times of the recording, s, at 0 and 100 %% of the poses",
     )
     p.add_argument(
         "--stance",

@@ -8,6 +8,7 @@ from typing import Any
 from tkamb.commands.scene_options import add_force
 from tkamb.errors import InputError
 from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.run.guard import say
 from tkamb.units import LENGTH
 
 UNIT_OPTIONS = ("--units", "--mesh-unit")
@@ -86,7 +87,7 @@ def _press(options: argparse.Namespace) -> int:
     from tkamb.run.press import press_meshes, read_pose
 
     if options.out and options.out.suffix.lower() != ".vtp":
-        raise InputError("is no .vtp file", options.out, "name it like map.vtp")
+        raise InputError("is not a .vtp file", options.out, "give a name like map.vtp")
     check_output_file(options.out, options.force)
     pose = read_pose(options.pose_file) if options.pose_file else options.pose
     report = press_meshes(
@@ -108,18 +109,21 @@ def _press(options: argparse.Namespace) -> int:
     if options.out:
         report.write_map(options.out)
     print(json.dumps(report.as_dict(), indent=2) if options.json else "\n".join(report.lines()))
-    return 0 if report.carried else 1
+    if not report.carried:
+        say(f"the load is not carried: {report.as_dict()['status']}")
+        return 1
+    return 0
 
 
 def add_mesh(commands: Any) -> None:
     """Add the command `mesh` and its verbs to the parser's commands."""
-    mesh = commands.add_parser("mesh", help="look at a mesh before it is used")
+    mesh = commands.add_parser("mesh", help="check a mesh before it is used")
     verbs = mesh.add_subparsers(required=True, metavar="VERB")
     check = verbs.add_parser("check", help="health, and unit and axes as questions")
     check.add_argument("files", type=Path, nargs="+", metavar="FILE", help="meshes")
     check.add_argument("--json", action="store_true", help="print the findings as JSON")
     check.set_defaults(command=_mesh_check)
-    part = verbs.add_parser("part", help="one of several bodies into a file of its own")
+    part = verbs.add_parser("part", help="write one of several bodies to a separate file")
     part.add_argument("file", type=Path, metavar="FILE", help="mesh of several bodies")
     part.add_argument("number", type=int, metavar="N", help="as `tkamb mesh check` numbers them")
     part.add_argument("--out", type=Path, required=True, metavar="F", help=".stl, .ply or .obj")
@@ -225,15 +229,15 @@ def add_no_cache(command: argparse.ArgumentParser) -> None:
 
 
 def without_cache(contact: str | None) -> dict[str, Any]:
-    """Return the options of a contact model that then keeps nothing on disk.
+    """Return the options of a contact model without a cache on disk.
 
     Raises:
-        InputError: there is no such model, or it keeps nothing anyway.
+        InputError: there is no such model, or it has no cache.
     """
     from tkamb.contact.registry import contact_options
 
     if contact is None:
         raise InputError("no contact is modelled", "--no-cache", "leave it out")
     if "cache" not in contact_options(contact):
-        raise InputError(f"'{contact}' keeps nothing on disk", "--no-cache", "leave it out")
+        raise InputError(f"'{contact}' has no cache on disk", "--no-cache", "leave it out")
     return {"cache": False}

@@ -1,8 +1,7 @@
 """Which options of a command mean nothing without, or beside, which others.
 
-An option that would be ignored is refused: it stands for something that the user believes to be
-done. The rules are a table, by command; `tests/test_option_rules.py` holds every option of every
-command to it.
+An option that would be ignored is refused, because the user expects an effect. The rules are a
+table, by command; `tests/test_option_rules.py` checks that it has every option of every command.
 """
 
 import argparse
@@ -20,8 +19,8 @@ class Rule:
         option: its name on the command line.
         needs: options of which at least one must be there; none: no such need.
         excludes: options beside which it means nothing.
-        because: why, after "does not go with --x" or "needs --x".
-        unless: a value of the excluded option beside which it means something all the same.
+        because: reason, after "does not go with --x" or "needs --x".
+        unless: value of the excluded option with which the option is allowed.
     """
 
     option: str

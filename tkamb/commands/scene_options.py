@@ -1,4 +1,4 @@
-"""What commands on a scene are told alike: contact model, frames, keys to override."""
+"""Options that all commands on a scene share: contact model, frames, keys to override."""
 
 import argparse
 import tomllib
@@ -38,7 +38,7 @@ def add_preset(command: Any) -> None:
         "--as",
         dest="preset",
         metavar="NAME",
-        help="lay a study's own choices over the scene: sharma-2008; --set still overrides",
+        help="apply a study's own choices to the scene: sharma-2008; --set still overrides them",
     )
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -65,7 +64,7 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     jobs = study.jobs(options.quick, options.scene, options.full)
     cases = study.cases_of(jobs)
     kept_rows = KeptRows(directory, options.resume)
-    references = study.references_for(cases, options.recompute, _announce, kept_rows)
+    references = study.references_for(cases, options.recompute, say, kept_rows)
     rows, whole = gather(
         study.run_tradeoff(jobs, references, kept_rows), study.expected_seconds(jobs, cases)
     )
@@ -124,14 +123,16 @@ def _stability(options: argparse.Namespace) -> int:
 
 
 def _study_stability(options: argparse.Namespace, directory: Path) -> int:
+    from tkamb.run.workers import PoolOptions
     from tkamb.show.stability_picture import picture
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.stability import table
 
+    workers = PoolOptions(options.workers).workers
     cases = study.stability_cases(options.quick)
     rows = KeptRows(directory, options.resume)
-    judged = study.run_stability(cases, kept=rows, workers=max(1, options.workers))
+    judged = study.run_stability(cases, kept=rows, workers=workers)
     verdicts, whole = gather(judged, [1.0] * len(cases))
     if not whole:
         verdicts = study.kept_verdicts(cases, rows)
@@ -179,7 +180,7 @@ def unfinished(count: int, total: int) -> list[str]:
 
 
 def _goes_on(directory: Path) -> str:
-    return f"what was finished is in {directory}; --resume goes on from there"
+    return f"finished rows are in {directory}; --resume continues from there"
 
 
 def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
@@ -191,7 +192,3 @@ def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any)
     if figure is not None:
         with replaced_file(directory / f"{name}.png") as temporary:
             figure.savefig(temporary, format="png", dpi=150)
-
-
-def _announce(line: str) -> None:
-    print(f"tkamb: {line}", file=sys.stderr, flush=True)

@@ -1,7 +1,6 @@
 """`tkamb uncertainty`: arguments in, exit status out."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +14,13 @@ SHOWN = 5
 """Inputs of the tornado table that are printed."""
 QUICK_CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 QUICK_FRAMES = 11
-"""What a screening takes where nothing else is asked for."""
+"""Frames of a screening without --frames."""
 LEAST_SHOWN = 0.01
-"""Share of a result's variance."""
+"""Smallest share of a result's variance that is printed."""
 TERMS = 2
 """Of each input in the regression, its value and its square: each explains 1/n by chance."""
 NOTABLE_FAILED = 0.05
-"""Share of samples: where more fail, the bands leave out a whole tail."""
+"""Share of failed samples above which the bands are cut off at one end."""
 
 
 def add_uncertainty(commands: Any) -> None:
@@ -70,7 +69,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
     )
     for line in warnings_of(result):
-        print(f"tkamb: {line}", file=sys.stderr)
+        say(line)
     print("\n".join([*headline(result), f"bands: {directory / 'bands.csv'}"]))
     if all(one.failed.all() for one in result.samples):
         say("every frame of every sample failed")
@@ -109,14 +108,18 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         text.append(f"not varied: {', '.join(constants)}")
     text.append("one input at a time by one standard deviation: minus, plus; no interactions")
     text.append(
-        "an offset either way may raise a force: it climbs one flank of the insert or other"
+        "an offset in either direction may raise a force, because the femur climbs a flank of the "
+        "insert"
     )
     print("\n".join([*screen_lines(rows), *(f"({line})" for line in text)]))
-    return 0 if rows else 1
+    if not rows:
+        say("no sample could be computed")
+        return 1
+    return 0
 
 
 def headline(uncertainty: "Uncertainty") -> list[str]:
-    """Return the peak's band and what moves it most, in lines of text."""
+    """Return the peak's band and the inputs with the largest influence, in lines of text."""
     from numpy import isfinite, nanargmax
 
     from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
@@ -130,7 +133,7 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
     words = of_samples["words"]
     if of_samples["median"] is None:
         why = uncertainty.results.why_no_band(peak)
-        value = f"{total[peak]:.2f} BW as the inputs stand, no median or band: {why}"
+        value = f"{total[peak]:.2f} BW with the inputs as given, no median or band: {why}"
     else:
         value = (
             f"median {of_samples['median']:.2f} BW, 5 to 95 %: {of_samples['p05']:.2f} to "
@@ -174,7 +177,7 @@ def _with_error(value: float, error: float) -> str:
 
 
 def warnings_of(uncertainty: "Uncertainty") -> list[str]:
-    """Return what the bands leave out."""
+    """Return the limits of the bands, in lines of text."""
     lines, summary = [], uncertainty.results.summary["uncertainty"]
     if summary["not_varied"]:
         names = ", ".join(summary["not_varied"])

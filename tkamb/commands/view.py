@@ -15,7 +15,7 @@ HIGHEST_PORT = 65535
 
 def add_view(commands: Any) -> None:
     """Add `view` to the command line."""
-    view = commands.add_parser("view", help="see a run and turn it around")
+    view = commands.add_parser("view", help="show a run in 3D")
     view.add_argument(
         "runs",
         type=Path,
@@ -87,7 +87,7 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse what is wrong whatever the runs hold, before they are read.
+    """Check options and output files, before the runs are read.
 
     Raises:
         InputError: an option that cannot be, or a file that cannot be written.

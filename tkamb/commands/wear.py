@@ -3,12 +3,12 @@
 import argparse
 import math
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.commands.scene_options import add_set
 from tkamb.errors import InputError
+from tkamb.run.guard import say
 
 if TYPE_CHECKING:
     from tkamb.studies.wear.run import WearRun
@@ -104,7 +104,7 @@ def _wear(options: argparse.Namespace) -> int:
     with claimed_directory(folder, options.force, "wear") as claimed:
         crew, run = PoolOptions(options.workers), _prepared(options)
         if crew.workers > 1 and run.sampling is None:
-            raise InputError("has no samples to compute", "--workers", "give --samples too")
+            raise InputError("has no samples to compute", "--workers", "also give --samples")
         with tqdm(total=options.cycles, desc="wearing", unit="cycle", disable=None) as bar:
             report = run.compute(
                 claimed,
@@ -117,9 +117,9 @@ def _wear(options: argparse.Namespace) -> int:
             )
         report.write(claimed)
     for question in report.questions():
-        print(f"tkamb: question: {question}", file=sys.stderr)
+        say(f"question: {question}")
     if report.state.end:
-        print(f"tkamb: {report.state.end}", file=sys.stderr)
+        say(report.state.end)
     if options.json:
         print((folder / "wear.json").read_text(encoding="utf-8"), end="")
     else:

@@ -14,11 +14,11 @@ class ContactAreaSettings:
     """Contact area from nodal pressures and gaps."""
 
     unknown_edge_share: float = 0.5
-    """Share of a cell side, 1: where the edge of contact is put if the femoral surface ends,
-    or rises more than it goes along, before the neighbour. Contact may then end anywhere
+    """Share of a cell side, 1: where the edge of contact is put if the femoral surface ends, or
+    rises more than it goes along, before the neighbour. Chosen: contact may then end anywhere
     between the two nodes, so the middle is taken."""
     least_gap: float = 1e-12
-    """m: smallest gap of a node that is not in contact. It keeps a division from zero; gaps
+    """m: smallest gap of a node that is not in contact. Chosen: it keeps a division from zero; gaps
     that matter are above 1e-7 m."""
 
 

@@ -24,18 +24,20 @@ class EdgeSettings:
     """When contact is at the edge of an insert."""
 
     spacing: float = 0.5 * MILLIMETRE
-    """m: spacing of the vertical rays that find the edge. The distance from the edge is known to
-    half of it."""
+    """m: spacing of the vertical rays that find the edge. Chosen: the distance from the edge is
+    known to half of it."""
     steepest: float = 50.0 * DEGREE
-    """rad from the horizontal: a steeper surface beside the outline belongs to the rim."""
+    """rad from the horizontal: a steeper surface beside the outline belongs to the rim. Chosen: it
+    is 50 deg, steeper than any part of a dish that carries."""
     rim: float = 4.0 * MILLIMETRE
-    """m: largest width of the rim. A steep surface farther inside is a flank of the eminence or
-    of a post."""
+    """m: largest width of the rim. Chosen: a steep surface farther inside is a flank of the
+    eminence or of a post."""
     reach: float = 2.5 * MILLIMETRE
-    """m: contact that is nearer to the edge is flagged. It is the radius of a usual insert's
+    """m: contact that is nearer to the edge is flagged. Chosen: the radius of a usual insert's
     rounded rim (1 to 2 mm) plus half the spacing of a map."""
     share: float = 0.05
-    """1: share of the peak pressure from which a point counts as loaded."""
+    """1: share of the peak pressure from which a point counts as loaded. Chosen: a smaller pressure
+    does no harm."""
 
 
 EDGE = EdgeSettings()

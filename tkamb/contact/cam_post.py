@@ -45,8 +45,8 @@ class CamPostSettings:
     ray_start_height: float = 1e-3
     """m: height above the post at which rays down begin. Chosen well above the noise of a mesh."""
     search_margin: float = 3 * MILLIMETRE
-    """m: the part of the component within this distance beside the post counts as cam, because
-    the femur moves from side to side."""
+    """m: the part of the component within this distance beside the post counts as cam. Chosen: the
+    femur moves from side to side."""
 
 
 CAM_POST = CamPostSettings()

@@ -16,15 +16,15 @@ class CurvatureSettings:
     """Rays per side of the square patch. Chosen: a quadric has six coefficients, 441 rays
     average out the mesh."""
     max_iterations: int = 12
-    """Iterations that find the contact point at most."""
+    """Iterations that find the contact point at most. Chosen: contacts of knees need fewer."""
     position_tolerance: float = 1e-7
-    """m: the contact point has converged when an iteration moves it by less. Far below the
+    """m: the contact point has converged when an iteration moves it by less. Chosen: far below the
     size of a triangle."""
     max_distance: float = 3.0
     """Patch radii: farthest distance of the contact point from where the meshes touch first.
-    Farther away the two surfaces are not described by the patch."""
+    Chosen: farther away the two surfaces are not described by the patch."""
     least_cover: float = 0.6
-    """Share of a patch, 1: part that both meshes must cover. With less the quadric is an
+    """Share of a patch, 1: part that both meshes must cover. Chosen: with less the quadric is an
     extrapolation."""
 
 

@@ -12,7 +12,7 @@ class EllipseSettings:
     """Hertz's contact ellipse."""
 
     smallest_axis_ratio: float = 1e-6
-    """1: smallest ratio of the semi-axes that is solved for. Below it the contact is a line
+    """1: smallest ratio of the semi-axes that is solved for. Chosen: below it the contact is a line
     contact, and elliptic integrals lose their digits."""
 
 

@@ -31,16 +31,17 @@ class FoundationSettings:
     """The elastic foundation (bed of springs)."""
 
     least_thickness: float = 1e-6
-    """m: a layer thinner than this, at the insert's rim, counts as this thick. It keeps
+    """m: a layer thinner than this, at the insert's rim, counts as this thick. Chosen: it keeps
     pressure = modulus * penetration / thickness finite."""
     approach_step: float = 1e-9
-    """m: distance of two approaches between which a reaction is taken as constant. With a
+    """m: distance of two approaches between which a reaction is taken as constant. Chosen: with a
     stiffness of some 1e8 N/m it changes by 0.1 N."""
     reached_share: float = 0.99
-    """1: a reaction below this share of the load, less `reached_force`, does not reach the
-    load within `approach_step`."""
+    """1: a reaction below this share of the load, less `reached_force`, does not reach the load
+    within `approach_step`. Chosen: a jump of the reaction, as map points come into contact, is
+    smaller."""
     reached_force: float = 1.0
-    """N: see `reached_share`; ten times what `approach_step` changes."""
+    """N: see `reached_share`. Chosen: ten times what `approach_step` changes."""
 
 
 FOUNDATION = FoundationSettings()

@@ -21,13 +21,13 @@ class HertzSettings:
 
     short_axis_sub_cells: int = 10
     """Sub-cells on the ellipse's short semi-axis over which the pressure of a map point is
-    averaged."""
+    averaged. Chosen: the mean of the semi-ellipsoid is then exact to a per cent."""
     least_share_on_insert: float = 0.95
-    """1: share of the semi-ellipsoid of pressure that must lie on the insert. With less the
+    """1: share of the semi-ellipsoid of pressure that must lie on the insert. Chosen: with less the
     contact reaches over the rim and Hertz's solution does not hold."""
     smallest_curvature_ratio: float = 1e-6
-    """1: smallest ratio of the two relative curvatures that still makes an ellipse; below it,
-    a line contact."""
+    """1: smallest ratio of the two relative curvatures that still makes an ellipse. Chosen: below
+    it, a line contact."""
 
 
 HERTZ = HertzSettings()

@@ -38,14 +38,14 @@ class PressSettings:
     """Evaluations of the reaction in one press; bisection of `max_approach` to `least_bracket`
     needs 48."""
     flagged_thickness_share: float = 0.5
-    """1: approach over thickness from which a result is flagged. At 1 the result is a failed
-    contact."""
+    """1: approach over thickness from which a result is flagged. Chosen: at 1 the result is a
+    failed contact."""
     rim_distance: float = 0.5 * MILLIMETRE
-    """m: near the rim the largest thickness within this distance counts, because the insert has
-    no thickness at the rim itself."""
+    """m: near the rim the largest thickness within this distance counts. Chosen: the insert has no
+    thickness at the rim itself."""
     ray_start_depth: float = 1e-7
     """m: depth below the surface at which rays into the insert begin; it is also the smallest
-    thickness."""
+    thickness. Chosen: above the rounding of a mesh."""
 
 
 PRESS = PressSettings()

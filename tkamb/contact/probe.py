@@ -121,15 +121,13 @@ class Probe:
         load: float,
         pose: Array,
         start: Guess | None,
-        like: tuple[WarmStart, WarmStart] | None = None,
     ) -> tuple[ContactResult, WarmStart]:
         """Return the contact under a load (N), of which only the forces need be right.
 
         Args:
             load: N.
             pose: (4, 4) pose_femoral_in_insert.
-            start: of a contact at a neighbouring pose.
-            like: start and end of a similar step near by, as a guide to the end of this one.
+            start: of a contact near by.
         """
         return self._model.press_from(self._state, load, pose, start)
 

@@ -22,7 +22,7 @@ class MapGridSettings:
     """The spacing of a pressure map."""
 
     coarsest_mm: float = 10.0
-    """mm: largest spacing that is accepted. A condyle's contact is 5 to 20 mm across; a
+    """mm: largest spacing that is accepted. Chosen: a condyle's contact is 5 to 20 mm across; a
     coarser map resolves nothing."""
 
 

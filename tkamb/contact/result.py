@@ -22,13 +22,14 @@ class ContactResultSettings:
     """Limits from which a contact result is flagged, and counts as two condyles."""
 
     max_measured_pressure: float = 100.0 * MEGAPASCAL
-    """Pa: peak pressure beyond which polyethylene's stress-strain curves are extrapolated.
-    They end at 40 to 60 MPa."""
+    """Pa: peak pressure beyond which polyethylene's stress-strain curves are extrapolated. Chosen:
+    they end at 40 to 60 MPa."""
     least_patch_share: float = 0.05
-    """1: share of the force that a patch of contact must carry to count as a second condyle's."""
+    """1: share of the force that a patch of contact must carry to count as a second condyle's.
+    Chosen: a smaller patch is a crumb of one condyle's contact."""
     least_patch_distance: float = 15.0 * MILLIMETRE
-    """m: smallest distance between the centres of two condyles' patches; those of a knee are
-    40 to 50 mm apart."""
+    """m: smallest distance between the centres of two condyles' patches. Chosen: those of a knee
+    are 40 to 50 mm apart."""
 
 
 CONTACT_RESULT = ContactResultSettings()

@@ -54,14 +54,17 @@ class AdjustmentSettings:
     """m: if a change of the recorded pose by this much can change the answer by a step, the
     result is flagged. Chosen: a fifth of the error of fluoroscopy."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
-    """m: with both condyles farther than this from the insert the pose is no recorded contact."""
+    """m: with both condyles farther than this from the insert the pose is no recorded contact.
+    Chosen: it is more than the errors of fluoroscopy."""
     level_difference: float = 5e-6
     """m: condyles whose gaps differ by less count as level, and the femur is not turned. Chosen:
     meshes do not resolve smaller differences."""
     touch_difference: float = 1e-7
-    """m: difference of the condyles' clearances below which they touch together."""
+    """m: difference of the condyles' clearances below which they touch together. Chosen: far below
+    what changes a force."""
     max_turns: int = 20
-    """Largest number of steps of the search for the turn at which both condyles touch together."""
+    """Largest number of steps of the search for the turn at which both condyles touch together.
+    Chosen: the search ends after fewer."""
 
 
 ADJUSTMENT = AdjustmentSettings()

@@ -16,11 +16,14 @@ class HeightBoundSettings:
     cell_edge: float = 1e-3
     """m: edge of a cell. Chosen: about the edge of a mesh's triangles."""
     most_cells: int = 400
-    """Largest number of cells along an edge of the grid; a larger surface gets larger cells."""
+    """Largest number of cells along an edge of the grid; a larger surface gets larger cells.
+    Chosen: it bounds memory."""
     wide_triangle_cells: int = 4
-    """Cells along an edge: triangles that span more are processed one by one."""
+    """Cells along an edge: triangles that span more are processed one by one. Chosen: such
+    triangles are few."""
     largest_slope: float = 3.0
-    """1: largest slope of a plane that bounds the height."""
+    """1: largest slope of a plane that bounds the height. Chosen: a steeper plane bounds too
+    loosely."""
 
 
 HEIGHT_BOUND = HeightBoundSettings()

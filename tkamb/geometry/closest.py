@@ -21,20 +21,25 @@ class ClosestPointSettings:
     """How the closest points of two surfaces are searched and weighted."""
 
     region_radius: float = 1.6e-2
-    """m; the close region ends this far from the closest point."""
+    """m; the close region ends this far from the closest point. Chosen: a condyle's contact lies
+    within it."""
     facing_cosine: float = 0.7
-    """Cosine of the angle between the surfaces, above which they face each other."""
+    """Cosine of the angle between the surfaces, above which they face each other. Chosen: surfaces
+    at more than 45 deg do not touch face to face."""
     clearance: float = 1e-6
     """m: a point farther than this above the bound of the insert's height is outside the insert,
-    whatever the rounding."""
+    whatever the rounding. Chosen: above the rounding of a mesh."""
     gap_range: float = 10 * CONDYLE.facet_depth
-    """m: samples count up to this much above the smallest gap. Their weight there is 5e-5."""
+    """m: samples count up to this much above the smallest gap. Chosen: their weight there is
+    5e-5."""
     rounds: int = 3
-    """Rounds of projection between the two surfaces."""
+    """Rounds of projection between the two surfaces. Chosen: more rounds move the points by less
+    than the tolerance."""
     kept_candidates: int = 8
-    """Triangles that are searched around each nearest vertex."""
+    """Triangles that are searched around each nearest vertex. Chosen: the nearest triangle is among
+    them."""
     batch_size: int = 64
-    """Samples that are projected together, for speed alone."""
+    """Samples that are projected together, for speed alone. Chosen: it changes speed alone."""
 
 
 CLOSEST_POINT = ClosestPointSettings()

@@ -32,9 +32,9 @@ class HeightFieldSettings:
 
     odd_share: float = 0.01
     """1: up to this share of lines with an odd number of crossings the lines are repaired; above it
-    the mesh is refused."""
+    the mesh is refused. Chosen: small defects of a mesh touch fewer lines."""
     same_height: float = 1e-12
-    """m: crossings nearer to each other belong to duplicate faces."""
+    """m: crossings nearer to each other belong to duplicate faces. Chosen: above rounding."""
 
 
 HEIGHT_FIELD = HeightFieldSettings()
@@ -45,7 +45,7 @@ class BodyContactSettings:
     """Bodies of one mesh that touch."""
 
     touching_distance: float = 1e-7
-    """m: bodies closer than this touch. Ten times the rounding of single precision."""
+    """m: bodies closer than this touch. Chosen: ten times the rounding of single precision."""
 
 
 BODY_CONTACT = BodyContactSettings()

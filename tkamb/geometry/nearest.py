@@ -21,7 +21,7 @@ class NearestSettings:
     """Nearest points of two surfaces."""
 
     max_samples: int = 150_000
-    """Samples of a surface at most; it bounds memory and time."""
+    """Samples of a surface at most. Chosen: it bounds memory and time."""
 
 
 NEAREST = NearestSettings()

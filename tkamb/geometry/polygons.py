@@ -13,9 +13,10 @@ class PolygonSettings:
     """Polygons of a section."""
 
     area_rounding: float = 1e-12
-    """1: a signed area below this share of the polygon's extent is zero."""
+    """1: a signed area below this share of the polygon's extent is zero. Chosen: above rounding."""
     least_area_share: float = 1e-9
-    """1: a polygon that encloses a smaller share of the area that it covers crosses itself."""
+    """1: a polygon that encloses a smaller share of the area that it covers crosses itself. Chosen:
+    above rounding."""
 
 
 POLYGON = PolygonSettings()

@@ -23,21 +23,25 @@ class PostSettings:
     """What counts as the post of an insert, and where it is cut off."""
 
     line_spacing: float = 1e-3
-    """m between the lines along y."""
+    """m between the lines along y. Chosen: a post is several times as wide."""
     least_rise: float = 8e-3
-    """m: what stands higher than this above the dishes may be a post."""
+    """m: what stands higher than this above the dishes may be a post. Chosen: flanks and lips of
+    dishes are lower."""
     side_drop: float = 3e-3
-    """m: a side of a post falls by this within two lines (56 deg) ..."""
+    """m: a side of a post falls by this within two lines (see `steep_share`). Chosen: it is 56 deg,
+    steeper than a dish."""
     steep_share: float = 0.75
-    """... on at least this share of its outline."""
+    """1: share of a post's outline that must be as steep as `side_drop` says. Chosen: a post may
+    lean on the rest."""
     middle_share: float = 0.25
-    """The centre of a post lies within this share of the width from the middle."""
+    """1: the centre of a post lies within this share of the width from the middle. Chosen: dishes
+    lie farther out."""
     foot_clearance: float = 0.25e-3
-    """m above that ground: where the post is cut off the dishes."""
+    """m above the dishes' level: where the post is cut off. Chosen: above the noise of a mesh."""
     back_share: float = 0.75
     """1: height above the foot, as a share of the post's height, at which its front is measured."""
     least_thickness: float = 2e-3
-    """m: a thinner post cannot carry a cam."""
+    """m: least thickness of a post. Chosen: a thinner one cannot carry a cam."""
 
 
 POST = PostSettings()

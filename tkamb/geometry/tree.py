@@ -26,9 +26,9 @@ class BoxTreeSettings:
     """The tree of boxes around a surface's triangles."""
 
     triangles_per_leaf: int = 4
-    """Triangles in a leaf, at most."""
+    """Triangles in a leaf, at most. Chosen: it changes speed alone."""
     margin: float = 1e-7
-    """1: boxes are wider by this share of the surface's size, to be safe from rounding."""
+    """1: boxes are wider by this share of the surface's size. Chosen: above rounding."""
 
 
 BOX_TREE = BoxTreeSettings()

@@ -39,10 +39,10 @@ class WindingSettings:
     """Winding numbers by a plan view."""
 
     max_buckets: int = 1_000_000
-    """Largest number of buckets of the plan view; more would cost memory and not save time."""
+    """Largest number of buckets of the plan view. Chosen: more would cost memory and not save
+    time."""
     plan_bits: int = 29
-    """Bits of half the size of the plan view, so that products of differences fit into 63
-    bits."""
+    """Bits of half the size of the plan view. Chosen: products of differences fit into 63 bits."""
 
 
 WINDING = WindingSettings()

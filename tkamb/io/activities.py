@@ -1,8 +1,8 @@
-"""Activities in which instrumented knees were measured, and the peak forces found in them.
+"""Activities in which instrumented knees were measured, and their published peak forces.
 
-Each number is a source's mean of the subjects' peaks: of the resultant force in five subjects
-(Kutzner et al. 2010, from its abstract), of the axial force (D'Lima et al. 2007, as it is quoted
-since). Single subjects and trials lie outside them.
+Each number is the mean of the subjects' peaks in one source: the resultant force of five subjects
+(Kutzner et al. 2010, abstract), or the axial force (D'Lima et al. 2007, as quoted in later papers).
+Single subjects and trials differ from these means.
 
 References: Kutzner et al. (2010), J Biomech 43:2164, doi:10.1016/j.jbiomech.2010.03.046; D'Lima et
 al. (2007), J Biomech 40 Suppl 1:S11, doi:10.1016/j.jbiomech.2007.03.004.
@@ -39,5 +39,5 @@ def peaks_words(activity: str) -> str:
     plural = "peaks" if len(parts) > 1 else "peak"
     return (
         f"Grey: mean {plural} of instrumented knees in {activity}, {', '.join(parts)}. "
-        "People differ by more; a peak that lies there proves nothing."
+        "Subjects differ by more than these means do; a peak near them does not validate a result."
     )

@@ -1,8 +1,8 @@
-"""Whose an output folder is, and that one process at a time writes into it.
+"""Ownership of output folders: a folder is tkamb's own, and one process at a time writes to it.
 
-The file `.tkamb` marks a folder as tkamb's; whoever writes holds a lock on it (flock), which
-the system drops when the process ends, however it ends. A folder with other things in it is
-not touched unless that is asked for, and nothing in it is ever removed but what tkamb names.
+The file `.tkamb` marks a folder as tkamb's own. A process that writes holds a lock on it (flock),
+which the system releases when the process ends for any reason. A folder with other files is
+used only if the user asks for it, and only files that tkamb itself names are ever removed.
 """
 
 import fcntl
@@ -31,7 +31,7 @@ from tkamb.io.occupants import check_occupants
 
 CHOOSE = "choose another folder with --out"
 LONGEST_WAIT = 5.0
-"""s that a reader waits for a writer that is just putting files in their places."""
+"""s: longest time that a reader waits for a writer that is moving finished files into place."""
 
 _held: set[tuple[int, int, int]] = set()
 """(thread, device, inode) of the folders that this process holds."""
@@ -39,17 +39,17 @@ _held: set[tuple[int, int, int]] = set()
 
 @contextmanager
 def claimed_directory(path: str | Path, force: bool = False, command: str = "") -> Iterator[Path]:
-    """Hold an output folder: it is there, can be written, is tkamb's, and nobody else's now.
+    """Lock an output folder that can be written, is tkamb's own and is used by no other process.
 
-    What a killed process left unfinished in it is finished or removed. After bad input the
-    folder is as it was: what was made for it is gone again. A thread may claim a folder that
-    it holds already.
+    Unfinished work of a killed process is finished or removed. After bad input the folder is as
+    it was before: new files and folders are removed. A thread may claim a folder that it holds
+    already.
 
     Args:
         path: of the folder; made if it is not there.
-        force: take it even if it holds things that are not tkamb's, which are left alone, or
-            another command's output.
-        command: of tkamb that writes there; without one any output of tkamb's may be there.
+        force: use it even if it holds other files, which are not changed, or another command's
+        output.
+        command: tkamb command that writes there; empty: output of any command may be there.
 
     Raises:
         InputError: it cannot be made or written, is not tkamb's, holds another command's output
@@ -78,7 +78,8 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
                     check_occupants(path, command)
                 yield path
             except InputError:
-                # what is kept of an interrupted computation stays ours, so that it can go on
+                # The kept part of an interrupted computation keeps the marker, so that it can go
+                # on.
                 if fresh and set(os.listdir(path)) - {MARKER} <= held_before:
                     (path / MARKER).unlink(missing_ok=True)
                 raise
@@ -92,7 +93,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
 
 def settle(folder: Path) -> None:
-    """Have what a killed process left half done in a folder finished, before it is read.
+    """Finish the interrupted file changes of a killed process in a folder, before it is read.
 
     Raises:
         InputError: it cannot be finished.
@@ -140,8 +141,8 @@ def _acquire_lock(path: Path) -> int:
             os.close(descriptor)
             what = f"cannot be locked ({error.strerror})"
             raise InputError(what, marker, CHOOSE) from None
-        # Whoever held it before may have removed the marker: then the lock is on a file that
-        # nobody else can find any more.
+        # The process that held the lock before may have removed the marker. The lock is then on a
+        # file that no other process can find.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(descriptor), marker.lstat()):
                 return descriptor
@@ -159,7 +160,7 @@ def _mark(path: Path) -> None:
     }
     marker = path / MARKER
     try:
-        with open(marker, "r+", encoding="utf-8") as file:  # in place: its inode bears the lock
+        with open(marker, "r+", encoding="utf-8") as file:  # in place: its inode has the lock
             file.truncate()
             file.write(json.dumps(content) + "\n")
             file.flush()
@@ -169,7 +170,7 @@ def _mark(path: Path) -> None:
 
 
 def _remove_temporaries(path: Path) -> None:
-    """Remove what a killed process left of files that it did not finish: those of our token."""
+    """Remove the unfinished temporary files of a killed process; they contain our token."""
     token = folder_token(path)
     for entry in path.glob(f".tkamb-{token}-*.part"):
         if stat.S_ISREG(entry.lstat().st_mode):
@@ -207,9 +208,9 @@ def is_ours(path: Path) -> bool:
 
 
 OWN_MARK = b"tkamb"
-"""Stands at the beginning of every page, map and deck that tkamb writes."""
+"""Bytes at the beginning of every page, map and deck that tkamb writes."""
 MARK_WITHIN = 4096
-"""Bytes of a file in which the mark is looked for."""
+"""Number of bytes at the beginning of a file in which the mark is searched."""
 PICTURES = {".png": b"\x89PNG", ".gif": b"GIF8"}
 """Formats without a mark: a picture takes the place of a picture."""
 
@@ -228,7 +229,7 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
         return
     path = Path(path)
     if not path.is_file():
-        raise InputError("is there already and no file", path, "give another name")
+        raise InputError("exists already and is not a file", path, "give another name")
     if force or path.suffix.lower() == ".mp4":
         return
     try:
@@ -239,7 +240,7 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
     magic = PICTURES.get(path.suffix.lower())
     if not head or (OWN_MARK in head if magic is None else head.startswith(magic)):
         return
-    what = "is there already, and tkamb did not write it"
+    what = "exists already, and tkamb did not write it"
     raise InputError(what, path, "give another name, or --force to replace it")
 
 

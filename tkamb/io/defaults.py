@@ -1,3 +1,3 @@
-"""What is taken where nothing is named, in scene files and on the command line alike."""
+"""Defaults of scene files and of the command line."""
 
 CONTACT_MODEL = "lattice"

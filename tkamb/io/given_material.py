@@ -159,7 +159,7 @@ def _check_name(entries: Mapping[str, Any], where: object) -> None:
     name = entries.get("name")
     if name in MATERIALS:
         what = f"name '{name}' is that of a built-in material"
-        raise InputError(what, where, "choose another: results of both must be told apart")
+        raise InputError(what, where, "choose another, so that results show which one was used")
 
 
 def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
@@ -181,7 +181,9 @@ def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> St
     for key in values:
         if key not in LAW_KEYS[name]:
             needs = ", ".join(LAW_KEYS[name]) or "no numbers"
-            raise InputError(f"'{key}' is none of the law '{name}'", where, f"it takes: {needs}")
+            raise InputError(
+                f"'{key}' is not a key of the law '{name}'", where, f"it takes: {needs}"
+            )
     for key in LAW_KEYS[name]:
         if key not in values:
             raise InputError(f"law '{name}' needs '{key}'", where, EXAMPLE)
@@ -196,4 +198,4 @@ def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> St
     except InputError as error:
         raise InputError(error.what, where, error.hint) from None
     except (TypeError, ValueError):
-        raise InputError("strain and stress_MPa are no lists of numbers", where, EXAMPLE) from None
+        raise InputError("strain and stress_MPa are not lists of numbers", where, EXAMPLE) from None

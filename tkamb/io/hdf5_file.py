@@ -1,9 +1,9 @@
 """HDF5 files that can be written on a disk that fills up.
 
 The HDF5 library cannot close a file of which a write has failed: it tries again, fails, and ends
-the process with it. Here the library writes through a Python file that notes the first failure
-and from then on takes what it is given without writing it, so that the library closes in peace.
-The failure is raised afterwards, once, and whoever asked for the file discards it.
+the process with it. Here the library writes through a Python file that records the first failure
+and ignores all later writes, so that the library can close the file. The failure is raised
+afterwards, once, and the caller discards the file.
 """
 
 import os
@@ -18,10 +18,10 @@ from tkamb.errors import InputError
 
 
 class NotingFile:
-    """A file for HDF5 that notes the first failure of the system instead of raising it.
+    """A file for HDF5 that records the first failure of the system instead of raising it.
 
     Args:
-        path: made anew, or emptied.
+        path: created, or emptied if it exists.
 
     Attributes:
         failure: the first error of a write; None: all is written.
@@ -84,7 +84,7 @@ class NotingFile:
         return size
 
     def flush(self) -> None:
-        """Do nothing: what is written has been handed to the system."""
+        """Do nothing: written bytes are with the system already."""
 
     def close(self) -> None:
         """Close the file."""

@@ -78,7 +78,7 @@ def lattice_of_file(
         InputError: bad file, unit, axes, side or resolution, or a mesh that is open.
     """
     if out is not None and Path(out).suffix != ".vtu":
-        raise InputError(f"'{out}' is no .vtu file", "out", "name it like lattice.vtu")
+        raise InputError(f"'{out}' is not a .vtu file", "out", "give a name like lattice.vtu")
     if not 0 < resolution_mm <= MAP_GRID.coarsest_mm:
         hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
         raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", hint)
@@ -86,7 +86,7 @@ def lattice_of_file(
     if side == "left":
         surface = mirrored(surface)
     elif side != "right":
-        raise InputError(f"'{side}' is no side", "side", "give right or left")
+        raise InputError(f"'{side}' is not a side", "side", "give right or left")
     surface = surface.moved(insert_placement(surface, axes_rotation(axes)))
     lattice = whole_lattice(surface, resolution_mm * MILLIMETRE)
     if out is not None:
@@ -97,7 +97,7 @@ def lattice_of_file(
 
 
 def write_body(path: str | Path, number: int, out: str | Path) -> str:
-    """Write a separate body of a mesh, mended as loading would, in the file's units and axes.
+    """Write a separate body of a mesh, repaired as on loading, in the file's units and axes.
 
     Args:
         path: the mesh.
@@ -115,7 +115,9 @@ def write_body(path: str | Path, number: int, out: str | Path) -> str:
     if out.suffix.lower() not in BODY_FORMATS:
         raise InputError(f"is none of {', '.join(BODY_FORMATS)}", out, "name a file that ends so")
     if os.path.exists(out):
-        raise InputError("is there already", out, "give a new file: nothing of yours is replaced")
+        raise InputError(
+            "exists already", out, "give a new file: tkamb does not replace your files"
+        )
     mended, scale = mended_mesh(path)
     bodies = separate_bodies(mended.vertices, mended.faces)
     if not 1 <= number <= len(bodies):

@@ -1,4 +1,4 @@
-"""Which commands' output a folder holds, so that none writes over or among another's."""
+"""Which commands' output a folder holds, so that no command overwrites or mixes another's."""
 
 import re
 from pathlib import Path
@@ -14,12 +14,13 @@ WRITTEN = {
     "cohort": ("cohort.json",),
     "wear": ("wear.json", ".wear.npz"),
 }
-"""Command -> files that only it leaves; results.csv is of `uncertainty` where bands.csv is.
+"""Command -> files that only it writes; results.csv is from `uncertainty` if there is a bands.csv.
 
-The page of `compare` and the maps of `export --vtp` have names of their own: they go anywhere.
+The page of `compare` and the maps of `export --vtp` have other names and fit into any folder.
 """
 BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear"}}
-"""Command -> those whose output it may join: no name is both's, and a run's page shows its wear."""
+"""Command -> commands whose folder it may share: their file names differ, and the page of a run
+shows its wear."""
 
 
 def occupants(folder: Path) -> dict[str, str]:
@@ -51,7 +52,7 @@ def check_occupants(folder: Path, command: str) -> None:
 
 
 def _frames_of(folder: Path) -> tuple[str, str]:
-    """Return whose finished frames or samples a run under way keeps, and where."""
+    """Return the command whose unfinished run is kept in a folder, and its file."""
     name = ".frames/run.json"
     try:
         result = read_json(folder / name)
@@ -65,7 +66,7 @@ def _frames_of(folder: Path) -> tuple[str, str]:
 
 
 def _rows_of(folder: Path) -> tuple[str, str]:
-    """Return whose rows a study under way keeps, and where: a verdict has a kind."""
+    """Return the command whose unfinished study is kept in a folder, and its file."""
     name = "rows.jsonl"
     if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
         return "", name

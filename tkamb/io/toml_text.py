@@ -1,4 +1,4 @@
-"""TOML that users give: read within limits, so that a small text cannot take hours or gigabytes.
+"""TOML from users, read within limits, so that a small text cannot take hours or gigabytes.
 
 Python's reader takes time with the square of a dotted key's parts, memory with nesting, and
 refuses integers of thousands of digits in its own way. Each is refused before it is read.
@@ -16,7 +16,7 @@ from tkamb.files import MEGABYTE, read_text
 
 @dataclass(frozen=True)
 class TomlLimits:
-    """What a TOML text may have. Scenes, cohorts and materials stay a hundred times below."""
+    """Limits of a TOML text. Scenes, cohorts and materials stay a hundred times below them."""
 
     size: int = 8 * MEGABYTE
     """Bytes of a file: ten seconds of Python's reader."""
@@ -30,7 +30,7 @@ class TomlLimits:
 
 LIMITS = TomlLimits()
 
-# strings and comments, whose content is no structure; each stands for itself as an empty string
+# Strings and comments, whose content is not structure; each is replaced by an empty string.
 _STRINGS = re.compile(
     r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
 )
@@ -66,7 +66,9 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # the parser's own error is a ValueError
-        raise InputError(f"is not TOML ({str(error)[:200]})", where) from None
+        raise InputError(
+            f"is not TOML ({str(error)[:200]})", where, "correct that line, or give a TOML file"
+        ) from None
 
 
 def check_key(dotted: str, where: object) -> None:

@@ -1,9 +1,9 @@
 """What the femoral adjustment does to the forces: the same equations at the recorded pose.
 
-The adjustment is meant to mend the split of the load and to leave the total alone (Sharma 2008,
-5.2.2: less than 0.001 BW). Where it does not, the frame's forces hang on a rotation and a
-translation that are smaller than fluoroscopy's error, and a reader has to know.
-"""
+The adjustment is meant to correct the medial-lateral split and to leave the total force unchanged
+(Sharma 2008, 5.2.2: less than 0.001 BW). If the total changes, the frame's forces depend on a
+rotation and a translation that are smaller than the error of fluoroscopy. The frame is then
+flagged."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ class AdjustmentEffectSettings:
     """What an adjustment of the pose changes."""
 
     jump_distance: float = 5.0 * MILLIMETRE
-    """m: a contact point that moves farther has jumped onto the eminence or lip, or off it."""
+    """m: a contact point that moves farther than this has jumped to or from the eminence or lip.
+    Chosen: on one dish a contact point moves by less from frame to frame."""
 
 
 ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
@@ -31,9 +32,9 @@ class AdjustmentEffect:
     """The adjusted frame against the recorded one.
 
     Args:
-        force: N, change of the total contact force; NaN where either is not solved.
+        force: N, change of the total contact force; NaN where one of the frames has no solution.
         share: change of medial / (medial + lateral) by coronal equilibrium.
-        cause: plain words, what in the contact changed most.
+        cause: in words, the largest change of the contact.
     """
 
     force: float

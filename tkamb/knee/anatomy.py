@@ -17,7 +17,7 @@ from tkamb.errors import InputError, names_near
 NEEDED = ("femur", "tibia")
 """Parts of the knee whose frames a model must have."""
 PARTS = (*NEEDED, "femoral", "insert", "patella", "hip")
-"""Parts of the knee that a frame may be named for."""
+"""Parts of the knee whose frames may be named."""
 INSERT_JOINT, PLANE_JOINT = "knee_ap", "patella_ap"
 """Joints of a tkamb URDF whose placements are the insert frame and the patella's plane."""
 
@@ -119,10 +119,12 @@ def find_anatomy(
     tibia, femur = places["tibia"], places["femur"]
     path = _path(model, tibia.joint, femur.joint)
     if not path:
-        raise InputError("are fixed to each other", "frames femur and tibia", "no joint is between")
+        raise InputError(
+            "are fixed to each other", "frames femur and tibia", "no joint lies between them"
+        )
     if tibia.joint in path and femur.joint in path:
         raise InputError(
-            "hang side by side on another body",
+            "are both carried by another body",
             "frames femur and tibia",
             "one must carry the other",
         )
@@ -159,7 +161,7 @@ def find_anatomy(
 
 
 def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
-    """Return a frame by name; of several of one name the body's."""
+    """Return a frame by name; of several with that name, the frame of a body."""
     if not model.existFrame(name):
         names = [frame.name for frame in model.frames]
         hint = names_near(name, names)
@@ -173,7 +175,7 @@ def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
 
 
 def _joint_placement(model: pin.Model, name: str, base: Place) -> Place | None:
-    """Return where a joint stands on the body of a frame; None where it does not."""
+    """Return the placement of a joint on the body of a frame; None if it is on another body."""
     if not model.existJointName(name):
         return None
     joint = model.getJointId(name)
@@ -183,7 +185,7 @@ def _joint_placement(model: pin.Model, name: str, base: Place) -> Place | None:
 
 
 def _ancestors(model: pin.Model, joint: int) -> list[int]:
-    """Return a joint and what carries it, up to the universe."""
+    """Return a joint and its parents, up to the universe."""
     line = [joint]
     while line[-1]:
         line.append(int(model.parents[line[-1]]))
@@ -210,10 +212,10 @@ def _check_joints(model: pin.Model, joints: Sequence[str], path: tuple[int, ...]
 def _shank(
     model: pin.Model, tibia: int, femur: int, path: tuple[int, ...], patella: Place | None
 ) -> tuple[int, ...]:
-    """Return the joints whose bodies hang together with the tibia once the knee is cut.
+    """Return the joints whose bodies stay connected to the tibia when the knee is cut.
 
-    A body between the two counts as the shank's. Whatever hangs from the femur, the patella or
-    the universe does not.
+    A body between femur and tibia belongs to the shank. Bodies carried by the femur, the patella or
+    the universe do not.
     """
     side = {tibia, *path} - {femur}
     apart = {0, femur} | (set() if patella is None else {patella.joint})

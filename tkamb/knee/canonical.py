@@ -2,9 +2,10 @@
 
     tibia -> (six knee coordinates) -> femur -> (patella's sagittal plane) -> patella
 
-The chain holds the thigh's and the patella's inertia. What the shank needs, with all that hangs
-from it, is one wrench: its own equations of motion in the user's model. A left knee is mirrored on
-the way in and its loads on the way out, so that the chain is always a right knee's.
+The chain holds the inertia of thigh and patella. The wrench that the knee must exert on the shank,
+and on everything that the shank carries, comes from their equations of motion in the user's model.
+A left knee is mirrored on the way in and its loads on the way out, so that the chain always
+describes a right knee.
 
 With s the twist of the femur against the tibia and s' its rate in the femur's axes, both from the
 spatial velocities v and accelerations a of the two frames,
@@ -43,7 +44,7 @@ def mirrored_spatial(vector: Array) -> Array:
 
 
 def se3(pose: Array) -> pin.SE3:
-    """Return a pose (4, 4) as Pinocchio has it."""
+    """Return a pose (4, 4) as a Pinocchio placement."""
     return pin.SE3(pose[:3, :3], pose[:3, 3])
 
 
@@ -215,8 +216,8 @@ class Bridge:
 
         Args:
             data: of the user's model.
-            patella: whether the chain has a patella; one that the model has not stands still, at
-                coordinates zero.
+            patella: whether the chain has a patella. If the user's model has none it stands still,
+            at coordinates zero.
         """
         anatomy, place = self.anatomy, self.place(data)
         tibia, still = anatomy.tibia, pin.Motion.Zero()
@@ -249,8 +250,8 @@ class Bridge:
             q: of the chain, its root at rest.
             place: (n,) the coordinates.
             data: of the user's model.
-            base: the body that carries,
-            follower: and the one that moves.
+            base: the body that carries the other.
+            follower: the body that moves.
             own: the n coordinates among the chain's joints.
         """
         twist, rate = self._relative(data, base, follower)

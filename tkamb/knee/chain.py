@@ -47,7 +47,8 @@ class Chain:
 
     Args:
         urdf: text of a checked URDF (`tkamb.io.recordings.patient.load_urdf`).
-        with_patella: whether the patella moves, or rides on the femur at its neutral pose.
+        with_patella: whether the patella moves; if not, it is fixed to the femur at its neutral
+        pose.
         gravity: m/s², downwards in the laboratory.
     """
 
@@ -72,7 +73,7 @@ class Chain:
         """Return the chain with other masses, and the insert elsewhere on the tibia.
 
         Args:
-            mass_factor: of every segment's mass; its inertia changes alike.
+            mass_factor: factor on the mass and inertia of every segment.
             insert_shift: (3,) m, in the insert's axes; the femur goes with the insert.
             insert_turn: (3, 3) rotation about the insert's origin, in its axes; None: none.
         """
@@ -108,7 +109,7 @@ class Chain:
         return other
 
     def _take(self, model: pin.Model) -> None:
-        """Make another model this chain's, and remember where the insert and the tibia are."""
+        """Use another model for this chain, and store where the insert and the tibia are."""
         self.model = model
         frames = enumerate(model.frames)
         self._frames = {frame.name: k for k, frame in frames if frame.type == pin.FrameType.BODY}
@@ -167,7 +168,7 @@ class Chain:
         return self._columns[:6]
 
     def patella_columns(self) -> list[int]:
-        """Those that belong to the three coordinates of the patella, none where it rides along."""
+        """Rows of the three patella coordinates; none where the patella is fixed to the femur."""
         return self._columns[6:]
 
     def at(self, motion: ChainMotion) -> "ChainState":
@@ -196,7 +197,7 @@ class ChainState:
     """The chain at one instant. Poses and loads are in the insert frame.
 
     Attributes:
-        inertial: (nv,) RNEA(q, v, a): what gravity and inertia ask of all loads together.
+        inertial: (nv,) RNEA(q, v, a): generalised forces that all loads together must supply.
     """
 
     def __init__(self, chain: Chain, q: Array, v: Array, a: Array) -> None:

@@ -27,14 +27,17 @@ class DifferenceSettings:
     """How the stiffness of a model without an exact tangent is found: by central differences."""
 
     step: float = 4e-6
-    """m: of a translation. Large against what the solver's tolerance leaves open, small
-    against the radius of the contact."""
+    """m: step of a translation. Chosen: large against the solver's residual error, small against
+    the radius of the contact."""
     exact_step: float = 1e-9
-    """m: the same for a model without a solver, whose answers are exact."""
+    """m: step for a model without a solver, whose answers are exact. Chosen: far above rounding,
+    far below the size of a facet."""
     arm: float = 0.025
-    """m: a rotation is this step over this arm."""
+    """m: lever arm; the step of a rotation is the step of a translation over this arm. Chosen: half
+    the distance of the condyles."""
     tolerance: float = 1e-6
-    """Solver tolerance of a model that has one, for these evaluations."""
+    """Solver tolerance of a model that has one, for these evaluations. Chosen: a finite difference
+    divides the solver's error by the step."""
 
 
 CONTACT_DIFFERENCE = DifferenceSettings()
@@ -109,7 +112,7 @@ class KneeContact:
         return total
 
     def _rubbing(self, load: CondyleWrench, twist: Array) -> Array:
-        """Return the friction's wrench (6,) on the insert per unit force of a condyle."""
+        """Return the wrench (6,) of friction on the insert per unit force of a condyle."""
         sliding = twist[:3] + cross(twist[3:], load.point)
         touch = CondylePoint(load.point, load.normal, sliding, 0.0)
         return wrench_of(touch.point, touch.normal - touch.direction(self.friction))
@@ -142,8 +145,8 @@ class KneeContact:
             probe: warm start.
             place: (4, 4) pose.
             contact: there.
-            twist: (6,) of the femur, held.
-            exact: a tangent that the model knows only roughly is not taken.
+            twist: (6,) of the femur, held constant.
+            exact: do not use an approximate tangent of the model.
         """
         rubs = bool(self.friction and np.any(twist) and contact.loads)
         if contact.tangent and not (exact and (rubs or not contact.exact)):

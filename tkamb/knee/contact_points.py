@@ -1,4 +1,4 @@
-"""Where the condyles meet the insert: contact points, which of them are off, what is wrong."""
+"""Contact points of the condyles on the insert, lift-off, and problems of a pose."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,9 +24,10 @@ class ContactPointSettings:
     """m: gap of a condyle that is off the insert, see `lift_off_angle`. It is the error of
     fluoroscopy (Sharma 2008, 4.3)."""
     max_gap: float = 3e-3
-    """m: a femoral component farther from the insert, or deeper in it, is misplaced."""
+    """m: a femoral component farther from the insert than this, or deeper in it, is misplaced.
+    Chosen: it is more than the errors of fluoroscopy."""
     standstill_speed: float = 1e-3
-    """m/s: friction fades below this sliding speed, because its direction is not defined at
+    """m/s: friction fades below this sliding speed. Chosen: its direction is not defined at
     rest."""
 
 
@@ -64,7 +65,7 @@ class CondylePoint:
 
 @dataclass(frozen=True, eq=False)
 class ContactPoints:
-    """The femorotibial contact of one pose, as the equations take it.
+    """The femorotibial contact of one pose, as input of the equations.
 
     Args:
         condyles: side -> contact point; empty when contact is not modelled.

@@ -6,11 +6,12 @@ load causes by itself,
 
     N_side = N_side(weight, inertia and ground) + N_side(ligaments) + Σ_i N_side(muscle i)
 
-(and N_side(post) where a cam on the insert's post is modelled), each found with the other muscles
-at zero force, the ligaments but for their own term too. A muscle alone leaves a flexion moment at
-the knee, which a moment about the insert's z carries, beside the residuals that carry the AP and ML
-force and the axial moment in every frame; these moments are the knee's reserve when all are summed
-up. The extensor group acts through patella and patellar ligament, and is one muscle here.
+(and N_side(post) where a cam on the insert's post is modelled). Each term is computed with all
+other muscles and, except in their own term, the ligaments at zero force. A muscle alone leaves a
+flexion moment at the knee. A moment about the insert's z balances it, beside the residuals that
+balance the AP and ML force and the axial moment in every frame. The sum of these moments over all
+terms is the knee's reserve. The extensor group acts through patella and patellar ligament, and is
+one muscle here.
 
 References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
 Sasaki & Neptune, J Biomech 43:2780 (2010), doi:10.1016/j.jbiomech.2010.06.011.
@@ -55,7 +56,7 @@ def condyle_contributions(
     caused = np.column_stack([outside, unit[:, :-1] * pulls])
     pulled = np.zeros(len(outside))
     if not slack:
-        # the extensor group is no unknown here but a load: what it takes is left to the moment
+        # The extensor group is a known load here; a flexion moment is the unknown in its place.
         row = system.names.index(unknowns.muscle_load(extensor.muscles[0]))
         per_newton = unit[:, -1] / unit[row, -1]
         caused = caused - np.outer(per_newton, caused[row])

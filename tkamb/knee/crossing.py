@@ -2,9 +2,9 @@
 
 A taut line crosses from the shank at p to the thigh, or the pelvis above it, at q. With force F it
 pulls the shank at p along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank are
-one body, so that a line which ends on the foot pulls that body where it leaves the foot. What
-pulls from the pelvis is carried by the femur and the loads across the hip, which take up
-whatever acts on the thigh. Both ends are fixed to their links and follow the knee.
+one body, so that a line which ends on the foot pulls that body where it leaves the foot. A pull
+from the pelvis acts on the femur here, and the loads across the hip balance it with all other
+loads on the thigh. Both ends are fixed to their links and follow the knee.
 """
 
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ class CrossingLines:
     Args:
         shank: (c, 3) m, where they leave the shank or the foot, tibia link.
         thigh: (c, 3) m, where they reach the thigh or the pelvis, femur link.
-        knee: (4, 4) pose of the femur link in the tibia link at which both were found on the
-            muscles' paths; None: not known.
+        knee: (4, 4) pose of the femur link in the tibia link at which both ends were computed from
+        the muscles' paths; None: not known.
     """
 
     shank: Array
@@ -37,7 +37,7 @@ class CrossingLines:
     knee: Array | None = None
 
     def turned(self, state: "ChainState") -> float:
-        """Return by how much the knee is turned from where the ends were found, rad; NaN: unknown.
+        """Return the turn of the knee since the ends were computed, rad; NaN: unknown.
 
         Ends that wrap a bone or pass a via point would move along it as the knee turns. Here they
         stay on their links, so that a line's direction errs by about this angle at most.
@@ -91,11 +91,11 @@ class MuscleShare:
         activation: (m,).
         force: (m,) N.
         coordinates: n names of those that are balanced.
-        moment: (n,) N·m, what muscles and reserves carry together.
-        reserve: (n,) N·m, what no muscle carries.
+        moment: (n,) N·m, joint moment that muscles and reserves supply together.
+        reserve: (n,) N·m, part of it that no muscle supplies.
         flexion: place of the knee's flexion among the coordinates.
-        crossing: (c,) places of the muscles that cross the knee, but for the extensor group.
-        lines: theirs.
+        crossing: (c,) places of the muscles that cross the knee, without the extensor group.
+        lines: lines of action of the crossing muscles.
         status: "ok" or "failed: …".
     """
 

@@ -2,7 +2,7 @@
 
 15 equations (free root 6, knee 6, patella 3) and 15 unknowns: hip force and moment,
 one muscle, patellar ligament, patellofemoral force (2), medial and lateral normal force,
-and three residuals. Less is asked for when less is modelled:
+and three residuals. A smaller model has fewer unknowns:
 
 - no muscles: the patella is left out, the flexion moment joins the residuals;
 - no contact: the knee's force and its coronal and axial moments (with muscles), or its
@@ -41,14 +41,14 @@ PATELLAR = ("patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
 @dataclass(frozen=True, eq=False)
 class Extensor:
-    """The extensor mechanism at one frame, but for the muscles' pull, insert frame.
+    """The extensor mechanism at one frame, without the muscles' forces, insert frame.
 
     Args:
         patellar_ligament: loads of one newton of patellar-ligament tension.
         contact_point: (3,) m, patellofemoral contact.
         contact_normal: (3,) unit, out of the femur into the patella, sagittal.
-        muscles: names of those that insert on the patella, the extensor group.
-        wrap: rad, by which they wrap the femur.
+        muscles: names of the muscles that insert on the patella, the extensor group.
+        wrap: rad, angle over which they wrap the femur.
     """
 
     patellar_ligament: tuple[PointForces, ...]
@@ -74,7 +74,7 @@ class KneeGeometry:
         lifted: sides that are clearly off the insert.
         extensor: the extensor mechanism, if modelled.
         muscles: one newton of tension on each muscle's line of action.
-        coordinates: (6,) knee coordinates, m and rad, at which all this stands.
+        coordinates: (6,) knee coordinates of this geometry, m and rad.
         tensions: ligament name -> N.
         share: the other muscles, with their forces, if modelled.
         post: known loads of a cam on the insert's post, if modelled.
@@ -97,7 +97,7 @@ class KneeGeometry:
 
 @dataclass(frozen=True, eq=False)
 class KneeLoads:
-    """What the equations of one frame say; NaN where they are singular.
+    """Loads from the equations of one frame; NaN where they are singular.
 
     Args:
         values: magnitude of each unknown, N or N·m.
@@ -108,8 +108,8 @@ class KneeLoads:
             moves by ±10 mm along y.
         condition: condition number (unit columns).
         lifted: sides that carry nothing.
-        slack: the extensor group would have had to push, so it carries nothing.
-        ambiguous: other load states have all signs right, too.
+        slack: the extensor group carries nothing, because it would have to push.
+        ambiguous: other load states, too, have no wrong sign.
         problems: plain words; empty when all is well.
     """
 
@@ -126,10 +126,10 @@ class KneeLoads:
 
 
 def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
-    """Return all loads of one frame: those of the load state whose signs all hold.
+    """Return all loads of one frame: those of the load state without a wrong sign.
 
-    Where several hold, the one that leaves out fewest loads is taken, and `ambiguous` says so;
-    where none does, the frame has no number. See `tkamb.knee.load_state`.
+    If several states have no wrong sign, the one that leaves out fewest loads is taken, and
+    `ambiguous` is true. If none has, the frame has no number. See `tkamb.knee.load_state`.
 
     Args:
         geometry: the frame.
@@ -187,15 +187,15 @@ def dome_sensitivity(
     The patellofemoral force passes through the button's contact with the femur, and muscle and
     patellar ligament are weighed against each other by their arms about that line. Both run
     along the patella, so a button that sits higher or lower on it (the patella's y axis) moves
-    the line across; one that sits deeper (x) moves it along itself and changes little. Nobody
-    knows that place to a millimetre.
+    the line sideways; a button that sits deeper (x) moves the line along itself and changes little.
+    The place of the button is not known to a millimetre.
 
     The line moves along the patella's y axis with the patella's place kept: with A x = b the
     frame's equations, dx = -A⁻¹ dA x. Measured per millimetre on the shipped knee, from extension
     to 120 deg: Q 1.6 to 5.6 % and PF 1.0 to 4.3 % along y; Q 0.1 to 2.2 % along x. A patella that
-    is free to find its balance anew turns by up to 1 deg per millimetre and evens most of it out:
-    along y Q then changes by at most 1.6 % and PF by 1.3 % (along x: PF by 7 %, in extension). So
-    this is the larger estimate for Q.
+    may move to its new equilibrium turns by up to 1 deg per millimetre, which cancels most of the
+    change: along y Q then changes by at most 1.6 % and PF by 1.3 % (along x: PF by 7 %, in
+    extension). The value returned here is therefore an upper estimate for Q.
 
     Args:
         geometry: the frame.
@@ -231,7 +231,7 @@ class KneeSystem:
     Args:
         geometry: the frame.
         friction: Coulomb coefficient.
-        assumed: what carries nothing.
+        assumed: loads that are assumed to be zero.
     """
 
     def __init__(self, geometry: KneeGeometry, friction: float, assumed: LoadState) -> None:
@@ -289,7 +289,7 @@ class KneeSystem:
         return np.asarray(np.sum(forces, axis=0))
 
     def response(self, loads: Array) -> Array:
-        """Return what one unit of each known load, columns (k, n), adds to the unknowns (k, n)."""
+        """Return the change of the unknowns (k, n) per unit of each known load, columns (k, n)."""
         # Unknowns balance the added loads, hence the sign.
         return np.asarray(-np.linalg.solve(self._columns, loads))
 
@@ -316,9 +316,9 @@ class KneeSystem:
     def external_moments(self) -> tuple[float, float]:
         """Return the external flexion and adduction moments, N·m.
 
-        The knee's generalised forces about the flexion and adduction coordinates that hip,
-        ground, gravity and inertia ask for; the external moment is their negative. The knee
-        centre is the femoral origin, where the three axes meet.
+        Hip, ground, gravity and inertia require generalised forces of the knee about its flexion
+        and adduction axes; the external moments are their negatives. The knee centre is the femoral
+        origin, where the three axes meet.
         """
         hip = self._columns[:, :6]
         # The first six equations are those of the floating base. The knee's internal loads vanish

@@ -1,4 +1,4 @@
-"""The extensor mechanism over all frames: where the patella is, and its lines of action."""
+"""The extensor mechanism over all frames: place of the patella, and lines of action."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -173,7 +173,7 @@ class ExtensorLines:
                 )
 
     def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
-        """Return the mechanism, and its contact as it was prepared."""
+        """Return the mechanism, and its prepared contact."""
         parts, chain = self._parts, self._chain
         stretch = off_femur(self.muscle.points, chain)
         origin, insertion = self.muscle.points[stretch : stretch + 2]
@@ -206,7 +206,7 @@ class ExtensorFrames(ExtensorLines):
     Attributes:
         muscle: its line of action.
         ligament: the patellar ligament's.
-        states: the patella at each frame; a recorded one is looked at when it is asked for.
+        states: the patella at each frame; a recorded one is evaluated on first use.
 
     Raises:
         InputError: a line starts inside what it wraps, or the patella is found nowhere.
@@ -229,13 +229,13 @@ class ExtensorFrames(ExtensorLines):
     def moved(self, parts: ExtensorParts, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
         """Return the mechanism of a solved patella with its parts or the femur a little elsewhere.
 
-        In the frames asked for the patella is found anew, from where it is here; its joint moves
-        by as much. Rates, and the patella in the other frames, stay.
+        In the given frames the patella is solved again, with its place here as initial guess; its
+        joint moves by as much. Rates, and the patella in the other frames, are kept.
 
         Args:
             parts: the mechanism.
             poses: (f, 4, 4) pose_femur_in_insert.
-            frames: in which the patella is found anew.
+            frames: frames in which the patella is solved again.
 
         Raises:
             InputError: a line starts inside what it wraps.
@@ -266,7 +266,7 @@ class ExtensorFrames(ExtensorLines):
             return patella_at(self._mechanism, pose, recorded, self._contacts[k])
         own = self.states[k]
         if guess is not None and own.status.found:
-            # a guess from a frame far before may lead nowhere, where its own leads to the place
+            # An initial guess from a distant frame may fail where the frame's own one converges.
             near = guess.coordinates
             solution = solve_patella(self._mechanism, pose, near, guess.slopes, anywhere=False)
             if solution.status.found:
@@ -322,7 +322,7 @@ def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> Patell
     """Return the contact of two surfaces, prepared once for the many samples of a scene.
 
     Args:
-        femoral: femoral component, femur link's frame; told from others by its identity.
+        femoral: femoral component, femur link's frame; compared by identity in the cache.
         button: patellar button, likewise.
         joint: (4, 4) pose_joint_in_femur, its bytes.
     """
@@ -331,7 +331,7 @@ def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> Patell
 
 
 class _RecordedContacts:
-    """The contact at each recorded place, found once it is asked for.
+    """The contact at each recorded place, computed on first use.
 
     Args:
         contact: of the two surfaces, unused.
@@ -350,10 +350,10 @@ class _RecordedContacts:
 
 @lru_cache(maxsize=1)
 def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
-    """Return the contacts at recorded places: where the knee is does not change them.
+    """Return the contacts at recorded places; they do not depend on the knee's pose.
 
     Args:
-        prepared: the contact; told from others by its identity.
+        prepared: the contact; compared by identity in the cache.
         coordinates: (f, 3) m and rad, their bytes.
     """
     return _RecordedContacts(prepared.unused(), np.frombuffer(coordinates).reshape(-1, 3))
@@ -395,5 +395,5 @@ def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]
 
 
 def _on_tibia(load: PointForces) -> PointForces:
-    """Return the load with the insert, which the tibia carries, named as the tibia."""
+    """Return the load with the link "insert", which is fixed to the tibia, renamed "tibia"."""
     return replace(load, link="tibia") if load.link == "insert" else load

@@ -1,7 +1,7 @@
-"""How the quadriceps' force answers to the other muscles: the flexion row of their sharing.
+"""How the quadriceps' force depends on the other muscles: the flexion row of the sharing.
 
-The equations of a frame are linear in all loads while contact points and lines stay. So the
-tension that they ask of the extensor group is
+The equations of a frame are linear in all loads while contact points and lines are fixed. The
+tension of the extensor group that they require is therefore
 
     Q = Q_0 + Σ_i g_i F_i + h r,
 
@@ -13,9 +13,10 @@ the insert's z. Solved for r this is the knee's row of a static optimisation,
 with contact, ligaments, patella and friction in it: -1/h is the arm of the extensor group, -Q_0/h
 the moment that all muscles together have to carry.
 
-Of a knee with released coordinates contact points and distribution follow the muscles: there the
-tension of the patellar ligament, as linear in them by the tangent of contact and ligaments, gives
-the row (`ReleasedForces.tension_per_wrench`), and a condyle that lifts off changes it smoothly.
+With released coordinates, contact points and the medial-lateral split depend on the muscles. The
+row then comes from the tension of the patellar ligament, which is linear in the muscle forces by
+the tangent of contact and ligaments (`ReleasedForces.tension_per_wrench`). A condyle that lifts
+off changes that row smoothly.
 """
 
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ class FlexionRow:
     """The knee's row of the muscles' sharing.
 
     Args:
-        moment: N·m, what muscles and reserve carry together, on the tibia about the insert's z.
+        moment: N·m on the tibia about the insert's z, which muscles and reserve supply together.
         extensor_arm: m, of the extensor group.
         arms: (c,) m, of the crossing muscles.
     """
@@ -79,10 +80,10 @@ def yielding_flexion_row(
 ) -> FlexionRow:
     """Return the row at one frame whose released coordinates yield to the muscles.
 
-    The patella ties the extensor group's tension to the ligament's: Q = a T + b.
+    The patella's equilibrium relates the extensor group's tension to the ligament's: Q = a T + b.
 
     Args:
-        geometry: the frame, with an extensor mechanism; its contact is not looked at.
+        geometry: the frame, with an extensor mechanism; its contact is not used.
         lines: of the muscles that cross the knee.
         base: N, tension of the patellar ligament without the other muscles.
         per_wrench: (6,) N per N and per N·m, what a wrench on the insert, about its origin,
@@ -101,7 +102,7 @@ def yielding_flexion_row(
 def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
     """Return a and b (N) of the extensor group's tension Q = a T + b, T the ligament's.
 
-    They are the patella's own three equations, in which no other load of the leg is.
+    They follow from the patella's own three equations, which contain no other load of the leg.
     """
     extensor, state = geometry.extensor, geometry.state
     assert extensor is not None

@@ -1,9 +1,9 @@
-"""A generic ligament set for a patient who has none: scaled to the implant, and named so.
+"""A generic ligament set, scaled to the implant, for a patient without measured ligaments.
 
 Femoral ends are placed about the axis of the posterior condyles, near which the collaterals
 are nearly isometric; distal ends about the insert's flat bottom. The proportions are those
 of an average knee in units of half the mediolateral width of the part (femoral component,
-insert). They are nobody's: look at the strain table before believing any force.
+insert). They do not belong to a real patient: check the strain table before using any force.
 
 Stiffness: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998); reference strains at
 extension: Blankevoort & Huiskes, J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883.

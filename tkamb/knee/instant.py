@@ -1,7 +1,7 @@
-"""A knee at one instant, at the pose of q or at others near by: what a search for equilibrium asks.
+"""A knee at one instant, at the pose of q or near it: input of a search for equilibrium.
 
-The shank moves as q, v and a say, whatever the knee coordinates of the search; so what it needs of
-the knee is found once.
+The shank moves as q, v and a say, whatever the knee coordinates of the search. The wrench that the
+knee must exert on it is therefore computed once.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ class PatellaAt:
         lines: the extensor mechanism.
         pose: (4, 4) of the femur in the insert frame, by q.
         coordinates: (3,) of the patella by q; None where the model has none.
-        solved: at other poses it is found anew, and not kept on the femur.
+        solved: whether it is solved again at other poses; if not, it stays fixed to the femur.
     """
 
     lines: "ExtensorLines"

@@ -1,15 +1,15 @@
 """Equilibrium of the knee joint at one frame, whatever its contact may be.
 
-Across the knee, femur and shank exchange one wrench: what ground, weight and inertia leave
-unbalanced on the shank. It does not depend on the knee coordinates, for the shank moves as
+Across the knee, femur and shank exchange one wrench. It balances ground reaction, weight and
+inertia of the shank. It does not depend on the knee coordinates, because the shank moves as
 recorded. Contact, ligaments, muscles and the patellar ligament must add up to it:
 
     R(q, y) = w_external + w_ligaments(q) + w_muscles(q) + w_contact(q) + B y = 0   (on the insert)
 
 The columns B are the loads that may keep the prescribed coordinates in place: the patellar
 ligament's line (flexion), and the residuals of the equations of motion for the others. The
-extensor muscle and the patellofemoral force are internal to the femur's side. What a released
-coordinate i is driven by is the generalised force
+extensor muscle and the patellofemoral force are internal to the femur's side. A released
+coordinate i is driven by the generalised force
 
     r_i = -J_i(q) . R(q, y),   y such that the prescribed coordinates have none,
 
@@ -57,7 +57,7 @@ class JointEquilibrium:
     Args:
         external: (6,) w_external on the insert, force and moment about its origin.
         ligaments: the bundles.
-        line: the patellar ligament, which balances flexion; None: a moment does.
+        line: the patellar ligament, which balances flexion; None: a moment balances it.
         keeping: (6, m) the other columns of B, of unit magnitude.
         released: indices of the n released coordinates.
         share: the muscles across the knee beside the quadriceps, if modelled.
@@ -85,7 +85,7 @@ class JointEquilibrium:
         return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], remainder)
 
     def kept(self, coordinates: Array, contact: Array) -> Array:
-        """Return y (6 - n,): what keeps the prescribed coordinates, flexion last."""
+        """Return y (6 - n,): the loads that keep the prescribed coordinates, flexion last."""
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         return _magnitudes(axes[..., self._prescribed, :], columns, wrench)
 
@@ -98,13 +98,13 @@ class JointEquilibrium:
         return np.asarray(-axes[list(self.released)] @ through)
 
     def kept_and_left(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
-        """Return what `kept` does and R (6,), the wrench on the insert that is left over then."""
+        """Return what `kept` does, and the residual wrench R (6,) on the insert."""
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         reactions = _magnitudes(axes[self._prescribed], columns, wrench)
         return reactions, wrench + columns @ reactions
 
     def whole(self, coordinates: Array, contact: Array) -> Array:
-        """Return (m, 6): generalised forces on all coordinates, kept as at the last of m places.
+        """Return generalised forces (m, 6) on all coordinates, with y of the last of m places.
 
         Args:
             coordinates: (m, 6) knee coordinates.
@@ -155,12 +155,12 @@ def joint_equilibrium(
     slack: bool,
     external: Array,
 ) -> JointEquilibrium:
-    """Return what the body asks of the knee at one frame.
+    """Return the equations of equilibrium of the knee at one frame.
 
     Args:
-        geometry: the frame; its condyles and ligament loads are not looked at.
+        geometry: the frame; its condyles and ligament loads are not used.
         ligaments: the bundles.
-        coordinates: (6,) knee coordinates at which the geometry stands.
+        coordinates: (6,) knee coordinates of the geometry.
         released: indices of the released coordinates; flexion is never among them.
         middle: (3,) m, where the residual forces act, insert frame.
         slack: the extensor mechanism carries nothing.
@@ -218,7 +218,7 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     hip = unknowns.hip(state.point("hip", np.zeros(3)))
     ground = [geometry.ground] if geometry.ground else []
     columns = state.generalised([*(unknown.loads for unknown in hip), ground])
-    # As in `KneeSystem`: what hip and knee supply together, the ground reaction taken off.
+    # As in `KneeSystem`: what hip and knee supply together, less the ground reaction.
     without = state.inertial - columns[:, -1]
     # The first six equations hold no internal loads of the knee, so that they give the hip's alone.
     at_hip = np.linalg.solve(columns[:6, :6], without[:6])
@@ -232,7 +232,7 @@ def crossing_bundles(
 ) -> "BundleArrays":
     """Return the bundles that cross the knee, their ends in the femur and insert frames.
 
-    An end on the patella moves with the femur from where it stands.
+    An end on the patella is taken as fixed to the femur.
     """
     from tkamb.knee.ligaments import BundleArrays
 

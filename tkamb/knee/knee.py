@@ -62,13 +62,16 @@ class KneeSettings:
     """The knee object: frames and poses."""
 
     frame_tolerance: float = 1e-9
-    """m and rad: an insert frame this near to that of its flat bottom is the same frame."""
+    """m and rad: an insert frame this near to that of its flat bottom is the same frame. Chosen:
+    above rounding."""
     pose_tolerance: float = 1e-12
-    """m and rad: residual of the joint coordinates that make a given pose of the knee."""
+    """m and rad: residual of the joint coordinates that make a given pose of the knee. Chosen: near
+    the rounding of double precision."""
     accepted_pose_error: float = 1e-8
-    """m and rad: at most what is left after the last Newton step of a pose that is reached."""
+    """m and rad: at most what is left after the last Newton step of a pose that is reached. Chosen:
+    far below what changes a force."""
     max_pose_steps: int = 30
-    """Newton steps at most to find these coordinates."""
+    """Newton steps at most to find these coordinates. Chosen: poses that converge need fewer."""
 
 
 KNEE = KneeSettings()

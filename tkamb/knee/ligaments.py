@@ -34,8 +34,8 @@ class LigamentSettings:
     """1: eps1 of Blankevoort's curve; the toe region ends at twice this strain, the same for
     every ligament."""
     max_reference_distance: float = 15.0 * DEGREE
-    """rad: a recorded frame whose flexion is farther from the reference flexion is no
-    reference pose."""
+    """rad: a recorded frame whose flexion is farther from the reference flexion is no reference
+    pose. Chosen: 15 deg: farther away a ligament has another strain."""
 
 
 LIGAMENT = LigamentSettings()
@@ -114,7 +114,7 @@ class Ligament:
 
 @dataclass(frozen=True, eq=False)
 class BundleArrays:
-    """Several bundles at once, their ends in two frames of one's choice.
+    """Several bundles at once, with their ends in two freely chosen frames.
 
     Args:
         proximal: (m, 3) m, one end of each.
@@ -196,7 +196,7 @@ def ligament_loads(
 def build_ligaments(
     ligaments: Sequence[Ligament], poses: Mapping[str, Array], flexion: Array
 ) -> tuple[Ligament, ...]:
-    """Return bundles whose slack lengths are found where a reference strain is given.
+    """Return bundles with slack lengths, computed from the reference strain where one is given.
 
     A reference strain eps_r holds at the frame nearest to the reference flexion, where the
     bundle has length L_r: L0 = L_r/(1 + eps_r).
@@ -251,13 +251,13 @@ def strain_table(
     at_deg: Sequence[float] = (0.0, 60.0, 90.0),
     within_deg: float = 10.0,
 ) -> dict[str, tuple[float, ...]]:
-    """Return strain per bundle at given flexions, so that a wrong insertion is seen.
+    """Return strain per bundle at given flexions, which reveals a wrong insertion.
 
     Args:
         ligaments: the bundles.
         poses: link -> pose_link_in_insert (f, 4, 4).
         flexion: (f,) rad, of the same frames.
-        at_deg: flexions to look at; the nearest recorded frame is taken.
+        at_deg: flexions; the nearest recorded frame of each is taken.
         within_deg: NaN where no recorded frame is nearer than this.
 
     Returns:

@@ -1,11 +1,10 @@
 """Which loads of the knee act at one frame: a condyle may be lifted, the extensor muscle slack.
 
 Lines pull and contacts push: N_medial, N_lateral, the muscle's tension, PL and PF along its normal
-are >= 0. A load that is left out is replaced by a residual moment, and only where it is asked for
-what it cannot do: a condyle that would have to pull, were it there; a muscle that would have to
-push. Otherwise a frame would be balanced without a load that it needs. So there are at most six
-sets: no condyle, the medial or the lateral one lifted, the extensor mechanism taut or slack, less
-those that the recorded gap excludes.
+are >= 0. A load is left out only where it would have the wrong sign: a condyle would have to pull,
+or a muscle to push. A residual moment then takes its place. There are at most six sets: no condyle,
+the medial or the lateral one lifted, each with the extensor mechanism taut or slack. The recorded
+gap may exclude some of them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -21,9 +20,9 @@ class LoadStateSettings:
     """Which parts of the extensor carry load."""
 
     force_rounding: float = 1e-6
-    """N: a force of the wrong sign that is smaller is rounding."""
+    """N: a force of the wrong sign that is smaller is rounding. Chosen: above rounding."""
     patella_moment: float = 0.25
-    """N m: moment of the patella's own weight and inertia, up to 5 N on an arm of 45 mm. It
+    """N m: moment of the patella's own weight and inertia, up to 5 N on an arm of 45 mm. Chosen: it
     separates an extensor that carries from one that is slack."""
 
 
@@ -34,7 +33,7 @@ PATELLAR_LOADS = ("patellar_ligament", "patellofemoral")
 
 
 class LoadState(NamedTuple):
-    """What carries nothing.
+    """Loads that are zero.
 
     Args:
         lifted: sides of the condyles that carry nothing.
@@ -46,7 +45,7 @@ class LoadState(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What is left out, in words."""
+        """The loads that are zero, in words."""
         left_out = [f"{side} lifted" for side in sorted(self.lifted)]
         left_out += [f"{muscle} slack" for muscle in sorted(self.slack)]
         return " and ".join(left_out) or "all loaded"
@@ -55,10 +54,10 @@ class LoadState(NamedTuple):
 def load_states(
     sides: Iterable[str], off: frozenset[str], extensors: Iterable[str]
 ) -> list[LoadState]:
-    """Return the sets to try, fewest left out first, a slack muscle before a lifted condyle.
+    """Return the sets to try, fewest zero loads first, a slack muscle before a lifted condyle.
 
-    The order is the preference where several hold: contact is seen in the recorded gap, the
-    muscle's activity is not.
+    If several sets hold, the first is preferred: the recorded gap shows contact, while nothing
+    recorded shows the muscle's activity.
 
     Args:
         sides: of the condyles that are modelled.
@@ -79,7 +78,7 @@ def _muscles(values: Mapping[str, float]) -> list[str]:
 
 
 def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
-    """Return what contradicts a set's own assumptions, with its size; empty where they hold."""
+    """Return the contradictions to a set's own assumptions, with their size; empty if they hold."""
     if not solution.regular:
         return ["singular equations"]
     values = solution.values

@@ -1,4 +1,4 @@
-"""What the equations of a knee say at one instant, in the axes and signs of the user's knee."""
+"""Loads of a knee at one instant, in the axes and signs of the user's knee."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,21 +33,21 @@ class KneeLoads:
         ligaments: bundle -> N.
         residuals: what an exact model would make zero: ap, ml (N), axial, and perhaps coronal,
             flexion (N·m), on the tibia.
-        hip_force: (3,) N on the femur at the hip centre, all that the thigh's other end carries.
+        hip_force: (3,) N on the femur at the hip centre: all loads that cross the hip.
         hip_moment: (3,) N·m.
         external_flexion: N·m, moment that tends to flex the knee.
         external_adduction: N·m, moment that tends to adduct it.
         condition: condition number of the equations.
         lifted: condyles that carry nothing.
         slack: the extensor mechanism carries nothing.
-        ambiguous: other sets of loads have all signs right, too.
+        ambiguous: other sets of loads, too, have no wrong sign.
         problems: why there is no solution; empty when there is one.
         external_forces: `pin.StdVec_Force`: contact, ligaments and extensor mechanism as found, as
             `fext` of the model. With them and the external loads `pin.rnea` leaves the residuals.
         residual_forces: `pin.StdVec_Force` of the residuals.
-        hip_forces: `pin.StdVec_Force` of what acts on the thigh at the hip.
-        equations: the solution as the equations have it, of a right knee.
-        geometry: what they stand on.
+        hip_forces: `pin.StdVec_Force` of the loads on the thigh at the hip.
+        equations: the solution of the equations, of a right knee.
+        geometry: the geometry of the equations.
     """
 
     contact_force: Array
@@ -100,7 +100,7 @@ def knee_loads(
     """Return solved loads as those of the user's knee.
 
     Args:
-        geometry: what the equations stand on.
+        geometry: the geometry of the equations.
         solved: their solution, of a right knee.
         is_left: the user's knee is a left one.
         forces: `external_forces`, `residual_forces` and `hip_forces`.

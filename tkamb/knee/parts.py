@@ -33,7 +33,8 @@ class PartSettings:
     """Checks of the implant meshes."""
 
     max_length: float = 0.5
-    """m: no part of an implant is longer; a longer one was given in millimetres."""
+    """m: no part of an implant is longer. Chosen: a longer mesh is probably in millimetres and is
+    refused."""
 
 
 PART = PartSettings()
@@ -51,8 +52,8 @@ class Implant:
         patella: patellar button, in the axes of the frame "patella", its joint side facing -x.
         material: of the insert, a name (`tkamb.contact.materials.MATERIALS`) or a `Material`.
         bearing: "fixed" (bottom glued) or "mobile" (bottom slides).
-        placed: the insert frame of the results is the frame "insert" itself. False: its origin is
-            the centre of the flat bottom that is found in the mesh.
+        placed: True: the insert frame of the results is the frame "insert" itself. False: its
+        origin is the centre of the flat bottom of the mesh.
     """
 
     femoral: Mesh = None
@@ -75,8 +76,8 @@ class Extensor:
     """Quadriceps, patella and patellar ligament.
 
     The patella moves in a sagittal plane of the femur. Where the model has a frame "patella" that
-    moves against the femur, its place is that of q. Otherwise the place is found where the forces
-    on a massless patella balance, with the ligament's length as given.
+    moves against the femur, its place is that of q. Otherwise the place follows from the
+    equilibrium of a massless patella, with the given length of the ligament.
 
     Args:
         quadriceps: from the femur to the patella.
@@ -84,8 +85,8 @@ class Extensor:
             of the patella is found.
         plane: pose of the plane's frame in the frame "femur"; None: of the joint "patella_ap"
             where the model has one, else the frame "femur" itself.
-        solved: a patella of the model is found anew where `Knee.equilibrium` moves the femur;
-            False: it stays where it is on the femur.
+        solved: True: a patella of the model is solved again where `Knee.equilibrium` moves the
+        femur. False: it stays fixed to the femur.
     """
 
     quadriceps: Muscle
@@ -103,7 +104,7 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
     Args:
         mesh: see `Mesh`; a `Surface` is taken as it is.
         name: what to call it in messages.
-        closed: it must enclose a volume.
+        closed: whether it must enclose a volume.
 
     Raises:
         InputError: no mesh, not finite, in millimetres, not a surface, or open.
@@ -145,7 +146,7 @@ def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
     if not triangles or not len(faces) or not np.issubdtype(faces.dtype, np.integer):
         raise InputError("is no triangle mesh", name, how)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError("has triangles of vertices that it does not have", name, how)
+        raise InputError("has triangles with vertex numbers out of range", name, how)
     return vertices.astype(float), faces.astype(np.int64)
 
 

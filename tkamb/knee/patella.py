@@ -1,8 +1,8 @@
 """The patella's forces at a place in the femur's sagittal plane, massless and without friction.
 
-A place is the three joint coordinates patella_ap, patella_si and patella_rotation. Muscle,
-patellar ligament and contact force balance at each; the moment that is left over vanishes where
-the patella rests (see `patella_search`).
+A place is the three joint coordinates patella_ap, patella_si and patella_rotation. At every place
+the muscle, patellar ligament and contact forces are in force equilibrium. The residual moment
+vanishes where the patella is in equilibrium (see `patella_search`).
 """
 
 from dataclasses import dataclass
@@ -21,24 +21,24 @@ class PatellaSettings:
     """Equilibrium of the patella."""
 
     least_determinant: float = 1e-6
-    """1: determinant of contact normal and ligament direction (unit vectors) below which the
-    two are one line."""
+    """1: determinant of contact normal and ligament direction (unit vectors) below which the two
+    are one line. Chosen: above rounding."""
 
 
 PATELLA = PatellaSettings()
 
 
 class PatellaStatus(Enum):
-    """How the search ended: found, or which condition of the place was not met."""
+    """How the search ended: a place was found, or the condition that could not be met."""
 
     OK = "ok"
     SEVERAL = "several_solutions"
     EDGE = "contact_on_edge_of_femoral_mesh"
-    NO_CONTACT = "no contact: the button meets the femoral component at no rotation"
+    NO_CONTACT = "no contact: the button does not meet the femoral component at any rotation"
     LINE = "a line's end lies inside what it wraps, or runs along the contact normal"
     GAP = "the gap to the femoral component does not close"
-    LIGAMENT = "the patellar ligament's length is not met"
-    MOMENT = "moments balance at no rotation that was tried"
+    LIGAMENT = "the given length of the patellar ligament cannot be reached"
+    MOMENT = "the moments do not balance at any rotation that was tried"
     PULL = "the contact would have to pull, or the patellar ligament to push"
 
     @property
@@ -60,11 +60,11 @@ class PatellaState:
         gap: m, positive when apart.
         ligament_ratio: patellar ligament tension per tension of the muscle, massless patella.
         patellofemoral_ratio: patellofemoral force per tension of the muscle, massless patella.
-        shift: m along z, the mediolateral shift that is left out of the motion; first order.
+        shift: m along z, mediolateral shift, first order; not part of the motion.
         tilt: rad about y, likewise.
         status: how the search ended.
-        slopes: (3, 3) of gap, ligament length and moment (m, per unit tension) by the coordinates,
-            about, which shortens a search near by; None if not known.
+        slopes: (3, 3) approximate derivatives of gap, ligament length and moment (m, per unit
+        tension) by the coordinates; they shorten a search near by. None if not known.
     """
 
     coordinates: Array
@@ -142,7 +142,7 @@ def patella_at(
 
 
 def touching_patella(coordinates: Array, point: Array, normal: Array) -> PatellaState:
-    """Return the state of a patella of which place and contact are known, and nothing else.
+    """Return the state of a patella of which only place and contact are known.
 
     Args:
         coordinates: (3,) of the patella, m and rad.
@@ -167,7 +167,7 @@ class PatellaFrame:
         self.tuberosity = transform(self.insert, mechanism.ligament_distal)
 
     def balance(self, coordinates: Array) -> PatellaBalance:
-        """Return the forces with the force balance met and the moment left over (m)."""
+        """Return the forces in force equilibrium, and the residual moment (m)."""
         return self.balance_at(coordinates, self.mechanism.contact.at(coordinates))
 
     def balance_at(self, coordinates: Array, contact: PatellarContact) -> PatellaBalance:
@@ -192,7 +192,7 @@ class PatellaFrame:
         # Force equilibrium in the sagittal plane, per newton of muscle: two equations for ligament
         # and contact.
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
-        # The moment about the origin that is left decides the patella's rotation: it vanishes in
+        # The residual moment about the origin decides the patella's rotation: it vanishes in
         # equilibrium.
         moment = (
             _cross(muscle.points[-1], pull)

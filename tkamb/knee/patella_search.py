@@ -1,4 +1,4 @@
-"""Where the patella rests when its motion was not recorded.
+"""Equilibrium of the patella when its motion was not recorded.
 
 Three unknowns per frame, the joint coordinates patella_ap, patella_si and patella_rotation,
 and three equations of a massless patella without friction:
@@ -8,9 +8,9 @@ and three equations of a massless patella without friction:
     muscle, ligament and contact force meet in one point (moment balance in the plane)
 
 By virtual work the third says that the muscle's length is stationary among all places
-that satisfy the first two; a stable patella sits at a minimum of it. Near a known place Newton's
-steps with learnt slopes close all three at once. Else the search turns the patella in the
-direction of the unbalanced moment until that changes sign.
+that satisfy the first two; a stable patella is at a minimum of it. Near a known place, Newton
+steps with Broyden's slopes solve all three at once. Elsewhere the search turns the patella in the
+direction of the residual moment until the moment changes sign.
 """
 
 from collections.abc import Sequence
@@ -37,30 +37,36 @@ class PatellaSearchSettings:
     """The search for the patella's place."""
 
     length_tolerance: float = 1e-8
-    """m: residual of gap and ligament length below which the search has converged."""
+    """m: residual of gap and ligament length below which the search has converged. Chosen: far
+    below what changes a force."""
     rotation_tolerance: float = 1e-7
-    """rad: tolerance of the rotation at which the moment vanishes."""
+    """rad: tolerance of the rotation at which the moment vanishes. Chosen: far below what changes a
+    force."""
     max_chord_lengths: float = 8.0
-    """Chord lengths: how far a search extrapolates along a chord."""
+    """Chord lengths: largest extrapolation along a chord. Chosen: farther away the chord does not
+    predict."""
     max_evaluations: int = 14
-    """Evaluations of one approach from a place near by."""
+    """Largest number of evaluations from one initial guess near by. Chosen: searches that converge
+    need fewer."""
     lever_arm: float = 0.02
-    """m: arm that makes a rotation comparable to a length when slopes are updated from a step."""
+    """m: arm that makes a rotation comparable to a length when slopes are updated from a step.
+    Chosen: half the width of a patella."""
     max_distance: float = 5e-3
-    """m: a place farther from where the button touched first lies behind the femur."""
+    """m: largest distance of a place from the button's first touch. Chosen: a place farther away
+    lies behind the femur."""
 
 
 PATELLA_SEARCH = PatellaSearchSettings()
 
 
 LONGEST_STEP = np.array([5e-3, 5e-3, np.deg2rad(4.0)])
-"""m, m and rad, of the coordinates in one step."""
+"""m, m and rad: largest change of the coordinates in one step."""
 
 
 FIRST_STEP = np.deg2rad(0.5)
 NEAR_TURN = np.deg2rad(12.0)
 WIDEST_TURN = np.deg2rad(40.0)
-"""rad: first step, reach of a quick look, and end of the search about the guess."""
+"""rad: first step of the search, and largest distance of the search from its initial guess."""
 
 
 class _Lost(ComputationError):
@@ -85,7 +91,7 @@ def solve_patella(
         pose_femur_in_insert: (4, 4) of the femur link.
         guess: (3,) coordinates of the previous frame; None searches all rotations.
         slopes: its `slopes`, if it has them.
-        anywhere: search all rotations where the guess leads nowhere.
+        anywhere: search all rotations where the search from the guess fails.
 
     Returns:
         The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
@@ -96,7 +102,7 @@ def solve_patella(
         try:
             balance = search.follow(guess, slopes)
         except ComputationError:
-            balance = None  # a guess that leads nowhere says nothing: all rotations are searched
+            balance = None  # the initial guess failed: all rotations are searched
     if balance is None:
         if not anywhere:
             return _nothing(PatellaStatus.MOMENT)
@@ -113,10 +119,10 @@ def solve_patella(
 
 
 class _Closing:
-    """Newton's steps that close gap and ligament length in the plane, with Broyden's slopes.
+    """Newton steps that solve gap and ligament length in the plane, with Broyden's slopes.
 
-    The contact's unit normal and the ligament's direction are the slopes to begin with. The
-    groove's flanks make the gap's up to a fifth less steep, which Broyden's updates learn.
+    The contact's unit normal and the ligament's direction are the first slopes. The flanks of the
+    groove make the slope of the gap up to a fifth smaller, which Broyden's updates correct.
     """
 
     def __init__(self, ligament_length: float) -> None:
@@ -168,11 +174,11 @@ class _Search(PatellaFrame):
         raise _Lost((PatellaStatus.GAP, PatellaStatus.LIGAMENT)[worst])
 
     def follow(self, guess: Array, slopes: Array | None = None) -> PatellaBalance:
-        """Return the stable balance next to a guess: turn with the moment to its zero.
+        """Return the stable equilibrium near a guess: the patella turns until the moment vanishes.
 
         Args:
             guess: (3,) coordinates.
-            slopes: of a place near by; with them the zero is looked for at once.
+            slopes: of a place near by; with them Newton's method is tried first.
 
         Raises:
             ComputationError: there is none within `WIDEST_TURN`.
@@ -210,8 +216,8 @@ class _Search(PatellaFrame):
         try:
             brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
-            # the patella that is followed from one end lies elsewhere at the other, so that the
-            # moment there has another sign than the one that was found before
+            # The patella that is followed from one end arrives at another place at the other end,
+            # where the moment has a different sign.
             raise _Lost(PatellaStatus.MOMENT) from None
         return last
 
@@ -236,7 +242,7 @@ class _Search(PatellaFrame):
     ) -> PatellaBalance | None:
         """Return the stable balance near a place: Newton's steps in all three, Broyden's slopes.
 
-        None where that leads out of a span, to an unstable place, or does not end.
+        None where that leaves the span, leads to an unstable place, or does not converge.
 
         Args:
             start: (3,) coordinates.
@@ -270,7 +276,7 @@ class _Search(PatellaFrame):
         """Return the stable balance with the shortest muscle, and whether there are more.
 
         Raises:
-            _Lost: there is none; with the condition that the nearest miss did not meet.
+            _Lost: there is none; it names the condition that the best attempt did not meet.
         """
         flexion = np.arctan2(self.in_insert[1, 0], self.in_insert[0, 0])
         rotations = -0.65 * flexion + np.deg2rad(np.arange(-50.0, 50.1, 10.0))
@@ -295,7 +301,7 @@ class _Search(PatellaFrame):
         return min(balances, key=lambda b: b.muscle.length), len(balances) > 1
 
     def first_touch(self, rotation: float) -> PatellaBalance:
-        """Return the balance at a rotation, the patella swung in on its ligament from in front.
+        """Return the balance at a rotation; the patella approaches from the front on its ligament.
 
         Raises:
             ComputationError: it touches nothing, or gap or length do not hold where it does.
@@ -330,7 +336,7 @@ _CONDITIONS = (
     PatellaStatus.GAP,
     PatellaStatus.MOMENT,
 )
-"""In the order in which a search meets them: the last that any rotation missed is named."""
+"""Conditions in the order in which a search checks them; the latest one that failed is named."""
 
 
 def _condition(error: ComputationError) -> PatellaStatus:
@@ -344,7 +350,7 @@ def _slopes_in_plane(balance: PatellaBalance) -> Array:
 
 
 def _stable(slopes: Array) -> bool:
-    """Say whether a turn with gap and ligament kept is turned back by the moment."""
+    """Say whether the moment opposes a turn at constant gap and ligament length."""
     plane = slopes[:2, :2]
     if abs(np.linalg.det(plane)) < PATELLA.least_determinant:
         return False

@@ -1,4 +1,4 @@
-"""Where the patella touches the femoral component, and along which line it is pressed.
+"""Contact point of the patella on the femoral component, and line of action of its force.
 
 Everything is in the patellar joint's frame: the femur's, x anterior, y superior, z right;
 the patella moves in it in the sagittal plane only (x, y, rotation about z).
@@ -21,8 +21,8 @@ times the lateral force and tilt by d times the tilting moment, per unit contact
     n_z = lambda n_lz + (1 - lambda) n_rz      a = lambda z_l + (1 - lambda) z_r
 
 z measured from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is
-the direction of the patellofemoral force. Shift and tilt are estimated to first order and
-reported, not carried out.
+the direction of the patellofemoral force. Shift and tilt are first-order estimates; they are
+reported, but the patella is not moved.
 """
 
 import copy
@@ -43,32 +43,35 @@ class PatellofemoralSettings:
     """Patellofemoral contact with smoothed gaps."""
 
     patch_depth: float = 5e-5
-    """m: tau of the module's equations. A contact of relative radius R is averaged over about
-    sqrt(R tau)."""
+    """m: tau of the module's equations. Chosen: a contact of relative radius R is averaged over
+    about sqrt(R tau)."""
     sample_spacing: float = 1e-3
-    """m: spacing of the button's samples in the patella's coronal plane."""
+    """m: spacing of the button's samples in the patella's coronal plane. Chosen: about the facets
+    of a mesh."""
     sample_range: float = 14.0 * patch_depth
-    """m: samples farther than this behind the nearest one get no weight. Their weight is
+    """m: samples farther than this behind the nearest one get no weight. Chosen: their weight is
     exp(-14) = 8e-7, by which the gap of a patch of twenty samples jumps by 3e-11 m."""
     coarse_samples: int = 60
-    """Samples of a coarse evaluation."""
+    """Samples of a coarse evaluation. Chosen: enough for an initial guess."""
     lateral_compliance: float = 0.01
-    """m: c of the module's equations, the shift if the contact force were purely lateral."""
+    """m: c of the module's equations, the shift if the contact force were purely lateral. Chosen:
+    soft enough to keep the search smooth."""
     tilt_compliance: float = 10.0
-    """rad/m: d of the module's equations, the tilt (5.7 deg) if the whole force acted 10 mm
-    beside the middle."""
+    """rad/m: d of the module's equations, the tilt (5.7 deg) if the whole force acted 10 mm beside
+    the middle. Chosen: soft enough to keep the search smooth."""
     least_sagittal_part: float = 1e-9
-    """1: sagittal part of a unit normal below which the normal has no sagittal direction."""
+    """1: sagittal part of a unit normal below which the normal has no sagittal direction. Chosen:
+    above rounding."""
 
 
 PATELLOFEMORAL = PatellofemoralSettings()
 
 
 STRAIGHT = 1e-12
-"""m: where the share changes the gap by less through what yields, all goes to the nearer side."""
+"""m: if the share changes the gap by less than this, the nearer side carries all of the force."""
 
 FIELDS = 11
-"""Numbers that say where and how the patella is pressed."""
+"""Count of the numbers that describe the contact; see `_shared`."""
 
 EDGE_MARGIN = 0.02
 """Barycentric distance from a sharp edge within which a point lies on it."""
@@ -83,8 +86,8 @@ class PatellarContact:
         point: (3,) m, on the line of action, at the height of the facets' contact points.
         normal: (3,) unit, in the sagittal plane, out of the femur into the patella.
         share_left: lambda, the share of the facet on the -z side.
-        shift: m along z, by which soft tissue would let the patella yield; first order.
-        tilt: rad about y, likewise.
+        shift: m along z, shift of the patella that soft tissue would allow; first order.
+        tilt: rad about y, tilt that it would allow; first order.
         on_edge: share of the force on sharp or open edges of the femoral mesh.
     """
 
@@ -100,9 +103,9 @@ class PatellarContact:
 class PatellofemoralContact:
     """Contact between button and femoral component, prepared for many positions.
 
-    Distances of samples that cannot matter are carried over from the position before, with
-    what the samples have moved since as a bound: this saves time and changes nothing, since
-    samples beyond `PATELLOFEMORAL.sample_range` have no weight.
+    The distance of a sample is computed again only if the sample may have a weight at the new
+    position. How far the sample has moved bounds its distance. That saves time and does not change
+    the result, because samples beyond `PATELLOFEMORAL.sample_range` have no weight.
 
     Args:
         femoral: femoral component in the patellar joint's frame; triangles share vertices.
@@ -132,15 +135,16 @@ class PatellofemoralContact:
         self._forget()
 
     def _forget(self) -> None:
-        """Have no distance carried over."""
+        """Drop all stored distances."""
         count = len(self._samples)
         never, zeros = np.full((count, 3), np.inf), np.zeros(count)
         places = np.zeros((count, 3)), np.zeros((count, 3))
-        # where each was seen, its distance, nearest point, normal there, and whether on an edge
+        # Position of each sample at its last evaluation, its distance, nearest point, normal there,
+        # and whether that is on an edge.
         self._seen = never, zeros, *places, np.zeros(count)
 
     def unused(self) -> "PatellofemoralContact":
-        """Return the same contact as it was before any position was looked at."""
+        """Return the same contact without stored distances."""
         other = copy.copy(self)
         other._forget()
         return other
@@ -165,7 +169,7 @@ class PatellofemoralContact:
         return PatellarContact(gap, contact[5:8], contact[8:], left_share, shift, tilt, on_edge)
 
     def touches(self, coordinates: Array) -> bool:
-        """Return whether a few of the samples lie in the femur: a quick look for searches."""
+        """Return whether any of a few samples lies in the femur: a quick check for searches."""
         few = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
         samples = transform(self.pose(np.asarray(coordinates, float)), few)
         low, high = self._nearest.surface.bounds
@@ -208,15 +212,15 @@ def _which_matter(
 ) -> Index:
     """Return the samples whose distances are out of date and could matter.
 
-    A sample that has moved by m since it was seen at distance d lies between d - m and d + m:
-    what cannot come within reach of its side's nearest keeps what was seen.
+    A sample that has moved by m since its distance was d has a distance between d - m and d + m.
+    A sample that cannot come within reach of the nearest one of its side keeps its stored distance.
 
     Args:
         samples: (n, 3) m, samples at their place.
         on_left: (n,) whether they are on the -z side.
         reach: m, behind the nearest one, beyond which a sample does not matter.
-        seen_at: (n, 3) m, where each was when it was looked at; inf: never.
-        distance: (n,) m, signed, there.
+        seen_at: (n, 3) m, position of each sample at its last evaluation; inf: none.
+        distance: (n,) m, signed distance at that position.
     """
     count, nearest = len(samples), np.full(2, np.inf)
     displacement, which, number = np.full(count, np.inf), np.empty(count, np.int64), 0
@@ -253,7 +257,7 @@ def _take(
     normal: Array,
     on_edge: Array,
 ) -> None:
-    """Write what the nearest points of samples say.
+    """Store the distances, nearest points and normals of samples.
 
     Args:
         which: (m,) samples.
@@ -336,8 +340,8 @@ def _mean_over_sides(
                 means[side, 1 + k] += weight * foot[n, k]
                 means[side, 4 + k] += weight * normal[n, k]
         means[side] /= total
-        # The weighted mean over a paraboloid exceeds its smallest distance by tau; that is taken
-        # off.
+        # The weighted mean over a paraboloid exceeds its smallest distance by tau, which is
+        # subtracted.
         means[side, 0] -= depth
 
 
@@ -380,7 +384,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
         yields[1] * lever,
         mean[7],
     )
-    # the mean point, moved in the sagittal plane onto the resultant's line
+    # The mean point, moved in the sagittal plane onto the line of action of the resultant.
     contact[5] = mean[1] + moment / length**2 * mean[5]
     contact[6], contact[7] = mean[2] - moment / length**2 * mean[4], mean[3]
     contact[8], contact[9], contact[10] = mean[4] / length, mean[5] / length, 0.0

@@ -4,7 +4,7 @@ From frame to frame the lowest point of a condyle travels an arc a_f on the femo
 and its projection travels an arc a_i on the insert. Both are taken in the insert's sagittal
 plane and are positive when the contact moves backwards, which is how flexion moves it.
 Rolling: equal arcs. What axial rotation alone would do, about the geometric centre of the
-femoral component, is taken out of a_i:
+femoral component, is subtracted from a_i:
 
     slip = sum (a_f - (a_i - a_axial)),   a_axial = d(alpha) (z_condyle - z_centre) / cos(slope)
 

@@ -24,10 +24,10 @@ class UnknownsSettings:
     """Solvability of the equations for the unknown forces."""
 
     max_condition: float = 1e4
-    """1: condition number (unit columns) above which a frame counts as singular. It grows as
-    one over the arm d at which the patellar ligament passes the femorotibial contact: 7 to
-    9 m / d. The shipped knee has d = 43 to 45 mm and 148 to 218. The limit is d = 0.8 mm,
-    where an error of 1 mm in a line of action exceeds the whole force."""
+    """1: condition number (unit columns) above which a frame counts as singular. Chosen: it grows
+    as one over the arm d at which the patellar ligament passes the femorotibial contact: 7 to 9 m /
+    d. The shipped knee has d = 43 to 45 mm and 148 to 218. The limit is d = 0.8 mm, where an error
+    of 1 mm in a line of action exceeds the whole force."""
 
 
 UNKNOWNS = UnknownsSettings()
@@ -88,7 +88,7 @@ AXES = {"ap": np.array([1.0, 0, 0]), "si": np.array([0, 1.0, 0]), "ml": np.array
 """Insert axes: x anterior, y superior, z to the right."""
 
 MUSCLE = "muscle_"
-"""Begins the names of the muscles' tensions."""
+"""First part of the names of the muscles' tensions."""
 
 
 def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces, ...]:
@@ -152,8 +152,8 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
         normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
         femur_ml: (3,) the femur's ML axis.
     """
-    # The second component, along the groove: frictionless contact needs it to be zero, and its size
-    # shows how far the place is from equilibrium.
+    # The second component, along the groove, is zero in a frictionless contact. Its size shows how
+    # far the place is from equilibrium.
     tangent = cross(femur_ml, normal)
     return [
         Unknown("patellofemoral", pair("patella", "femur", point, normal)),
@@ -162,7 +162,7 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
 
 
 def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
-    """Return what carries the patella's own weight when the extensor mechanism is slack.
+    """Return the loads that hold the patella's own weight when the extensor mechanism is slack.
 
     Args:
         point: (3,) where it rests on the femur.

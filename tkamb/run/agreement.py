@@ -24,16 +24,19 @@ class AgreementSettings:
     """When two estimates contradict each other."""
 
     share_difference: float = 0.25
-    """Two estimates of the medial share that differ by more contradict each other."""
+    """Two estimates of the medial share that differ by more contradict each other. Chosen: smaller
+    differences are within the errors of both."""
     large_residual_share: float = 0.10
-    """Of the superior-inferior contact force: a larger AP and ML residual is flagged."""
+    """1: share of the superior-inferior contact force; a larger AP and ML residual is flagged.
+    Chosen: a smaller one is within the errors of the forces."""
     unloaded_share: float = 0.01
-    """Of the load: a condyle that carries less carries nothing."""
+    """1: share of the load; a condyle that carries less counts as unloaded. Chosen: it is below the
+    errors of the split."""
     adduction_error: float = 0.5 * DEGREE
-    """How well fluoroscopy knows the adduction."""
+    """rad: error of the recorded adduction, 0.5 deg. Chosen: that of fluoroscopy."""
     moved_load_share: float = 0.25
-    """Of the load: where the adduction's error moves more, the split by deformation is not
-determined by the recorded pose."""
+    """1: share of the load; where the adduction's error moves more of it, the recorded pose does
+    not determine the split by deformation. Chosen: a quarter decides which condyle carries more."""
 
 
 AGREEMENT = AgreementSettings()

@@ -28,12 +28,11 @@ class FrameLoopSettings:
     """How frames are shared and which contacts are kept as guesses."""
 
     kept_contacts: int = 20
-    """How many contacts are kept as guesses for the next."""
+    """How many contacts are kept as guesses for the next. Chosen: older ones are farther away than
+    a new search begins."""
     frames_per_chunk: int = 10
-    """Frames that a worker computes in a row: the first of them has no guess from the one before.
-
-The same for any number of workers, so that their number changes no answer.
-"""
+    """Frames that a worker computes in a row; the first of them has no guess from the one before.
+    Chosen: the same for any number of workers, so that their number changes no answer."""
 
 
 FRAME_LOOP = FrameLoopSettings()
@@ -88,7 +87,7 @@ class FrameSolver:
     def _keep(self, contact: "FrameContact") -> None:
         """Keep a contact; only the last that was found keeps its warm start, which is large."""
         if contact.result is not None:
-            self.before = [replace(each, start=None, turned=None) for each in self.before]
+            self.before = [replace(each, start=None) for each in self.before]
         self.before.append(contact)
         del self.before[: -FRAME_LOOP.kept_contacts]
 

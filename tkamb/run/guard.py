@@ -7,6 +7,7 @@ nobody foresaw is one line too; its traceback goes into a file beside the output
 import argparse
 import errno
 import io
+import json
 import logging
 import os
 import sys
@@ -18,6 +19,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
+from unicodedata import category
 
 from tkamb import __version__
 from tkamb.errors import TkambError
@@ -92,15 +94,28 @@ def say(line: str) -> None:
 
 
 def printable(text: str) -> str:
-    """Return text of others with what could steer a terminal written out, lines kept."""
-    return "".join(
-        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
-    )
+    """Return text with what could steer a terminal written out as in JSON; lines and tabs stay."""
+    if text.isascii() and text.replace("\n", "").isprintable():
+        return text
+    return "".join(c if _is_harmless(c) else json.dumps(c)[1:-1] for c in text)
+
+
+def _is_harmless(character: str) -> bool:
+    return character.isprintable() or character in "\n\t" or category(character) == "Zs"
+
+
+class _PrintableFormatter(logging.Formatter):
+    """Writes out what could steer a terminal: messages quote names and texts of others."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
 
 
 def log_to_stderr() -> None:
     """Have warnings printed on standard error, as tkamb's."""
-    logging.basicConfig(format="tkamb: %(levelname)s: %(message)s", level=logging.WARNING)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_PrintableFormatter("tkamb: %(levelname)s: %(message)s"))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
 
 
 def open_streams() -> None:
@@ -132,13 +147,16 @@ def open_streams() -> None:
 
 
 def _watch(stream: TextIO) -> None:
-    """Have a stream say `StreamError` when it cannot be written, as on a full disk."""
+    """Have a stream say `StreamError` when it cannot be written, as on a full disk.
+
+    What is written is `printable`: commands print names and texts from files of others.
+    """
     for name in ("write", "flush"):
         inner = getattr(stream, name)
 
         def call(*arguments: str, inner: Callable[..., object] = inner) -> object:
             try:
-                return inner(*arguments)
+                return inner(*map(printable, arguments))
             except BrokenPipeError:
                 raise
             except OSError as error:

@@ -23,7 +23,8 @@ class KnownErrorSettings:
     """How known errors of the contact settings are shown."""
 
     notable_share: float = 0.10
-    """Share of the reference; a known error above it is shown in colour."""
+    """1: share of the reference; a known error above it is shown in colour. Chosen: a reader should
+    not miss it."""
 
 
 KNOWN_ERROR = KnownErrorSettings()

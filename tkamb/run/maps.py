@@ -40,8 +40,8 @@ class MapWriteSettings:
     """How pressure maps are written."""
 
     buffer_bytes: float = 4e6
-    """Bytes of maps that are collected for one write: a write costs as much as the maps of a
-    frame."""
+    """Bytes of maps that are collected for one write. Chosen: a write costs as much as the maps of
+    a frame."""
 
 
 MAP_WRITE = MapWriteSettings()

@@ -1,11 +1,13 @@
 """The few numbers that say what happened in a run."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.articular_edge import AT_EDGE
+from tkamb.contact.narrow import TOO_NARROW
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run.agreement import AGREEMENT
@@ -20,15 +22,23 @@ class MetricSettings:
     """What counts as a jump of a centre of pressure, and as an unloaded quadriceps."""
 
     jump: float = 8.0 * MILLIMETRE
-    """m; a centre of pressure that moves farther between two frames may have jumped."""
+    """m; a centre of pressure that moves farther between two frames may have jumped. Chosen: on one
+    dish a contact point moves by less from frame to frame."""
     jump_steps: float = 5.0
-    """A centre of pressure that moves by more than `jump` and by many median steps from a frame to
-the next has not travelled there."""
+    """Median steps: a centre of pressure that moves by more than these and by more than `jump` from
+    a frame to the next has jumped. Chosen: a movement does not speed up as much."""
     least_tension: float = 1.0
-    """N: below this quadriceps tension its ratios are not shown."""
+    """N: below this quadriceps tension its ratios are not shown. Chosen: a quotient of small
+    numbers says nothing."""
 
 
 METRICS = MetricSettings()
+
+PEAK_DOUBTS = {
+    AT_EDGE: AT_EDGE,
+    TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
+}
+"""Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,30 @@ def peak(results: "Results", column: str) -> Peak | None:
         if np.isfinite(values := results[column.replace("<side>", side)]).any()
     ]
     return max(result, key=lambda one: one.value, default=None)
+
+
+def doubt_of_peak(results: "Results", side: str, frame: int) -> str:
+    """Return in words why the peak pressure of a condyle at a frame is in doubt; "" if it is not.
+
+    A run's status tells the flags of each frame.
+    """
+    status = str(results.status[frame])
+    words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
+    return " and ".join(words)
+
+
+def peak_pressure(results: "Results") -> dict[str, Any] | None:
+    """Return the largest peak pressure, where it is and what is in doubt; None without contact."""
+    largest = peak(results, "<side>_peak_pressure_MPa")
+    if largest is None:
+        return None
+    return {
+        "MPa": largest.value,
+        "side": largest.side,
+        "frame": largest.frame,
+        "time_s": float(results["time_s"][largest.frame]),
+        "doubt": doubt_of_peak(results, largest.side, largest.frame),
+    }
 
 
 def medial_share(results: "Results", estimate: str) -> Array:

@@ -43,7 +43,7 @@ class PressLimitSettings:
     """Which loads are accepted."""
 
     max_load: float = 1e5
-    """N; over a hundred body weights."""
+    """N; largest load. Chosen: over a hundred body weights."""
 
 
 PRESS_LIMITS = PressLimitSettings()

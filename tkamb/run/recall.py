@@ -1,8 +1,8 @@
 """A frame's contact as arrays, and the warm start that they give a resumed run's next frame.
 
 The start is as good as the one that the frame left, but for what is not kept: the lattice's
-displacements, the contact and muscle forces that a released knee begins from, and the turned
-contact. Answers stay within the solver's tolerance.
+displacements, and the contact and muscle forces that a released knee begins from. Answers stay
+within the solver's tolerance.
 """
 
 from collections.abc import Mapping

@@ -31,9 +31,11 @@ class ComparisonSettings:
     """How predicted and measured courses are compared."""
 
     least_correlation_rise: float = 1e-6
-    """By how much the largest correlation exceeds those at the ends, where it is a maximum."""
+    """1: least excess of the largest correlation over those at the ends of the range of lags, from
+    which it is a maximum. Chosen: above rounding."""
     fewest_frames: int = 8
-    """Frames below which nothing is said of correlation and lag."""
+    """Frames below which nothing is said of correlation and lag. Chosen: a correlation of fewer
+    means little."""
 
 
 COMPARISON = ComparisonSettings()

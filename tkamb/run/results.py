@@ -30,9 +30,9 @@ class StatisticsSettings:
     """When a band of samples is stated."""
 
     min_samples: int = 20
-    """Number of samples; with fewer, the 5th percentile is not between the two smallest."""
+    """Number of samples. Chosen: with fewer, the 5th percentile is not between the two smallest."""
     max_failed_share: float = 0.5
-    """Share of samples; where more fail, the others say too little."""
+    """Share of samples. Chosen: where more fail, the others say too little."""
 
 
 STATISTICS_LIMITS = StatisticsSettings()

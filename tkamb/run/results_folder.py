@@ -48,6 +48,8 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """
     directory = Path(directory)
     settle(directory)
+    if not (directory / CSV_NAME).exists():
+        raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
     columns = read_csv(directory / CSV_NAME)
     summary = read_summary(directory)
     maps = None

@@ -14,6 +14,7 @@ from tkamb.io.scene import Scene, load_scene, with_overrides, with_preset
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.frames import FRAME_LOOP, ChunkSolver, Finished, FrameSolver, finished_in_order
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.metrics import peak_pressure
 from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
 from tkamb.run.results import Results
 from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
@@ -178,7 +179,10 @@ class _Run:
         summary["inputs"] = self.inputs
         summary["resumed_frames"] = self.resumed
         summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
-        return Results(columns, summary, self.recorder.maps)
+        results = Results(columns, summary, self.recorder.maps)
+        if (largest := peak_pressure(results)) is not None:
+            summary["peak_pressure"] = largest
+        return results
 
     def _finished(
         self, remaining: Sequence[int], progress: Progress, team: WorkerPool | None

@@ -20,16 +20,22 @@ class StatusSettings:
     """Limits beyond which a frame's status carries a flag."""
 
     filter_translation: float = 0.5 * MILLIMETRE
-    """m; where filtering moves a pose by more than fluoroscopy errs, the frame is flagged."""
+    """m; where filtering moves a pose by more, the frame is flagged. Chosen: fluoroscopy errs by
+    less."""
     filter_rotation: float = 0.5 * DEGREE
-    """Where filtering moves a pose by more than fluoroscopy errs, the frame is flagged."""
+    """rad; where filtering turns a pose by more (0.5 deg), the frame is flagged. Chosen:
+    fluoroscopy errs by less."""
     flank_angle: float = 20.0 * DEGREE
-    """A condyle whose contact normal leans by more than this runs against eminence or lip: the
-recorded position, the ML one above all, deserves a look."""
+    """rad; where the contact normal of a condyle leans by more (20 deg) the frame is flagged.
+    Chosen: the condyle then runs against eminence or lip; check the recorded position, above all
+    ML."""
     adjusted_total_BW: float = 0.01
-    """BW: a femoral adjustment that changes the total force by more decides more than the split."""
+    """BW: a femoral adjustment that changes the total force by more decides more than the split.
+    Chosen: a femoral adjustment that changes the total force by more decides more than the
+    split."""
     marker_distance: float = 20.0 * MILLIMETRE
-    """Skin that has moved by more than this against the other segment's: at 700 N 14 N·m."""
+    """m; skin that has moved by more against the other segment's is flagged. Chosen: at 700 N it is
+    14 N·m."""
 
 
 STATUS = StatusSettings()

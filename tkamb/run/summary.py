@@ -51,7 +51,8 @@ class SummarySettings:
     """What a summary warns of."""
 
     notable_reserve: float = 0.05
-    """Share of a coordinate's largest moment; more reserve than this is a warning."""
+    """1: share of a coordinate's largest moment; more reserve than this is a warning. Chosen: less
+    changes no muscle force noticeably."""
 
 
 SUMMARY = SummarySettings()
@@ -285,8 +286,8 @@ def assumptions(case: Case) -> list[str]:
         sentences.append("The force plate lies at the laboratory's height 0: no column says where.")
     if case.motion.unrecorded:
         sentences.append(
-            f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are found, and the rates "
-            "that enter inertia and the direction of sliding are those of a first guess."
+            f"Nobody recorded {', '.join(case.motion.unrecorded)}: they are computed. The "
+            "rates that enter inertia and the direction of sliding are those of an initial guess."
         )
     if scene.motion.motion == "roll-slip":
         sentences.append(
@@ -358,7 +359,7 @@ def _agreement(table: ContactTable) -> str:
     """Return how body and contact were brought together."""
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
-        return f"{names} are not the recorded ones: body and contact are at rest in them."
+        return f"{names} are computed, not recorded: body and contact are in equilibrium there."
     sentence = "The contact model presses in the superior-inferior force at the measured rotation; "
     if table.coupling == "points":
         return sentence + "the deformed contact's resultants act in the body's equations."

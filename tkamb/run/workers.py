@@ -28,7 +28,7 @@ class WorkerLimitSettings:
     """How many processes a run may start."""
 
     max_workers: int = 256
-    """Number of worker processes; no machine for which tkamb is meant has more cores."""
+    """Number of worker processes. Chosen: no machine for which tkamb is meant has more cores."""
 
 
 WORKER_LIMITS = WorkerLimitSettings()

@@ -1,7 +1,7 @@
-"""What a reader gets: report, comparison, check of a scene, viewer.
+"""Output for readers: report, comparison, check of a scene, viewer.
 
-`tkamb.show(results)` was a function before release 0.2 and works until 0.3; `tkamb.view(results)`
-is its name now.
+`tkamb.show(results)` was a function before release 0.2. It is now `tkamb.view(results)`; the old
+call works until 0.3.
 """
 
 import sys
@@ -11,7 +11,7 @@ from typing import Any
 
 
 class _CallableModule(ModuleType):
-    """This package, which may still be called as the function of its name was."""
+    """This package, which can still be called like the former function of its name."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Return what `tkamb.view` returns, with a warning."""

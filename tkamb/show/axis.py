@@ -19,12 +19,12 @@ UNITS = {"flexion": "°", "cycle": " %", "time": " s"}
 
 @dataclass(frozen=True, eq=False)
 class HorizontalAxis:
-    """What the results are drawn against, in time order; it need not be monotonic.
+    """Horizontal axis of the plots, in time order; it need not be monotonic.
 
     Args:
         kind: "flexion", "cycle" or "time".
         values: (f,) deg, per cent or s.
-        stances: from and to of each stance of gait on the axis; empty on one of flexion.
+        stances: begin and end of each stance on the axis; empty on an axis of flexion.
     """
 
     kind: str
@@ -42,7 +42,7 @@ class HorizontalAxis:
         return f"{self.values[frame]:.{digits}f}{UNITS[self.kind]}"
 
     def broken(self, values: Array) -> tuple[Array, Array]:
-        """Return x and y for drawing, interrupted where a cycle starts anew."""
+        """Return x and y for drawing, interrupted where a new cycle starts."""
         x = self.values
         if self.kind != "cycle":
             return x, values

@@ -1,4 +1,4 @@
-"""The cohort's report: one page that stands by itself, groups side by side."""
+"""The cohort's report: one self-contained page, with the groups side by side."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,9 +48,9 @@ class CohortReportSettings:
     """How much a cohort's page shows."""
 
     most_maps: int = 24
-    """Pressure maps on the page; more make it slow to open."""
+    """Pressure maps on the page. Chosen: more make it slow to open."""
     most_failed: int = 100
-    """Failed runs that the page lists."""
+    """Failed runs that the page lists. Chosen: the page stays readable."""
 
 
 COHORT_REPORT = CohortReportSettings()
@@ -71,6 +71,7 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
         rows=[_row(group, _there(groups)) for group in groups],
         plots=list(_plots(groups)),
         designs=_designs(cohort, groups),
+        wear=_wear_table(groups),
         maps=_maps(cohort, outcomes, groups),
         failed=_failed(cohort, outcomes)[: COHORT_REPORT.most_failed],
         failed_count=sum(bool(one.reason) for one in outcomes.values()),
@@ -86,7 +87,7 @@ def _designs(cohort: Cohort, groups: Sequence[Group]) -> dict[str, str] | None:
 
 
 def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
-    """Return by how much the cohort's contact models are known to err; None without contact."""
+    """Return the known error of the cohort's contact models; None without contact."""
     words: dict[str, str] = {}
     large = False
     for n in outcomes:
@@ -150,32 +151,36 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
 
 
 def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:
-    """Return each group's worn volume, its range by the wear factor, and what other laws say."""
-    failures = sum(bool(one.wear_problem) for one in outcomes.values())
-    parts = []
+    """Return the groups' worn volumes from least to most, and what they say of designs."""
+    lost = sum(bool(one.wear_problem) for one in outcomes.values())
+    name = "volume_mm3_per_Mc"
+    means = [float(np.nanmean(group.wear[name])) for group in groups if name in group.wear]
+    value = f"{min(means):.3g}–{max(means):.3g} mm³ per million cycles" if means else "none"
+    text = (
+        f"mean of the runs by group; {len(outcomes) - lost} of {len(outcomes)} runs. By archard "
+        "and cross-shear the contact area cancels: the volume hardly follows the design's "
+        "conformity. A difference that only one law shows is that law's: see the table of wear"
+    )
+    if lost:
+        text += f". {lost} runs have none, see wear_failed in runs.csv"
+    return Card("Worn volume", value, text, lost > 0)
+
+
+def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:
+    """Return each group's worn volume, its range, its depth and the first cycle by every law."""
+    groups = [group for group in groups if "volume_mm3_per_Mc" in group.wear]
+    if not groups:
+        return None
+    laws = [name for name in groups[0].wear if name.startswith("first_")]
+    words = [name.removeprefix("first_").removesuffix("_mm3_per_Mc") for name in laws]
+    rows = []
     for group in groups:
-        if "volume_mm3_per_Mc" not in group.wear:
-            continue
-        ends = ("volume_mm3_per_Mc", "volume_mm3_per_Mc_low", "volume_mm3_per_Mc_high")
-        mean, low, high = (float(np.nanmean(group.wear[name])) for name in ends)
-        laws = ", ".join(
-            f"{name.removeprefix('first_').removesuffix('_mm3_per_Mc')} {np.nanmean(values):.3g}"
-            for name, values in group.wear.items()
-            if name.startswith("first_")
-        )
-        parts.append(
-            f"{group.name} {mean:.3g} ({low:.3g} to {high:.3g} by the wear factor; {laws})"
-        )
-    text = "mean of the runs, mm³ per million cycles: " + "; ".join(parts or ["none"])
-    text += (
-        ". By archard and cross-shear the contact area cancels: the volume hardly follows the "
-        "design's conformity. A difference that only one law shows is that law's"
-    )
-    if failures:
-        text += f". {failures} runs have none, see wear_failed in runs.csv"
-    return Card(
-        "Worn volume", f"{len(outcomes) - failures} of {len(outcomes)} runs", text, failures > 0
-    )
+        mean = {name: float(np.nanmean(values)) for name, values in group.wear.items()}
+        low, high = mean["volume_mm3_per_Mc_low"], mean["volume_mm3_per_Mc_high"]
+        cells = [f"{mean['volume_mm3_per_Mc']:.3g} ({low:.3g}–{high:.3g})"]
+        cells += [f"{mean['max_depth_mm']:.3g}"] if "max_depth_mm" in mean else ["–"]
+        rows.append([group.name, *cells, *(f"{mean[law]:.3g}" for law in laws)])
+    return {"laws": words, "rows": rows}
 
 
 def _row(group: Group, names: Sequence[str]) -> list[str]:
@@ -197,7 +202,7 @@ def _row(group: Group, names: Sequence[str]) -> list[str]:
 
 
 def _plots(groups: Sequence[Group]) -> Any:
-    """Yield plots per quantity and axis, each of so many groups as one can tell apart."""
+    """Yield plots per quantity and axis, each with as many groups as colours can distinguish."""
     for name in _there(groups):
         for axis in dict.fromkeys(group.axis for group in groups):
             own = [group for group in groups if group.axis == axis and name in group.bins]
@@ -209,10 +214,10 @@ def _plots(groups: Sequence[Group]) -> Any:
 
 
 def _told_apart(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
-    """Return plots: what all groups of one have in common, and name -> group.
+    """Return plots: the common labels of their groups, and name -> group.
 
-    Too many for one plot are divided by the label with the fewest values that makes them few
-    enough, so that what differs in all else stands in one plot; else in their order.
+    If there are too many groups for one plot, they are divided by the label with the fewest values
+    that makes them few enough; if no label does, in their order.
     """
     if len(groups) > AT_ONCE:
         values = {
@@ -267,8 +272,8 @@ def _maps(
     cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
 ) -> dict[str, Any] | None:
     """Return one map of each group side by side on one scale; None without contact."""
-    rows = [(group, _typical(group, outcomes)) for group in groups]
-    with_map = [(group, n) for group, n in rows if n is not None][: COHORT_REPORT.most_maps]
+    shown, alike = _typical(cohort, outcomes, groups)
+    with_map = shown[: COHORT_REPORT.most_maps]
     if not with_map:
         return None
     flexion = cohort.table.map_flexion_deg
@@ -276,19 +281,47 @@ def _maps(
     return {
         "svg": svg_text(draw_group_maps(cohort, outcomes, with_map), "maps"),
         "frame": frame,
+        "whose": "one run in all groups alike but for the group's own labels, that with the peak "
+        "forces nearest to the groups' medians"
+        if alike
+        else "the run whose peak force is its group's median",
         "more": len(groups) - len(with_map),
     }
 
 
-def _typical(group: Group, outcomes: Mapping[int, Outcome]) -> int | None:
-    """Return the run whose peak force is the group's median, of those with a map."""
-    peaks = {
-        n: float(np.nanmax(outcomes[n].columns["force_total_BW"]))
-        for n in group.numbers
-        if outcomes[n].chosen is not None
-    }
-    ordered = sorted(peaks, key=lambda n: peaks[n])
-    return ordered[(len(ordered) - 1) // 2] if ordered else None
+def _typical(
+    cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
+) -> tuple[list[tuple[Group, int]], bool]:
+    """Return each group's run to show, and whether the runs differ in the groups' labels alone.
+
+    Of the subjects, trials and so on that every group has, those whose peak forces are nearest
+    to the groups' medians: maps of one person beside each other. Where no such set is in all
+    groups, each group's own median. Runs without a map are left out.
+    """
+    peaks = [
+        {
+            _rest(cohort, group, n): (n, float(np.nanmax(outcomes[n].columns["force_total_BW"])))
+            for n in group.numbers
+            if outcomes[n].chosen is not None
+        }
+        for group in groups
+    ]
+    there = [(group, own) for group, own in zip(groups, peaks, strict=True) if own]
+    if not there:
+        return [], False
+    medians = [sorted(peak for _, peak in own.values())[(len(own) - 1) // 2] for _, own in there]
+    pairs = list(zip((own for _, own in there), medians, strict=True))
+    common = [rest for rest in there[0][1] if all(rest in own for _, own in there)]
+    if common:
+        rest = min(common, key=lambda rest: sum(abs(own[rest][1] - m) for own, m in pairs))
+        return [(group, own[rest][0]) for group, own in there], True
+    nearest = [min(own.values(), key=lambda one: abs(one[1] - m))[0] for own, m in pairs]
+    return [(group, n) for (group, _), n in zip(there, nearest, strict=True)], False
+
+
+def _rest(cohort: Cohort, group: Group, number: int) -> tuple[str, ...]:
+    """Return the labels of a run that do not make its group."""
+    return tuple(v for k, v in cohort.runs[number].labels.items() if k not in group.labels)
 
 
 def draw_group_maps(

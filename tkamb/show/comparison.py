@@ -1,4 +1,4 @@
-"""What was measured against what a run predicts, in words (`tkamb.run.recorded`)."""
+"""Measured forces compared with those of a run, in words (`tkamb.run.recorded`)."""
 
 from collections.abc import Mapping
 from typing import Any

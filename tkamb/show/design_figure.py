@@ -1,4 +1,4 @@
-"""Designs of a cohort side by side: peak pressure and wear, each with what is not certain of it."""
+"""Designs of a cohort side by side: peak pressure and wear, each with its uncertainty."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from tkamb.studies.cohort.statistics import Group
 WEAR = "volume_mm3_per_Mc"
 """Name of the worn volume in a group's wear; its ends by the wear factor add _low and _high."""
 BANDS = (
-    "Dot: mean over the runs. Thick bar: smallest to largest run. Thin bar: pressure, those ends "
-    "with the known error of the contact model; wear, those ends by the range of the wear factor, "
+    "Dot: mean over the runs. Thick bar: smallest to largest run. Thin bar: these ends extended by "
+    "the known error of the contact model (pressure), or by the range of the wear factor (wear), "
     "which scales all designs alike."
 )
 
@@ -29,7 +29,8 @@ class DesignFigureSettings:
     """Looks of the figure."""
 
     spread: float = 0.5
-    """Of the room of a place on the horizontal axis, over which its dots stand side by side."""
+    """1: share of the width of a place on the horizontal axis over which its dots stand side by
+    side. Chosen by looks."""
 
 
 DESIGN_FIGURE = DesignFigureSettings()
@@ -45,8 +46,8 @@ class Bar:
         mean: over the runs.
         low: smallest run.
         high: largest run.
-        least: lower end of what is not certain.
-        most: upper end.
+        least: lower end of the uncertainty.
+        most: upper end of the uncertainty.
     """
 
     place: str

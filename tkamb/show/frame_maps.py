@@ -31,11 +31,14 @@ class FrameMapSettings:
     """The pressure maps behind the report's frame slider."""
 
     rim_byte: int = 64
-    """Byte of the page's picture where the contact ends; above it there is pressure."""
+    """Byte of the page's picture where the contact ends; above it there is pressure. Chosen: bytes
+    below it describe the fading rim."""
     most_frames: int = 250
-    """A longer run shows, at each place of the slider, the nearest of so many maps."""
+    """Largest number of maps in the page. Chosen: a longer run shows the nearest one at each place
+    of the slider."""
     coarsening: int = 2
-    """The page's grid has every so-manieth point of the picture's."""
+    """Ratio of the grid in the page to the grid of the picture. Chosen: the page is a quarter of
+    the size."""
 
 
 FRAME_MAP = FrameMapSettings()

@@ -1,4 +1,4 @@
-"""What a reader learns in the first half minute: a few cards and sentences, in plain words."""
+"""The report's headline: a few cards and sentences, in plain words."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.articular_edge import AT_EDGE
-from tkamb.contact.narrow import TOO_NARROW
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run import metrics
 from tkamb.run.agreement import AGREEMENT
@@ -24,26 +22,29 @@ AXIS_NAMES = {"ap": "AP", "si": "SI", "ml": "ML"}
 
 @dataclass(frozen=True)
 class HeadlineSettings:
-    """What the report's first lines name."""
+    """Limits of the report's headline."""
 
     most_inputs: int = 2
-    """How many inputs a sentence names."""
+    """Number of inputs that a sentence names. Chosen: a sentence stays short."""
     most_muscles: int = 4
-    """How many saturated muscles are named."""
+    """Number of saturated muscles that a sentence names. Chosen: a sentence stays short."""
     notable_failed_share: float = 0.05
-    """Share of samples: where more fail, the bands leave out a whole tail."""
+    """1: share of failed samples above which the bands are cut off at one end. Chosen: fewer do not
+    move the 5th or 95th percentile far."""
     residual_percent: float = 0.05
-    """%, of the SI contact force: what a search for equilibrium may leave of residuals."""
+    """% of the SI contact force: smaller residuals are not mentioned. Chosen: the tolerance of the
+    equilibrium leaves them."""
     distant_frames_deg: float = 5.0
-    """deg: what begins between frames farther apart is said with both."""
+    """deg: if an event lies between frames that are farther apart than this, both frames are named.
+    Chosen: an event is read to some degrees."""
 
 
 HEADLINE = HeadlineSettings()
 
 OTHER_ERRORS = (
-    "; that is the error of the contact model alone: load, pose, shape and material add theirs"
+    "; that is the error of the contact model alone; load, pose, shape and material add their own"
 )
-"""Said beside a known error, which is not the error of the result."""
+"""Added to a known error, which is not the error of the result."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -55,7 +56,7 @@ class Card:
         title: what it is.
         value: the number with its unit.
         detail: where it occurs and what it means.
-        warning: shown as something to look at.
+        warning: whether it is highlighted as a warning.
     """
 
     title: str
@@ -75,13 +76,6 @@ def run_title(summary: Mapping[str, Any]) -> str:
     scene = Path(str(summary.get("scene") or "tkamb run"))
     name = scene.parent.name if scene.stem == "scene" and scene.parent.name else scene.stem
     return name.upper() if len(name) <= 3 else name.replace("_", " ").capitalize()
-
-
-PEAK_DOUBTS = {
-    AT_EDGE: "contact reaches the edge of the insert's articular surface",
-    TOO_NARROW: "contact is too narrow for the map, so that the peak is not resolved",
-}
-"""Flag of a frame, after "the <side> ", -> words beside the peak pressure."""
 
 
 def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
@@ -142,12 +136,12 @@ def peaks_of(summary: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def peak_legend(peaks: Mapping[str, Any]) -> str:
-    """Return in words what stands in the brackets of `peak_words`."""
+    """Return in words the meaning of the brackets of `peak_words`."""
     if not any(one.get("p05") is not None for one in peaks.values()):
-        return "as the inputs stand; tkamb uncertainty says how sure that is"
+        return "with the inputs as given; `tkamb uncertainty` computes their uncertainty"
     words = "median of the samples (5 to 95 % by the inputs"
     if any(one.get("discrepancy_p05") is not None for one in peaks.values()):
-        words += "; 5 to 95 % by the inputs and by what the model leaves out"
+        words += "; 5 to 95 % by the inputs and by the discrepancy of the model"
     return words + ")"
 
 
@@ -163,18 +157,18 @@ def _peaks(results: "Results") -> Card | None:
         bands += [f"{name} {band.removesuffix(')').replace('; ', ' and ')}"] if band else []
     value = ", ".join(values) + " BW"
     detail = peak_legend(peaks) + (": " + ", ".join(bands) if bands else "")
-    detail += "; each at the frame where it is largest as the inputs stand"
+    detail += "; each at its own frame of the largest value"
     detail += "; total along the insert's axis, as an instrumented tray measures it"
     return Card("Peak total, medial and lateral force", value, detail)
 
 
 def _discrepancy(results: "Results") -> Card | None:
-    """Return how far the method was off in measured knees, where this one was not measured."""
+    """Return the method's error in measured knees, if this knee was not measured."""
     words = (results.summary.get("discrepancy") or {}).get("words")
     if not words or results.summary.get("measured"):
         return None
-    value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW off in total"
-    return Card("Compared with measured knees", value, words)
+    value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW RMS"
+    return Card("Error of this method in measured knees", value, f"total force; {words}")
 
 
 def muscle_limits(results: "Results") -> Card | None:
@@ -187,7 +181,7 @@ def muscle_limits(results: "Results") -> Card | None:
     largest = max((one["percent_of_largest_moment"] for one in hip.values()), default=0.0)
     named = sorted(saturated, key=lambda name: -saturated[name])[: HEADLINE.most_muscles]
     listed = ", ".join(f"{name} ({saturated[name]} frames)" for name in named)
-    detail = f"muscles that pull as hard as they can: {listed or 'none'}"
+    detail = f"muscles at their largest force: {listed or 'none'}"
     if len(saturated) > len(named):
         detail += f" and {len(saturated) - len(named)} more"
     value = f"hip {largest:.0f} % of its largest moment" if hip else "no hip"
@@ -203,7 +197,7 @@ def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
     if table and band is not None and np.isfinite(band[0, result.frame]):
         low, middle, high = band[:, result.frame]
         sampled = table.get("peak_force_total_BW") or {}
-        words = sampled.get("words", f"{result.value:.2f} BW as the inputs stand")
+        words = sampled.get("words", f"{result.value:.2f} BW with the inputs as given")
         detail = (
             f"median of {table['samples']} samples and 5 to 95 % of them, "
             f"{_where(results, axis, result.frame)}; {words}"
@@ -217,7 +211,7 @@ def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
 
 
 def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
-    """Return how sure the peak force is, what moves it, and what the band leaves out."""
+    """Return the band of the peak force, its main causes, and inputs that are not varied."""
     table, peak = results.summary.get("uncertainty"), metrics.peak(results, "force_total_BW")
     band = results.band("force_total_BW")
     if not table or peak is None or band is None:
@@ -249,9 +243,9 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
         parts.append(f"in up to {worst:.0%} of the samples a frame failed{why}")
     if not_varied:
         names = ", ".join(name.replace("_", " ") for name in not_varied)
-        parts.append(f"not varied, and so not in the band: {names}")
+        parts.append(f"not varied, so not included in the band: {names}")
     value = f"{low:.2f}–{high:.2f} BW" if np.isfinite(low) else "–"
-    return Card("How sure the peak is", value, "; ".join(parts), bool(not_varied))
+    return Card("Uncertainty of the peak", value, "; ".join(parts), bool(not_varied))
 
 
 def _largest(table: Mapping[str, Any], result: str) -> str:
@@ -268,13 +262,13 @@ def _plain(name: str) -> str:
 
 
 def _measured(results: "Results") -> Card | None:
-    """Return how far the run is from what an instrumented implant measured, with [measured]."""
+    """Return the difference from the forces of an instrumented implant, with [measured]."""
     if not results.summary.get("measured"):
         return None
     from tkamb.show.comparison import comparison_words
 
     value, detail, incomplete = comparison_words(results.summary["measured"])
-    return Card("Against what was measured", value, detail, incomplete)
+    return Card("Compared with the measured force", value, detail, incomplete)
 
 
 def _shares(results: "Results") -> Card | None:
@@ -290,16 +284,16 @@ def _shares(results: "Results") -> Card | None:
     rest = [f"by {name} {text}" for name, text in texts.items() if name != first]
     share = metrics.medial_share(results, "deformation" if "deformation" in texts else first)
     alone = int(((share <= 0) | (share >= 1)).sum())
-    rest += [f"one condyle carries nothing in {alone} frame{'s' * (alone > 1)}"] if alone else []
+    rest += [f"one condyle is unloaded in {alone} frame{'s' * (alone > 1)}"] if alone else []
     apart = int((metrics.shares_apart(results) > AGREEMENT.share_difference).sum())
-    rest += [f"the two contradict each other in {apart} frame{'s' * (apart > 1)}"] if apart else []
+    rest += [f"both estimates disagree in {apart} frame{'s' * (apart > 1)}"] if apart else []
     rest += _adduction(results, unknown)
     detail = "; ".join([f"by {first}, the rest lateral", *rest])
     return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))
 
 
 def _adduction(results: "Results", unknown: int) -> list[str]:
-    """Return what an error of the adduction does to the split by deformation, in words."""
+    """Return the effect of an error of the adduction on the split by deformation, in words."""
     shift = metrics.moved_per_half_degree(results)
     words = []
     if unknown:
@@ -307,7 +301,7 @@ def _adduction(results: "Results", unknown: int) -> list[str]:
         words.append(f"the split by deformation is not determined {where}")
     if np.isfinite(shift).any():
         text = _range(shift, " N")
-        words.append(f"± 0.5 deg of adduction moves {text} between condyles that both carry")
+        words.append(f"± 0.5 deg of adduction moves {text} between two loaded condyles")
     return [": ".join(words)] if words else []
 
 
@@ -316,7 +310,7 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     if result is None:
         return None
     detail = f"{result.side}, {_where(results, axis, result.frame)}"
-    doubt = _doubt_of_peak(results, result.side, result.frame)
+    doubt = metrics.doubt_of_peak(results, result.side, result.frame)
     detail += f", where {doubt}" if doubt else ""
     detail += _above_yield(results, result.side)
     error = results.summary.get("known_error")
@@ -346,16 +340,6 @@ def _above_yield(results: "Results", first: str) -> str:
         return f"; never above yield ({stress:g}\u00a0MPa)"
     words = " and ".join(f"{percent:.0f} % of the {side} area" for percent, side in parts)
     return f"; up to {words} is above yield ({stress:g}\u00a0MPa)"
-
-
-def _doubt_of_peak(results: "Results", side: str | None, frame: int) -> str:
-    """Return in words why the peak pressure of a condyle at a frame is in doubt; "" if it is not.
-
-    A run's status tells the flags of each frame.
-    """
-    status = str(results.status[frame])
-    words = [word for flag, word in PEAK_DOUBTS.items() if f"the {side} {flag}" in status]
-    return " and ".join(words)
 
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
@@ -400,7 +384,7 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
 
 
 def _wraps_from(results: "Results", first: float) -> str:
-    """Return where the quadriceps begins to wrap, as well as the frames tell it."""
+    """Return where the quadriceps begins to wrap, as far as the frames show it."""
     flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
     last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)
     if first - last > HEADLINE.distant_frames_deg:
@@ -442,7 +426,7 @@ def _frames(results: "Results") -> Card:
     if failed or flagged:
         words = [f"{failed} failed (no numbers)"] if failed else []
         words += [f"{flagged} to be read with care"] if flagged else []
-        detail = "; ".join(words) + ": why is in the report's table and in column status"
+        detail = "; ".join(words) + ": the reasons are in the report's table and in column status"
     else:
         detail = "none failed, none flagged"
     return Card("Frames computed", value, detail, bool(failed or flagged))

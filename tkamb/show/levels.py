@@ -1,4 +1,4 @@
-"""Pressure between a map's points, for the eye: where contact ends, and a grid to draw it on."""
+"""Pressure between a map's points, for pictures: the edge of contact, and a grid to draw on."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,14 +13,16 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class LevelSettings:
-    """How a pressure map becomes a picture."""
+    """Conversion of a pressure map to a picture."""
 
     edge_tolerance: float = 1e-9
-    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge."""
+    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge.
+    Chosen: above rounding."""
     largest_gap: float = 10 * MILLIMETRE
-    """A gap above this, infinite where nothing lies above, counts as this."""
+    """m: a larger gap, also an infinite one where nothing lies above, counts as this. Chosen: far
+    above any contact."""
     margin_points: int = 2
-    """Grid points kept around contacts."""
+    """Number of grid points kept around contacts. Chosen: the edge of a contact is drawn whole."""
 
 
 LEVELS = LevelSettings()
@@ -103,7 +105,7 @@ class PageGrid:
         height = (weights * self._points[self._triangles[face], 1]).sum(axis=1)
         order = np.argsort(
             height, kind="stable"
-        )  # of triangles over each other the highest is seen
+        )  # of triangles over each other the highest is visible
         ids = np.full(len(self.up) * len(self.across), -1)
         ids[place[order]] = order
         over = ids >= 0

@@ -17,7 +17,7 @@ class MethodsTextSettings:
     """How `tkamb methods` prints its text."""
 
     line_width: int = 92
-    """Letters per line: a terminal and a mail show it without breaks."""
+    """Letters per line. Chosen: a terminal and a mail show it without breaks."""
 
 
 METHODS_TEXT = MethodsTextSettings()
@@ -337,10 +337,10 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
         yield "The superior–inferior load was pressed in at the recorded rotation."
     error = summary.get("known_error")
     if isinstance(error, str):
-        yield "How far this setting of the contact model is off was not measured."
+        yield "The error of this setting of the contact model was not measured."
     elif isinstance(error, Mapping):
         yield (
-            "On the cases of tkamb's trade-off study this setting was off by at most "
+            "On the cases of tkamb's trade-off study the error of this setting was at most "
             f"{100 * error['peak_pressure']:.2g} % in peak pressure and "
             f"{100 * error['area']:.2g} % in area."
         )

@@ -1,4 +1,4 @@
-"""The report's section on muscles: activations beside EMG, forces, and what they do to the knee."""
+"""The report's section on muscles: activations and EMG, forces, and their effect on the knee."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,9 +37,11 @@ GROUP_COLOURS = (QUADRICEPS, *LIST, GREY, GREY)
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
 """Contributions beside those of single muscles."""
 HELD = (
-    "What makes a force: each load alone in the frame's equations, with pose, contact points and "
-    "normals, friction's direction and all lines of action held; they sum up to the force by "
-    "equilibrium. What a muscle alone leaves unbalanced in flexion is carried by a moment. "
+    "Contribution of each load to a force: the load acts alone in the frame's equations, with "
+    "constant "
+    "pose, contact points and normals, direction of friction and lines of action. The "
+    "contributions "
+    "sum up to the force by equilibrium. A moment balances the flexion moment of a single muscle. "
     "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
 )
 
@@ -49,7 +51,7 @@ class MuscleFigureSettings:
     """Pictures of muscle activations."""
 
     axis_top: float = 1.02
-    """Upper end of the axis of activations; lines at 1 stay visible."""
+    """Upper end of the axis of activations. Chosen: lines at 1 stay visible."""
 
 
 MUSCLE_FIGURE = MuscleFigureSettings()
@@ -80,7 +82,7 @@ class Cell:
 
 
 def muscle_panels(results: "Results") -> tuple[Panel, ...]:
-    """Return the plots of what makes either condyle's force, and of the forces by group."""
+    """Return the plots of the contributions to each condyle's force, and of the forces by group."""
     panels = (
         *(_contributions(results, side) for side in CONTRIBUTIONS),
         _forces(results),
@@ -121,7 +123,7 @@ def _contributions(results: "Results", side: str) -> Panel:
             dashed = part in (EXTERNAL, LIGAMENTS, POST)
             label = labels.get(part, part)
             lines.append(Line(f"part-{k}", label, scale * values, shades[part], dashed))
-    panel = Panel(f"from_{side}", f"What makes the {side} force", "BW", tuple(lines))
+    panel = Panel(f"from_{side}", f"Contributions to the {side} force", "BW", tuple(lines))
     return panel if len(lines) > 1 else Panel(panel.name, panel.title, "BW", ())
 
 
@@ -214,7 +216,7 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
 
 
 def _beyond(results: "Results", cell: Cell) -> str:
-    """Return in words how far an envelope goes beyond the plot: above its normalising value."""
+    """Return in words how far an envelope exceeds the plot, above its normalising value."""
     if cell.envelope is None:
         return ""
     envelope = results[family_column(ENVELOPE, cell.envelope)]
@@ -234,7 +236,7 @@ def _agreement(results: "Results", cell: Cell) -> str:
 
 
 def reserve_words(summary: Mapping[str, Any]) -> str:
-    """Return in a sentence what no muscle carries; empty without reserves."""
+    """Return a sentence on the reserve moments; empty without reserves."""
     result: Mapping[str, Any] = summary.get("reserves") or {}
     if not result:
         return ""

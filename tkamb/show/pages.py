@@ -1,4 +1,4 @@
-"""Pages that stand by themselves: their templates, and the policy that holds foreign scripts off.
+"""Self-contained pages: their templates, and the security policy that blocks foreign scripts.
 
 The assets lie in the folder `assets` of the package that shows them. Text that is put into a
 template is escaped unless the template calls it safe.

@@ -1,4 +1,4 @@
-"""What the report draws: the plots of a run, their lines and what they mean."""
+"""The plots of the report: their lines and notes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -42,8 +42,8 @@ class PanelSettings:
     """When one curve of a plot hides another."""
 
     line_width_share: float = 0.005
-    """Of the curves' height: two that are nowhere farther apart are drawn over each other. A line
-    is 1.5 points wide in a plot of 220."""
+    """Of the curves' height: two that are nowhere farther apart are drawn over each other. Chosen:
+    a line is 1.5 points wide in a plot of 220."""
 
 
 PANEL = PanelSettings()
@@ -61,8 +61,8 @@ class Line:
         dashed: drawn dashed.
         band: (3, f) p05, p50 and p95 over samples with varied inputs, in the panel's unit; None:
             there are none.
-        wide_band: (2, f) p05 and p95 by the inputs and by what the model leaves out; None: unknown.
-        behind: drawn broad and pale behind the others: what they are held against.
+        wide_band: (2, f) p05 and p95 by the inputs and the model's discrepancy; None: unknown.
+        behind: drawn broad and pale behind the others, for comparison.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Panel:
         logarithmic: vertical axis.
         from_zero: the vertical axis holds zero.
         limits: of the vertical axis, where they are known beforehand.
-        warning: the note is something to look at.
+        warning: whether the note is highlighted as a warning.
     """
 
     name: str
@@ -238,8 +238,8 @@ def _sensitivity(results: "Results") -> Panel:
     name = "medial_force_per_adduction_N_per_deg"
     lines = (_line(results, name, "medial force", BLACK),)
     note = (
-        "Change of the medial force by deformation with the adduction, at constant load. "
-        "Fluoroscopy knows the adduction to about 0.5 deg."
+        "Change of the medial force by deformation per degree of adduction, at constant load. "
+        "The error of the adduction from fluoroscopy is about 0.5 deg."
     )
     return Panel("sensitivity", "Sensitivity of the split to adduction", "N/deg", lines, note)
 
@@ -275,7 +275,7 @@ def _areas(results: "Results") -> Panel:
 
 
 def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) -> Panel:
-    """Return the panel with what its contact model is known to be off by."""
+    """Return the panel with the known error of its contact model."""
     error = results.summary.get("known_error")
     if error is None:
         return panel
@@ -318,7 +318,7 @@ def _post(results: "Results") -> Panel:
         _line(results, "post_force_si_N", "inferior", SUPERIOR, scale=scale),
         _line(results, "post_force_ml_N", right, RIGHT, scale=scale),
     )
-    note = "On the insert, without friction; the contact force holds it."
+    note = "On the insert, without friction; it is part of the contact force."
     return Panel("post", "Force of the cam on the post", "BW", lines, note)
 
 
@@ -381,7 +381,7 @@ def _residuals(results: "Results") -> Panel:
             ),
         )
     note = (
-        "Forces that balance needs beyond the modelled loads; an exact model has none. "
+        "Forces that equilibrium needs beyond the modelled loads; an exact model has none. "
         "Dashed: change of the total contact force when they act 10 mm higher or lower."
     )
     return Panel("residuals", "Residual forces", "% of the SI contact force", lines, note)
@@ -403,7 +403,7 @@ def _hip_force(results: "Results") -> Panel:
 
 def _hip_moment(results: "Results") -> Panel:
     lines = _components(results, "hip_moment", "Nm")
-    note = "About the axes named; what muscles across the hip do is in it."
+    note = "About the named axes, including the effect of muscles across the hip."
     return Panel("hip_moment", "Intersegmental moment on the femur at the hip", "N·m", lines, note)
 
 
@@ -420,8 +420,8 @@ def _motion(results: "Results") -> Panel:
 
 def _slip(results: "Results") -> Panel:
     note = (
-        "By arcs, without the part that axial rotation alone would do: condyles of one radius "
-        "slip alike."
+        "From arc lengths, without the part that is due to axial rotation alone; condyles of equal "
+        "radius then slip alike."
     )
     return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"), note)
 
@@ -439,12 +439,12 @@ def _adjustment_effect(results: "Results") -> Panel:
         _line(results, "adjust_force_change_BW", "total force, BW", BLACK),
         _line(results, "adjust_share_change", "medial share (by equilibrium)", GREY, True),
     )
-    note = "Adjusted less recorded pose. Frames whose total changes by over 0.01 BW are flagged."
-    return Panel("adjustment_effect", "What the adjustment changes", "BW or share", lines, note)
+    note = "Adjusted minus recorded pose. Frames whose total changes by over 0.01 BW are flagged."
+    return Panel("adjustment_effect", "Effect of the adjustment", "BW or share", lines, note)
 
 
 def _condition(results: "Results") -> Panel:
     lines = (_line(results, "condition_number", "condition number", BLACK),)
-    note = "How much an input error may grow in the solution (scaled columns)."
+    note = "Largest factor by which an input error may grow in the solution (scaled columns)."
     title = "Condition number of the equilibrium"
     return Panel("condition", title, "–", lines, note, logarithmic=True, from_zero=False)

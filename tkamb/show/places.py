@@ -1,4 +1,5 @@
-"""Where plots stand in their figures: what their labels need is known, no layout looks for it."""
+"""Places of plots in their figures, from the known sizes of their labels, without a layout
+engine."""
 
 from dataclasses import dataclass
 
@@ -13,18 +14,18 @@ class LabelPlaceSettings:
     """Room around the labels of a figure."""
 
     edge_points: float = 3.0
-    """Points around all labels of a figure."""
+    """Points around all labels of a figure. Chosen by looks."""
     tick_points: float = 6.5
-    """Points that ticks with their gap take."""
+    """Points that ticks with their gap take. Chosen by looks."""
     tick_label_points: float = 9.0
-    """Points, size of letters."""
+    """Points: size of letters. Chosen by looks."""
 
 
 LABEL_PLACE = LabelPlaceSettings()
 
 
 def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> None:
-    """Put axes at a place in their figure (points), whose layout engine then rests."""
+    """Put axes at a place in their figure (points); its layout engine is not used."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     figure.set_layout_engine("none")
@@ -33,7 +34,7 @@ def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> 
 
 
 def leave_unmeasured(axis: Axis) -> None:
-    """Have an axis draw its labels without looking first how far they reach."""
+    """Have an axis draw its labels without measuring them first."""
     for tick in axis.get_major_ticks(len(axis.get_majorticklocs())):
         tick.label1.set_in_layout(False)
         tick.label2.set_in_layout(False)

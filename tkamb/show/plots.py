@@ -48,13 +48,13 @@ class PlotSettings:
     """Looks of the report's plots."""
 
     label_offset_points: float = 12.0
-    """Points from a plot's edge to the near side of an axis' label."""
+    """Points from a plot's edge to the near side of an axis' label. Chosen by looks."""
     side_gap: float = 0.01
-    """Of the width, between the axes and what is written beside them."""
+    """1: share of the width between the axes and what is written beside them. Chosen by looks."""
     band_opacity: float = 0.16
-    """Opacity of the band around a line, 0 to 1."""
+    """1: opacity of the band around a line, 0 to 1. Chosen by looks."""
     wide_band_opacity: float = 0.07
-    """Opacity of the band that what the model leaves out adds, 0 to 1."""
+    """1: opacity of the band that includes the model's discrepancy, 0 to 1. Chosen by looks."""
 
 
 PLOT = PlotSettings()
@@ -69,8 +69,8 @@ STANCE = "#eef3f7"
 class Sheet:
     """A figure on which the plots of a run are drawn one after the other.
 
-    Axes and ticks are most of what a plot takes to make: they stay, all that is drawn goes. A plot
-    that `_place_alone` has no place for has a figure of its own.
+    Axes and ticks take most of the time of a plot, so they are reused and only the curves are
+    replaced. A plot that `_place_alone` cannot place has a figure of its own.
 
     Args:
         results: of the run.
@@ -85,7 +85,7 @@ class Sheet:
     def draw(self, panel: Panel) -> Figure:
         """Return one plot with its flagged and failed frames marked along the bottom.
 
-        Each curve's id in the picture is its line's name. It stands until the next is drawn.
+        Each curve's id in the picture is its line's name. The figure is valid until the next plot.
         """
         with settings():
             self._clear()
@@ -156,9 +156,8 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
 def _place_alone(axes: Axes, panel: Panel) -> bool:
     """Give a plot that stands alone the room that its labels need; say whether that was possible.
 
-    The places are those that matplotlib's constrained layout finds, which looks at everything
-    four times; it still has to place what is not simple: a factor over a vertical axis, a legend
-    that is too wide.
+    The places are those of matplotlib's constrained layout, which is slow. That layout is still
+    used for plots with a factor over a vertical axis or with a legend that is too wide.
     """
     for second in axes.child_axes:
         second.apply_aspect()  # takes its range from the first

@@ -37,17 +37,19 @@ class PressurePictureSettings:
     """Looks of the pressure maps."""
 
     margin_mm: float = 2.0
-    """Around the insert in a picture."""
+    """mm: margin around the insert in a picture. Chosen by looks."""
     step_mm: float = 0.3
-    """Between the points of the grid that pressures are drawn on."""
+    """mm: distance of the points of the grid that pressures are drawn on. Chosen: no steps are
+    seen."""
     rim_share: float = 0.03
-    """Share of the scale over which a flat map fades at its rim; elsewhere it fades from
-one point of the grid to the next, so that no steps are seen there."""
+    """1: share of the scale over which a flat map fades at its rim; elsewhere it fades from one
+    point of the grid to the next. Chosen: no steps are seen."""
     outline_margin: int = 8
-    """Points of the grid around it on which the insert's smooth outline may lie."""
+    """Number of grid points around the insert on which its smooth outline may lie. Chosen:
+    smoothing moves it by less."""
     outline_width: float = 0.7
-    """Of the map's edge length: standard deviation of the average that smooths the outline. Half
-    an edge leaves the steps visible, a whole one rounds the notch."""
+    """Of the map's edge length: standard deviation of the average that smooths the outline. Chosen:
+    half an edge leaves the steps visible, a whole one rounds the notch."""
 
 
 PRESSURE_PICTURE = PressurePictureSettings()
@@ -218,7 +220,7 @@ def draw_map(
 def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list[Axes], Axes]:
     """Return axes for maps, row by row, and for their colour bar, `gap` points beside them.
 
-    What stands around maps is known, so that no layout need look for it.
+    The sizes of the labels around maps are known, so that no layout engine is needed.
     """
     figure.set_layout_engine("none")
     width, height = 72 * figure.get_size_inches()
@@ -374,7 +376,7 @@ def _label_stops(
 
 
 def _spread(heights: Array, step: float) -> Array:
-    """Return rising heights moved apart to at least a step, about where they were."""
+    """Return rising heights moved apart to at least a step, near their original places."""
     count = np.arange(len(heights))
     pressed = np.maximum.accumulate(heights - step * count) + step * count
     return pressed - 0.5 * float(np.mean(pressed - heights))

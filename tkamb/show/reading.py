@@ -1,4 +1,4 @@
-"""What a reader may conclude from a run, and what not: in words, on the report's first screen."""
+"""Conclusions that a run supports, and those that it does not: on the report's first screen."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -19,14 +19,14 @@ ALWAYS_NOT = (
 
 
 def conclusions(results: "Results") -> tuple[list[str], list[str]]:
-    """Return what the run's numbers bear and what they do not, a sentence each."""
+    """Return the conclusions that the run supports and those that it does not, a sentence each."""
     sentences = (_force(results), _split(results), _pressure(results), _certainty(results))
     bears = [words for good, _ in sentences for words in good]
     bears_not = [words for _, bad in sentences for words in bad]
     questions = len(results.summary.get("questions") or [])
     if questions:
         many = "questions above are" if questions > 1 else "question above is"
-        bears_not.insert(0, f"Anything, before the {many} answered.")
+        bears_not.insert(0, f"Any conclusion, before the {many} answered.")
     return bears, [*bears_not, ALWAYS_NOT]
 
 
@@ -34,22 +34,26 @@ def _force(results: "Results") -> tuple[list[str], list[str]]:
     if not np.isfinite(results["force_total_N"]).any():
         return [], ["The contact force: it is not modelled here, or every frame failed."]
     failures = metrics.failed(results)
-    bad = [f"What happened in {_frames(failures)}: no numbers there."] if failures.any() else []
+    bad = [f"Results in {_frames(failures)}, which failed."] if failures.any() else []
     measured = _compared(results)
     if measured:
         parts = [f"{name} {one['rmse_BW']:.2f} BW" for name, one in measured.items()]
         worse = [name for name, one in measured.items() if (one["r_squared"] or 0.0) < 0.0]
-        bad += [f"The course of the {name} force: its mean would be nearer." for name in worse]
+        bad += [
+            f"The course of the {name} force: its constant mean would fit the measurement better."
+            for name in worse
+        ]
         return [
-            f"The forces of this trial, off from those measured by {', '.join(parts)} (rms)."
+            f"The forces of this trial, with an error of {', '.join(parts)} (rms) against the "
+            f"measurement."
         ], bad
     if results.summary.get("muscle_groups"):
-        bad.append("How far the muscles truly shared the load: nothing was measured against.")
+        bad.append("How the muscles really shared the load: nothing was measured for comparison.")
         return ["The total force if the muscles share the joint moments as the scene says."], bad
-    bad.append("What hamstrings and gastrocnemius add: only the quadriceps pulls here.")
+    bad.append("The effect of hamstrings and gastrocnemius: only the quadriceps is modelled.")
     return [
-        "The force that this motion needs at least, by the quadriceps alone: muscles that pull "
-        "against each other raise it."
+        "The least force that this motion needs, with the quadriceps alone: co-contraction of "
+        "other muscles raises it."
     ], bad
 
 
@@ -69,13 +73,16 @@ def _split(results: "Results") -> tuple[list[str], list[str]]:
     bad = []
     if unknown.any():
         bad = [
-            f"The split by deformation in {_frames(unknown)}: half a degree of adduction moves it."
+            f"The split by deformation in {_frames(unknown)}: half a degree of adduction changes "
+            f"it."
         ]
     if apart.any():
-        bad.append(f"The split in {_frames(apart)}: balance and deformation contradict each other.")
+        bad.append(
+            f"The split in {_frames(apart)}: the estimates by equilibrium and deformation differ."
+        )
     if apart.all():
         return [], bad
-    how = ", by balance of moments" if unknown.any() else ", as far as the knee's pose is right"
+    how = ", by equilibrium of moments" if unknown.any() else ", as far as the knee's pose is right"
     return [f"Which condyle carries more{' elsewhere' if apart.any() else ''}{how}."], bad
 
 
@@ -84,20 +91,20 @@ def _pressure(results: "Results") -> tuple[list[str], list[str]]:
     if error is None:
         return [], ["Pressures and areas: contact is not modelled."]
     bears = [
-        "Whether another design, pose or setting, computed the same way, presses more or less."
+        "Whether another design, pose or setting, computed in the same way, has higher pressure."
     ]
     if isinstance(error, str):
-        return bears, [f"Pressures and areas as numbers: how far they are off is {error}."]
+        return bears, [f"Pressures and areas as absolute values: their error is {error}."]
     words = f"{known_error_words(error, PRESSURE_AND_AREA)} by the contact model alone"
     if is_large(error, PRESSURE_AND_AREA):
-        return bears, [f"Pressures and areas as numbers: {words}."]
+        return bears, [f"Pressures and areas as absolute values: {words}."]
     return [f"Pressures and areas of unworn surfaces, {words}.", *bears], []
 
 
 def _certainty(results: "Results") -> tuple[list[str], list[str]]:
     if results.summary.get("uncertainty"):
-        return ["How much the varied inputs matter: the shaded bands."], []
-    return [], ["How sure any of it is: no input was varied (tkamb uncertainty does)."]
+        return ["The effect of the varied inputs: the shaded bands."], []
+    return [], ["The uncertainty of these results: no input was varied (use tkamb uncertainty)."]
 
 
 def _frames(chosen: Mask) -> str:

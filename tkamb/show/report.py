@@ -1,7 +1,7 @@
-"""The report: one page that stands by itself, for a biomechanist to read in a minute.
+"""The report: one self-contained page, for a biomechanist to read in a minute.
 
-Its frame slider moves one cursor in every plot; the numbers of the frames stand in the page as
-JSON, rounded to five digits. Without scripts, and on paper, the page reads as before.
+Its frame slider moves one cursor in every plot; the numbers of the frames are in the page as JSON,
+rounded to five digits. Without scripts, and on paper, the page can be read without the cursor.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -44,8 +44,8 @@ SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
 COLOURS = (
     "Lines run in time order. In every plot blue is medial, red lateral, black the total; violet "
     "is superior–inferior, teal anterior–posterior, olive medial–lateral, and moments and "
-    "rotations have the colour of the axis they turn about. Ligaments and muscles are told apart "
-    "within one plot."
+    "rotations have the colour of the axis they turn about. Colours of ligaments and muscles "
+    "differ within one plot."
 )
 PROVENANCE = (
     "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
@@ -177,12 +177,12 @@ def _plot(panel: Panel, sheet: Sheet) -> dict[str, Any]:
 
 
 def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
-    """Return what the marks in the plots mean."""
+    """Return the meaning of the marks in the plots."""
     sentences = [COLOURS]
     if results.bands:
         sentences.append(
             "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
-            "full lines: the scene as it stands."
+            "full lines: the inputs as given."
         )
     if axis.stances:
         words = "Shaded blue-grey: stance, the foot on its force plate"
@@ -191,8 +191,8 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
         sentences.append(f"{words}.")
     if results.band_with_discrepancy("force_total_N") is not None:
         sentences.append(
-            "Paler and wider: 5 to 95 % by the varied inputs and by what the model leaves out, as "
-            "far as comparisons with measured knees say."
+            "Paler and wider: 5 to 95 % by the varied inputs and by the model's discrepancy, as "
+            "estimated from measured knees."
         )
     if flagged(results).any():
         sentences.append("Orange ticks at the bottom: frames to be read with care.")
@@ -202,7 +202,7 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return what a reader must know, one sentence each, without repeats."""
+    """Return the notes for the reader, one sentence each, without repeats."""
     result: list[str] = []
     for key in ("residuals", "notes", "assumptions"):
         value = summary.get(key) or []
@@ -214,7 +214,7 @@ def _sentences(summary: dict[str, Any]) -> list[str]:
 
 
 def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return where the run came from: name and text."""
+    """Return the provenance of the run: name and text."""
     return [
         (key.replace("_", " ").replace("sha256", "SHA-256"), _text(summary[key]))
         for key in PROVENANCE

@@ -11,7 +11,7 @@ COLOURS = {"converged": BLUE, "flagged": ORANGE}
 
 
 def picture(verdicts: Sequence[Verdict]) -> Figure:
-    """Return one dot per case: what was driven out against the distance from the reference."""
+    """Return one dot per case: its extreme parameter against the distance from the reference."""
     groups = list(dict.fromkeys(_group(v) for v in verdicts))
     with settings():
         figure = new_figure(8.0, 1.6 + 0.2 * len(groups))
@@ -46,7 +46,7 @@ def _distance(verdict: Verdict) -> float:
 
 
 def _group(verdict: Verdict) -> str:
-    """Return the quantities that were driven out, or the run's kind."""
+    """Return the extreme parameters, or the run's kind."""
     if verdict.contact == "run":
         return " ".join(verdict.case.split()[:2])
     if verdict.contact != "lattice":

@@ -1,4 +1,4 @@
-"""OpenSim's files, written: `.sto` and `.mot` tables, `.trc` markers."""
+"""Writes OpenSim's files: `.sto` and `.mot` tables, `.trc` markers."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,7 +24,7 @@ def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) ->
     Args:
         path: the file.
         columns: name -> (n,) values, "time" (s) first.
-        in_degrees: what the header says of the angles.
+        in_degrees: whether the header states degrees.
 
     Raises:
         InputError: no time, unequal lengths, a blank in a name, or no place to write.
@@ -70,7 +70,9 @@ def write_results_storage(results: "Results", path: Path) -> str:
     if path.suffix.lower() not in STORAGE:
         raise InputError(f"is none of {', '.join(STORAGE)}", path, "name a file that ends so")
     if path.exists():
-        raise InputError("is there already", path, "give a new file: nothing of yours is replaced")
+        raise InputError(
+            "exists already", path, "give a new file: tkamb does not replace your files"
+        )
     numbers = {name: v for name, v in results.columns.items() if KINDS.get(name) != "text"}
     time = numbers.pop("time_s")
     if not (np.diff(time) > 0).all():

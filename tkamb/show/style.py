@@ -44,7 +44,7 @@ SETTINGS: Any = {
     "font.size": 9,
     "axes.labelsize": 9,
     "axes.titlesize": 9,
-    "axes.titley": 1.0,  # where they stand anyhow; sought, it costs a twentieth of a report
+    "axes.titley": 1.0,  # fixed, because searching the place takes 5 % of a report's time
     "axes.edgecolor": "#8a8a8a",
     "axes.linewidth": 0.8,
     "axes.spines.top": False,

@@ -1,4 +1,4 @@
-"""Figures written as SVG for a page: what they have in common is found once."""
+"""Figures written as SVG for a page; sizes of texts are computed once for all figures."""
 
 import base64
 import io
@@ -18,7 +18,7 @@ from PIL import Image
 
 
 class Renderer(RendererSVG):
-    """Draws as matplotlib's own does, but measures a text once for all figures.
+    """Draws like matplotlib's own renderer, but measures each text once for all figures.
 
     Pictures given point by point (`interpolation="none"`) are smoothed by whoever shows them and
     stand once in a figure, however often they are drawn; they are not clipped.
@@ -53,7 +53,7 @@ class Renderer(RendererSVG):
         self.writer.element("use", href=f"#{name}", transform=f"matrix({matrix})")
 
     def _get_font_height_metrics(self, prop: FontProperties) -> tuple[float, float, float]:
-        """Return what matplotlib asks for since 3.11: ascent, descent and line gap, points."""
+        """Return ascent, descent and line gap, points, which matplotlib needs since 3.11."""
         return _letter_heights(prop.copy())
 
     def get_text_width_height_descent(

@@ -50,7 +50,7 @@ def motion_table(results: "Results", axis: HorizontalAxis) -> Table:
 
 
 def strain_table(summary: Mapping[str, Any]) -> Table | None:
-    """Return the ligaments' strains in per cent, so that a wrong insertion is seen."""
+    """Return the ligaments' strains in per cent, which reveal a wrong insertion."""
     result = summary.get("ligament_strain")
     if not result:
         return None
@@ -64,7 +64,7 @@ def strain_table(summary: Mapping[str, Any]) -> Table | None:
 
 
 def flag_rows(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str, str, str]]:
-    """Return what is not ok: why, in how many frames, in which, and where they lie."""
+    """Return the statuses other than "ok": reason, number of frames, frames, and their places."""
     return [
         (reason, str(len(frames)), _stretches(frames), _positions(frames, axis))
         for reason, frames in reasons(results.status).items()

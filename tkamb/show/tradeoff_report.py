@@ -1,4 +1,4 @@
-"""The trade-off for a reader: table, picture, the fastest model for an error, comparisons."""
+"""Report of the trade-off: table, picture, fastest model for an error, comparisons."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,9 +22,10 @@ class TradeoffPictureSettings:
     """Looks of the trade-off's picture."""
 
     unlabelled_mm: float = 2.0
-    """The cell size at which most points lie."""
+    """mm: cell size that is not written beside its point. Chosen: most points have it."""
     short_axis_ratio: float = 30.0
-    """Largest over smallest value up to which a logarithmic axis has numbers within its decades."""
+    """Largest over smallest value up to which a logarithmic axis has numbers within its decades.
+    Chosen: with more decades, those alone have numbers."""
 
 
 TRADEOFF_PICTURE = TradeoffPictureSettings()
@@ -219,7 +220,7 @@ def _fastest(settings: dict[Setting, list[Row]], key: str, limit: float) -> str:
         best = min(within, key=lambda setting: times[setting])
         return f"the fastest is {_named(best)} ({milliseconds(times[best])} ms warm)"
     if not worst:
-        return "nothing can be said: no setting was tried on all bodies"
+        return "no recommendation: no setting was measured on all bodies"
     nearest = min(worst, key=lambda setting: worst[setting])
     return f"no setting: the nearest is {_named(nearest)} with {100 * worst[nearest]:.2g} %"
 
@@ -296,4 +297,4 @@ def _apart(own: Row, peer: Row) -> str:
         "condyle force": max(abs(a[f"{s}_force"] - b[f"{s}_force"]) for s in SIDES) / load,
     }
     text = ", ".join(f"{100 * share:.2g} % in {name}" for name, share in shares.items())
-    return f"the lattice is off it by {text}"
+    return f"the lattice differs from it by {text}"

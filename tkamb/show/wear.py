@@ -1,4 +1,4 @@
-"""The report's section on wear: what `tkamb wear` wrote into the folder of a run."""
+"""The report's section on wear, from the files of `tkamb wear` in the folder of a run."""
 
 import base64
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class WearPageSettings:
     """The wear page."""
 
     max_bytes: float = 64 * MEGABYTE
-    """Bytes of a file of results; those of 10,000 updates have 10 MB."""
+    """Bytes of a file of results. Chosen: those of 10,000 updates have 10 MB."""
 
 
 WEAR_PAGE = WearPageSettings()
@@ -35,11 +35,11 @@ ROWS = (
     ("creep depth, mm", "creep_depth_mm"),
     ("creep volume, mm³", "creep_volume_mm3"),
 )
-"""What is shown, and its key."""
+"""Label of a number, and its key."""
 FIRST_RATE = "first_volume_mm3_per_Mc"
 OTHER = (
-    "The wear.json in this folder is of another scene, other frames or other meshes, or of a tkamb "
-    "that did not say which: it is not shown."
+    "The wear.json in this folder belongs to another scene, other frames or other meshes, or does "
+    "not state them; it is not shown."
 )
 
 
@@ -113,7 +113,7 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
 
 
 def _legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
-    """Return in words what was simulated, and what of it varied."""
+    """Return in words the simulation, and its varied inputs."""
     words = (
         f"Law {wear['law']}, material {wear['material']}, {wear['control']} control, contact "
         f"{wear['contact']} at {wear['resolution_mm']:g} mm, {wear['blocks']} blocks of cycles; "

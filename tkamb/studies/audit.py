@@ -1,15 +1,15 @@
-"""What every answer must obey, whatever model gave it; found from the answer alone.
+"""Checks that every contact result must pass, whatever its model; they need only the result.
 
 - The nodal forces carry the load.
-- The pressures, over the areas that they stand on, carry it too.
-- Nothing pulls, and nothing that is solved for passes through the femoral component.
-- What the condyles are said to carry is what the map under them carries.
+- The pressures, times their areas, carry it too.
+- No pressure is negative, and no solved node lies inside the femoral component.
+- The forces of the condyles are the sums over the map under them.
 
-Beside that stand CalculiX's answers to some extremes, stored; `scripts/make_stability_answers`
-makes them. CalculiX (C3D8I) solves the same hexahedra, so that cells as coarse as those of the
-quick study do. Where contact is a few cells wide the two differ by what their elements differ; the
-bounds are the largest of those distances as measured, rounded up.
-"""
+Some extremes are also compared with stored results of CalculiX, which
+`scripts/make_stability_answers` makes. CalculiX (C3D8I) solves the same hexahedra, so that the
+coarse cells of the quick study suffice. Where contact is a few cells wide, the two programs differ
+because their elements differ. The bounds are the largest differences that were measured, rounded
+up."""
 
 import json
 import math
@@ -29,13 +29,14 @@ from tkamb.studies.quantities import Quantities, errors, quantities
 
 @dataclass(frozen=True)
 class AuditSettings:
-    """What an answer must fulfil whatever its reference."""
+    """Tolerances of the checks that need no reference."""
 
     force_tolerance: float = 0.005
-    """Relative: forces, pressures and condyles against the load."""
+    """Relative: forces, pressures and condyles against the load. Chosen: a few times the solver's
+    tolerance."""
     penetration_tolerance: float = 5e-3
-    """Of the approach: how far a node may be inside the femoral component, a few times the solver's
-tolerance."""
+    """1: largest depth of a node inside the femoral component, as a share of the approach. Chosen:
+    a few times the solver's tolerance."""
 
 
 AUDIT = AuditSettings()
@@ -47,10 +48,10 @@ PEER_MODELS = ("lattice", "lattice-linear", "fe")
 
 
 def complaints(result: ContactResult, load: float, solved: bool, source_rule: bool) -> list[str]:
-    """Return in words what an answer does not obey.
+    """Return in words which checks a result fails.
 
     Args:
-        result: that calls itself ok.
+        result: a result with status ok.
         load: N, along -y.
         solved: the gaps are those of deformed nodes; else penetration is the model's measure.
         source_rule: pressure is the force along the insert's normal over an even area; else
@@ -106,10 +107,10 @@ def stored_answers(path: Path = PEER_ANSWERS) -> Mapping[str, tuple[str, Quantit
 
 
 def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
-    """Return the relative distances from CalculiX; nothing where it was not asked.
+    """Return the relative distances from CalculiX's stored result; empty if there is none.
 
     Raises:
-        InputError: the case has changed since it was asked.
+        InputError: the case has changed since that result was computed.
     """
     if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
         return {}

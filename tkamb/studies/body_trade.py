@@ -1,8 +1,9 @@
-"""The body's own trade: what coupling, filtering, frame rate, patella and wrapping cost and change.
+"""Trade-off of the body side: cost and effect of coupling, filter, frame rate, patella and
+wrapping.
 
 The shipped knee bend is run with one thing changed at a time, against the run as shipped, on
-the same instants. Fewer frames per second are fewer rows of the recordings themselves: motion,
-shank and ground reaction, so that derivatives come from what is left.
+the same instants. A lower frame rate removes rows of the recordings themselves (motion, shank and
+ground reaction), so that derivatives come from the remaining rows.
 """
 
 import json
@@ -34,7 +35,7 @@ class BodyTradeSettings:
     recorded_frames: int = 101
     """Frames of the shipped motion."""
     stride: int = 10
-    """Every so many of the recorded frames are compared: those that all frame rates have."""
+    """Every tenth recorded frame is compared: all frame rates have these."""
 
 
 BODY_TRADE = BodyTradeSettings()
@@ -42,11 +43,11 @@ BODY_TRADE = BodyTradeSettings()
 
 @dataclass(frozen=True)
 class Change:
-    """One thing done otherwise than shipped.
+    """One change of the shipped scene.
 
     Args:
         keys: of the scene, overridden.
-        every: only every so many recorded frames are there.
+        every: step between the recorded frames that are kept.
     """
 
     keys: dict[str, Any] = field(default_factory=dict)
@@ -84,11 +85,11 @@ CLOCKS = ("query_seconds", "body_seconds", "contact_seconds")
 
 @dataclass(frozen=True)
 class BodyRow:
-    """What one change costs and changes.
+    """Cost and effect of one change.
 
     Args:
         name: of the change.
-        status: "ok", or why there is nothing.
+        status: "ok", or why there is no result.
         prepare_seconds: of the whole run outside the frames.
         frame_seconds: per frame, median.
         changed: column, "peak_force", or derivative of flexion -> largest change over the
@@ -204,4 +205,4 @@ def read_body_rows(path: Path) -> list[BodyRow]:
     try:
         return [BodyRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
     except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"is no table of a body's trade ({error})", path) from None
+        raise InputError(f"is not a table of the body's trade-off ({error})", path) from None

@@ -1,4 +1,4 @@
-"""CalculiX as a process: one thread, a limit of time, its own peak memory, what it prints."""
+"""CalculiX as a process: one thread, a time limit, its peak memory and its output."""
 
 import math
 import os
@@ -26,9 +26,11 @@ class CalculixSettings:
     """How long CalculiX may take."""
 
     longest_seconds: float = 600.0
-    """A run that takes longer is stopped and says so."""
+    """s: a run that takes longer is stopped and says so. Chosen: most runs take less than a
+    minute."""
     poll_seconds: float = 0.05
-    """Between two looks at the process's memory."""
+    """s: interval at which the memory of the process is read. Chosen: short beside a run, and
+    cheap."""
 
 
 CALCULIX = CalculixSettings()
@@ -38,7 +40,7 @@ OUTPUT_FILE = "output"
 
 @dataclass(frozen=True, eq=False)
 class PeerRun:
-    """What one run of CalculiX gave and took.
+    """Results and cost of one run of CalculiX.
 
     Args:
         blocks: the last block of numbers of each kind in its .dat file, by the first word.
@@ -116,7 +118,7 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
 
 
 def _last_words(path: Path) -> str:
-    """Return the line that says what went wrong, or the last one."""
+    """Return the line with the error, or the last one."""
     lines = [line.strip(" *") for line in path.read_text(errors="replace").splitlines()]
     lines = [line for line in lines if line]
     wrong = [line for line in lines if line.lower().startswith("error")]

@@ -1,4 +1,4 @@
-"""What the studies are made on: two bodies, a pose and a load; the shipped knee bend, changed."""
+"""The cases of the studies: two bodies, a pose and a load; changes of the shipped knee bend."""
 
 import csv
 import hashlib
@@ -24,7 +24,7 @@ KNEE_CASES = Path(__file__).with_name("knee_cases.json")
 RECORDINGS = ("motion.csv", "tibia.csv", "ground_reaction.csv")
 """Of the shipped knee bend."""
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
-"""Of the shipped knee, and of a user's scene where it gets there."""
+"""deg: flexions of the cases of the shipped knee, and of a user's scene if it reaches them."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class StudyCase:
 def content_hash(pair: ContactPair, arrays: Sequence[Array], words: tuple[Any, ...]) -> str:
     """Return the SHA-256 of two bodies, further arrays, and words as they are printed.
 
-    To 1e-12, and without the sign of a zero: another way to the same numbers is no other case.
-    """
+    Numbers are rounded to 1e-12 and zeros have no sign, so that rounding does not make another
+    case."""
     digest = hashlib.sha256()
     meshes = [a for body in (pair.femoral, pair.insert) for a in (body.vertices, body.faces)]
     for array in (*meshes, *arrays):
@@ -140,8 +140,8 @@ _ANALYTIC = {"sphere": _sphere, **dict.fromkeys(BICONDYLAR, _two_condyles)}
 def _shipped(name: str) -> StudyCase:
     """Return a case of the shipped knee's meshes at a stored pose and load.
 
-    They are what the knee bend had when its references were computed; they stay when its
-    motion or muscles are changed.
+    Pose and load are those of the knee bend when its references were computed. They are kept when
+    its motion or muscles change.
     """
     from tkamb.geometry.flat_bottom import insert_placement
     from tkamb.io.recordings.meshes import load_surface

@@ -1,6 +1,6 @@
-"""Contacts with a solution in closed form, on which every family of models is judged.
+"""Contacts with a closed-form solution, on which every family of models is tested.
 
-Nothing here calls the models' own physics: the formulas are written out once more.
+The formulas are written out here and do not use the models' code.
 
 - plate: a rigid flat plate on a block of height h and area A whose nu is 0. Stress is F/A
   everywhere, the approach is h eps(F/A), with the material's curve eps(sigma) = sigma/E +
@@ -9,8 +9,8 @@ Nothing here calls the models' own physics: the formulas are written out once mo
   the column, p = sigma(-ln(1 - d/h)), here d = h (1 - exp(-eps)).
 - slide: the same on a mobile bearing, any nu and strain. Two nodes of its bottom are held
   against rigid motion, also from each other: that makes it stiffer by up to 2 %.
-- kept: the same with prepared operators kept on disk, after another modulus was kept there: each
-  has its own.
+- kept: the same with the operator cache on disk, after an operator of another modulus was stored
+  there. Each modulus must have its own.
 - layer: a rigid sphere on a layer bonded to a rigid base (`elastic_layer`), linear.
 - bed: the sphere on a bed of springs, F = 2 pi R h int_0^(d/h) p(e) de (paraboloid).
 - hertz: the sphere on a half-space, a³ = 3 F R / (4 E*), d = a²/R, p0 = 3 F / (2 pi a²).
@@ -50,13 +50,14 @@ class ClosedFormSettings:
     """Bodies with an analytic solution."""
 
     block_side_mm: float = 24.0
-    """Of the block under the plate: divides by the cells of 2 and 3 mm."""
+    """mm: side of the block under the plate. Chosen: cells of 2 and 3 mm divide it."""
     kept_grid_mm: float = 0.9
-    """Cells small enough that the operator of the block is worth a file."""
+    """mm: cell size of the block whose operator is stored in a file. Chosen: the operator is large
+    enough to be stored."""
     sharma_approach_ratio: float = 0.6808
     """Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
-0.35 whatever the material, and they are too stiff at free sides. A number of its own, kept so
-that a change is seen."""
+0.35 whatever the material, and they are too stiff at free sides. The number is measured, and
+stored so that a change is noticed."""
 
 
 CLOSED_FORM = ClosedFormSettings()
@@ -69,8 +70,8 @@ TOLERANCES: dict[str, tuple[float, float]] = {
     "bed": (0.01, 0.06),
     "hertz": (0.01, 0.01),
 }
-"""Largest relative distances of approach and pressure: for plates a few times the solver's
-tolerance, else what the cells leave, measured and half as much again."""
+"""Largest relative distances of approach and pressure. For plates: a few times the solver's
+tolerance. For others: 1.5 times the measured error of the cells."""
 
 
 @dataclass(frozen=True)

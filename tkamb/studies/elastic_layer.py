@@ -22,9 +22,11 @@ class ElasticLayerSettings:
     """The numerical solution of a layer under a sphere."""
 
     rings: int = 160
-    """Rings of constant pressure under the sphere."""
+    """Rings of constant pressure under the sphere. Chosen: twice as many change the result by less
+    than is compared."""
     half_space_wave_number: float = 60.0
-    """Wave number times thickness beyond which the layer is a half space."""
+    """Wave number times thickness beyond which the layer is a half space. Chosen: the difference is
+    below rounding."""
 
 
 ELASTIC_LAYER = ElasticLayerSettings()

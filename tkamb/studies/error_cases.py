@@ -1,9 +1,9 @@
 """Pairs of bodies on which the contact models' errors are measured, by situation.
 
-Three situations differ in what limits a map: contact in the interior of a smooth surface, on a
-flank (its normal far from the vertical) and at an edge (the outline of the insert, a rim with a
-fillet, a femoral part with an edge). Every second pair of each situation is held out: it judges
-the errors that the other half states, and takes no part in them.
+There are three situations with different errors of a map: contact in the interior of a smooth
+surface, on a flank (its normal far from the vertical) and at an edge (the outline of the insert, a
+rim with a fillet, a femoral part with an edge). Every second pair of each situation is held out:
+it tests the errors that the other half states and does not enter them.
 """
 
 from collections.abc import Iterator
@@ -28,10 +28,11 @@ class ErrorCaseSettings:
     """The cases from which known errors are measured."""
 
     insert_mm: float = 16.0
-    """mm; edge of the inserts. Small enough for fine cells, wide enough that contact ends
+    """mm; edge of the inserts. Chosen: small enough for fine cells, wide enough that contact ends
     inside."""
     vertex_spacing_mm: float = 0.25
-    """mm; distance between the vertices of the surfaces."""
+    """mm; distance between the vertices of the surfaces. Chosen: facets then change no pressure
+    noticeably."""
 
 
 ERROR_CASE = ErrorCaseSettings()
@@ -39,12 +40,12 @@ ERROR_CASE = ErrorCaseSettings()
 
 @dataclass(frozen=True, eq=False)
 class ErrorCase:
-    """A pair of bodies, where they meet and the load.
+    """A pair of bodies, the place of their contact, and the load.
 
     Args:
         name: of the case.
         situation: where the contact lies.
-        held_out: whether it judges the stated errors; else they are made from it.
+        held_out: whether it tests the stated errors; if not, it is used to compute them.
         femoral: height (m) of the femoral component's underside over its lowest point.
         insert: height (m) of the insert's top.
         load: N.

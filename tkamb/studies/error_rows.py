@@ -1,7 +1,7 @@
 """Errors of the contact models on the pairs of `tkamb.studies.error_cases`.
 
 The reference of a pair is the B-bar finite elements at cells of
-`ERROR_REFERENCE.resolution_mm`. Half of what changes from cells twice as large is its uncertainty.
+`ERROR_REFERENCE.resolution_mm`. Its uncertainty is half the change from cells twice as large.
 """
 
 import json
@@ -22,7 +22,7 @@ class ErrorReferenceSettings:
     """The reference of the known errors."""
 
     resolution_mm: float = 0.5
-    """mm; resolution of the reference, half of the finest that is compared with it."""
+    """mm; resolution of the reference. Chosen: half of the finest that is compared with it."""
 
 
 ERROR_REFERENCE = ErrorReferenceSettings()
@@ -54,12 +54,12 @@ class ErrorRow:
     Args:
         case: name of the pair.
         situation: where its contact lies.
-        held_out: whether it judges the statement; else it is part of it.
+        held_out: whether it tests the stated errors; if not, it is used to compute them.
         material: of the insert.
         contact: name of the model.
         resolution_mm: of its map.
-        status: how the press ended; "too narrow" where the contact is flagged as that, which no
-            statement holds for.
+        status: how the press ended; "too narrow" where the contact is flagged so: no error is
+        stated for such contacts.
         errors: relative, approach, mean and peak pressure and area; empty without an answer.
         uncertainty: of the reference, relative.
     """

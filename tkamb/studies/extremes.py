@@ -1,4 +1,4 @@
-"""The extremes on which stability is tried: a base case with one or two things driven far out."""
+"""The extreme cases of the stability study: a base case with one or two extreme parameters."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,16 +22,17 @@ class ExtremeMeshSettings:
     """Meshes of the study of extreme cases."""
 
     sectors: int = 48
-    """Sectors of the rings of the condyles; all compared models use the same mesh."""
+    """Number of sectors of the rings of the condyles. Chosen: all compared models use the same
+    mesh."""
 
 
 EXTREME_MESH = ExtremeMeshSettings()
 
 
 Shape = Literal["usual", "swapped", "lip", "spike", "subdivided", "slivers"]
-"""Of the two bodies: as they are meant; one for the other; with a steep rim of 6 mm in front; with
-a vertex of the femoral component pulled out by 3 mm; with each femoral triangle in four; with
-needles for triangles (one vertex of each ring moved almost onto the next)."""
+"""Shape of the two bodies: usual; exchanged; with a steep rim of 6 mm in front; with a vertex of
+the femoral component pulled out by 3 mm; with each femoral triangle divided into four; with
+needle-shaped triangles (one vertex of each ring moved almost onto the next)."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ ALONE: dict[str, tuple[object, ...]] = {
     "facet_deg": (0.2, 2.0, 5.0, 11.0),
     "shape": ("swapped", "lip", "spike", "subdivided", "slivers"),
 }
-"""One thing at a time; `TOGETHER`: two at a time."""
+"""Extreme values of one parameter at a time; `TOGETHER`: of two at a time."""
 
 TOGETHER: tuple[tuple[str, tuple[object, ...], str, tuple[object, ...]], ...] = (
     ("load_N", (10.0, 6000.0, 20000.0), "thickness_mm", (2.1, 4.0, 20.0)),
@@ -221,7 +222,7 @@ HARDEST: tuple[dict[str, object], ...] = (
     {"shape": "spike"},
     {"shape": "subdivided"},
 )
-"""On which the other models are tried."""
+"""Extremes on which the other models are tested."""
 
 BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
     {"linear": True},
@@ -233,7 +234,7 @@ BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
     {"linear": True, "thickness_mm": 4.0},
     {"linear": True, "modulus_MPa": 2000.0},
 )
-"""Of which CalculiX's answers are stored, for the lattice and `fe`, on cells of 3 mm."""
+"""Extremes with stored results of CalculiX, for the lattice and `fe`, on cells of 3 mm."""
 
 
 def extremes() -> Iterator[Extreme]:

@@ -1,4 +1,4 @@
-"""Rows of a study, kept one by one as they are measured, so that it can be stopped and go on.
+"""Rows of a study, stored one by one as they are measured, so that it can be stopped and resumed.
 
 Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ..., "sha256": ...}.
 The key is the SHA-256 of what was measured and of the code that measured it, "sha256" that of key

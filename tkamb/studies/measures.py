@@ -1,8 +1,8 @@
 """One row of the trade-off: a model on a case, timed, in a process of its own.
 
 `python -m tkamb.studies.measures` reads a `Job` as JSON from standard input and prints the
-measure as JSON, so that its peak memory is its own and a crash or a hang is a row too. The
-process computes with one thread: timings repeat, and are those of a worker among others.
+measure as JSON. So the peak memory is that of the job alone, and a crash or a hang gives a row,
+too. The process computes with one thread, so that timings are repeatable.
 """
 
 import json
@@ -34,13 +34,15 @@ class MeasureSettings:
     """How times of the trade-off study are measured."""
 
     longest_seconds: float = 300.0
-    """A job that takes longer is stopped and says so."""
+    """s: a job that takes longer is stopped and says so. Chosen: the whole page takes minutes."""
     repeats: int = 3
-    """Of preparing and pressing for the first time; of warm presses at least."""
+    """Repeats of the preparation and the first press; also the smallest number of warm presses.
+    Chosen: enough for a median."""
     warm_presses: int = 7
-    """Presses from a neighbouring pose that are timed."""
+    """Presses from a neighbouring pose that are timed. Chosen: enough for a median."""
     enough_seconds: float = 3.0
-    """No more repeats once this much was measured; warm presses: `REPEATS` in any case."""
+    """s: no more repeats after this time of measurement, except `repeats` warm presses. Chosen: the
+    whole page takes minutes."""
 
 
 MEASURE = MeasureSettings()
@@ -165,7 +167,7 @@ def _first(
 ) -> tuple[tuple[float, float], tuple[StudyCase, Any, ContactResult, WarmStart]]:
     """Return the median seconds of prepare and first press, and what the last of both gave.
 
-    The bodies are made anew each time: nothing that is remembered of them makes it faster.
+    The bodies are made again each time, so that no cached property of them saves time.
     """
     prepares: list[float] = []
     colds: list[float] = []

@@ -1,15 +1,15 @@
 """CalculiX beside the built-in models: the same hexahedra, pose and load, another program.
 
-It starts without any answer of the lattice's: the femoral component begins where an elastic
-foundation would carry the load. Each position begins anew, so that its cold and warm times are the
-same. Its contact nodes lie on the smooth surface that the insert's mesh stands for, as those of the
-lattice do; the femoral component is faceted. Its pressures act on the deformed faces; here they
-become nodal forces, and those, over the undeformed tributary areas, pressures as the built-in
-models define them.
+It starts without a result of the lattice: the initial position of the femoral component is the one
+at which an elastic foundation carries the load. Each position starts from zero, so that its cold
+and warm times are equal. Its contact nodes lie on the smooth surface of the insert's mesh, as those
+of the lattice do; the femoral component is faceted. CalculiX's pressures act on the deformed faces.
+Here they are converted to nodal forces, and these, divided by the undeformed tributary areas, to
+pressures as the built-in models define them.
 
-Strain: linear cases have small strain on both sides. CalculiX's Ramberg-Osgood law wants finite
-strain (true stress over the Eulerian strain of the deformed shape), the built-in models keep
-small strain: a nonlinear comparison is one of the two measures as well.
+Strain: linear cases use small strain in both programs. CalculiX's Ramberg-Osgood law uses finite
+strain (true stress over the Eulerian strain of the deformed shape), the built-in models small
+strain. A nonlinear comparison therefore includes the difference of these two measures.
 """
 
 import time as clock
@@ -37,7 +37,8 @@ class PeerSettings:
     """When a result of the peer finite-element program is accepted."""
 
     max_residual: float = 0.01
-    """Share of the load; largest difference of the summed contact forces from it."""
+    """Share of the load: largest difference of the summed contact forces from it. Chosen: above
+    what a converged solution leaves."""
 
 
 PEER = PeerSettings()
@@ -45,14 +46,14 @@ PEER = PeerSettings()
 
 @dataclass(frozen=True, eq=False)
 class PeerAnswer:
-    """What CalculiX found.
+    """Result of CalculiX.
 
     Args:
         result: on the contact nodes of the lattice's grid, by the contract's definitions.
         run: its times, memory and iterations.
         prepare_seconds: for the grid, the guess and the input.
         nodes: of the insert.
-        balance: vertical contact forces over the load.
+        balance: sum of the vertical contact forces over the load.
     """
 
     result: ContactResult
@@ -126,7 +127,8 @@ def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, flo
     """Return what CalculiX found by the contract's definitions, and its forces over the load.
 
     Raises:
-        ComputationError: it touched beyond its femoral patch, or does not carry the load.
+        ComputationError: contact reached beyond the femoral patch of the deck, or the forces do not
+        sum to the load.
     """
     if not {"NREF", "NINSERT", "contact"} <= run.blocks.keys():
         raise ComputationError("gave no contact stress", "CalculiX")

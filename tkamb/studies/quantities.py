@@ -1,4 +1,4 @@
-"""What two contact results are compared by, and how far they are apart."""
+"""The quantities by which two contact results are compared, and their relative differences."""
 
 from collections.abc import Mapping
 
@@ -29,9 +29,9 @@ def quantities(result: ContactResult) -> Quantities:
 def errors(values: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
     """Return relative errors: approach, force, mean_pressure, peak_pressure, area.
 
-    A condyle's error counts against what both carry (force, area) or against the higher one
-    (pressures), so that a condyle that hardly touches does not decide; of the two condyles
-    the larger error is given.
+    Errors of force and area are relative to the sum over both condyles, errors of pressure to the
+    higher one, so that a condyle that hardly touches does not dominate. The larger error of the two
+    condyles is returned.
     """
     result = {"approach": _relative(values, reference, ["approach"], np.max)}
     for part in PARTS:

@@ -3,9 +3,9 @@
 A sphere on a linear layer has the elastic layer's solution. Elsewhere finite elements and the
 lattice are solved to a tolerance of 1e-6 on ever finer grids. Approach and forces are their
 common limit (Richardson); peak pressures and areas jump from node to node without order: theirs
-are the average of the two finest grids. The uncertainty is the largest of what the fit leaves,
-of the families' disagreement, and of the distance between limit and finest grids (half of it
-where the finest grids are the reference).
+are the average of the two finest grids. The uncertainty is the largest of three numbers: the
+residual of the fit, the disagreement of the two families, and the distance between limit and
+finest grids (half of it where the finest grids are the reference).
 """
 
 import json
@@ -41,9 +41,10 @@ class ReferenceSettings:
     """How the studies' reference solutions are computed."""
 
     large_volume: float = 2e-5
-    """m³: of an insert's bounding box from which on the coarser grids must do."""
+    """m³: volume of an insert's bounding box from which only the coarser grids are used. Chosen:
+    finer grids of it do not fit into memory."""
     tolerance: float = 1e-6
-    """Relative tolerance of the reference solutions."""
+    """Relative tolerance of the reference solutions. Chosen: far below what is compared."""
     width_effect: float = 0.005
     """Relative: a block 3.4 times as wide as high against an endless layer."""
 
@@ -189,7 +190,9 @@ def read_references(path: Path = STORED) -> dict[str, Reference]:
             for name, entry in stored.items()
         }
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"is no file of references ({error})", path, "use --recompute") from None
+        raise InputError(
+            f"is not a file of references ({error})", path, "use --recompute"
+        ) from None
 
 
 def write_references(references: dict[str, Reference], path: Path) -> None:

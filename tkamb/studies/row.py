@@ -23,7 +23,8 @@ class TimingSettings:
     """How times are compared."""
 
     equal_ratio: float = 1.2
-    """Ratio; two medians of time within this factor count as equal."""
+    """Ratio: two medians of time within this factor count as equal. Chosen: repeated measurements
+    vary by as much."""
 
 
 TIMING = TimingSettings()
@@ -99,7 +100,7 @@ def compared(job: Job, measure: Measure, reference: Reference) -> Row:
 
 
 def floor_of(reference: Reference) -> float:
-    """Return the largest relative uncertainty of what the front goes by."""
+    """Return the largest relative uncertainty among `FRONT_ERRORS`."""
     shifted = {k: v + reference.uncertainty[k] for k, v in reference.values.items()}
     apart = errors(shifted, reference.values)
     return max(apart[key] for key in FRONT_ERRORS)
@@ -146,4 +147,4 @@ def read_rows(path: Path) -> list[Row]:
     try:
         return [row_of(content) for content in json.loads(path.read_text(encoding="utf-8"))]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"is no table of a trade-off ({error})", path) from None
+        raise InputError(f"is not a table of a trade-off ({error})", path) from None

@@ -1,7 +1,7 @@
 """Extremes of a whole run: time steps, noise, friction, moment arms, meshes, flexion.
 
-The shipped knee bend is run on a few frames with one thing driven far out. What it must obey
-is known without a second solver:
+The shipped knee bend is run on a few frames with one extreme parameter. The right result is
+known without a second solver:
 
 - time: forces are F_rest + F_inertia / scale² where the same motion takes `scale` times as long;
 - always: the deformed insert carries the superior-inferior force that balance asks for;
@@ -39,8 +39,8 @@ class InertiaStudySettings:
     """How the effect of inertia is found."""
 
     slow_factor: float = 10.0
-    """Times as slow as recorded; the difference from the recorded motion is the effect of
-    inertia."""
+    """Ratio of the time of the slow motion to the recorded one; the difference from the recorded
+    motion is the effect of inertia. Chosen: inertia is then negligible."""
 
 
 INERTIA_STUDY = InertiaStudySettings()
@@ -48,8 +48,8 @@ INERTIA_STUDY = InertiaStudySettings()
 NOISES = (1e-3, 1e-2, 0.1, 1.0)
 FRICTIONS = (0.0, 0.2, 0.6, 1.0)
 ARMS_MM = (-20.0, -60.0, -90.0, -98.0, -101.0, -104.0, -108.0, -120.0)
-"""How far back the patellar ligament's insertion is moved, its line straight: to no moment arm (at
--98 to -108, by flexion) and past it."""
+"""mm: positions of the patellar ligament's insertion, with a straight line, until the moment arm is
+zero (at -98 to -108, depending on flexion) and beyond."""
 DEFECTS = ("hole", "flipped", "doubled", "sliver", "nan", "empty", "tiny")
 
 Check = Callable[["Results", Path], float]
@@ -85,7 +85,7 @@ def scene_extremes() -> Iterator[SceneExtreme]:
 
 
 def judge_scene(extreme: SceneExtreme) -> Verdict:
-    """Run an extreme and check what it must obey."""
+    """Run an extreme and check its result."""
     start = clock.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         scene = copied_scene(Path(folder))

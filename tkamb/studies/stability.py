@@ -1,4 +1,5 @@
-"""Stability at the extremes: every case judged in a process that may crash or hang."""
+"""Stability at the extremes: every case is judged in a process of its own, which may crash or
+hang."""
 
 import json
 import multiprocessing
@@ -31,18 +32,17 @@ class StabilitySettings:
     """Limits of the stability study."""
 
     longest_seconds: float = 120.0
-    """A case whose model takes longer hangs."""
+    """s: a case whose model takes longer counts as hanging. Chosen: usual cases take seconds."""
     longest_reference_seconds: float = 900.0
-    """A case whose reference takes longer is unverified."""
+    """s: a case whose reference takes longer is unverified. Chosen: the study ends within a day."""
     workers: int = 2
-    """Processes of the study."""
+    """Number of processes of the study. Chosen: a small computer has as many cores."""
     quick_share: int = 13
-    """The quick study takes one case in so many."""
+    """Ratio of all cases to those of the quick study. Chosen: it takes minutes."""
     quick_grid_mm: float = 3.0
-    """mm; the quick study takes no finer grid."""
+    """mm; finest grid of the quick study. Chosen: it takes minutes."""
     quick_with_peer: int = 4
-    """The quick study takes one extreme in so many, no finer than this; unusual shapes; the first
-cases beside CalculiX; the first closed forms; no runs."""
+    """Number of cases of the quick study that CalculiX solves too. Chosen: it takes minutes."""
 
 
 STABILITY = StabilitySettings()
@@ -114,8 +114,8 @@ def _row_key(case: Case, longest: float) -> str:
 class _Judges:
     """Cases put to processes that may crash or hang, a new one for each case.
 
-    They are forked from a server that has imported all it takes (and computes nothing itself),
-    so that a new one costs milliseconds. Each computes with one thread.
+    They are forked from a server process that has only imported the modules, so that a new one
+    costs milliseconds. Each computes with one thread.
     """
 
     def __init__(self, longest: float, rows: KeptRows | None) -> None:
@@ -185,9 +185,9 @@ class _Judges:
 
 
 def _leave_interrupts_to_parent() -> None:
-    """Have Ctrl-C end this thread's processes by the parent alone, which kills them.
+    """Block Ctrl-C in this thread's processes; the parent ends them.
 
-    A process begins with the signals blocked that the thread which starts it has blocked.
+    A process inherits the blocked signals of the thread that starts it.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
@@ -203,7 +203,7 @@ def _ended(case: Case, kind: str, reason: str) -> Verdict:
 
 
 def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:
-    """Return the verdict on a case; an exception that is no clean error is a verdict too."""
+    """Return the verdict on a case; an unexpected exception is a verdict, too."""
     try:
         if isinstance(case, Extreme):
             return judge(case, pressed)

@@ -1,8 +1,7 @@
 """Speed against accuracy: every contact model on every case, against converged references.
 
-The default matrix leaves out what repeats something else: fine grids and the solver's variants are
-measured on one case of each pair of bodies, not at every pose; `full` measures everything on every
-case.
+The default matrix is reduced: fine grids and the solver's variants are measured on one case of
+each pair of bodies, not at every pose. `full` measures every setting on every case.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -37,12 +36,12 @@ ONE_OF_EACH = ("sphere", "two condyles", "conforming", "knee 60 deg", "scene 60 
 TRIED_ON = ("two condyles", "conforming", "knee 60 deg")
 """Cases on which the variants are measured."""
 PEER_GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
-"""Cell sizes of the cases that CalculiX is given; two condyles at 1 mm take it minutes."""
+"""mm: cell sizes of the cases for CalculiX; two condyles at 1 mm take minutes."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is measured of a contact model.
+    """Settings at which a contact model is measured.
 
     Args:
         everywhere_mm: cell sizes on every case.
@@ -103,7 +102,7 @@ def _of(settings: Settings, case: str, full: bool) -> list[tuple[float, dict[str
 
 
 def expected_seconds(jobs: Sequence[Job], cases: Sequence[StudyCase]) -> list[float]:
-    """Return roughly how long each job takes, for the time left: by the number of cells."""
+    """Return the approximate time of each job, from the number of cells, to show the time left."""
     box = {c.name: float(np.prod(np.ptp(c.pair.insert.vertices, axis=0))) for c in cases}
     return [2.0 + _per_node(job) * box[job.case] / (job.resolution_mm * 1e-3) ** 3 for job in jobs]
 

@@ -1,9 +1,9 @@
 """One case judged: converged, flagged, or failed.
 
-An extreme is judged by what every answer must obey and by CalculiX where its answer is stored
-(`audit`), and by full Newton on the same grid, which finds what is the solver's
-alone. A closed form is judged by its formula (`closed_forms`). What a case was judged before is
-stored as well: converged once, it may not become flagged.
+An extreme is tested by the checks that every result must pass, by CalculiX where its result is
+stored (`audit`), and by full Newton on the same grid, which reveals errors of the solver alone. A
+closed form is tested by its formula (`closed_forms`). Earlier verdicts are stored: a case that was
+converged must not become flagged.
 
 - converged: status ok, no complaint, and within 2 % of the reference in approach, condyle force and
   peak.
@@ -36,16 +36,17 @@ class VerdictSettings:
     """When a result of a study is wrong."""
 
     max_error: float = 0.02
-    """Relative distance from the reference from which a result counts as wrong."""
+    """1: relative distance from the reference above which a result is wrong. Chosen: below what is
+    published of models compared with tests."""
 
 
 VERDICT = VerdictSettings()
 
 JUDGED = ("approach", "force", "peak_pressure")
 NEWTON_TOLERANCES = (1e-6, 1e-4, 1e-3)
-"""Of the reference: the tightest that Newton's method reaches."""
+"""Tolerances that are tried for the reference; the tightest that converges is used."""
 LOAD_STEPS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
-"""Shares of the load in which Newton's method goes where it does not get at once."""
+"""Shares of the load in which it is applied if Newton's method does not converge at once."""
 KINDS = ("converged", "flagged", "unflagged_wrong", "unverified", "exception", "hang")
 PASSED_KINDS = ("converged", "flagged")
 
@@ -55,7 +56,7 @@ class Verdict:
     """How a case ended.
 
     Args:
-        case: what was driven out.
+        case: the extreme parameters.
         contact: model.
         kind: one of `KINDS`.
         reason: plain words; empty where all is well.
@@ -81,7 +82,7 @@ class Verdict:
 
     @property
     def worse(self) -> bool:
-        """Whether what was converged is flagged now."""
+        """Whether a case that was converged is flagged now."""
         return self.kind == "flagged" and self.expected == "converged"
 
     @property
@@ -169,7 +170,7 @@ def _beside_peer(extreme: Extreme, result: ContactResult) -> list[str]:
 def compared(
     extreme: Extreme, result: ContactResult, reference: ContactResult, seconds: float
 ) -> Verdict:
-    """Return the verdict on a result that calls itself ok."""
+    """Return the verdict on a result with status ok."""
     misses = errors(quantities(result), quantities(reference))
     distance = max(misses[key] for key in JUDGED)
     right = math.isfinite(distance) and distance <= VERDICT.max_error
@@ -212,7 +213,7 @@ def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactRe
             press = _by_steps(newton, extreme, state, shares, start)
             if press is not None:
                 return press
-    raise ComputationError("Newton's method does not get there, at once or in steps", "reference")
+    raise ComputationError("Newton's method does not converge, at once or in steps", "reference")
 
 
 def _by_steps(

@@ -62,41 +62,27 @@ def solve_contact(
         active: (n,) first guess of the nodes in contact.
         approach: m, used when the load is None.
     """
-    count = 0
-    active = active.copy()
-    seen: set[bytes] = set()
-    careful = False
+    active, seen, careful, done, sets = active.copy(), set[bytes](), False, False, 0
     while True:
         if load is not None and not active.any():
             active[np.argmin(gap / -normal_y)] = True
         force, depth = _forces_of(compliance, gap, normal_y, load, active, approach)
         opening = gap + compliance @ force + depth * normal_y
         opening[active] = 0.0
-        count += 1
-        scale = 1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300)
-        leave, join = active & (force < -scale), ~active & (opening < -1e-15)
-        if not (leave.any() or join.any()):
-            return ContactForces(np.maximum(force, 0), opening, depth, active, count, True)
-        if count >= MOST_SETS:
-            return ContactForces(np.maximum(force, 0), opening, depth, active, count, False)
+        leave = active & (force < -1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300))
+        join = ~active & (opening < -1e-15)
+        done, sets = not (leave.any() or join.any()), sets + 1
+        if done or sets >= MOST_SETS:
+            return ContactForces(np.maximum(force, 0), opening, depth, active, sets, done)
         key = active.tobytes()
-        careful = careful or key in seen or count > PATIENCE
+        careful = careful or key in seen or sets > PATIENCE
         seen.add(key)
-        active = _next_set(active, leave, join, force, opening, careful)
-
-
-def _next_set(
-    active: Mask, leave: Mask, join: Mask, force: Array, opening: Array, careful: bool
-) -> Mask:
-    """Return the next set: all changes at once, or when careful only the worst one."""
-    if not careful:
-        return (active & ~leave) | join
-    result = active.copy()
-    if leave.any():
-        result[np.argmin(np.where(leave, force, 0.0))] = False
-    else:
-        result[np.argmin(np.where(join, opening, 0.0))] = True
-    return result
+        if not careful:
+            active = (active & ~leave) | join
+        elif leave.any():
+            active[np.argmin(np.where(leave, force, 0.0))] = False
+        else:
+            active[np.argmin(np.where(join, opening, 0.0))] = True
 
 
 def _forces_of(
@@ -112,9 +98,8 @@ def _forces_of(
     if not active.any():
         return force, approach
     chosen = np.flatnonzero(active)
-    among = compliance[chosen[:, None], chosen]
     right = np.column_stack([-gap[chosen], -normal_y[chosen]])
-    *_, solved, failed = dposv(among, right, lower=True)
+    *_, solved, failed = dposv(compliance[chosen[:, None], chosen], right, lower=True)
     if failed:
         raise np.linalg.LinAlgError("the compliance of the nodes in contact is singular")
     closing, per_depth = solved.T

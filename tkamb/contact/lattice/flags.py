@@ -25,23 +25,23 @@ class LatticeFlagSettings:
     """When a result of the lattice gets a flag."""
 
     edge_distance_cells: float = 2.0
-    """Cells: distance from the peak at which the femoral normal is looked at. A peak at an
+    """Cells: distance from the peak at which the femoral normal is looked at. Chosen: a peak at an
     edge lies one or two cells inside it."""
     least_edge_distance: float = 2.0 * MILLIMETRE
-    """m: smallest distance from the peak at which the femoral normal is looked at, so that an
-    edge of 6 mm radius counts as an edge with fine cells too."""
+    """m: smallest distance from the peak at which the femoral normal is looked at. Chosen: an edge
+    of 6 mm radius counts as an edge with fine cells too."""
     sharp_edge_angle: float = 20.0 * DEGREE
-    """rad: turn of the femoral normal over that distance from which a peak is flagged. It is
-    the turn of a radius of 6 cells."""
+    """rad: turn of the femoral normal over that distance from which a peak is flagged. Chosen: the
+    turn of a radius of 6 cells."""
     strain_flag: float = -0.4
     """1: principal strain below which a result is flagged. The material law has no barrier at
     -1, and measured curves end before -0.4."""
     max_unseen_height: float = 0.2e-3
-    """m: height of the femoral surface between nodes that may stay unseen. A node of a 3 mm
+    """m: height of the femoral surface between nodes that may stay unseen. Chosen: a node of a 3 mm
     cell misses the bottom of a ball of 15 mm radius by 0.15 mm."""
     collapse_strain: float = -1.0
-    """1: principal strain at which a cell is compressed to nothing; the result is out of
-    range."""
+    """1: principal strain at which a cell is compressed to nothing; the result is out of range. By
+    definition of the strain."""
 
 
 LATTICE_FLAG = LatticeFlagSettings()
@@ -114,7 +114,7 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
     """Return the flags and whether the insert is compressed to nothing."""
     if solution.field is not None:
         solid = state.problem.solid
-        least = solid.least_principal_strain(solution.field, solution.noticed)
+        least = solid.least_principal_strain(solution.field)
         kind = "principal strain"
     else:
         # A linear solver keeps no field of displacements: the mean strain of a column stands for
@@ -151,8 +151,9 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
 
 def unsettled_flag(solution: Solution) -> str:
     """Return in words how large the residual of a solution is that has not converged."""
+    percent = 100 * solution.residual.reported
     return (
         f"the solver has not converged: after {solution.passes} passes the residual is "
-        f"{100 * solution.residual:.2g} % of the force or of the distance to the femoral surface; "
+        f"{percent:.2g} % of the force or of the distance to the femoral surface; "
         "check whether the femoral mesh is rough"
     )

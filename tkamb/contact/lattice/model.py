@@ -8,7 +8,6 @@ import numpy as np
 
 from tkamb.contact.lattice.flags import unseen_flags
 from tkamb.contact.lattice.initial_guess import (
-    FORCES_ONLY_GROWTH,
     InitialGuess,
     LatticeStart,
     guessed_depth,
@@ -33,7 +32,7 @@ from tkamb.contact.lattice.problem import (
     TangentPlanes,
     undeformed,
 )
-from tkamb.contact.lattice.report import PressureRule, gaps_of_others, result_of
+from tkamb.contact.lattice.report import PressureRule, result_of
 from tkamb.contact.lattice.settings import LATTICE_SOLVER, LatticeSolverSettings
 from tkamb.contact.lattice.solids.bbar import BbarHexahedra
 from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
@@ -54,8 +53,6 @@ TOUCHING = 1e-13
 """m; bodies that overlap by less carry nothing: 1e-6 N at 1e7 N/m."""
 COARSE = 1e-3
 """From this tolerance on the factor is kept in 16 bits: they leave an imbalance of 3e-4."""
-TURNED_TOLERANCE = 3.0
-"""Times the tolerance, for a step that is extrapolated: what it changes is known to 1 %."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
 
@@ -178,8 +175,8 @@ class CellContact(ContactModel):
             state: what `prepare` returned.
             pose: (4, 4) pose_femoral_in_insert.
             start: an earlier result, or the start that came with it.
-            forces_only: areas are whole nodes', nothing is flagged, and close to the start the
-                elements that did not count there are not looked at.
+            forces_only: the elements that did not count at the start are not looked at, areas are
+                whole nodes', nothing is flagged. It holds near the start (`LatticeProbe`).
         """
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
@@ -196,7 +193,6 @@ class CellContact(ContactModel):
         load: float,
         pose: Array,
         start: Guess | None = None,
-        forces_only: bool = False,
     ) -> tuple[ContactResult, WarmStart]:
         """Return the contact under a load (N), and the start of the next; see `evaluate_from`."""
         check_load(load)
@@ -221,14 +217,13 @@ class CellContact(ContactModel):
             depth = start.approach
         else:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load)
-        return self._solved(state, pose, load, (gaps, planes), depth, start, forces_only)
+        return self._solved(state, pose, load, (gaps, planes), depth, start)
 
     def probe(self, state: LatticeState, guess: Guess | None = None) -> Probe:
         """Return the probe with stiffness; see `ContactModel`."""
         if self.direction == "vertical":
             return Probe(self, state, guess)
-        rough = replace(self, tolerance=TURNED_TOLERANCE * self.tolerance)
-        return LatticeProbe(self, state, guess, self.tolerance, rough)
+        return LatticeProbe(self, state, guess, self.tolerance)
 
     def _solved(
         self,
@@ -238,52 +233,38 @@ class CellContact(ContactModel):
         rest: tuple[Array, TangentPlanes],
         depth: float,
         begin: Guess | None,
-        forces_only: bool,
+        region_only: bool = False,
     ) -> tuple[ContactResult, WarmStart]:
         """Solve with growing candidate sets until they cover the approach.
 
         `rest` is what `undeformed` says at the pose.
         """
-        gaps, planes = rest
-        settings = self.settings
-        last = lattice_start(state, begin)
-        warm = None if last is None else last.extrapolated(pose)
-        near = forces_only and last is not None and last.near(pose)
-        unmeasured = FORCES_ONLY_GROWTH * last.looked[0] if last is not None and near else 0.0
-        touched = begin.pressure > 0 if begin and len(begin.pressure) == len(gaps) else None
+        (gaps, planes), settings = rest, self.settings
+        start = lattice_start(state, begin)
+        forces_only = region_only and start is not None and not self.newton
         for _ in range(settings.max_expansions):
-            start = initial_guess(
-                state.compliance,
-                gaps,
-                planes,
-                depth,
-                load is None,
-                touched,
-                warm,
-                unmeasured,
-                settings.candidate_margin,
-            )
+            guess = initial_guess(
+                state.compliance, gaps, planes, depth, load is None, start,
+                settings.candidate_margin, forces_only,
+            )  # fmt: skip
             below = -min(float(gaps.min()), 0.0)
-            covered = load is None or len(start.candidates) == np.isfinite(gaps).sum()
-            within = np.inf if covered else (start.reach - below) / REACH
-            solution = self._solution(state.problem, pose, load, start, settings, within)
-            outgrown = solution.forces.approach > within
-            if solution.converged:  # a repetition with more candidates begins here
-                below += solution.forces.approach
-                warm = _start_after(state, pose, gaps, solution, below, last)
-            others = gaps <= solution.forces.approach * REACH + below
-            if not outgrown or _others_clear(state, pose, others, solution):
+            covered = load is None or len(guess.candidates) == np.isfinite(gaps).sum()
+            within = np.inf if covered else (guess.reach - below) / REACH
+            solution = self._solution(state.problem, pose, load, guess, settings, within)
+            approach = solution.forces.approach
+            if approach <= within:
                 rule = self.pressure_rule
                 result = result_of(state, pose, load, gaps, solution, rule, forces_only)
-                if load is not None and not forces_only:
-                    sunk = solution.forces.approach + max(-float(gaps.min()), 0.0)
+                if load is not None:
+                    sunk = approach + max(-float(gaps.min()), 0.0)
                     result = within_insert(state, result, *unseen_flags(state, result, sunk))
-                if not solution.converged or warm is None:
+                if not solution.converged:
                     return _alone(result)
-                return result, replace(
-                    warm, pose=result.pose, pressure=result.pressure, gap=result.gap
-                )
-            depth, touched = 1.1 * solution.forces.approach, None
+                return result, _start_after(state, result, solution, below + approach)
+            if solution.converged:  # the repetition with more candidates begins here
+                place = WarmStart(state.pair, pose, state.points, np.zeros(len(gaps)), gaps)
+                start = _start_after(state, place, solution, below + approach)
+            depth = 1.1 * approach
         saturated = "the set of candidate nodes is saturated"
         return _alone(ContactResult.failed(state, pose, saturated))
 
@@ -307,7 +288,7 @@ class CellContact(ContactModel):
         if (
             solution.converged
             or problem.solid.material.is_linear
-            or solution.gap == solution.residual
+            or solution.residual.gap >= solution.residual.force
         ):
             return solution
         if solution.forces.approach > within:
@@ -375,59 +356,22 @@ def _alone(result: ContactResult) -> tuple[ContactResult, WarmStart]:
 
 
 def _start_after(
-    state: LatticeState,
-    pose: Array,
-    gaps: Array,
-    solution: Solution,
-    depth: float,
-    last: LatticeStart | None,
+    state: LatticeState, place: Guess, solution: Solution, depth: float
 ) -> LatticeStart:
     """Return where the next solution may begin after one that has converged.
 
     Args:
         state: prepared contact.
-        pose: (4, 4) at approach 0 of the solution.
-        gaps: (c,) m, vertical, there.
+        place: pose, pressure and gap of the solution.
         solution: what the solver found.
         depth: m, how far the femoral component is below the lowest contact node.
-        last: where it began, or None.
     """
     moved = np.zeros_like(state.surface.points)
     moved[solution.candidates] = solution.displacement
-    looked = float(np.linalg.norm(solution.forces.force)), pose
-    if last is not None and not solution.seen:
-        looked = last.looked
     return LatticeStart(
-        pair=state.pair,
-        pose=pose,
-        points=state.points,
-        pressure=np.zeros(len(gaps)),
-        gap=gaps,
-        problem=state.problem,
-        loads=solution.loads,
-        moved=moved,
-        depth=depth,
-        region=solution.region,
-        looked=looked,
-        before=None if last is None else replace(last, before=None),
-    )
-
-
-def _others_clear(state: LatticeState, pose: Array, near: Mask, solution: Solution) -> bool:
-    """Say whether no node touches the femoral component that was no candidate.
-
-    Args:
-        state: prepared contact.
-        pose: (4, 4) at approach 0 of the solution.
-        near: (c,) nodes that might.
-        solution: under a load.
-    """
-    if not (solution.converged and solution.seen):
-        return False
-    others, there = near.copy(), pose.copy()
-    others[solution.candidates] = False
-    there[1, 3] -= solution.forces.approach
-    return bool((gaps_of_others(state, there, np.flatnonzero(others), solution) > 0).all())
+        state.pair, place.pose, state.points, place.pressure, place.gap,
+        state.problem, solution.loads, moved, depth, solution.region,
+    )  # fmt: skip
 
 
 def _warm_up(problem: ContactProblem, pair: ContactPair) -> None:
@@ -436,6 +380,5 @@ def _warm_up(problem: ContactProblem, pair: ContactPair) -> None:
     pair.touch_at(np.eye(4))
     if not problem.solid.material.is_linear:
         still = np.zeros_like(problem.solid.nodes)
-        noticed = problem.solid.noticeable(still, 1.0)
-        problem.solid.nonlinear_residual(still, None if noticed is None else noticed.elements)
+        problem.solid.nonlinear_residual(still)
         problem.solid.least_principal_strain(still)

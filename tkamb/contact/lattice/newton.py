@@ -12,7 +12,7 @@ from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.linear.operator import prepare_operator
-from tkamb.contact.lattice.nonlinear_balance import Residual
+from tkamb.contact.lattice.nonlinear_balance import Residual, forces_of
 from tkamb.contact.lattice.problem import ContactProblem, TangentPlanes
 from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.contact.lattice.solver import SlidingNodes, Solution, solve_pass
@@ -46,40 +46,26 @@ def solve_by_newton(
     solid, nodes = problem.solid, problem.contact_nodes[guess.candidates]
     points = problem.surface_points[guess.candidates]
     u = np.zeros_like(solid.nodes) if field is None else field
-    active, step, last, steps = guess.active, 1.0, np.inf, 0
+    active, step, before, free = guess.active, 1.0, np.inf, ~problem.held.reshape(-1, 3)
     sliding = SlidingNodes(problem, points, u[nodes], pose, guess.planes)
-    while True:
-        steps += 1
-        planes = sliding.planes
+    for steps in range(1, MOST_STEPS + 1):
+        planes, last = sliding.planes, steps == MOST_STEPS
         u_full, forces = _step(problem, nodes, points, u, planes, load, active)
-        u = u + step * (u_full - u)
-        active = forces.active
-        residual = _residual(problem, nodes, u, forces.force[:, None] * planes.normals)
-        gap, ends = sliding.follow(u[nodes], forces), steps == MOST_STEPS
-        done = residual.within(settings)
-        done = done and gap <= (settings.force_tolerance if ends else settings.gap_tolerance)
-        if done or ends:
-            forces = replace(forces, converged=done and forces.converged)
-            h = solid.residual_force(u)
-            h[problem.held.reshape(-1, 3)] = 0.0
-            return Solution(
-                guess.candidates, forces, planes, u[nodes], u, h, steps,
-                max(residual.force, gap), work=residual.work, gap=gap,
-            )  # fmt: skip
-        step, last = 0.5 if residual.force > 2 * last else 1.0, residual.force
-
-
-def _residual(problem: ContactProblem, nodes: Index, u: Array, force: Array) -> Residual:
-    """Return what is out of balance at u (n, 3) under forces (m, 3) on nodes."""
-    outside = -problem.solid.internal_force(u)
-    outside[nodes] += force
-    outside[problem.held.reshape(-1, 3)] = 0.0
-    size = max(float(np.linalg.norm(force)), 1e-300)
-    work = max(float(np.vdot(force, u[nodes])), 1e-300)
-    residual = float(np.linalg.norm(outside)) / size
-    if not np.isfinite(residual):
-        raise ComputationError("Newton's iteration left the range of numbers")
-    return Residual(residual, abs(float(np.vdot(outside, u))) / work)
+        u, active = u + step * (u_full - u), forces.active
+        gap, force = sliding.follow(u[nodes], forces), forces.force[:, None] * planes.normals
+        internal, shares, softening = forces_of(solid, u)
+        outside = -internal
+        outside[nodes] += force
+        residual = replace(Residual.of(free * outside, u, force, u[nodes], softening), gap=gap)
+        if not np.isfinite(residual.force):
+            raise ComputationError("Newton's iteration left the range of numbers")
+        within = residual.within(settings, last)
+        if within or last:
+            break
+        step, before = 0.5 if residual.force > 2 * before else 1.0, residual.force
+    forces = replace(forces, converged=within and forces.converged)
+    h = free * solid.scatter.sum(shares)
+    return Solution(guess.candidates, forces, planes, u[nodes], u, h, steps, residual)
 
 
 def _step(

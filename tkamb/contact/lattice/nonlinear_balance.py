@@ -6,7 +6,8 @@ The solid is linear but for loads h that stand for what its material carries les
 
 K is the factorised linear stiffness, f the contact forces, f_int the forces of the displaced
 solid under its nonlinear law. At equilibrium r = 0 and h = K u - f_int(u). Every pass solves
-K u = f + h and takes h + r as the next h (modified Newton), accelerated by Anderson's method.
+K u = f + h and takes h + r as the next h (modified Newton), accelerated by Anderson's method
+(Walker & Ni, SIAM J Numer Anal 49:1715, 2011, doi:10.1137/10078356X).
 
 An element's share of h falls with a power of its strain (4.5 for polyethylene). So passes work on
 the `Region` of the elements that count. What the rest asks for, and what the rounding of the
@@ -14,14 +15,14 @@ factor leaves, changes little from pass to pass: it is measured with the whole s
 (`NonlinearBalance.measure`) and then held constant.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tkamb.contact.lattice.anderson import AndersonMixer
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.problem import ContactProblem, Region
 from tkamb.contact.lattice.settings import LatticeSolverSettings
+from tkamb.contact.lattice.solids.solid import Solid
 from tkamb.geometry.frames import Array, Mask
 
 NEAR = 0.05
@@ -32,20 +33,71 @@ OUTSIDE = 0.8
 
 @dataclass(frozen=True)
 class Residual:
-    """What the displaced solid leaves out of balance.
+    """What is measured of a state, and stops the iteration.
 
     Args:
         force: |f - f_int(u)| over the free unknowns, relative to |f|.
         work: |(f - f_int(u)) · u|, relative to f · u, times the softening
             s = (f_int(u) · u) / (uᵀ K_T u): an estimate of the relative error of the approach.
+        gap: largest distance of an active node from the femoral surface (overlap of the others),
+            relative to the largest displacement of an active node.
     """
 
     force: float
-    work: float
+    work: float = 0.0
+    gap: float = 0.0
 
-    def within(self, settings: LatticeSolverSettings) -> bool:
-        """Say whether both are within their tolerances; NaN is not."""
-        return self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
+    @classmethod
+    def of(
+        cls, outside: Array, field: Array, force: Array, moved: Array, softening: float
+    ) -> "Residual":
+        """Return the residual of forces outside of balance.
+
+        Args:
+            outside: f - f_int(u) (n, 3), N, zero where held.
+            field: (n, 3) u, m.
+            force: (m, 3) contact forces, N.
+            moved: (m, 3) displacement of their nodes, m.
+            softening: s.
+        """
+        size = max(float(np.linalg.norm(force)), 1e-300)
+        work = abs(float(np.vdot(outside, field))) / max(float(np.vdot(force, moved)), 1e-300)
+        return cls(float(np.linalg.norm(outside)) / size, softening * work)
+
+    def within(self, settings: LatticeSolverSettings, last: bool = False) -> bool:
+        """Say whether all are within their tolerances; NaN is not. The last pass allows more."""
+        gap = settings.force_tolerance if last else settings.gap_tolerance
+        balanced = self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
+        return balanced and self.gap <= gap
+
+    @property
+    def reported(self) -> float:
+        """The larger one of force and gap."""
+        return max(self.force, self.gap)
+
+
+class LinearBalance:
+    """Hooke's law needs no loads h: only rays and contact are repeated.
+
+    Attributes:
+        offset: (m, 3) m, displacement of the candidates that no contact force made.
+        moved: (m, 3) m, theirs in all.
+    """
+
+    residual, field, loads, region = Residual(0.0), None, None, None
+
+    def __init__(self, offset: Array) -> None:
+        self.offset = offset
+
+    def displace(self, force: Array, moved: Array) -> None:
+        """Take the displacement (m, 3) of the condensed compliance."""
+        del force
+        self.moved = moved
+
+    def measure(self) -> None:
+        """There is nothing more to measure."""
+
+    advance = measure
 
 
 class NonlinearBalance:
@@ -57,11 +109,10 @@ class NonlinearBalance:
         settings: tolerances.
 
     Attributes:
-        h: (n, 3) N, the loads taken.
-        region: elements on which passes work; h is zero on other nodes.
+        moved: (m, 3) m, displacement of the candidates: by the compliance, then as measured.
         field: (n, 3) m, displacement of the region's nodes; of all after `measure`.
-        residual: of the region; of the whole solid after `measure`.
-        measured: the residual is that of the whole solid.
+        residual: force and work of the region; of the whole solid after `measure`.
+        loads: (n, 3) N, h + r after `measure`: where a next solution may begin.
     """
 
     def __init__(
@@ -69,18 +120,18 @@ class NonlinearBalance:
     ) -> None:
         self._problem, self._response, self._settings = problem, guess.response, settings
         self._candidates = problem.contact_nodes[guess.candidates]
-        self.region = problem.everywhere if guess.region is None else guess.region
+        self._region = guess.region or problem.everywhere
         self._constant = np.zeros_like(problem.solid.nodes)
         self._rounding = np.zeros((len(guess.candidates), 3))
-        self._mixer, self._softening = AndersonMixer(settings.anderson_depth), 1.0
-        self.h = np.zeros_like(problem.solid.nodes)
-        if guess.loads is not None:
-            self.h[self.region.nodes] = guess.loads[self.region.nodes]
-        self.residual = Residual(np.inf, np.inf)
-        self._begin()
+        self._differences: list[tuple[Array, Array]] = []
+        self._softening, self.residual = 1.0, Residual(np.inf, np.inf)
+        self._take(self._constant if guess.loads is None else guess.loads)
 
-    def _begin(self) -> None:
-        self._half = self._problem.operator.start(self.h, self.region.fronts)
+    def _take(self, h: Array) -> None:
+        """Take loads (n, 3), N; on other nodes than the region's they are zero."""
+        self._h, nodes = np.zeros_like(h), self._region.nodes
+        self._h[nodes] = h[nodes]
+        self._half = self._problem.operator.start(self._h, self._region.fronts)
 
     @property
     def offset(self) -> Array:
@@ -94,101 +145,118 @@ class NonlinearBalance:
             force: (m, 3) N, on the candidates.
             moved: (m, 3) m, their displacement by the condensed compliance.
         """
-        operator, region, solid = self._problem.operator, self.region, self._problem.solid
-        self._force, self._moved = force, moved
+        operator, region, solid = self._problem.operator, self._region, self._problem.solid
+        self._force, self.moved = force, moved
         self._x = self._half.copy()
         self._response.push(force, self._x)
         operator.factor.backward(self._x, region.fronts)
-        self.measured = False
+        self._measured = False
         if region.whole:
-            self._measure()
+            self.measure()
             return
-        self.field = np.zeros_like(self.h)
+        self.field = np.zeros_like(self._h)
         self.field[region.nodes] = operator.nodal(self._x, region.nodes)
         shares = solid.nonlinear_residual(self.field, region.elements)
-        self._asked = self._constant + solid.scatter.sum(shares, region.elements)
-        outside = np.zeros_like(self.h)
-        outside[region.nodes] = (self._asked - self.h)[region.nodes]
-        self.residual = self._residual(outside)
+        self.loads = self._constant + solid.scatter.sum(shares, region.elements)
+        outside = np.zeros_like(self._h)
+        outside[region.nodes] = (self.loads - self._h)[region.nodes]
+        self._found(outside)
 
     def measure(self) -> None:
-        """Measure the residual of the whole solid, and its displacement."""
-        if self.measured:
+        """Measure displacement and residual of the whole solid, by the law of every element."""
+        if self._measured:
             return
-        factor, every = self._problem.operator.factor, self._problem.everywhere.fronts.fronts
-        rest = np.setdiff1d(every, self.region.fronts.fronts, assume_unique=True)
-        factor.backward(self._x, factor.shared(rest))
-        self._measure()
-
-    def _measure(self) -> None:
-        solid = self._problem.solid
-        self.field = self._problem.operator.nodal(self._x)
-        internal, self._shares, tangent_work = solid.forces(self.field)
-        work = float(np.vdot(internal, self.field))
-        self._softening = work / max(tangent_work, 1e-3 * abs(work), 1e-300)
+        solid, operator = self._problem.solid, self._problem.operator
+        if not self._region.whole:
+            every = self._problem.everywhere.fronts.fronts
+            rest = np.setdiff1d(every, self._region.fronts.fronts, assume_unique=True)
+            operator.factor.backward(self._x, operator.factor.shared(rest))
+        self.field = operator.nodal(self._x)
+        internal, self._shares, self._softening = forces_of(solid, self.field)
         outside = -internal
         outside[self._candidates] += self._force
-        self._asked = self.h + outside
-        self.residual = self._residual(outside)
-        self.measured = True
+        self.loads, self._measured = self._h + outside, True
+        self._found(outside)
         # The factor is kept with less precision than the compliance.
-        self._rounding = self._rounding + self.field[self._candidates] - self._moved
+        measured = self.field[self._candidates]
+        self._rounding, self.moved = self._rounding + measured - self.moved, measured
 
-    def _residual(self, outside: Array) -> Residual:
-        """Return the residual (n, 3) relative to the contact forces and their work."""
-        outside.ravel()[self._problem.held_unknowns] = 0.0
-        self._size = max(float(np.linalg.norm(self._force)), 1e-300)
-        force = float(np.linalg.norm(outside)) / self._size
-        work = abs(float(np.vdot(outside, self.field)))
-        work *= self._softening / max(float(np.vdot(self._force, self._moved)), 1e-300)
+    def _found(self, outside: Array) -> None:
+        """Note the residual (n, 3), N, relative to the contact forces and their work."""
+        for loads in (outside, self.loads):
+            loads.ravel()[self._problem.held_unknowns] = 0.0
+        last, self._size = self.residual, float(np.linalg.norm(self._force))
+        new = Residual.of(outside, self.field, self._force, self.moved, self._softening)
         # The work changes its sign from time to time: it has not fallen more than the force.
-        last = self.residual
-        if np.isfinite(last.force):
-            work = max(work, min(force / max(last.force, 1e-300), 1.0) * last.work)
-        return Residual(force, work)
+        fall = min(new.force / max(last.force, 1e-300), 1.0) if np.isfinite(last.force) else 0.0
+        self.residual = replace(new, work=max(new.work, fall * last.work if fall else 0.0))
 
     def advance(self) -> None:
-        """Take the next loads h."""
-        self._asked.ravel()[self._problem.held_unknowns] = 0.0
-        if self.measured:
+        """Take the next loads h: h + r, accelerated."""
+        if self._measured:
             self._choose_region()
-        nodes = self.region.nodes
-        mixed = self._mixer.next(self.h[nodes].ravel(), self._asked[nodes].ravel())
-        self.h = np.zeros_like(self.h)
-        self.h[nodes] = mixed.reshape(-1, 3)
-        self._begin()
+        nodes = self._region.nodes
+        h, asked = self._h[nodes].ravel(), self.loads[nodes].ravel()
+        self._differences.append((asked, asked - h))
+        del self._differences[: -self._settings.anderson_depth - 1]
+        following = np.zeros_like(self._h)
+        following[nodes] = accelerated(self._differences).reshape(-1, 3)
+        self._take(following)
 
     def _choose_region(self) -> None:
         """Choose the elements that count, and hold constant what the others ask for."""
         most = OUTSIDE * self._settings.force_tolerance * self._size
-        if self.region.whole or self._beyond(self.region, self._asked - self.h) > most:
-            region = self._counting()
-            if self.residual.force > NEAR or self._beyond(region, self._asked) > most:
+        if self._region.whole or self._beyond(self._region, self.loads - self._h) > most:
+            region = self.region
+            if self.residual.force > NEAR or self._beyond(region, self.loads) > most:
                 region = self._problem.everywhere
-            if not (region.whole and self.region.whole):  # earlier differences do not apply
-                self._mixer = AndersonMixer(self._settings.anderson_depth)
-            self.region = region
-        elements = self.region.elements
+            if not (region.whole and self._region.whole):  # earlier iterates do not apply
+                self._differences = []
+            self._region = region
+        elements = self._region.elements
         known = self._problem.solid.scatter.sum(self._shares[elements], elements)
-        self._constant = self._asked - known
+        self._constant = self.loads - known
 
-    def _counting(self) -> Region:
-        """Return the region of the elements that count at the displacement that was measured."""
+    @property
+    def region(self) -> Region:
+        """The elements that count at the displacement that was measured."""
+        if not self._measured:
+            return self._region
         settings, shares = self._settings, self._shares
         allowed = settings.region_tolerance * settings.force_tolerance * self._size
         size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
         return Region.of(self._problem, np.flatnonzero(elements_that_count(size, allowed)))
-
-    def next_start(self) -> tuple[Array, Region]:
-        """Return the loads (n, 3), N, and the region with which a next solution may begin."""
-        self._asked.ravel()[self._problem.held_unknowns] = 0.0
-        return self._asked, self._counting() if self.measured else self.region
 
     def _beyond(self, region: Region, force: Array) -> float:
         """Return the norm of forces (n, 3) on nodes outside of a region, N."""
         outside = force.copy()
         outside[region.nodes] = 0.0
         return float(np.linalg.norm(outside))
+
+
+def forces_of(solid: Solid, field: Array) -> tuple[Array, Array, float]:
+    """Return f_int(u) (n, 3), each element's share of h (k, 3p), N, and the softening s at u."""
+    internal, shares, tangent_work = solid.forces(field)
+    work = float(np.vdot(internal, field))
+    return internal, shares, work / max(tangent_work, 1e-3 * abs(work), 1e-300)
+
+
+def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
+    """Return the next x of a fixed-point iteration x = g(x), by Anderson's method.
+
+    The combination of the last iterates whose linearised residual is smallest.
+
+    Args:
+        iterates: g(x) and g(x) - x, (n,), the last one last.
+    """
+    value, residual = iterates[-1]
+    if len(iterates) == 1:
+        return value
+    values, residuals = (np.diff(np.stack(each), axis=0) for each in zip(*iterates, strict=True))
+    gram = residuals @ residuals.T
+    gram[np.diag_indices(len(gram))] *= 1 + 1e-12
+    weights = np.linalg.lstsq(gram, residuals @ residual, rcond=1e-14)[0]
+    return np.asarray(value - weights @ values)
 
 
 def elements_that_count(size: Array, allowed: float) -> Mask:
@@ -198,10 +266,8 @@ def elements_that_count(size: Array, allowed: float) -> Mask:
         size: (c,) norm of each element's share of h, N.
         allowed: N, root of the sum of squares of those left out.
     """
-    surely = size <= allowed / np.sqrt(max(len(size), 1))  # even if all were as large
-    others = np.flatnonzero(~surely)
-    order = others[np.argsort(size[others])]
-    total = (size[surely] ** 2).sum() + np.cumsum(size[order] ** 2)
+    order = np.argsort(size)
     counts = np.zeros(len(size), bool)
-    counts[order[np.searchsorted(total, allowed**2, side="right") :]] = True
+    left_out = np.searchsorted(np.cumsum(size[order] ** 2), allowed**2, side="right")
+    counts[order[left_out:]] = True
     return counts

@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tkamb.contact.lattice.initial_guess import lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
@@ -24,13 +23,17 @@ from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, medial_points
 from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.frames import Array, Index
-from tkamb.units import DEGREE
 
 TURN_STEP = 5e-5
 """m: between the places where femoral normals are compared; well below a cell."""
-LARGEST_EXTRAPOLATION = 2.0 * DEGREE
-"""Farthest turn between two poses of which one's step is used for the other's: beyond it what the
-extrapolated step leaves open (1 %) grows to some per cent of what the step changes."""
+REGION_HOLDS_WITHIN = 0.1
+"""Of a cell: how far a search may go from the pose at which the whole solid was measured last. Up
+to there the residual of the whole solid stays within 1.2 times the tolerance
+(`tests/test_lattice_probe.py`), and an evaluation takes half the time."""
+REGION_HOLDS_TO = 1.1
+"""How much the contact forces may have grown since."""
+LEVER_ARM = 0.03
+"""m, from the femoral axis to the contact: turns a rotation into a distance."""
 
 
 class FindsForces(Presses, Protocol):
@@ -38,16 +41,6 @@ class FindsForces(Presses, Protocol):
 
     def evaluate_from(
         self, state: Any, pose: Array, start: Guess | None = None, forces_only: bool = False
-    ) -> tuple[ContactResult, WarmStart]:
-        """See `tkamb.contact.lattice.model.CellContact`."""
-
-    def press_from(
-        self,
-        state: Any,
-        load: float,
-        pose: Array,
-        start: Guess | None = None,
-        forces_only: bool = False,
     ) -> tuple[ContactResult, WarmStart]:
         """See `tkamb.contact.lattice.model.CellContact`."""
 
@@ -60,39 +53,28 @@ class LatticeProbe(Probe):
         state: what its `prepare` returned.
         start: an earlier result or warm start.
         accuracy: the model's tolerance, share of the contact force.
-        rough: the model with a wider tolerance, for steps that are extrapolated.
     """
 
     def __init__(
-        self,
-        model: FindsForces,
-        state: LatticeState,
-        start: Guess | None,
-        accuracy: float,
-        rough: FindsForces,
+        self, model: FindsForces, state: LatticeState, start: Guess | None, accuracy: float
     ) -> None:
         super().__init__(model, state, start)
-        self._exact_model, self._accuracy, self._rough = model, accuracy, rough
+        self._finds, self._accuracy = model, accuracy
+        self._measured: tuple[Array, float] | None = None
+        """Pose at which the whole solid was measured last, and norm of the forces there, N."""
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
-        """Return the forces at a pose; see `Probe`."""
-        return self._exact_model.evaluate_from(self._state, pose, self.start, forces_only=True)
-
-    def pressed(
-        self,
-        load: float,
-        pose: Array,
-        start: Guess | None,
-        like: tuple[WarmStart, WarmStart] | None = None,
-    ) -> tuple[ContactResult, WarmStart]:
-        """Return the forces under a load; see `Probe`."""
-        here, model = lattice_start(self._state, start), self._exact_model
-        step = [lattice_start(self._state, each) for each in like or ()]
-        if here is not None and like and _turn(like[0].pose, pose) <= LARGEST_EXTRAPOLATION:
-            first, last = step
-            if first is not None and last is not None:
-                start, model = here.going_as(first, last, pose), self._rough
-        return model.press_from(self._state, load, pose, start, forces_only=True)
+        """Return the forces at a pose; the whole solid is measured unless that was done near by."""
+        if self._measured is not None:
+            way = (pose - self._measured[0])[:3] * [LEVER_ARM, LEVER_ARM, LEVER_ARM, 1.0]
+            way[1, 3] = 0.0  # what the height changes, the forces tell
+            if np.linalg.norm(way) <= REGION_HOLDS_WITHIN * self._state.lattice.spacing.min():
+                result, start = self._finds.evaluate_from(self._state, pose, self.start, True)
+                if np.linalg.norm(result.nodal_force) <= REGION_HOLDS_TO * self._measured[1]:
+                    return result, start
+        result, start = self._finds.evaluate_from(self._state, pose, self.start)
+        self._measured = pose, float(np.linalg.norm(result.nodal_force))
+        return result, start
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return what a result says of the condyles, with their stiffness."""
@@ -114,11 +96,6 @@ class LatticeProbe(Probe):
                 stiffness = np.vstack([part.sum(axis=0), moment.sum(axis=0)])
                 condyles[side] = replace(condyles[side], stiffness=stiffness)
         return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
-
-
-def _turn(first: Array, second: Array) -> float:
-    """Return the angle (rad) between the rotations of two poses."""
-    return float(Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).magnitude())
 
 
 def force_changes(state: LatticeState, result: ContactResult, moved: Array, nodes: Index) -> Array:

@@ -34,7 +34,7 @@ def result_of(
         gaps: (c,) vertical gaps at that pose, m.
         solution: solution of the lattice.
         rule: how a nodal force becomes a pressure.
-        forces_only: no areas within nodes, no gaps beside the contact and no flags are computed.
+        forces_only: the residual and the field are those of the region: nothing is flagged.
     """
     # `evaluate` gets the final pose, `press` the pose of first touch, from which the solver's
     # approach is taken off.
@@ -48,15 +48,13 @@ def result_of(
         ContactResult.of,
         status=ContactStatus.OK if solution.converged else ContactStatus.NOT_CONVERGED,
         iterations=solution.passes,
-        residual=solution.residual,
+        residual=solution.residual.reported,
     )
-    flags: tuple[str, ...] = ()
-    if solution.seen:  # forces alone, close by: it knows the strains of its region alone
-        flags, collapsed = strain_flags(state, solution)
-        if collapsed:
-            return ContactResult.failed(state, pose, *flags)
     if forces_only:
         return with_fields(state, pose, pressure, gaps - depth, force, area, area)
+    flags, collapsed = strain_flags(state, solution)
+    if collapsed:
+        return ContactResult.failed(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, unsettled_flag(solution))
     gap = _gaps(state, pose, gaps - depth, force, solution)

@@ -11,15 +11,15 @@ f_int are the forces of the displaced solid under its nonlinear law, p the femor
 pass of the iteration is a modified Newton step with the factorised linear stiffness K:
 
 1. Femoral points and normals: vertical rays through the displaced nodes.
-2. Contact: an active set on the condensed compliance of the candidate nodes, K⁻¹ at those nodes,
-   with the displacement K⁻¹ h of the nonlinear loads h as offset (`active_set.py`).
-3. Displacement: K u = f + h. Residual: r = f - f_int(u).
-4. Next loads: h + r, accelerated by Anderson's method (`anderson.py`).
+2. Contact: a primal-dual active set on the condensed compliance of the candidate nodes, K⁻¹ at
+   those nodes, with the displacement K⁻¹ h of the nonlinear loads h as offset (`active_set.py`).
+3. Displacement: K u = f + h. Residual: r = f - f_int(u) (`nonlinear_balance.py`).
+4. Next loads: h + r, accelerated by Anderson's method.
 
-Passes look at the region of the elements that have softened (`nonlinear_balance.py`). When the
-residual there is within the tolerances, the residual of the whole solid is measured at u: r from
-the law of every element, without any factor; the gap at the displaced nodes, with rays fired
-anew. Only these stop the iteration, and these are reported:
+Passes look at the region of the elements that have softened. When the residual there is within
+the tolerances, the residual of the whole solid is measured at u: r from the law of every element,
+without any factor; the gap at the displaced nodes, with rays fired anew. Only these stop the
+iteration, and these are reported:
 
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
@@ -37,7 +37,7 @@ import numpy as np
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
-from tkamb.contact.lattice.nonlinear_balance import NonlinearBalance
+from tkamb.contact.lattice.nonlinear_balance import LinearBalance, NonlinearBalance, Residual
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
 from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.geometry.frames import Array, Index, Mask
@@ -62,14 +62,8 @@ class Solution:
         field: (n, 3) displacement of all nodes, or None (linear material).
         loads: (n, 3) N, h + r: where a next solution may begin; None (linear material).
         passes: how many.
-        residual: force of the whole solid that is out of balance, relative to the contact
-            forces, or the gap of active nodes, relative to their displacement, the larger one.
+        residual: of the whole solid.
         region: the elements with which a next solution may begin, or None.
-        seen: the residual is that of the whole solid; else that of the region (forces only).
-        noticed: None: strains of all elements are looked at.
-        work: work of the residual force times the softening, relative to that of the contact
-            forces: an estimate of the relative error of the approach.
-        gap: that of active nodes, relative to their displacement.
     """
 
     candidates: Index
@@ -79,16 +73,12 @@ class Solution:
     field: Array | None
     loads: Array | None
     passes: int
-    residual: float
+    residual: Residual
     region: Region | None = None
-    seen: bool = True
-    noticed: None = None
-    work: float = 0.0
-    gap: float = 0.0
 
     @property
     def converged(self) -> bool:
-        """Whether residual force, gap and active set are within their tolerances."""
+        """Whether residual and active set are within their tolerances."""
         return self.forces.converged
 
 
@@ -100,49 +90,37 @@ def solve(
     settings: LatticeSolverSettings,
 ) -> Solution:
     """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
-    if problem.solid.material.is_linear:
-        return _solve_linear(problem, pose, load, guess, settings)
     points = problem.surface_points[guess.candidates]
-    active, passes, warm = guess.active, 0, guess.loads is not None
-    balance = NonlinearBalance(problem, guess, settings)
+    balance: LinearBalance | NonlinearBalance
+    if problem.solid.material.is_linear:
+        balance = LinearBalance(np.zeros_like(points) if guess.offset is None else guess.offset)
+    else:
+        balance = NonlinearBalance(problem, guess, settings)
     moved = balance.offset if guess.moved is None else guess.moved
     sliding = SlidingNodes(problem, points, moved, pose, guess.planes)
+    active, passes = guess.active, 0
     while True:
-        planes = sliding.planes
+        planes, passes = sliding.planes, passes + 1
         forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
-        if warm and not forces.active.any():
+        active = forces.active
+        if guess.loads is not None and not active.any():
             # What a heavier contact left behind holds the nodes down: begin without it.
             return solve(problem, pose, load, guess.cold, settings)
-        active, passes = forces.active, passes + 1
-        gap = sliding.follow(moved, forces)
         balance.displace(forces.force[:, None] * planes.normals, moved)
-        last = passes == settings.max_passes
-        forces_only = float(np.linalg.norm(forces.force)) <= guess.unmeasured
-        allowed = settings.force_tolerance if last else settings.gap_tolerance
-        last = last or not balance.residual.force < DIVERGED
-        if (last or (balance.residual.within(settings) and gap <= allowed)) and not forces_only:
-            balance.measure()
-        if balance.measured:
-            moved = balance.field[problem.contact_nodes[guess.candidates]]
-            gap = sliding.gap(moved, forces)
-        within = balance.residual.within(settings) and gap <= allowed
-        if last or (within and (balance.measured or forces_only)):
-            loads, region = balance.next_start()
-            return Solution(
-                guess.candidates,
-                replace(forces, converged=within and forces.converged),
-                planes,
-                moved,
-                balance.field,
-                loads,
-                passes,
-                max(balance.residual.force, gap),
-                region,
-                balance.measured,
-                None,
-                balance.residual.work,
-                gap,
-            )
+        residual = replace(balance.residual, gap=sliding.follow(moved, forces))
+        last = passes == settings.max_passes or not residual.force < DIVERGED
+        if last or residual.within(settings):
+            if last or not guess.region_only:
+                balance.measure()
+            gap = sliding.gap(balance.moved, forces) if balance.moved is not moved else residual.gap
+            residual = replace(balance.residual, gap=gap)
+            within = residual.within(settings, last)
+            if last or within:
+                forces = replace(forces, converged=within and forces.converged)
+                return Solution(
+                    guess.candidates, forces, planes, balance.moved, balance.field,
+                    balance.loads, passes, residual, balance.region,
+                )  # fmt: skip
         balance.advance()
 
 
@@ -169,32 +147,6 @@ def solve_pass(
     return forces, offset + response.moved(pushed, forces.force)
 
 
-def _solve_linear(
-    problem: ContactProblem,
-    pose: Array,
-    load: float | None,
-    guess: InitialGuess,
-    settings: LatticeSolverSettings,
-) -> Solution:
-    """Repeat rays and contact until active nodes are on the femoral surface."""
-    points = problem.surface_points[guess.candidates]
-    offset = np.zeros_like(points) if guess.offset is None else guess.offset
-    active, passes = guess.active, 0
-    first = offset if guess.moved is None else guess.moved
-    sliding = SlidingNodes(problem, points, first, pose, guess.planes)
-    while True:
-        passes += 1
-        planes, last = sliding.planes, passes == settings.max_passes
-        forces, moved = solve_pass(guess.response, offset, points, planes, load, active)
-        active, gap = forces.active, sliding.follow(moved, forces)
-        done = gap <= (settings.force_tolerance if last else settings.gap_tolerance)
-        if done or last:
-            forces = replace(forces, converged=done and forces.converged)
-            return Solution(
-                guess.candidates, forces, planes, moved, None, None, passes, gap, gap=gap
-            )
-
-
 class SlidingNodes:
     """Femoral planes over the candidates, renewed as the nodes slide.
 
@@ -219,39 +171,35 @@ class SlidingNodes:
         planes: TangentPlanes,
     ) -> None:
         self._problem, self._points, self._pose = problem, points, pose
-        self._fired = points + moved
+        self._fired, self.planes = points + moved, planes
         self._share, self._last, self._gap = 1.0, np.inf, np.zeros(len(points))
-        self.planes = planes
         if moved.any():
-            self.planes = tangent_planes(problem, self._fired, pose, planes)
+            self.planes = self._at(self._fired)
+
+    def _at(self, positions: Array) -> TangentPlanes:
+        return tangent_planes(self._problem, positions, self._pose, self.planes)
 
     def follow(self, moved: Array, forces: ContactForces) -> float:
-        """Renew the planes for nodes displaced by moved (m, 3).
-
-        Returns:
-            The largest distance of an active node from the femoral surface where it now is
-            (overlap of the others counts too), relative to the largest displacement of an
-            active node; inf where no node is active, for bodies that overlap touch.
-        """
+        """Renew the planes for nodes displaced by moved (m, 3); return what `gap` does."""
         positions = self._points + moved
-        there = tangent_planes(self._problem, positions, self._pose, self.planes)
+        there = self._at(positions)
         missed = self._relative_gap(there, moved, forces)
         gap = there.gap(positions) + forces.approach * there.normal_y
         gap = np.where(forces.active, gap, 0.0)
         if missed > STAGNATION_RATIO * self._last and float(gap @ self._gap) < 0:
             self._share = max(self._share / 2, LEAST_DAMPING)
         self._last, self._gap = missed, gap
-        if self._share == 1.0:
-            self._fired, self.planes = positions, there
-        else:
-            self._fired = self._fired + self._share * (positions - self._fired)
-            self.planes = tangent_planes(self._problem, self._fired, self._pose, self.planes)
+        self._fired = self._fired + self._share * (positions - self._fired)
+        self.planes = there if self._share == 1.0 else self._at(self._fired)
         return missed
 
     def gap(self, moved: Array, forces: ContactForces) -> float:
-        """Measure the same distance for nodes displaced by moved (m, 3); renew nothing."""
-        there = tangent_planes(self._problem, self._points + moved, self._pose, self.planes)
-        return self._relative_gap(there, moved, forces)
+        """Return the largest distance of an active node from the femoral surface where it is.
+
+        Overlap of the others counts too. It is relative to the largest displacement of an active
+        node; inf where no node is active, for bodies that overlap touch.
+        """
+        return self._relative_gap(self._at(self._points + moved), moved, forces)
 
     def _relative_gap(self, there: TangentPlanes, moved: Array, forces: ContactForces) -> float:
         if not forces.active.any():

@@ -1,6 +1,7 @@
-"""Files of a data set into its folder: downloaded or copied, by their SHA-256, each whole or not.
+"""Download or copy the files of a data set into its folder, checked by their SHA-256.
 
-What is there already with the right content is kept, so that an interrupted download goes on.
+A file is written completely or not at all. Files with the right content are kept, so that an
+interrupted download continues.
 """
 
 import shutil
@@ -16,18 +17,18 @@ from tkamb.files import sha256_of
 from tkamb.io.datasets.dataset import DataFile, Dataset
 
 TIMEOUT_S = 30
-"""s without an answer after which a server counts as gone."""
+"""s: time without an answer after which the download fails."""
 LONGEST_S = 1800.0
-"""s that one file may take: 500 MB at 0.3 MB/s."""
+"""s: longest time for one file, 500 MB at 0.3 MB/s."""
 LARGEST = 1_000_000_000
-"""Bytes of a file whose size is not registered."""
+"""Bytes: largest file whose size is not registered."""
 CHUNK = 65_536
-"""Bytes that are asked for at a time."""
+"""Bytes that are read at a time."""
 
 
 @dataclass
 class Got:
-    """What became of the files: names, by what was done."""
+    """Names of the files that were kept, written, or not found."""
 
     kept: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
@@ -88,7 +89,7 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
 
     sources = {
         file.name: _found(file, folder) for file in dataset.files
-    }  # all, before any is copied
+    }  # search all files before copying any
     if not any(sources.values()):
         hint = f"download or clone {dataset.repository} first"
         raise InputError("holds none of the files of this data set", folder, hint)
@@ -122,7 +123,7 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
 
     fetch = _LimitedDownload(LARGEST if file.size is None else file.size)
     digest = f"sha256:{file.sha256}"
-    hint = "run it again: what is complete is kept; or --from DIR for what you downloaded by hand"
+    hint = "run it again: complete files are kept; or give --from DIR with files you downloaded"
     try:
         return Path(pooch.retrieve(address, digest, "whole", folder, downloader=fetch))
     except HTTPError as error:
@@ -163,10 +164,10 @@ class _LimitedDownload:
                 received += len(chunk)
                 if received > self.size:
                     what = f"gives more than the {self.size} bytes that are registered"
-                    raise InputError(what, url, "another version? nothing of it is kept")
+                    raise InputError(what, url, "it may be another version; the file was not kept")
                 if clock.monotonic() > end:
-                    what = f"is not there after {LONGEST_S / 60:.0f} minutes"
-                    raise InputError(what, url, "run it again: what is complete is kept")
+                    what = f"is not complete after {LONGEST_S / 60:.0f} minutes"
+                    raise InputError(what, url, "run it again: complete files are kept")
                 file.write(chunk)
 
 
@@ -183,7 +184,7 @@ def _found(file: DataFile, folder: Path) -> Path | None:
 
 def _other_content(where: str | Path, file: DataFile) -> InputError:
     what = f"is not {file.name} as registered: its SHA-256 is not {file.sha256[:12]}..."
-    return InputError(what, where, "cut short, or another version? nothing of it is kept")
+    return InputError(what, where, "it is cut short or another version; the file was not kept")
 
 
 def _is_there(file: DataFile, to: Path) -> bool:
@@ -192,5 +193,5 @@ def _is_there(file: DataFile, to: Path) -> bool:
         return False
     if sha256_of(target) == file.sha256:
         return True
-    hint = "move it away: nothing of yours is replaced"
-    raise InputError("is there with another content than the published file's", target, hint)
+    hint = "move it away: tkamb does not replace your files"
+    raise InputError("exists with another content than the published file", target, hint)

@@ -20,7 +20,8 @@ from tkamb.io.opensim.model import Coordinate, Joint, OpenSimModel
 
 OTHER = {"right": "left", "left": "right"}
 SEGMENT_LENGTH = (0.15, 0.75)
-"""m; thigh and shank of a child of six (about 0.25) to the tallest (about 0.6), with room."""
+"""m: range of thigh and shank lengths that are accepted, from a child of six (about 0.25) to the
+tallest adult (about 0.6), with a margin."""
 SUFFIX = {"right": ("_r", "_R", ".r"), "left": ("_l", "_L", ".l")}
 
 
@@ -100,7 +101,7 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     try:
         joint, hip, ankle, femur, tibia = _joints(model, side, knee)
     except InputError as error:
-        # what is missing may be what could not be read
+        # The missing part may be one that could not be read.
         raise _unread_joint(model) or error from None
     patellas = [
         body
@@ -259,7 +260,7 @@ def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]
 
 
 def _carried(model: OpenSimModel, body: str) -> list[str]:
-    """Return a body and all that hang on it outwards."""
+    """Return a body and all bodies that it carries."""
     result = [body]
     for joint in model.joints:  # from ground outwards
         if joint.inboard in result:
@@ -282,7 +283,7 @@ def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[
         raise InputError(
             f"has not one joint {where} ({', '.join(bodies)}), but {result}",
             model.name,
-            "is the right joint taken for the knee? give --knee",
+            "give the femorotibial joint with --knee",
         )
     return joints[0]
 

@@ -1,10 +1,10 @@
-"""Forces of a table of ground reactions: which columns are force, point and moment of which.
+"""Forces of a table of ground reactions: the columns of force, point and moment of each.
 
 Programs name these columns in many ways: `ground_force_1_vx`, `1_ground_force_px`,
 `ground_torque_1_y`, `ground_moment_1_mx`, `ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A name is
-taken apart into what it is (force, point, moment), its axis, and what is left: the name of the
-force that it belongs to. A column that speaks of a moment and belongs to no force is an error
-for who needs moments, never zero.
+divided into its kind (force, point, moment), its axis, and the rest: the name of the force that
+it belongs to. A column of moments that belongs to no force is an error if moments are needed; it
+is never taken as zero.
 """
 
 import re
@@ -29,7 +29,7 @@ class TableForce:
     """A force of a table.
 
     Args:
-        name: what its columns begin with.
+        name: common beginning of its column names.
         columns: role of a scene, like "force_1" or "moment_2" -> column.
     """
 
@@ -94,7 +94,7 @@ def table_forces(table: Table) -> list[TableForce]:
 
 
 def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[TableForce]) -> None:
-    """Raise where columns speak of a moment, and some force has none."""
+    """Raise if columns of moments belong to no force, and some force has no moment."""
     read = {name for force in forces for name in force.columns.values()}
     others = [
         name
@@ -113,7 +113,7 @@ def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[Table
 
 
 def _taken_apart(name: str) -> _Column | None:
-    """Return what a column's name says; None if it is of no force, point or moment."""
+    """Return the parts of a column's name; None if it is not a force, point or moment."""
     plain = name.lower().rstrip()
     if match := _NUMBERED.fullmatch(plain):
         kind, owner, axis = match.groups()

@@ -34,17 +34,17 @@ from tkamb.io.recordings.tables import Table, read_table
 
 @dataclass(frozen=True)
 class ImportedForceSettings:
-    """What an imported scene says about its measured ground reaction."""
+    """Settings of the ground reaction in an imported scene."""
 
     hold_below: float = 40.0
-    """N; vertical force below which the imported scene holds the centre of pressure. The shipped
-    imports use it: below 40 N the quotient of moment and force is noise."""
+    """N; vertical force below which the imported scene holds the centre of pressure. Chosen: the
+    shipped imports use it: below 40 N the quotient of moment and force is noise."""
 
 
 IMPORTED_FORCE = ImportedForceSettings()
 
 COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
-"""Of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
+"""Columns of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
 Interval = tuple[float, float]
 
 
@@ -53,10 +53,10 @@ class FoundGround:
     """A foot's ground reaction.
 
     Args:
-        ground: where it stands; None: none is modelled.
-        interval: s, in which all that the foot stands on was measured; None: nobody knows.
+        ground: file and columns; None: no ground reaction is modelled.
+        interval: s, in which every surface under the foot was measured; None: unknown.
         span: s, first and last sample of a table; None: the recording's own.
-        said: lines on it.
+        said: lines for the report.
     """
 
     ground: GroundFile | None
@@ -72,10 +72,10 @@ def find_ground(request: ImportRequest, side: str, axes: str, feet: Feet | None)
         request: recording, table, plates and interval.
         side: of the knee.
         axes: the recording's and the table's that point forward, up and right.
-        feet: where the feet are; None: nobody knows.
+        feet: where the feet are; None: unknown.
 
     Raises:
-        InputError: plates or columns that cannot be used, or that bear both feet.
+        InputError: plates or columns that cannot be used, or that carry both feet.
     """
     if request.grf is not None:
         return _from_table(request, request.grf, side, axes, feet)
@@ -312,14 +312,14 @@ def _unmeasured_line(
         return []
     return [
         f"ATTENTION: off its plates the foot is nearly still in {len(times)} frames, first at "
-        f"{times[0]:.3f} s: does it stand on something that was not measured?"
+        f"{times[0]:.3f} s: it may stand on something that was not measured"
     ]
 
 
 def _drift_lines(forces: list[RecordedForce], plates: tuple[int | str, ...]) -> list[str]:
     return [
         f"ATTENTION: {one.title} reads {one.drift:.1f} N while nobody stands on it: it drifts, and "
-        "bears as much too much under the foot"
+        "its force under the foot is too large by as much"
         for one in forces
         if one.key in plates and abs(one.drift) > PLATE_LOAD.drift_N
     ]

@@ -13,11 +13,11 @@ from tkamb.units import DEGREE
 
 @dataclass(frozen=True)
 class LinkFitSettings:
-    """How the links of the URDF are laid into the bodies of an OpenSim model."""
+    """How the links of the URDF are placed in the bodies of an OpenSim model."""
 
     max_implant_rotation: float = 35.0 * DEGREE
-    """rad; largest rotation between the implant's axes and the bone's. A wrong axis is off by 90
-    deg, a real implantation by a few degrees."""
+    """rad; largest rotation between the implant's axes and the bone's. Chosen: a wrong axis is off
+    by 90 deg, a real implantation by a few degrees."""
 
 
 LINK_FIT = LinkFitSettings()
@@ -29,8 +29,8 @@ class MeshFrame:
 
     Args:
         body: the body.
-        pose: (4, 4) in it; None: at its origin, with the axes that anatomy says.
-        why: how it was found, for the reader.
+        pose: (4, 4) in it; None: at its origin, with anatomical axes.
+        why: how it was found, for the report.
     """
 
     body: str
@@ -77,12 +77,12 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
             if stem in name.lower():
                 return MeshFrame(*frames[name], f"'{name}', by its name")
     if part == "patellar button" and leg.patella:
-        return MeshFrame(leg.patella, None, "the patella's origin, for want of a frame")
+        return MeshFrame(leg.patella, None, "the patella's origin, because there is no frame")
     option = {"femoral component": "--femoral-frame", "insert": "--insert-frame"}.get(
         part, "--patella-frame"
     )
     raise InputError(
-        f"says nowhere how the {part}'s mesh stands on the bone",
+        f"does not say how the {part}'s mesh is placed on the bone",
         model.name,
         f"give {option}, one of {', '.join(frames)}",
     )
@@ -139,7 +139,7 @@ class Links:
         ):
             if body in bodies and own is not None:
                 return link, inverse(own) @ leg.in_body(body, str(bodies[0]))
-        raise InputError(f"body '{body}' moves with no link of the leg", leg.model.name)
+        raise InputError(f"body '{body}' is not part of any link of the leg", leg.model.name)
 
     def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
         """Return the link that a body moves with, and a point (3,) of the body in it."""

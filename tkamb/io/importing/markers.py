@@ -1,4 +1,5 @@
-"""The leg's markers in a recording: matched to the model's, and what they say of the laboratory."""
+"""The leg's markers in a recording: matched to the model's, and used to find the laboratory
+axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -190,9 +191,9 @@ class Facing:
     """Which of a recording's axes point where, and how far the subject is from them.
 
     Args:
-        axes: those that point forward, up and to the right, like "-x,+z,+y".
-        up_deg: between the mean upward axis of shank, thigh and pelvis and the file's.
-        forward_deg: between the mean forward axis and the file's, in the horizontal plane.
+        axes: axes of the file that point forward, up and to the right, like "-x,+z,+y".
+        up_deg: angle between the mean upward axis of shank, thigh and pelvis and the file's axis.
+        forward_deg: angle between the mean forward axis and the file's, in the horizontal plane.
     """
 
     axes: str

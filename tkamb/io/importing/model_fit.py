@@ -1,7 +1,7 @@
 """An OpenSim model's own chain fitted to markers: what OpenSim's InverseKinematicsTool does.
 
-All coordinates that are not locked are free, those that follow others by an enforced coupler
-follow. Ranges are not imposed. The same least squares as for a leg
+All coordinates are free, except locked ones and those that follow others by an enforced coupler.
+Ranges are not imposed. The least squares are the same as for a leg
 (`tkamb.io.recordings.inverse_kinematics`), with the model's joints.
 """
 
@@ -27,10 +27,11 @@ class ModelFitSettings:
     """How the poses of a model are fitted to markers."""
 
     block_frames: int = 128
-    """Frames that are fitted in one call; trades memory for speed and changes no result."""
+    """Frames that are fitted in one call. Chosen: it trades memory for speed and changes no
+    result."""
     coarse_stride: int = 8
-    """Frames between those that are fitted first; the others begin from their poses. It changes the
-    initial guesses only."""
+    """Frames between those that are fitted first; the others begin from their poses. Chosen: it
+    changes the initial guesses only."""
 
 
 MODEL_FIT = ModelFitSettings()
@@ -61,7 +62,7 @@ class ModelChain:
         self._couplers = [
             (index[c.dependent], index[c.independent], c.function) for c in model.couplers
         ]
-        # what moves: the free ones first, then what follows them, over others or not
+        # Coordinates that move: the free ones first, then those that follow them directly or not.
         follow: list[int] = []
         for dependent, independent, _ in self._couplers:
             if independent in self.free or independent in follow:
@@ -96,15 +97,15 @@ class ModelChain:
         """Return the least squares to markers (f, m, 3) m with weights (f, m).
 
         With s = (a, b) a coordinate's twist in ground (rotation a, velocity b of ground's
-        origin), a marker at x that hangs on its joint moves by u = b + a × x. For i above j in
-        the chain, sums over the markers that j carries,
+        origin), a marker at x that is carried by its joint moves by u = b + a × x. For i above j
+        in the chain, with sums over the markers that j carries,
 
             (Jᵀ W J)_ij = s_i · Σ w (x × u_j, u_j)
             residuals' curvature_ij = -Σ w r · (a_i × u_j) = -a_i · Σ w u_j × r,   r = p - x
 
-        so that a coordinate needs the moments Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ of what
-        it carries, and no marker needs its own Jacobian. How the splines of a joint bend is
-        left out of the curvature.
+        so that a coordinate needs the sums Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ over the
+        markers that it carries, and no marker needs its own Jacobian. The curvature of a joint's
+        splines is neglected.
         """
         poses, twists = self.kinematics.joint_twists(state)
         twists = twists[:, self._moving]
@@ -251,7 +252,8 @@ def fit_model(
     values = np.array([(weights or {}).get(name, 1.0) for name in match])
     first = int(np.argmax(np.isfinite(measured).all(axis=2).sum(axis=1)))
     begin = fit_chain(chain, measured[first : first + 1], values, chain.default(1))
-    # some frames first, from the best seen; between them the others are nearly there
+    # Some frames first, beginning with the one that shows most markers. They are good initial
+    # guesses for the frames between them.
     coarse = np.unique(
         np.append(np.arange(0, len(measured), MODEL_FIT.coarse_stride), len(measured) - 1)
     )

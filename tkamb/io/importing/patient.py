@@ -1,4 +1,4 @@
-"""A patient brought in: model, recording and meshes to a URDF and a scene that runs."""
+"""Import of a patient: from model, recording and meshes to a URDF and a scene that runs."""
 
 import os
 from contextlib import suppress
@@ -37,21 +37,24 @@ class ModelMassSettings:
     """How the mass of an OpenSim model becomes the mass of a patient."""
 
     one_leg_share: float = 0.6
-    """Share of the mass of a model that thigh, shank and foot have at least where it is a model of
-    one leg."""
+    """1: a model whose thigh, shank and foot have at least this share of its mass is a model of one
+    leg. Chosen: of a whole body, one leg has less than a fifth."""
     leg_mass_share: float = 0.161
     """Share of the body's mass in one leg: thigh 0.100, shank 0.0465, foot 0.0145 (Winter,
     Biomechanics, 2009)."""
     max_reasons: int = 3
-    """Parts that were not read of which the report of an import gives the reason."""
+    """Largest number of parts that could not be read whose reasons the report of an import gives.
+    Chosen: a report stays short."""
     same_mass_share: float = 0.01
-    """Share of the subject's mass; a model whose mass differs by less is not scaled."""
+    """Share of the subject's mass: a model whose mass differs by less is not scaled. Chosen:
+    clothes and rounding differ by less."""
 
 
 MODEL_MASS = ModelMassSettings()
 
 LEG_SHARES = (0.10, 0.25)
-"""Of the body's mass: from Winter's 0.161 to de Leva's 0.20 (1996), with room for other people."""
+"""Accepted share of one leg in the body's mass: Winter (2009) gives 0.161, de Leva (1996) 0.20; the
+margin is for individual differences."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,7 @@ class ImportedPatient:
         scene: the scene, to be written as text.
         motion: text of motion.csv; None where markers are read from the recording.
         ground: text of ground_reaction.csv; None where the ground reaction has one file.
-        report: lines on what was understood and assumed.
+        report: lines on what was read and what was assumed.
     """
 
     urdf: str
@@ -81,7 +84,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         folder: where the scene will stand.
 
     Raises:
-        InputError: whatever cannot be used, in one line.
+        InputError: a file or value that cannot be used, in one line.
     """
     model = read_osim(request.model, partial=True)
     leg = find_leg(model, request.side, request.knee)
@@ -101,7 +104,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     tissue = soft_tissue(links)
     if meshes and meshes.femur_bone and not (tissue.quadriceps and tissue.patellar_ligament):
         hint = "leave it out, or complete the model"
-        what = "is what the quadriceps wraps, and the model gives none"
+        what = "is the bone that the quadriceps wraps, but the model has no quadriceps"
         raise InputError(what, "--femur-bone", hint)
     result = _trial(request, leg, links, insert)
     scene = SceneText(
@@ -171,8 +174,8 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
     """Write URDF and scene, load them as a run would, and return what the markers say.
 
-    A file that is there already is left as it is: one of the same content may be shared with
-    another scene. Nothing is left behind where anything fails.
+    Existing files are not changed: a file of the same content may be shared with another scene. If
+    anything fails, no new file remains.
 
     Raises:
         InputError: the folder cannot be written, holds a file of one of these names with another
@@ -180,7 +183,7 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
     """
     scene = folder / name
     if os.path.lexists(scene):
-        raise InputError("is there already", scene, CHOOSE_OUT)
+        raise InputError("exists already", scene, CHOOSE_OUT)
     files = {folder / patient.scene.urdf: patient.urdf, scene: patient.scene.text()}
     if patient.motion is not None:
         files[folder / MOTION_FILE] = patient.motion
@@ -209,7 +212,7 @@ def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
     """Return what the force plates show of gait, in a line.
 
     Raises:
-        InputError: a cycle is wanted from the plates, and they show none.
+        InputError: a gait cycle is requested from the plates, and they show none.
     """
     gait = None if case.ground is None else case.ground.gait
     if asks_gait and case.gait_cycle_s is None:
@@ -234,14 +237,14 @@ def _same_there(path: Path, text: str) -> bool:
     """Say whether a file of that content is there.
 
     Raises:
-        InputError: one of another content is, or something that is no file.
+        InputError: there is a file of another content, or something that is not a file.
     """
     if not os.path.lexists(path):
         return False
     with suppress(InputError):
         if read_bytes(path, FILE_LIMITS.table_bytes) == text.encode("utf-8", "backslashreplace"):
             return True
-    what = "is there already with another content; another scene may need it"
+    what = "exists already with another content; another scene may need it"
     raise InputError(what, path, CHOOSE_OUT)
 
 
@@ -301,7 +304,7 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
         raise InputError(
             f"weighs {model:.1f} kg, the subject {subject:g} kg",
             request.model,
-            "is --mass-kg in kilograms? else scale the model first",
+            "check that --mass-kg is in kilograms; if it is, scale the model first",
         )
     return (ratio, text + f"scaled by {ratio:.4f}") if scaled else (1.0, text + "not scaled")
 
@@ -309,8 +312,8 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
 def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
     """Return the factor on the masses of a model that is little more than one leg, and a line.
 
-    Such a model holds the leg's own mass, or, where a scaling tool was told the subject's mass,
-    the whole body's. The leg's own is `MODEL_MASS.leg_mass_share` of the subject.
+    Such a model has the mass of the leg or, if a scaling tool used the subject's mass, that of the
+    whole body. The leg's mass is `MODEL_MASS.leg_mass_share` of the subject's.
 
     Raises:
         InputError: neither of the two.
@@ -329,7 +332,8 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
             f"is one leg of {own:.1f} kg, the subject weighs {subject:g} kg: a leg has "
             f"{low:.0%} to {high:.0%} of the body's mass",
             request.model,
-            "is --mass-kg in kilograms? else give the model's bodies a leg's masses",
+            "check that --mass-kg is in kilograms; if it is, give the model's bodies a leg's "
+            "masses",
         )
     why = ", the whole body's" if whole_body else ""
     return target / own, (
@@ -339,7 +343,7 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
 
 
 def _model_lines(model: OpenSimModel) -> list[str]:
-    """Return how the model was read, and what of it was not, because this knee needs none of it."""
+    """Return lines on how the model was read, and on parts that this knee does not need."""
     lines = [f"model: {notice}" for notice in model.notices]
     unread = [f"{one.kind} '{one.name}'" for one in model.unread]
     if unread:
@@ -386,9 +390,9 @@ def _notes(
     request: ImportRequest, scale: float, trial: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
     alone = (
-        "Without [muscles] only the quadriceps acts: where hamstrings and gastrocnemius act too, "
-        "the contact force is too low and the quadriceps force is what the joint moment needs at "
-        "least."
+        "Without [muscles] only the quadriceps acts. When hamstrings and gastrocnemius act too, "
+        "the contact force is too low, and the quadriceps force is the least that the joint moment "
+        "needs."
     )
     notes = [
         *(() if request.muscles else (alone,)),
@@ -397,15 +401,17 @@ def _notes(
     ]
     if request.meshes and not trial.poses:
         notes.append(
-            "Adduction, axial rotation, AP and ML of the femur are where contact, ligaments and "
-            "muscle line leave them; nobody recorded them."
+            "Adduction, axial rotation, AP and ML of the femur were not recorded; they follow from "
+            "the equilibrium of contact, ligaments and muscle line."
         )
     if request.meshes and not own_ligaments:
-        notes.append("The ligaments are a generic set scaled to the implant, nobody's own.")
+        notes.append(
+            "The ligaments are a generic set scaled to the implant, not the patient's own."
+        )
     if scale != 1.0:
         notes.append(f"Segment masses are the model's times {scale:.4f}.")
     if trial.ground is None:
-        notes.append("No ground reaction: the shank hangs in the air.")
+        notes.append("No ground reaction is modelled: the foot is unloaded.")
     return tuple(notes)
 
 
@@ -421,12 +427,14 @@ def _motion_notes(request: ImportRequest, trial: Trial) -> list[str]:
         notes.append(f"The poses are read with the other sign of {names}.")
     if request.poses.stride:
         notes.append(
-            "The knee's motion is of another recording than ground reaction and shank, laid on "
-            "one stride of theirs phase for phase: an assumption."
+            "The knee's motion is from another recording than ground reaction and shank. Its "
+            "phase is "
+            "mapped to one of their strides: an assumption."
         )
     if centres := [centre.name.replace("_", " ") for centre in trial.shank.centres]:
         notes.append(
-            f"The shank shows {len(trial.shank.points)} markers; {' and '.join(centres)}, which "
-            "the neighbours' markers carry, complete it. Its lean is less certain for that."
+            f"The shank shows {len(trial.shank.points)} markers. They are completed by "
+            f"{' and '.join(centres)} from the markers of its neighbours, so its lean is less "
+            f"certain."
         )
     return notes

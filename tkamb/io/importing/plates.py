@@ -1,4 +1,4 @@
-"""Which foot bore which force, and while which part of a recording all of its load is known.
+"""Which foot exerted which force, and in which part of a recording all of its load is known.
 
 The forces are those of a C3D file's plates, or of a table of ground reactions.
 """
@@ -22,20 +22,22 @@ class FootContactSettings:
     """Which force plate carries which foot, from forces and markers."""
 
     min_force: float = 40.0
-    """N; vertical force at which a plate counts as loaded. The noise of a plate is a few
+    """N: vertical force from which a plate counts as loaded. Chosen: the noise of a plate is a few
     newtons."""
     min_duration: float = 0.1
-    """s; a load that lasts less is a knock, not a step."""
+    """s: a shorter load is no step. Chosen: it is a knock."""
     max_foot_distance: float = 0.25
-    """m; horizontal distance from the centre of pressure to the middle of the foot's markers: about
-    the length of a foot."""
+    """m; horizontal distance from the centre of pressure to the middle of the foot's markers.
+    Chosen: about the length of a foot."""
     min_step_height: float = 0.15
-    """m; a foot whose markers are this far above the plate stands on something else. The lowest
-    stair of the data sets is 0.17 m high."""
+    """m; a foot whose markers are this far above the plate stands on something else. Chosen: the
+    lowest stair of the data sets is 0.17 m high."""
     marker_height: float = 0.055
-    """m; height of the middle of a foot's markers above the ground on which it stands."""
+    """m; height of the middle of a foot's markers above the ground on which it stands. Chosen: a
+    usual foot's markers have it on level ground."""
     same_height: float = 0.05
-    """m; heights that differ by less belong to one step."""
+    """m; heights that differ by less belong to one step. Chosen: the steps of stairs differ by
+    more."""
     max_standing_speed: float = 0.15
     """m/s; a foot off the plates that moves less stands on something that was not measured."""
 
@@ -49,11 +51,11 @@ class RecordedForce:
 
     Args:
         key: number of the plate, or name of the table's force.
-        title: what to call it.
+        title: name in messages.
         time: (k,) s.
         wrench: (k, 6) N and N·m about the laboratory's origin.
         level: m, height of the surface.
-        drift: N, what it reads while nobody stands on it.
+        drift: N, reading while nobody stands on it.
     """
 
     key: int | str
@@ -84,13 +86,13 @@ class Load:
 
     Args:
         plate: number of the plate, or name of the table's force.
-        title: what to call it.
-        side: whose foot; empty: nobody's whose markers are known.
+        title: name in messages.
+        side: side of the foot; empty: a foot without known markers.
         start: s.
         end: s.
         distance: m, median, between the centre of pressure and that foot's markers.
-        other: m, the same to the other foot's; NaN if that has no markers.
-        surface: m, about how high above the plate that foot stands: zero, or a step.
+        other: m, median distance to the other foot's markers; NaN if that has none.
+        surface: m, approximate height of that foot above the plate: zero, or a step.
     """
 
     plate: int | str
@@ -185,7 +187,7 @@ def _load(
 def own_plates(
     loads: list[Load], side: str, path: Path, hint: str = "give --plates and --interval"
 ) -> tuple[int | str, ...]:
-    """Return the plates that one foot stood on, and no other.
+    """Return the plates that only this foot stood on.
 
     Raises:
         InputError: none, or a plate that both feet stood on.

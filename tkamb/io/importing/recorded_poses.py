@@ -64,7 +64,7 @@ class PoseRecording:
 
 @dataclass(frozen=True, eq=False)
 class RecordedPoses:
-    """Poses that were read.
+    """Poses after reading.
 
     Args:
         given: the table of poses and its units.
@@ -72,7 +72,7 @@ class RecordedPoses:
         time: (n,) s, on the recording's clock.
         femur: (n, 4, 4) m, the femur's body in the tibia link.
         in_stance: (n,) whether the foot is loaded.
-        said: lines on them.
+        said: lines for the report.
     """
 
     given: PoseRecording

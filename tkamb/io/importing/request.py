@@ -1,4 +1,4 @@
-"""What an import is asked for."""
+"""The request of an import."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +11,7 @@ from tkamb.io.recordings.unit_words import GivenUnits
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """What is to be imported; None: to be inferred, or not there.
+    """Files and options of an import; None: inferred, or absent.
 
     Args:
         model: the .osim file.
@@ -31,7 +31,7 @@ class ImportRequest:
         interval: s, the part of the recording.
         laboratory_axes: the file's that point forward, up and right.
         scale_mass: whether the model's masses are scaled to the subject's.
-        method: reading of the markers that is used.
+        method: how the markers are fitted, "segments" or "chain".
         cutoff_Hz: of markers and plates.
         contact: the scene's contact model.
         activity: what the report compares with; None: with nothing.
@@ -39,7 +39,7 @@ class ImportRequest:
         prefix: of the markers' labels that are used, where several prefixes share a label.
         muscles: whether the scene has all muscles of the model, which share the load.
         cycle: s, 0 and 100 % of the gait cycle; "plates": two foot strikes of the plates.
-        units: what the recording's units are, where it does not say.
+        units: the recording's units, where it does not state them.
     """
 
     model: Path

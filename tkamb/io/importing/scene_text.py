@@ -19,7 +19,8 @@ from tkamb.io.recordings.unit_words import GivenUnits
 from tkamb.units import DEGREE
 
 GROUND_FILE = "ground_reaction.csv"
-"""Beside the scene: a foot's ground reaction, where it is a sum of several of a table's forces."""
+"""File beside the scene: a foot's ground reaction, if it is the sum of several forces of a
+table."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Meshes:
 
 @dataclass(frozen=True, eq=False)
 class GroundFile:
-    """Where the ground reaction stands: plates of a C3D file, or columns of a table.
+    """Source of the ground reaction: plates of a C3D file, or columns of a table.
 
     A foot on a step stands `surface` (m) above its plates. `made` is the text of a table that the
     import writes: forces in turn, summed.
@@ -72,7 +73,7 @@ class MarkerFile:
 
 @dataclass(frozen=True, eq=False)
 class SceneText:
-    """Everything that the scene says.
+    """Content of the scene.
 
     Args:
         title: comment lines at the top.
@@ -158,18 +159,16 @@ class SceneText:
         lines += [f'length_unit = "{m.length_unit}"'] if m.length_unit else []
         lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
         if m.interval:
-            lines.append("# the part in which all that the foot stands on was measured, own clock")
+            lines.append("# s on the file's clock, while every surface under the foot was measured")
             lines.append(f"interval_s = [{m.interval[0]:.9f}, {m.interval[1]:.9f}]")
         if m.frames:
-            lines.append(
-                "# every so many frames of the recording: five times the cut-off is enough"
-            )
+            lines.append("# every k-th frame of the recording: five times the cut-off is enough")
             lines.append(f"frames = {m.frames}")
         coordinates = ["flexion"] if self.meshes else _ALL
         lines += [
             "",
             "[motion.markers]",
-            f'method = "{m.method}"  # "segments": shank and thigh each by itself; or "chain"',
+            f'method = "{m.method}"  # "segments": shank and thigh separately; or "chain"',
             f'knee = "{m.knee}"',
             f"coordinates = {json.dumps(coordinates)}",
             "# where the model keeps the straight knee",
@@ -289,7 +288,7 @@ class SceneText:
         if self.meshes is None:
             return []
         return [
-            "# The model has none: a generic set, nobody's, scaled to the implant.",
+            "# The model has none: a generic set, scaled to the implant, not the patient's own.",
             "[generic_ligaments]",
             'ligaments = ["MCL", "LCL", "PCL"]',
         ]
@@ -307,7 +306,8 @@ class SceneText:
             return lines
         return [
             *lines,
-            "# nobody recorded these: contact, ligaments and muscle line find them",
+            "# not recorded: they follow from the equilibrium of contact, ligaments and muscle "
+            "line",
             'released = ["adduction", "axial_rotation", "ap", "ml"]',
         ]
 

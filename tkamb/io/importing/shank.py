@@ -1,4 +1,4 @@
-"""The shank in the laboratory by itself: its markers, and joint centres that others carry."""
+"""The shank in the laboratory: its markers, and joint centres from its neighbours' markers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ def shank_markers(
     recording: Path,
     axes: str,
 ) -> ShankMarkers:
-    """Return what fixes the shank: three markers or more, else joint centres with them.
+    """Return the points that place the shank: its markers and, if fewer than three, joint centres.
 
     The ankle's centre is carried by three or more markers of the foot, the knee's by those of
     the thigh. Where the knee's centre lies in the shank is the mean over the poses given.

@@ -1,4 +1,4 @@
-"""What of a model's muscles and ligaments the scene can take over, and why the rest is left out."""
+"""The muscles and ligaments of a model that a scene can hold, and why others are left out."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from tkamb.io.opensim.lines import Ligament, Path, PathPoint
 
 @dataclass(frozen=True)
 class ImportedLigamentSettings:
-    """What an imported ligament has that an OpenSim model does not state."""
+    """Properties of imported ligaments that an OpenSim model does not state."""
 
     toe_strain: float = 0.06
     """Strain at which the toe of law \"quadratic-toe\" ends: twice eps1 = 0.03 (Blankevoort
@@ -43,14 +43,14 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class SoftTissue:
-    """What is taken over.
+    """Muscles and ligaments that are imported.
 
     Args:
         quadriceps: origin and insertion; None without a patella or a vastus intermedius.
         patellar_ligament: ends on patella and tibia; None without.
         ligament_length: m, of the patellar ligament.
         bundles: femorotibial ligaments.
-        said: lines on what was taken and what was left out, and why.
+        said: lines on what is imported, what is left out, and why.
     """
 
     quadriceps: tuple[End, End] | None
@@ -170,7 +170,7 @@ def _reason_against(ligament: Ligament, fixed: int) -> str:
     if not ligament.enabled:
         return "switched off in the model"
     if fixed != 2 or len(ligament.path.points) != 2:
-        return "which run by more than two points"
+        return "which have more than two path points"
     if ligament.stiffness_N is None:
         return f"of class {ligament.kind}, whose law the scene does not have"
     if (
@@ -192,8 +192,8 @@ def _name_muscles(links: Links, remarks: list[str]) -> None:
     ]
     if across:
         remarks.append(
-            f"{len(across)} muscles run from thigh or pelvis to the shank; without --muscles none "
-            f"but the quadriceps line acts: {some_names(across)}"
+            f"{len(across)} muscles run from thigh or pelvis to the shank; they act with "
+            f"--muscles, without it the quadriceps line alone: {some_names(across)}"
         )
 
 

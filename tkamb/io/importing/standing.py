@@ -1,4 +1,4 @@
-"""Markers put where a standing trial has them."""
+"""Marker positions calibrated by a standing trial."""
 
 import tomllib
 from dataclasses import replace
@@ -62,8 +62,8 @@ def calibrated_markers(
     """Return where the markers sit on a subject who stands: segment -> marker -> (3,) m.
 
     The chain is fitted to the standing trial with the markers as the table has them; each
-    marker's mean place in its fitted segment is its calibrated one. So the chain decides how
-    the bones stand, and the markers follow.
+    marker's mean position in its fitted segment is its calibrated one. So the chain decides the
+    pose of the bones, and the markers follow.
 
     Args:
         table: markers and joints; those that the trial does not hold are left as they are.

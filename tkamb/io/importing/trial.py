@@ -1,4 +1,4 @@
-"""A trial: markers or coordinates, which way the subject faces, which plates bear the foot."""
+"""A trial: markers or coordinates, the direction the subject faces, the plates under the foot."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -33,8 +33,8 @@ class TrialFrameSettings:
     """How many frames of a trial an imported scene holds."""
 
     frames_per_period: float = 5.0
-    """Frames per period of the cut-off frequency. A low-pass-filtered motion has no content between
-    them."""
+    """Frames per period of the cut-off frequency. Chosen: a low-pass-filtered motion has no content
+    between them."""
 
 
 TRIAL_FRAMES = TrialFrameSettings()
@@ -131,7 +131,7 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
 
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
-    """Return lines on what of the recording is not used or was read otherwise than stated."""
+    """Return lines on parts of the recording that are not used, or not read as stated."""
     notices = recorded.notices
     if recorded.path.suffix.lower() == ".c3d":
         notices = read_c3d(recorded.path, request.units).all_notices

@@ -19,7 +19,7 @@ WHAT = "OpenSim model"
 
 @dataclass(frozen=True)
 class DocumentSettings:
-    """What is read of an OpenSim file."""
+    """Limits of reading an OpenSim file."""
 
     max_nested_files: int = 5
     """Files that name files in turn; OpenSim's own models nest one deep."""
@@ -28,7 +28,7 @@ class DocumentSettings:
 DOCUMENT = DocumentSettings()
 
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
-"""Sets of which tkamb reads nothing but the names: their file may be absent."""
+"""Sets of which tkamb reads only the names; their file may be absent."""
 
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[0-9]+|#x[0-9a-fA-F]+);)")
 _COMMENT = re.compile(r"<!--(.*?)-->", re.S)
@@ -38,7 +38,7 @@ _END = re.compile(r"</OpenSimDocument\s*>")
 
 
 def open_document(path: Path) -> tuple[Element, list[str]]:
-    """Return the root of an OpenSim file, what it names put in its place, and notices.
+    """Return the root of an OpenSim file with its included files, and notices.
 
     Args:
         path: the file.
@@ -143,7 +143,7 @@ def _replace(
 
 
 def _apply_defaults(target: Element, defaults: Element | None) -> None:
-    """Write a file's own defaults into its elements: they hold for no other file's."""
+    """Write a file's own defaults into its elements; they do not apply to other files."""
     by_tag = {} if defaults is None else {entry.tag: entry for entry in defaults}
     inside = set() if defaults is None else set(defaults.iter())
     for element in [e for e in target.iter() if e.tag in by_tag and e not in inside]:

@@ -26,7 +26,7 @@ Element = ElementTree.Element
 class Document:
     """An OpenSim document: where it lies, and what its <defaults> say for each class.
 
-    OpenSim leaves out what equals the defaults, so that a missing element is looked up there.
+    OpenSim omits values that equal the defaults, so that a missing element is looked up there.
 
     Args:
         path: the file.
@@ -150,7 +150,7 @@ class Document:
         return name
 
     def objects(self, owner: Element, set_tag: str) -> Iterator[Element]:
-        """Yield what stands in <set_tag><objects>."""
+        """Yield the elements in <set_tag><objects>."""
         for holder in owner.findall(f"{set_tag}/objects"):
             yield from holder
 

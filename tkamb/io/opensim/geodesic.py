@@ -34,11 +34,14 @@ class GeodesicSettings:
     """The Newton iteration for a geodesic between two points."""
 
     max_iterations: int = 30
-    """Newton steps, after which a string without convergence fails."""
+    """Newton steps, after which a string without convergence fails. Chosen: strings that converge
+    need fewer."""
     tolerance: float = 1e-11
-    """rad; error of the direction in which the string arrives."""
+    """rad; error of the direction in which the string arrives. Chosen: far below what moves a point
+    of contact."""
     overshoot_below: float = 0.05
-    """rad; at a smaller error, a string that arrives backwards has gone too far."""
+    """rad: if the error is smaller than this, a string that arrives backwards has overshot. Chosen:
+    farther away the derivative may turn its sign."""
 
 
 GEODESIC = GeodesicSettings()
@@ -126,7 +129,8 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
         if is_converged.all():
             break
         step = -np.linalg.solve(jacobian[~is_converged], residual[~is_converged][..., None])[..., 0]
-        # a string that would turn back has gone past where it leaves, by as far as it must return
+        # A string that would turn back has overshot the point where it leaves the surface, by the
+        # distance that it has to return.
         past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~is_converged]
         step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~is_converged][past]])
         waiting = waiting[~is_converged]

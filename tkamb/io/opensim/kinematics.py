@@ -92,7 +92,7 @@ class Kinematics:
         self._index_joints(model)
 
     def _index_joints(self, model: OpenSimModel) -> None:
-        """Keep what the joints' axes belong to, and the frames at both ends of each joint."""
+        """Store joint and coordinate of each axis, and the frames at both ends of each joint."""
         joints = model.joints
         self._ends = [(self.bodies[j.inboard], self.bodies[j.outboard]) for j in joints]
         self._backwards = np.array([j.backwards for j in joints], bool).reshape(-1, 1, 1)
@@ -142,7 +142,7 @@ class Kinematics:
     def coupling(self, q: ArrayLike) -> Array:
         """Return ∂q/∂q (..., n, n): one coordinate's own change, and that of what follows it.
 
-        The column of a coordinate that follows another is zero: it is none of its own.
+        The column of a coordinate that follows another is zero, because it is not independent.
         """
         values = self.vector(q)
         result = np.broadcast_to(np.eye(values.shape[-1]), (*values.shape, values.shape[-1])).copy()

@@ -1,4 +1,4 @@
-"""What muscles and ligaments are: their paths, what lies in the way, their few numbers.
+"""Muscles and ligaments as data: paths, wrap objects and parameters.
 
 SI and radians; points and poses in the bodies themselves.
 """
@@ -60,7 +60,7 @@ class WrapObject:
         dimensions: m. Cylinder: radius, length; sphere: radius; ellipsoid: semi-axes x, y, z;
             torus: radius of the centre line, radius of the tube.
         quadrant: axis 0, 1 or 2 and sign ±1 of the half on which paths must lie; None: either.
-        active: whether paths notice it.
+        active: whether paths wrap it.
     """
 
     name: str
@@ -91,7 +91,7 @@ class PathWrap:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Where a muscle or ligament runs: points in order, and what lies in its way."""
+    """Path of a muscle or ligament: points in order, and wrap objects."""
 
     points: tuple[AnyPathPoint, ...]
     wraps: tuple[PathWrap, ...]

@@ -1,7 +1,7 @@
-"""What an OpenSim model is: bodies, joints, constraints, markers, muscles, ligaments.
+"""An OpenSim model as data: bodies, joints, constraints, markers, muscles, ligaments.
 
-Frames are those of the file: each body's own, and "ground". SI and radians. Offset frames are
-gone: points and poses are given in the bodies themselves.
+Frames are those of the file: each body's own, and "ground". SI and radians. There are no offset
+frames: points and poses are given in the bodies themselves.
 
 References: Delp et al., IEEE Trans Biomed Eng 54:1940 (2007), doi:10.1109/TBME.2007.901024;
 Seth et al., PLoS Comput Biol 14:e1006223 (2018), doi:10.1371/journal.pcbi.1006223.
@@ -41,7 +41,7 @@ class Coordinate:
         name: the coordinate's name.
         joint: the joint it belongs to.
         rotational: whether it is an angle (files "in degrees" hold it in degrees).
-        default: its value where nothing else is said.
+        default: its default value.
         range: smallest and largest value.
         clamped: whether OpenSim keeps it within the range.
         locked: whether OpenSim keeps it at its default.
@@ -182,9 +182,9 @@ class OpenSimModel:
         muscles: by name.
         ligaments: by name.
         wrap_objects: by name.
-        offset_frames: those that hang on bodies: name -> body and pose (4, 4) in it.
+        offset_frames: offset frames of bodies: name -> body and pose (4, 4) in it.
         left_out: "class 'name'" of everything in the file that was not taken over.
-        unread: what a partial reading could not read; whoever needs it refuses.
+        unread: elements that a partial reading could not read; they are an error if needed.
         notices: lines on how the file was read.
     """
 

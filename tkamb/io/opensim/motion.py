@@ -17,12 +17,13 @@ class AngleUnitSettings:
     """How angles in degrees are told from angles in radians."""
 
     max_radians: float = 6.5
-    """rad; largest joint angle that is read as radians. A joint never exceeds a whole turn, 6.28;
-    in degrees most movements do."""
+    """rad: largest joint angle that can be in radians. Chosen: a joint never exceeds a whole turn,
+    6.28; in degrees the number is larger in most movements."""
     min_rotation_deg: float = 0.2
-    """deg; a joint that rotates by less in a whole recording stands still, in either unit."""
+    """deg; a joint that rotates by less in a whole recording stands still, in either unit. Chosen:
+    noise of a recording is of this size."""
     max_angle: float = 2.0 * np.pi
-    """rad; no joint of a leg rotates further."""
+    """rad; no joint of a leg rotates further. Chosen: a whole turn."""
 
 
 ANGLE_UNIT = AngleUnitSettings()
@@ -127,7 +128,7 @@ def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str,
     if recorded.in_degrees and small and turns.max() > ANGLE_UNIT.min_rotation_deg:
         return (
             "ATTENTION: by inDegrees=yes no joint of the whole motion bends or turns by more than "
-            f"{turns.max():.2g} deg: is it in radians?",
+            f"{turns.max():.2g} deg: check whether the file is in radians",
         )
     return ()
 

@@ -1,7 +1,7 @@
 """Lengths and moment arms of muscles and ligaments, by the virtual work of a taut string.
 
-A unit tension pulls each point that the string passes by the change of its direction there,
-and so it does the wrap objects at the places where it meets and leaves them. With the wrench
+A unit tension acts on each point that the string passes with the change of its direction there, and
+on the wrap objects at the points where it meets and leaves them. With the wrench
 w_b of all these on body b and its twist J_b per unit of the coordinates,
 
     -dL/dq = Σ_b w_b · J_b,
@@ -35,8 +35,8 @@ class PathSettings:
     condition_tolerance: float = 1e-5
     """rad or m; OpenSim widens the range of a conditional point by as much."""
     block_frames: int = 256
-    """Frames that are evaluated in one call; keeps arrays to some tens of megabytes and changes no
-    result."""
+    """Frames that are evaluated in one call. Chosen: keeps arrays to some tens of megabytes and
+    changes no result."""
 
 
 PATH = PathSettings()

@@ -1,9 +1,9 @@
 """An .osim file read into an OpenSimModel; OpenSim itself is not needed.
 
 Both layouts are read: that of OpenSim 4 (sockets, offset frames, sets of joints) and the older
-one (joints nested in their bodies), and sets that stand in files of their own. What cannot be
-read is refused by name, or, in a partial reading, listed in `unread` for whoever needs it; forces
-and the like that play no part here are listed in `left_out`.
+one (joints nested in their bodies), and sets in separate files. An element that cannot be read is
+refused by name or, in a partial reading, listed in `unread`. Forces and other elements that are not
+used here are listed in `left_out`.
 """
 
 from collections.abc import Mapping
@@ -43,9 +43,9 @@ class ModelReadSettings:
     """Which OpenSim models are read, and how."""
 
     oldest_version: int = 20302
-    """Version number of OpenSim 2.3.2; older files name things differently."""
+    """Version number of OpenSim 2.3.2; older files use other names."""
     massless_below: float = 2e-14
-    """kg; a body of less has no inertia, whatever the file says (OpenSim's Body::getInertia)."""
+    """kg: a lighter body has no inertia, as in OpenSim's Body::getInertia."""
 
 
 MODEL_READ = ModelReadSettings()

@@ -195,7 +195,7 @@ def read_joints(
 def _joint(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[Joint, dict[str, Coordinate]]:
-    """Return a joint and its coordinates; in a partial reading one that holds still, if need be."""
+    """Return a joint and its coordinates; a partial reading locks a joint that it cannot read."""
     (parent, in_parent), (body, in_child) = _joint_frames(document, element, frames, child)
     entries = [*document.objects(element, "CoordinateSet"), *element.findall("coordinates/*")]
     names = [document.name(entry) for entry in entries]
@@ -214,7 +214,7 @@ def _joint(
             raise InputError("is there twice", document.where(entry), "rename one")
         still = (
             coordinate.name not in coordinates
-        )  # it moves nothing: none that a motion could find
+        )  # it moves nothing, so that no motion can change it
         own[coordinate.name] = replace(coordinate, locked=True) if still else coordinate
     return Joint(name, element.tag, parent, body, in_parent, in_child, *axes, unread=unread), own
 
@@ -324,7 +324,7 @@ def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
 
 
 def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
-    """Return the joints in an order that leads out from ground, each the way it is passed.
+    """Return the joints in an order that leads outwards from ground, each with its direction.
 
     In a partial reading a joint that closes a loop is left out, and a body that nothing joins to
     ground stands still in it, held by a joint that is marked as unread.

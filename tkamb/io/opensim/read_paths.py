@@ -1,4 +1,4 @@
-"""Muscles, ligaments, their paths and the objects in the way, out of an OpenSim document."""
+"""Muscles, ligaments, their paths and wrap objects from an OpenSim document."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -213,7 +213,7 @@ class _PathReader:
             raise InputError("has fewer than two path points", document.where(element))
         wraps = []
         for entry in document.objects(geometry, "PathWrapSet"):
-            with document.reading(element):  # the line without what lies in its way
+            with document.reading(element):  # on failure, the line without its wrap objects
                 wraps.append(self._wrap(element, entry, len(points)))
         return Path(points, tuple(wraps))
 

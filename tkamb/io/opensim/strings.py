@@ -19,11 +19,14 @@ class StringSettings:
     """The shortest string over several wrap objects, object by object."""
 
     max_sweeps: int = 100
-    """Sweeps over all objects, after which a string without convergence is reported as failed."""
+    """Sweeps over all objects, after which a string without convergence is reported as failed.
+    Chosen: strings that converge need fewer."""
     max_extrapolation: float = 10.0
-    """Times the last step; two sweeps say little about places farther ahead."""
+    """Largest extrapolation, as a multiple of the last step. Chosen: two sweeps do not predict
+    farther."""
     tolerance: float = 1e-10
-    """m; a string has converged when the last sweep moves no touching point by more."""
+    """m; a string has converged when the last sweep moves no touching point by more. Chosen: far
+    below what changes a muscle's length."""
 
 
 STRING = StringSettings()
@@ -38,7 +41,7 @@ class WrappedStrings:
         entry: (f, w, 3) m, where it meets object w.
         exit: (f, w, 3) m, where it leaves object w.
         arc_m: (f, w) its length on object w; NaN where no taut string was found.
-        push: (f, w, 2, 3) what object w, where it yields, does to the string's two ends.
+        push: (f, w, 2, 3) force of a shrinking object w on the two ends, per unit tension.
     """
 
     order: Index
@@ -90,9 +93,9 @@ def strings_over(
 
 
 def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array) -> Array:
-    """Return the step (f, 6w) beyond the last sweep to where two of them lead (Aitken, Anderson).
+    """Return the extrapolated step (f, 6w) from the last two sweeps (Aitken, Anderson).
 
-    Zero where there are not yet two sweeps over the same objects, or they lead too far.
+    Zero before there are two sweeps over the same objects, or if it is too large.
     """
     change = residual - last_residual
     squared = np.maximum((change**2).sum(axis=1), 1e-300)
@@ -103,7 +106,7 @@ def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array
 
 
 class _Strings:
-    """Strings as they are, object by object; see `strings_over` for the arguments."""
+    """Current state of the strings, object by object; see `strings_over` for the arguments."""
 
     def __init__(
         self, wraps: Sequence[WrapObject], poses: Array, start: Array, end: Array, moves: Mask
@@ -129,13 +132,13 @@ class _Strings:
         self.entry, self.exit = both[..., :3].copy(), both[..., 3:].copy()
 
     def sweep(self, rows: Index, allowed: Mask) -> None:
-        """Lay some strings anew over each object (f, w) allowed, in turn."""
+        """Lay some strings again over each allowed object (f, w), one after the other."""
         for w in range(len(self.wraps)):
             self.remove(w, rows)
             self.insert(w, rows[allowed[rows, w]])
 
     def remove(self, w: int, rows: Index) -> None:
-        """Take object w out of the way of some strings."""
+        """Remove object w from the path of some strings."""
         kept = np.where(self.order[rows] == w, -1, self.order[rows])
         closed = np.argsort(kept < 0, axis=1, kind="stable")
         self.order[rows] = np.take_along_axis(kept, closed, axis=1)

@@ -1,4 +1,4 @@
-"""What strings of unit tension do to the bodies that they pass, summed up part by part."""
+"""Loads of strings of unit tension on the bodies that they pass, summed part by part."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,1 +1,1 @@
-"""Named presets: what a study chose, laid over any scene by `tkamb run SCENE --as NAME`."""
+"""Named presets: the choices of a study, applied to any scene by `tkamb run SCENE --as NAME`."""

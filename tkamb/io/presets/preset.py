@@ -1,4 +1,4 @@
-"""What a preset is, and how it is laid over what a scene file says."""
+"""A preset, and how it is applied to the content of a scene file."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ class Change:
 
     Args:
         key: dotted, as for `--set`.
-        before: what the scene said; None: nothing, so that the default would have held.
-        after: what the preset says; None: the table is left out.
+        before: value in the scene; None: not given, so that the default would hold.
+        after: value of the preset; None: the table is left out.
     """
 
     key: str
@@ -27,14 +27,14 @@ class Change:
 
 @dataclass(frozen=True)
 class AppliedPreset:
-    """A preset as it was laid over a scene.
+    """A preset as it was applied to a scene.
 
     Args:
         name: as given to `--as`.
         source: of the study.
-        changes: keys whose value in the scene was another one.
+        changes: keys whose value in the scene was different.
         overridden: keys of the preset that `--set` or another option replaced.
-        departures: in words, what the scene does otherwise than the study and the preset leaves.
+        departures: in words, remaining differences between the scene and the study.
     """
 
     name: str
@@ -60,10 +60,12 @@ class AppliedPreset:
             f"(scene: {_words(change.before, 'not given')})"
             for change in self.changes
         )
-        result = [f"Run as {self.name} ({self.source}): {changed or 'the scene says so already'}."]
+        result = [
+            f"Run as {self.name} ({self.source}): {changed or 'no change of the scene needed'}."
+        ]
         if self.overridden:
             names = ", ".join(self.overridden)
-            result.append(f"Not as {self.name}, since the run was told otherwise: {names}.")
+            result.append(f"Not as {self.name}, because the run's options replaced it: {names}.")
         return result + [f"Not as {self.name}: {words}." for words in self.departures]
 
 
@@ -76,7 +78,7 @@ def _words(value: Any, none: str) -> str:
 
 
 class Preset:
-    """What a study chose. Subclass it, and name the class in the registry.
+    """The choices of a study. Subclass it, and name the class in the registry.
 
     Attributes:
         name: as given to `--as`.
@@ -91,7 +93,7 @@ class Preset:
     needs: ClassVar[Mapping[str, str]] = {}
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return in words what of a scene's content, beside missing tables, the study cannot use.
+        """Return in words why the study cannot use a scene, beside missing tables; None: it can.
 
         Args:
             content: of the scene, as its file is written.
@@ -100,7 +102,7 @@ class Preset:
         return None
 
     def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return in words what of a scene's content differs from the study and stays.
+        """Return in words the differences between a scene and the study that remain.
 
         Args:
             content: of the scene, as its file is written.
@@ -115,7 +117,7 @@ class Preset:
 
         Args:
             content: of the scene, as its file is written.
-            overrides: dotted key -> value that will be laid over it afterwards.
+            overrides: dotted key -> value that replaces the preset's afterwards.
             where: of the scene, for messages.
 
         Raises:
@@ -145,7 +147,7 @@ class Preset:
         missing = [key for key in self.needs if not _value_at(content, key)]
         if missing:
             key = missing[0]
-            more = f"; it lacks {', '.join(f'[{k}]' for k in missing[1:])} too" * bool(missing[1:])
+            more = f"; it also needs {', '.join(f'[{k}]' for k in missing[1:])}" * bool(missing[1:])
             raise InputError(
                 f"preset '{self.name}' needs [{key}]: {self.needs[key]}{more}",
                 where,

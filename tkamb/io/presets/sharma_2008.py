@@ -10,7 +10,7 @@ from tkamb.io.presets.preset import Preset
 class Sharma2008(Preset):
     """Sharma, dissertation, University of Tennessee, Knoxville (2008), chapter 4.
 
-    What of it has a key of the scene, with the section in which it is described.
+    Each choice that a key of the scene can express, with the section that describes it.
     """
 
     name: ClassVar[str] = "sharma-2008"
@@ -36,7 +36,7 @@ class Sharma2008(Preset):
             # 4.3: 0.5 mm, 0.5 deg; undone where penetration and angle exceed it.
             "contact.adjust": True,
             "contact.adjust_restore_when": "both",
-            # 4.4, 4.5.5: the total force goes from the body to the lattice, nothing comes back.
+            # 4.4, 4.5.5: the body's total force loads the lattice; there is no coupling back.
             "contact.coupling": "none",
             "contact.released": [],
             "contact.post": False,
@@ -55,7 +55,7 @@ class Sharma2008(Preset):
     )
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return what a motion without fluoroscopy lacks."""
+        """Return why a motion without fluoroscopy cannot be used."""
         if content.get("motion", {}).get("interpretation") != "markers":
             return None
         return (
@@ -64,7 +64,7 @@ class Sharma2008(Preset):
         )
 
     def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return in words what of a scene differs from the study and stays."""
+        """Return in words the differences between a scene and the study that remain."""
         result = []
         kind = content["tibia"].get("kind")
         if kind != "sagittal":

@@ -4,8 +4,8 @@ The clock is the recording's own: frame k of the file is at (first frame + k)/ra
 first frame counted from zero, so that a trial cut out of a longer one keeps its times. A sample
 with a negative residual, or at exactly (0, 0, 0), was not seen: a gap.
 
-A recording is read for what a job needs. Markers, channels and each plate are read by
-themselves; what is wrong with one of them is kept, and raised by who asks for it.
+Markers, channels and each plate are read separately. A fault in one of them is stored, and raised
+only when that part is used.
 
 Format: C3D user guide, https://www.c3d.org.
 """
@@ -162,7 +162,7 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
 @lru_cache(maxsize=2)
 def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
-    """Read the file as it was at `changed`; markers and plates of one trial are asked apart."""
+    """Read the file as it was at `changed`; cached, because several parts of a run need it."""
     with np.errstate(all="ignore"):  # damaged numbers overflow; they are gaps below
         file = parse_c3d(read_bytes(path, FILE_LIMITS.table_bytes), path)
         return _Reader(path, file, units).recording()
@@ -368,7 +368,7 @@ class _Reader:
         return matrix if matrix.any() else None
 
     def _zero(self) -> slice | None:
-        """Return the samples that FORCE_PLATFORM:ZERO calls unloaded; None if it names none.
+        """Return the samples that FORCE_PLATFORM:ZERO states as unloaded; None if it states none.
 
         Its frames are those of the recording's own count. In a recording cut out of a longer
         one they may lie before its first frame; they are then counted from that.
@@ -387,7 +387,7 @@ class _Reader:
 
 
 def no_length_unit(word: str, path: Path) -> InputError:
-    """Return the refusal of a recording whose unit of length is not understood."""
+    """Return the error for a recording whose unit of length is not understood."""
     stated = f"the unit '{word}'" if word else "no unit"
     return InputError(
         f"states {stated} for its markers (POINT:UNITS)",
@@ -399,7 +399,7 @@ def no_length_unit(word: str, path: Path) -> InputError:
 def _check_rates(analog_rate: float | None, rate: float, samples: int, path: Path) -> None:
     """Raise unless the rates that a file states are those of the samples that it holds."""
     if analog_rate is None or analog_rate == 0:
-        return  # the samples a frame say it
+        return  # the number of samples per frame gives the rate
     ratio = analog_rate / rate
     if not ratio >= 1 or abs(ratio - round(ratio)) > 1e-4:
         raise InputError(

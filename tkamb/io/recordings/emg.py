@@ -30,11 +30,14 @@ class EmgSettings:
     """How a recorded EMG becomes an envelope."""
 
     filter_order: int = 2
-    """Order of either Butterworth filter in each direction; it runs forward and backward."""
+    """Order of either Butterworth filter in each direction. Chosen: forward and backward make the
+    usual fourth order."""
     flat_share: float = 1e-9
-    """Share of the largest value; a signal that departs less from its mean holds round-off only."""
+    """Share of the largest value. Chosen: a signal that departs less from its mean holds round-off
+    only."""
     step_tolerance: float = 0.01
-    """Share of the median time step by which steps between samples may differ from it."""
+    """Share of the median time step by which steps between samples may differ from it. Chosen: the
+    jitter of a clock is smaller."""
 
 
 EMG = EmgSettings()
@@ -111,7 +114,7 @@ def envelope(
         signal: (n,) evenly sampled.
         rate_Hz: of the samples.
         cutoff_Hz: of the low-pass after rectifying.
-        high_pass_Hz: of the high-pass before; "none" takes the mean away alone.
+        high_pass_Hz: of the high-pass before; "none" only subtracts the mean.
 
     Raises:
         InputError: a gap, a cut-off at or above half the rate, or a signal shorter than a

@@ -7,7 +7,7 @@ least
 
 with w_i the spacing of the samples. Away from the ends its frequency response is
 1 / (1 + (f / f_c)^6), that of a third-order Butterworth filter run forwards and backwards
-(one half at the cut-off f_c, no phase), but samples may be uneven and first and second
+(one half at the cut-off f_c, no phase shift), but samples may be uneven, and first and second
 derivatives are those of one smooth curve. Polynomials of degree two pass unchanged. Ends
 are natural: nothing is padded. The acceleration of a 1 Hz wave through a 6 Hz cut-off errs
 (root mean square over phases, share of its amplitude) by 0.23 at an end, 0.06 a quarter of
@@ -44,12 +44,13 @@ class SplineFilterSettings:
     """The low-pass filter by splines."""
 
     degree: int = 5
-    """Degree of the splines: accelerations are then cubic and continuous."""
+    """Degree of the splines. Chosen: accelerations are then cubic and continuous."""
     knots_per_period: int = 16
-    """Knots per period of the cut-off frequency; where samples are denser, knots are thinned to
-    it."""
+    """Knots per period of the cut-off frequency; where samples are denser, knots are thinned to it.
+    Chosen: the splines follow all that the filter passes."""
     min_periods: float = 1.0
-    """Periods of the cut-off frequency; a shorter motion is refused."""
+    """Periods of the cut-off frequency; a shorter motion is refused. Chosen: the filter's ends
+    would cover all of it."""
 
 
 SPLINE_FILTER = SplineFilterSettings()
@@ -172,8 +173,8 @@ def _check_samples(time: Array, values: Array, at: Array, name: str) -> None:
 def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
     """Raise an InputError where `frames` resample to times (f,) s too far apart for the cut-off.
 
-    A recording is filtered at its own samples before it is resampled; what is found at the
-    frames (a solved patella, a rolling femur) is filtered at the frames' own rate.
+    A recording is filtered at its own samples before it is resampled. Results at the frames (a
+    solved patella, a rolling femur) are filtered at the rate of the frames.
     """
     if frames is None or cutoff_Hz == "none":
         return
@@ -181,34 +182,38 @@ def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
     if cutoff_Hz >= 0.5 * rate:
         least = math.floor(2.0 * cutoff_Hz * float(time[-1] - time[0])) + 2
         raise InputError(
-            f"frames = {frames} resamples to {rate:.3g} Hz, and what is found at the frames is "
-            f"low-passed at {cutoff_Hz:g} Hz too, which needs more than twice as many a second",
+            f"frames = {frames} resamples to {rate:.3g} Hz, and results at the frames are low-pass "
+            f"filtered at {cutoff_Hz:g} Hz, which needs more than twice as many frames per second",
             "[motion] frames",
-            f"give {least} or more, or none, and look at few of them with --frames A:B:STEP",
+            f"give {least} or more, or leave frames out; --frames A:B:STEP computes fewer of them",
         )
 
 
 def _check_cutoff(time: Array, cutoff_Hz: float, name: str) -> None:
     duration, half_rate = time[-1] - time[0], 0.5 / np.diff(time).max()
     if not (math.isfinite(cutoff_Hz) and cutoff_Hz > 0):
-        raise InputError(f"cut-off {cutoff_Hz:g} Hz is not a positive number", name)
+        raise InputError(
+            f"cut-off {cutoff_Hz:g} Hz is not a positive number",
+            name,
+            'set cutoff_Hz of the scene to a positive number, or "none" to trust the samples',
+        )
     if cutoff_Hz >= half_rate:
         raise InputError(
             f"cut-off {cutoff_Hz:g} Hz is not below {half_rate:g} Hz, half the sampling rate "
             "at the widest step",
             name,
-            'lower cutoff_Hz, or "none" to trust the samples',
+            'lower cutoff_Hz of the scene, or set it to "none" to trust the samples',
         )
     if duration * cutoff_Hz < SPLINE_FILTER.min_periods:
         raise InputError(
             f"{duration:g} s are shorter than one period of the cut-off {cutoff_Hz:g} Hz",
             name,
-            'record longer, raise cutoff_Hz, or "none" to trust the samples',
+            'record longer, raise cutoff_Hz of the scene, or set it to "none" to trust the samples',
         )
 
 
 def _interpolating_spline(time: Array, values: Array, periodic: bool) -> "BSpline":
-    # here and below: a mistake in a table is told without waiting for scipy.interpolate
+    # Imported here, so that a mistake in a table is reported without waiting for scipy.interpolate.
     from scipy.interpolate import make_interp_spline
 
     if periodic:

@@ -17,7 +17,7 @@ POINT:UNITS. Where the channels of a type 4 plate themselves state units of forc
 these count; if both readings differ, the one that puts the centre of pressure on the plate does.
 
 With o = ORIGIN from the transducers' origin to the surface's centre the moment there is
-M - o × F. A centre of pressure is a quotient and is left to who knows the threshold.
+M - o × F. The centre of pressure is not computed here: it needs a force threshold.
 
 FORCE_PLATFORM:ZERO names frames in which nobody stands on the plates. The mean of each channel
 over them is subtracted, unless the plate is loaded in them.
@@ -45,18 +45,20 @@ class PlateSettings:
     """How the channels of a force plate are read."""
 
     steady_N: float = 10.0
-    """N; largest standard deviation of the vertical force over the frames of ZERO. A foot that
-    comes or goes makes more."""
+    """N; largest standard deviation of the vertical force over the frames of ZERO. Chosen: a foot
+    that comes or goes makes more."""
     baseline_N: float = 20.0
-    """N; a vertical force over the frames of ZERO up to this is drift of the amplifier."""
+    """N; a vertical force over the frames of ZERO up to this is drift of the amplifier. Chosen: a
+    foot makes more."""
     baseline_share: float = 0.2
-    """Share of the largest change that the plate shows. A larger force over the frames of ZERO
-    is drift too where it is at most this; a person who stands on the plate makes more."""
+    """Share of the largest change that the plate shows. Chosen: a larger force over the frames of
+    ZERO is drift too where it is at most this; a person who stands on the plate makes more."""
     loaded_N: float = 100.0
-    """N; force from which the centre of pressure of a plate is checked."""
+    """N; force from which the centre of pressure of a plate is checked. Chosen: with less it is a
+    quotient of small numbers."""
     beside: float = 0.2
-    """Share of the plate's half width by which the centre of pressure may lie outside the
-    corners."""
+    """1: share of the plate's half width by which the centre of pressure may lie outside the
+    corners. Chosen: errors of a loaded plate are smaller."""
 
 
 SETTINGS = PlateSettings()
@@ -166,7 +168,7 @@ def force_plate(record: PlateRecord) -> ForcePlate:
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
-    """Return why the frames of ZERO are no baseline; empty if they are."""
+    """Return why the frames of ZERO cannot be a baseline; empty if they can."""
     assert record.zero is not None
     vertical = force[:, 2]
     window = vertical[record.zero]
@@ -176,8 +178,8 @@ def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
     if drift and spread <= SETTINGS.steady_N:
         return ""
     return (
-        f"force plate {record.number} bears {abs(level):.0f} N in the frames that "
-        "FORCE_PLATFORM:ZERO calls unloaded: no baseline is subtracted"
+        f"force plate {record.number} shows {abs(level):.0f} N in the frames that "
+        "FORCE_PLATFORM:ZERO states as unloaded: no baseline is subtracted"
     )
 
 

@@ -20,7 +20,8 @@ class GaitSettings:
     """N, vertical: Zeni et al., Gait & Posture 27:710 (2008); above a plate's noise, reached within
     some milliseconds of the strike."""
     shortest_phase_s: float = 0.1
-    """s: a shorter contact or gap is noise; stance and swing of walking last 0.6 and 0.4 s."""
+    """s: a shorter contact or gap is noise. Chosen: stance and swing of walking last 0.6 and 0.4
+    s."""
 
 
 GAIT = GaitSettings()

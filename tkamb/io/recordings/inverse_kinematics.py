@@ -1,4 +1,4 @@
-"""Inverse kinematics: where a chain of segments brings its markers closest to those seen.
+"""Inverse kinematics: the pose of a chain of segments that fits the measured markers best.
 
 Per frame, with measured markers p_m, weights w_m (zero for a marker that is missing) and the
 chain's markers x_m(q),
@@ -8,7 +8,7 @@ chain's markers x_m(q),
 by Gauss-Newton with Levenberg's damping and analytic Jacobians, and by Newton's method near
 the solution where the chain brings the residuals' curvature. Frames are independent of each
 other and solved all at once: every array has the frames as its first axis. Bounds are not
-imposed: a coordinate that wants to leave its range is a finding.
+imposed, so that a coordinate outside its range shows.
 
 Reference: Lu & O'Connor, J Biomech 32:129 (1999), doi:10.1016/S0021-9290(98)00158-4.
 """
@@ -27,12 +27,15 @@ class InverseKinematicsSettings:
     """The fit of the poses of a leg to its markers, frame by frame."""
 
     step_tolerance: float = 1e-6
-    """m and rad; a frame has converged when its step is smaller."""
+    """m and rad; a frame has converged when its step is smaller. Chosen: far below the noise of
+    markers."""
     newton_below: float = 0.1
-    """m and rad; after a step smaller than this the curvature of the residuals is taken in
-    (Newton's method, otherwise Gauss-Newton)."""
+    """m and rad: after a smaller step the curvature of the residuals is included (Newton's method),
+    before that it is not (Gauss-Newton). Chosen: nearer to the solution Newton's method
+    converges."""
     max_iterations: int = 60
-    """Iterations after which a frame without convergence fails."""
+    """Iterations after which a frame without convergence fails. Chosen: frames that converge need
+    fewer."""
 
 
 INVERSE_KINEMATICS = InverseKinematicsSettings()
@@ -44,13 +47,13 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """The least squares of f frames, linearised where they stand.
+    """The least squares of f frames, linearised at their states.
 
     Args:
         cost: (f,) m², sum of weighted squared distances.
         matrix: (f, n, n) Jᵀ W J.
         right: (f, n) Jᵀ W (p - x).
-        curvature: (f, n, n) what the residuals add to the Hessian; None: not known.
+        curvature: (f, n, n) part of the Hessian due to the residuals; None: not known.
     """
 
     cost: Array
@@ -76,7 +79,7 @@ class NormalEquations:
 
 
 class MarkerChain(Protocol[State]):
-    """What the least squares need of a chain with n freedoms and m markers."""
+    """Interface of a chain with n degrees of freedom and m markers for the least squares."""
 
     def places(self, state: State) -> Array:
         """Return the markers (f, m, 3) m."""
@@ -144,7 +147,7 @@ def fit_chain(
             break
         trial = chain.chosen(trial, np.flatnonzero(~converged))
         trial_residual = chain.normal(trial, target[active], each[active])
-        # a frame that would get worse stays where it is
+        # A frame whose cost would rise keeps its state.
         better = trial_residual.cost <= residual.cost[active] * (1.0 + 1e-12) + 1e-24
         accepted, rows = active[better], np.flatnonzero(better)
         state = chain.replaced(state, accepted, chain.chosen(trial, rows))
@@ -166,7 +169,7 @@ def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -
     """
     matrix, right = equations.matrix, equations.right
     diagonal = np.einsum("fii->fi", matrix)
-    # the floor keeps what no marker sees where it is
+    # The floor keeps degrees of freedom that no marker determines at their value.
     floor = 1e-9 * diagonal.max(axis=1, keepdims=True, initial=1e-12)
     added = (damping[:, None] * diagonal + floor)[:, :, None] * np.eye(matrix.shape[1])
     step = np.zeros_like(right)

@@ -1,4 +1,4 @@
-"""A leg as a chain for skin markers: shank, knee, thigh, and what hangs on them by ball joints."""
+"""A leg as a chain for skin markers: shank, knee, thigh, and neighbours on ball joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ class Segment:
     """A body with markers.
 
     Args:
-        name: "shank" and "thigh" are the knee's; others hang on one of them by a ball joint.
+        name: "shank" and "thigh" are the knee's; others are joined to one of them by a ball joint.
         labels: (m) of its markers.
         points: (m, 3) m, the markers in its frame.
         weights: (m,) of their squared distances.
-        joined_to: the segment on which it hangs; empty for shank and thigh.
+        joined_to: the segment that carries it; empty for shank and thigh.
         joint: (3,) m, the ball joint in that segment's frame.
         centre: (3,) m, the same in its own.
     """
@@ -38,13 +38,13 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class LegState:
-    """Where the segments of a leg stand.
+    """Poses of the segments of a leg.
 
     Args:
         shank: (f, 4, 4) pose_shank_in_world.
         knee: (f, 6) knee coordinates of the thigh, of which a hinge changes flexion alone.
         thigh: (f, 4, 4) pose_thigh_in_world.
-        turns: segment -> (f, 3, 3), its rotation in the segment that it hangs on.
+        turns: segment -> (f, 3, 3), its rotation in the segment that carries it.
     """
 
     shank: Array
@@ -54,13 +54,13 @@ class LegState:
 
 
 class LegChain:
-    """Shank and thigh joined by the knee, and what hangs on them by ball joints.
+    """Shank and thigh joined by the knee, and neighbours joined by ball joints.
 
     Freedoms, in order: shank (translation, rotation about its origin; world axes), knee
     (flexion of a hinge, or translation and rotation of a free thigh), three of each ball joint.
 
     Args:
-        segments: "shank" and "thigh", and what hangs on either.
+        segments: "shank" and "thigh", and their neighbours.
         pose_insert_in_shank: (4, 4), the frame of the knee coordinates.
         free: whether the knee has six freedoms; else flexion alone.
     """

@@ -1,14 +1,14 @@
 """Knee and shank from skin markers: rigid fits and a chain, side by side.
 
-Two readings of the same markers, both computed, one of them used:
+The same markers are fitted in two ways. Both are computed, and one of them is used:
 
 - segments: shank and thigh are each fitted rigidly, by themselves. The joint between them may
-  come apart, and by how much says how far the skin has moved.
+  come apart, and the distance shows how far the skin has moved.
 - chain: shank, knee, thigh and their neighbours are fitted at once, held together by their
   joints. Nothing comes apart; the skin's movement is spread over the segments instead.
 
-The neighbour's knee centre as the thigh carries it against the same as the shank carries it is
-their disagreement: it acts on the knee's moments as a lever of that length.
+The distance of the knee centre of the thigh's markers from that of the shank's markers measures
+the disagreement: it acts on the knee's moments as a lever of that length.
 """
 
 from dataclasses import dataclass
@@ -43,8 +43,8 @@ class MarkerMotionSettings:
     """The motion of a leg from markers."""
 
     max_joint_gap: float = 0.1
-    """m; largest distance of a joint from where the markers show it. Skin moves by a third of this
-    at the hip; the other foot is farther."""
+    """m: largest distance of a joint from where the markers show it. Chosen: at the hip, skin moves
+    by a third of this; the other foot is farther away."""
 
 
 MARKER_MOTION = MarkerMotionSettings()
@@ -52,13 +52,13 @@ MARKER_MOTION = MarkerMotionSettings()
 
 @dataclass(frozen=True, eq=False)
 class MarkerKinematics:
-    """What skin markers say of a leg, as a right one's, SI.
+    """Kinematics of a leg from skin markers, as a right leg, SI.
 
     Args:
         time: (n,) s, frames that `method` could place without a break.
-        method: the reading that is used.
-        tibia: (n, 4, 4) pose_tibia_in_laboratory by it.
-        coordinates: (n, 6) knee coordinates by it.
+        method: the fit that is used.
+        tibia: (n, 4, 4) pose_tibia_in_laboratory by this fit.
+        coordinates: (n, 6) knee coordinates by this fit.
         flexion: method -> (n,) rad; NaN where the segments could not be fitted.
         rms: method -> (n,) m, of the markers: those of shank and thigh, or all of the chain.
         centre_distance: (n,) m, between the knee centre of the shank's and of the thigh's
@@ -111,9 +111,10 @@ def load_marker_motion(
     fits, whole = both_fits(chain, segments, measured, neutral, recorded)
     if not whole.solved.all():
         raise InputError(
-            f"the chain of segments does not settle at {time[int(np.argmin(whole.solved))]:.4f} s",
+            f"the chain of segments does not converge at {time[int(np.argmin(whole.solved))]:.4f} "
+            f"s",
             recorded.path,
-            "are labels swapped? check labels and joints in [motion.markers]",
+            "check labels and joints in [motion.markers]; two labels may be swapped",
         )
     blind = np.isnan(whole.rms)[:, None, None]
     readings: dict[Method, tuple[Array, Array]] = {
@@ -210,7 +211,7 @@ def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Ta
                 f"markers of the {own.name} put its joint with the {own.joined_to} "
                 f"{np.nanmedian(apart) / MILLIMETRE:.0f} mm from where the {own.joined_to}'s do",
                 recorded.path,
-                "are left and right labels swapped? check the labels in [motion.markers]",
+                "check the labels in [motion.markers]; left and right may be swapped",
             )
 
 
@@ -224,7 +225,7 @@ def _compare_readings(
     measured: dict[str, Array],
     neutral: Array,
 ) -> MarkerKinematics:
-    """Return both readings, (shank, thigh) in the laboratory, where the one in use is whole."""
+    """Return both fits, (shank, thigh) in the laboratory, in the frames of the one in use."""
     assert source.markers is not None
     used = source.markers.method
     knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}

@@ -1,4 +1,4 @@
-"""Skin markers: found by their labels, and the rigid fit that says where their body stands.
+"""Skin markers: found by their labels, and rigid fits of bodies to them.
 
 The same marker is `R.Thigh.Superior`, `RThighSuperior`, `JW:RThighSuperior`.
 """
@@ -21,7 +21,8 @@ class MarkerFitSettings:
     """When fitted markers are refused."""
 
     max_median_residual: float = 0.05
-    """m; a larger median residual shows a wrong marker, unit or set, not soft tissue."""
+    """m: largest median residual. Chosen: a larger one is due to a wrong marker, unit or set, not
+    to soft tissue."""
 
 
 MARKER_FIT = MarkerFitSettings()
@@ -71,7 +72,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
 def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, measured and in the tibia link.
 
-    A joint centre is carried by a rigid fit of the neighbouring segment's markers.
+    A joint centre comes from a rigid fit of the neighbouring segment's markers.
 
     Returns:
         Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.

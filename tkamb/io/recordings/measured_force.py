@@ -17,10 +17,10 @@ FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
 
 @dataclass(frozen=True)
 class ForceSampleSettings:
-    """Between which samples of a measured force is interpolated."""
+    """Interpolation between the samples of a measured force."""
 
     max_gap: float = 2.5
-    """Times the median step; in a wider gap nothing is interpolated."""
+    """Multiple of the median step: a wider gap is not interpolated. Chosen: one lost sample is."""
 
 
 FORCE_SAMPLES = ForceSampleSettings()

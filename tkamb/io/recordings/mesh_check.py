@@ -1,4 +1,4 @@
-"""The health of a mesh file: what is there, what would be mended, what is guessed."""
+"""The health of a mesh file: content, repairs on loading, and guesses of unit and axes."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,11 +26,13 @@ class MeshUnitSettings:
     """How the unit of a mesh is recognized, and how many notices are listed."""
 
     typical_size: float = 0.08
-    """m; largest extent of a typical component of a knee."""
+    """m: largest extent of a typical component of a knee. Chosen to tell metres, millimetres and
+    inches apart."""
     min_size_share: float = 0.12
-    """Share of the largest mesh; a smaller one is in another unit."""
+    """Share of the largest mesh; a smaller one is in another unit. Chosen: the parts of a knee
+    differ by less."""
     max_listed: int = 10
-    """Places of a fault that one message lists."""
+    """Places of a fault that one message lists. Chosen: a message stays short."""
 
 
 MESH_UNIT = MeshUnitSettings()
@@ -160,7 +162,7 @@ class MeshHealth:
             self.extents
         ):
             lines.append(
-                "  an open sheet, which no run takes as a part: give the whole closed part"
+                "  an open sheet, which a run refuses as a part: give the whole closed part"
             )
         if len(self.remaining_holes) > 5:
             lines.append(f"  open: {len(self.remaining_holes) - 5} more")
@@ -172,7 +174,7 @@ class MeshHealth:
 
     def _unit_question(self) -> str:
         if not self.units:
-            return f"no unit of {', '.join(LENGTH)} makes this a part of a knee: is it one?"
+            return f"in no unit of {', '.join(LENGTH)} is this the size of a part of a knee"
         names = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "inch": "inches"}
         return " or ".join(f"{names[unit]}? then pass --units {unit}" for unit in self.units)
 

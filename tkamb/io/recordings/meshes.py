@@ -34,15 +34,17 @@ class MeshFileSettings:
     """Which meshes of components are used."""
 
     min_size: float = 0.034
-    """m; no whole component of a knee is smaller. The smallest are 50 mm wide."""
+    """m: smallest whole component of a knee that is accepted. Chosen: real ones are at least 50 mm
+    wide."""
     rounding_notice: float = 1e-6
-    """m; a mesh whose coordinates are rounded more coarsely gets a notice: forces change by about
-    half a per cent."""
+    """m; a mesh whose coordinates are rounded more coarsely gets a notice. Chosen: forces change by
+    about half a per cent."""
     rounding_limit: float = 5e-6
-    """m; a mesh whose coordinates are rounded more coarsely is refused: 8 µm change forces by 4
-    %."""
+    """m; a mesh whose coordinates are rounded more coarsely is refused. Chosen: 8 µm change forces
+    by 4 %."""
     sheet_opening: float = 1.0 / 3.0
-    """Share of a part's length; a wider opening makes the part an open sheet."""
+    """Share of a part's length; a wider opening makes the part an open sheet. Chosen: holes of
+    damaged files are smaller."""
 
 
 MESH_FILE = MeshFileSettings()
@@ -206,8 +208,8 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
 def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> list[str]:
     """Return the units in which the largest extent (file units) is within `size` (m).
 
-    One that makes a part of an implant smaller than any knee's is left out if another one makes
-    it as large as they are: inches taken for centimetres give a knee of 30 mm.
+    A unit that makes a part of an implant too small is left out if another unit gives a usual size:
+    inches read as centimetres give a knee of 30 mm.
     """
     lengths = {unit: extent * metres for unit, metres in LENGTH.items()}
     fits = [unit for unit, length in lengths.items() if size[0] <= length <= size[1]]
@@ -245,7 +247,7 @@ def _opposite(names: list[str]) -> str:
 
 
 def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
-    """Return the part without a wall inside it, and a wall that has to stay; both are told."""
+    """Return the part without a wall inside it, and a wall that has to stay; both get notices."""
     wall = find_inner_wall(mended.vertices, mended.faces)
     if wall is None:
         return mended, None
@@ -269,8 +271,8 @@ def _check_part(
     if mended.holes and mended.holes[0].width > MESH_FILE.sheet_opening * extent:
         raise InputError(
             f"{name} is an open sheet, like a contact surface: its opening is "
-            f"{mended.holes[0].width / MILLIMETRE:.3g} mm wide, so that nothing tells its inside "
-            "(where another part overlaps it) from its outside",
+            f"{mended.holes[0].width / MILLIMETRE:.3g} mm wide, so that its inside cannot be "
+            "distinguished from its outside",
             path,
             "give the whole closed part that the sheet was cut from",
         )
@@ -287,8 +289,8 @@ def _check_part(
         raise InputError(
             f"{name} is {len(bodies)} separate bodies ({sizes}{more}; mm), not one",
             path,
-            "`tkamb mesh check` numbers them, `tkamb mesh part` writes one into a file of its own"
-            + ("; or are they two condyles, and the axes wrong?" if len(bodies) == 2 else ""),
+            "`tkamb mesh check` numbers them, `tkamb mesh part` writes one into a separate file"
+            + ("; if they are two condyles, check the axes" if len(bodies) == 2 else ""),
         )
 
 
@@ -325,7 +327,7 @@ def _check_size(
     raise InputError(
         f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {why}",
         path,
-        f"is the unit right? {advice}" if fits else "check the mesh and its unit",
+        f"check the unit: {advice}" if fits else "check the mesh and its unit",
     )
 
 
@@ -337,12 +339,12 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
             f"{surface.name} has two condyles and is {extents[2] / MILLIMETRE:.3g} mm wide, "
             "smaller than any person's knee",
             path,
-            f"is the unit right? one of {', '.join(LENGTH)}; or was the mesh scaled before?",
+            f"check the unit, one of {', '.join(LENGTH)}, and whether the mesh was scaled before",
         )
 
 
 def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
-    """Tell or refuse coordinates so far from the origin that the file's digits do not suffice.
+    """Warn of or refuse coordinates so far from the origin that the file's digits do not suffice.
 
     Args:
         corners: (n, 3), file units.

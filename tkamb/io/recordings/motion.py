@@ -41,10 +41,11 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.marker_motion import MarkerKinematics
 
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
-"""Beyond these, columns, axes or units are mistaken; adduction also stays off its gimbal."""
+"""deg: beyond these limits, columns, axes or units are wrong. The limits of adduction also exclude
+its singularity."""
 FARTHEST_MM = (-200, 200)
-"""The femoral origin lies within a hand's breadth of the insert; beyond, units are mistaken.
-So does the patella of the femoral origin."""
+"""mm: limits of the translations. The femoral origin lies within a hand's breadth of the insert,
+and the patella within one of the femoral origin; beyond, units are wrong."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +53,16 @@ class PatellaMotionSettings:
     """Which recorded poses of the patella are plausible."""
 
     max_rotation_deg: int = 180
-    """deg; largest rotation of the patella against the femur, either way."""
+    """deg; largest rotation of the patella against the femur, either way. Chosen: half a turn,
+    which no patella reaches."""
 
 
 PATELLA_MOTION = PatellaMotionSettings()
 
 FASTEST = {"turn": 100.0, "move": 10.0}
-"""rad/s and m/s: five times the fastest kick, and more than noise makes of a recording."""
+"""rad/s and m/s: five times the fastest kick, and more than the noise of a recording."""
 ODD = {"turn": 0.5 * DEGREE, "move": 0.5 * MILLIMETRE}
-"""What fluoroscopy errs by: a sample that is no farther off its neighbours' curve is not odd."""
+"""Error of fluoroscopy: a sample that is nearer than this to its neighbours' curve is not odd."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ class KneeMotion:
         patella_acceleration: (f, 3) its second derivative.
         cycle_percent: (f,) per cent of the cycle, if the motion is one.
         closed_cycle: the cycle's ends agree, so it was filtered as periodic.
-        unrecorded: coordinates without a column, held at zero here.
+        unrecorded: coordinates without a column, zero here.
         odd: samples off their neighbours' curve.
         markers: what it was read from, if from skin markers.
     """
@@ -170,7 +172,7 @@ def _from_markers(
         raise InputError(
             f"nothing gives {', '.join(needed)}",
             "[motion.markers]",
-            "add it to coordinates, or let the knee find it: [contact] released",
+            "add it to coordinates, or release it: [contact] released",
         )
     result = load_marker_motion(source, side, insert)
     knee = result.coordinates.copy()
@@ -192,7 +194,7 @@ def _find_unrecorded(
     ]
     needed = [role for role in missing if role not in released]
     if needed:
-        more = "" if needed == ["flexion"] else ", or let the knee find it: [contact] released"
+        more = "" if needed == ["flexion"] else ", or release it: [contact] released"
         raise InputError(
             f"has no column for {', '.join(needed)} (it has {', '.join(recorded.columns)})",
             recorded.path,
@@ -255,7 +257,7 @@ def _bending_role(recorded: Table, source: MotionRecording) -> str:
 
 
 def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
-    """Raise where knee coordinates (n, 6) are those of no knee.
+    """Raise where knee coordinates (n, 6) are impossible for a knee.
 
     Args:
         knee: the coordinates.
@@ -269,7 +271,9 @@ def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
             low, high = limits
             turned = name == "flexion" and bending is not None
             if turned and values.min() < low <= -values.max() and -values.min() <= high:
-                question = f'is bending negative in it? then [motion] signs_turned = ["{bending}"]'
+                question = (
+                    f'if bending is negative in it, set [motion] signs_turned = ["{bending}"]'
+                )
         else:
             question = "check [motion] columns, length_unit and where the meshes have their origin"
             values, limits, unit = knee[:, i] / MILLIMETRE, FARTHEST_MM, "mm"
@@ -284,7 +288,7 @@ def _check_patella(patella: Array, path: Path) -> None:
         ("patella_si", patella[:, 1] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
         ("patella_rotation", patella[:, 2] / DEGREE, turn, "deg", "angle_unit"),
     ):
-        question = f"is a cell mistyped? check [motion] columns and {key}"
+        question = f"check [motion] columns, {key}, and whether a cell is mistyped"
         check_range(path, f"knee: {name}", values, limits, unit, question)
 
 

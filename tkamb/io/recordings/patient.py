@@ -1,4 +1,4 @@
-"""The patient's URDF: read, mirrored if left, completed with segment inertias, checked.
+"""Reads the patient's URDF, mirrors a left one, adds missing segment inertias, and checks it.
 
 Links that must exist: `tibia` (shank and foot, its origin at the ankle centre), `femur`,
 `patella`, and `hip`, a frame fixed to the femur at the hip centre. Joints: `ankle` (or the
@@ -37,23 +37,25 @@ class PatellaLinkSettings:
     mass: float = 0.1
     """kg; mass of the patella at its link's origin unless the URDF says otherwise."""
     radius_of_gyration: float = 0.015
-    """m; about that of a disc 40 mm across and 20 mm thick."""
+    """m; chosen: about that of a disc 40 mm across and 20 mm thick."""
     max_lateral_share: float = 0.5
     """Share of a link's length by which its other end may lie beside the link's y axis, which
-    points up."""
+    points up. Chosen: a link that leans more is not along its y axis."""
 
 
 PATELLA_LINK = PatellaLinkSettings()
 
 
 THIGH = (0.2, 0.7)
-"""m, from the femoral component's flexion axis to the hip centre: a child's to a giant's."""
+"""m: accepted distances from the femoral component's flexion axis to the hip centre, from a child
+to a giant."""
 
 SHANK = (0.15, 0.65)
-"""m, from the ankle centre to the insert's bottom, likewise."""
+"""m: accepted distances from the ankle centre to the insert's bottom, from a child to a giant."""
 
 MOST_TURNED = np.radians(40.0)
-"""rad, of the insert's axes from the tibia's: slope, torsion and varus of a deformed leg."""
+"""rad: largest angle between the insert's axes and the tibia's: slope, torsion and varus of a
+deformed leg."""
 
 
 def load_urdf(patient: Patient, with_patella: bool) -> str:
@@ -151,7 +153,7 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
         raise InputError(
             f"the origin of knee_ap turns the insert's axes by {tilts} deg from the tibia's",
             path,
-            "is its rpy in radians, and are the axes anterior, superior and right?",
+            "check that rpy is in radians, and that the axes are anterior, superior and right",
         )
 
 

@@ -1,8 +1,8 @@
-"""When a force plate is loaded, and what it reads while nobody stands on it.
+"""When a force plate is loaded, and its reading while nobody stands on it.
 
-Amplifiers drift. A plate that nobody stands on then adds a moment about the knee that no foot
-exerts, with the plate's whole distance as its lever. So a plate counts while it is loaded, and
-its unloaded level is told.
+Amplifiers drift. A plate that nobody stands on then adds a false moment about the knee, with its
+distance from the knee as lever arm. Therefore a plate counts only while it is loaded, and its
+unloaded level is reported.
 """
 
 import math
@@ -15,26 +15,28 @@ from tkamb.geometry.frames import Array
 
 @dataclass(frozen=True)
 class PlateLoadSettings:
-    """When a force plate counts as loaded, and what of its force is drift."""
+    """When a force plate counts as loaded, and which force is drift."""
 
     load_N: float = 20.0
-    """N; force beyond the unloaded level that is a load. Filters of ground reactions mostly use
-    20 N."""
+    """N; force beyond the unloaded level that is a load. Chosen: filters of ground reactions mostly
+    use 20 N."""
     margin_s: float = 0.05
-    """s; the wrench counts from this much before a load to this much after it. A foot comes
+    """s; the wrench counts from this much before a load to this much after it. Chosen: a foot comes
     down and leaves within 0.02 s."""
     quiet_share: float = 0.1
-    """Share of the samples, those of the smallest force, that show the unloaded level."""
+    """Share of the samples, those of the smallest force, that show the unloaded level. Chosen: a
+    plate is unloaded for longer in a usual recording."""
     quiet_spread_N: float = 2.0
-    """N; these samples show the level if they lie within this of each other. No foot is so
+    """N; these samples show the level if they lie within this of each other. Chosen: no foot is so
     steady."""
     most_drift_N: float = 60.0
-    """N; largest unloaded level that is drift; a larger force is that of a foot."""
+    """N; largest unloaded level that is drift. Chosen: a larger force is that of a foot."""
     drift_N: float = 2.0
-    """N; a larger unloaded level gets a note. The median of noise is zero, and 2 N change the
-    force of the knee by less than 0.5 % of a body weight."""
+    """N; a larger unloaded level gets a note. Chosen: the median of noise is zero, and 2 N change
+    the force of the knee by less than 0.5 % of a body weight."""
     unloaded_s: float = 0.1
-    """s; a plate that is unloaded for less shows no drift."""
+    """s; a plate that is unloaded for less shows no drift. Chosen: a foot that swings leaves the
+    plate for longer."""
 
 
 PLATE_LOAD = PlateLoadSettings()

@@ -1,4 +1,4 @@
-"""What is to be read and how: files with the places of their markers, in SI.
+"""Descriptions of the recordings to be read: files, columns, units and marker positions, in SI.
 
 Units of length and angle here are those of the files' columns; all other numbers are SI.
 """
@@ -15,7 +15,7 @@ Side = Literal["right", "left"]
 
 @dataclass(frozen=True, eq=False)
 class Patient:
-    """Who it is.
+    """The patient.
 
     Args:
         urdf: file of the chain.
@@ -34,13 +34,13 @@ class Patient:
 
 @dataclass(frozen=True, eq=False)
 class MarkerSegment:
-    """A segment with skin markers: shank, thigh, or what hangs on one of them.
+    """A segment with skin markers: shank, thigh, or a neighbour of one of them.
 
     Args:
         name: of the segment.
         markers: name -> (3,) m, in the segment's frame.
         weights: of the squared distances, where not 1.
-        joined_to: the segment that a neighbour hangs on by a ball joint.
+        joined_to: the segment that carries a neighbour by a ball joint.
         joint: (3,) m, that joint in its frame.
         centre: (3,) m, the same in the neighbour's own frame.
     """
@@ -58,11 +58,11 @@ class MarkerSet:
     """The markers of a leg.
 
     Args:
-        method: the reading that is used: rigid fits of each segment, or the chain.
+        method: the fit that is used: rigid fits of each segment, or the chain.
         knee: of the chain: flexion alone, or six freedoms.
         coordinates: knee coordinates that are taken from the markers.
-        neutral_translation: (3,) m, ap, si, ml that a hinge keeps.
-        neutral_rotation: (2,) rad, axial rotation and adduction that a hinge keeps.
+        neutral_translation: (3,) m, constant ap, si, ml of a hinge.
+        neutral_rotation: (2,) rad, constant axial rotation and adduction of a hinge.
         laboratory_axes: axes of the file that point forward, up and right.
         segment: shank, thigh and neighbours.
     """
@@ -115,7 +115,7 @@ class MotionRecording:
 
 @dataclass(frozen=True, eq=False)
 class JointCentre:
-    """A joint centre that a neighbouring segment's markers carry: one more shank marker.
+    """A joint centre from a neighbouring segment's markers, used as one more shank marker.
 
     Args:
         name: of the joint.
@@ -175,9 +175,9 @@ class ForceRecording:
         laboratory_axes: axes of the file that point forward, up and right.
         force: what the file's force acts on; that on the plate is the opposite of that on the foot.
         unloaded: N, vertical force below which the centre of pressure is held.
-        surface: m, of a C3D file: height above the plates of what the foot stands on.
-        force_unit: of a C3D file's force channels, where it does not say; None: it does.
-        moment_unit: of its moment channels, likewise.
+        surface: m, of a C3D file: height of the surface under the foot above the plates.
+        force_unit: of a C3D file's force channels; None: the file states it.
+        moment_unit: of its moment channels; None: the file states it.
     """
 
     file: Path
@@ -195,7 +195,7 @@ class ForceRecording:
 
     @property
     def sign(self) -> float:
-        """What turns the file's force and moment into those on the foot."""
+        """Factor, 1 or -1, from the file's force and moment to those on the foot."""
         return -1.0 if self.force == "on the plate" else 1.0
 
 
@@ -220,7 +220,7 @@ class ForceMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class EmgRecording:
-    """Surface EMG and what its envelopes are made by.
+    """Surface EMG and the processing of its envelopes.
 
     Args:
         file: a C3D file or a table.

@@ -1,8 +1,8 @@
-"""Samples that cannot be, and samples that do not fit their neighbours: typing mistakes, mostly.
+"""Impossible samples, and samples that do not fit their neighbours: mostly typing mistakes.
 
 A sample is odd where it lies off the cubic through its two neighbours on either side by more
-than `floor` and by more than many times what the samples around it do. Noise of any level is
-no oddity: the neighbourhood is the measure, by its median, which the odd sample cannot move.
+than `floor` and by many times more than the samples around it. Noise of any level is not odd,
+because the limit is a multiple of the neighbourhood's median, which one sample cannot change.
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,15 @@ class SampleSettings:
     """How samples that were not measured are recognized."""
 
     neighbours: int = 12
-    """Samples on either side that show what is usual."""
+    """Samples on either side whose median deviation is the usual one. Chosen: enough for a median,
+    few enough to follow a movement."""
     outlier_factor: float = 8.0
-    """Times the usual deviation: normal noise reaches it once in 10 million samples."""
+    """Times the usual deviation. Chosen: normal noise reaches it once in 10 million samples."""
     max_step: float = 5.0
-    """s; samples farther apart are no record of a movement."""
+    """s: largest step between samples. Chosen: samples farther apart do not record a movement."""
     end_factor: float = 4.0
-    """A cubic that is extrapolated by one sample has an error larger by this factor than one
-    between samples."""
+    """Factor on `outlier_factor` at the ends of a recording. Chosen: a cubic that is extrapolated
+    by one sample has a larger error than one between samples."""
 
 
 SAMPLE = SampleSettings()
@@ -107,7 +108,7 @@ def check_spacing(path: Path, time: Array) -> None:
         raise InputError(
             f"samples are {spacing:g} s apart, too far to be a movement",
             path,
-            "is the time in seconds? No key says another unit: rewrite the column in seconds",
+            "the time must be in seconds: rewrite the column if it is in another unit",
         )
 
 
@@ -142,7 +143,7 @@ def check_steps(
             f"{what} steps from {values[k] / scale:.4g} to {values[k + 1] / scale:.4g} {unit} "
             f"between {time[k]:g} and {time[k + 1]:g} s, which nobody does",
             path,
-            "is a cell mistyped, or the time not in seconds?",
+            "check whether a cell is mistyped, and whether the time is in seconds",
         )
 
 

@@ -42,7 +42,7 @@ DE_LEVA: dict[Sex, dict[Segment, SegmentFractions]] = {
         "foot": SegmentFractions(0.0129, 0.0, (0.0, 0.0, 0.0)),
     },
 }
-"""The foot is a point mass at the ankle: it stands still on the ground and is light."""
+"""De Leva's fractions. The foot is a point mass at the ankle: it is light and hardly moves."""
 
 
 @dataclass(frozen=True, eq=False)

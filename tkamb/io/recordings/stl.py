@@ -1,4 +1,4 @@
-"""Triangles from binary STL files, whatever programs write after the last one."""
+"""Triangles from binary STL files, also with extra bytes at the end."""
 
 import logging
 from pathlib import Path
@@ -22,8 +22,8 @@ def read_binary_stl(path: Path) -> Array | None:
 
     80 bytes of anything, the number of triangles, then for each a normal, three corners and two
     bytes (little-endian). Several solids one after the other are read as one. Bytes after the last
-    triangle are left out, with a notice on the logger "tkamb"; so is a number of triangles of 0 or
-    of the largest that there is, which programs write that do not go back to the beginning.
+    triangle are left out, with a notice on the logger "tkamb". A number of triangles of 0 or of the
+    largest integer is ignored, too: programs write it if they do not return to the header.
 
     Raises:
         InputError: it is cut short.

@@ -22,8 +22,8 @@ class TableValueSettings:
     """Which numbers of a table are measurements."""
 
     trc_time_rounding: float = 1e-3
-    """s; cameras write the times of a `.trc` rounded to the millisecond; the header's rate is
-    exact."""
+    """s; rounding of the times of a `.trc`. Chosen: cameras write milliseconds; the header's rate
+    is exact."""
     max_value: float = 1e12
     """Largest number in any unit: a larger one was not measured, and its square may overflow."""
 
@@ -35,7 +35,7 @@ _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 """Plain decimal: Python alone also reads 1_000 and the digits of other scripts."""
 _OF_NUMBERS = "0123456789+-.eE "
-"""What plain decimals are written with."""
+"""Characters of plain decimal numbers."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
 
@@ -52,7 +52,7 @@ class Table:
         equal: names that stand for several columns; none of these is in `columns`.
         notices: remarks on what was read otherwise than stated, or not at all.
         unit_word: the file's own word for its unit of length, understood or not.
-        unit_given: whether the unit of length is the user's word, for want of the file's.
+        unit_given: whether the user states the unit of length, because the file does not.
     """
 
     path: Path
@@ -383,7 +383,7 @@ def _of_equal(names: tuple[str, ...]) -> tuple[str, ...]:
 
 def _row(cells: list[str], path: Path, line: int) -> list[float]:
     if not "".join(cells).strip(_OF_NUMBERS):
-        # The whole row at once is quicker; what is no number after all gets its message below.
+        # The whole row at once is faster; a cell that is not a number gets its message below.
         with contextlib.suppress(ValueError):
             numbers = [float(cell) for cell in cells]
             if max(numbers) <= TABLE_VALUE.max_value and min(numbers) >= -TABLE_VALUE.max_value:
@@ -396,7 +396,7 @@ def _number(cell: str, path: Path, line: int) -> float:
     if not text or _NOT_A_NUMBER.fullmatch(text.lower()):
         return math.nan
     if not (_NUMBER.fullmatch(text) or _INFINITE.fullmatch(text.lower())):
-        comma = "is the comma a decimal point? write a point" if _COMMA_NUMBER.match(text) else None
+        comma = "write a decimal point, not a comma" if _COMMA_NUMBER.match(text) else None
         plain = comma or "write plain decimal numbers like -12.5"
         raise InputError(f"line {line} holds '{text}', which is no number", path, plain)
     number = float(text)
@@ -414,10 +414,10 @@ def _why_uneven(cells: list[str], names: list[str]) -> str:
     """Return what may make a row longer or shorter than the header."""
     if len(cells) < len(names):
         return "add the missing cell or comma"
-    # a decimal comma cuts every number in two: whole parts alone, and rows about twice as long
+    # A decimal comma cuts every number in two: integers only, and rows about twice as long.
     whole = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
     if whole and 4 * len(cells) > 5 * len(names):
-        return "are there decimal commas? write points"
+        return "write decimal points, not commas"
     return "give every column a name in the header"
 
 

@@ -35,14 +35,16 @@ class TibiaPoseSettings:
     """Which recorded poses of the tibia are plausible."""
 
     max_lean_deg: float = 150.0
-    """deg; lean of a shank from the vertical, either way. A sprinter's shank swings back by 110
-    deg."""
+    """deg; lean of a shank from the vertical, either way. Chosen: a sprinter's shank swings back by
+    110 deg."""
     max_distance: float = 100.0
-    """m; distance from the laboratory's origin that no camera covers."""
+    """m: distance from the laboratory's origin that is beyond the view of any camera."""
     shank_length: float = 0.4
-    """m; distance from the knee at which the far end of the shank is compared."""
+    """m: distance from the ankle at which the upper end of the shank is compared. Chosen: about the
+    length of an adult's shank."""
     window: float = 0.5
-    """s; samples farther from the frames than this do not reach them through the filter."""
+    """s: samples farther from the frames than this do not affect them through the filter. Chosen:
+    several times as long as the filter's response."""
 
 
 TIBIA_POSE = TibiaPoseSettings()
@@ -50,7 +52,8 @@ TIBIA_POSE = TibiaPoseSettings()
 FASTEST_TURN, FASTEST_MOVE = 100.0, 30.0
 """rad/s and m/s: twice the fastest sprinter's and kicker's shank."""
 ODD_TURN, ODD_MOVE = 0.5 * DEGREE, 3.0 * MILLIMETRE
-"""As near to its neighbours' curve as skin markers are, no sample is odd."""
+"""A sample that is nearer than this to its neighbours' curve is not odd: the noise of skin
+markers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,7 @@ def load_tibia(source: ShankRecording, time: Array, side: Side, cutoff_Hz: Cutof
 
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
-    """Return the odd samples of the shank's two ends, none of which is or moves impossibly."""
+    """Return the odd samples of the shank's two ends; raise for impossible positions or speeds."""
     near = (stamps >= time[0] - TIBIA_POSE.window) & (stamps <= time[-1] + TIBIA_POSE.window)
     ends = {
         "ankle": np.zeros(3),

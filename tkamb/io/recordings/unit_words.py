@@ -46,12 +46,12 @@ def plain_unit(word: str) -> str:
 
 
 def metres(word: str) -> float | None:
-    """Return metres per unit of length; None for a word that is none."""
+    """Return metres per unit of length; None for a word that is not a unit."""
     return LENGTH_WORDS.get(plain_unit(word))
 
 
 def newtons(word: str) -> float | None:
-    """Return newtons per unit of force; None for a word that is none."""
+    """Return newtons per unit of force; None for a word that is not a unit."""
     return FORCE_WORDS.get(plain_unit(word))
 
 

@@ -1,7 +1,7 @@
-"""What a patient's URDF must be: parsed numbers, one tree, the exact knee chain, real bodies.
+"""Checks of a patient's URDF: numbers, one tree, the exact knee chain, physical inertias.
 
-Parsers of URDF drop what they do not know and fill in what is missing, silently: a misspelt
-attribute becomes zero, a joint without limits another type. Here each is an error.
+Parsers of URDF silently ignore unknown attributes and fill in missing ones: a misspelt attribute
+becomes zero, a joint without limits another type. Here each of these is an error.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -69,7 +69,7 @@ class UrdfAngleSettings:
     """Which angles of a URDF are in radians."""
 
     max_angle: float = 8.0 * np.pi
-    """rad; a larger number is in degrees: angles in a URDF are below one turn."""
+    """rad; a larger number is in degrees. Chosen: four turns, as angles in a URDF are below one."""
 
 
 URDF_ANGLE = UrdfAngleSettings()
@@ -117,11 +117,11 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
         place = element.tag == "origin" and key == "xyz"
         if place and np.abs(numbers_of(element, key)).max() > _FARTHEST:
-            hint = "xyz is in metres: is it in millimetres?"
+            hint = "give xyz in metres, not in millimetres"
             raise InputError(f'<origin xyz="{text}"> is beyond {_FARTHEST:g} m', where, hint)
         if key in ("value", *_INERTIA) and abs(float(text)) > _HEAVIEST:
             hint = f"give at most {_HEAVIEST:g} (kg, kg·m²)"
-            raise InputError(f'<{element.tag} {key}="{text}"> is of no body', where, hint)
+            raise InputError(f'<{element.tag} {key}="{text}"> is too large for a body', where, hint)
         if key == "rpy" and np.abs(numbers_of(element, key)).max() > URDF_ANGLE.max_angle:
             hint = "give rpy in radians, not in degrees"
             raise InputError(f'<origin rpy="{text}"> turns by several turns', where, hint)
@@ -163,7 +163,7 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
                 hint = f"add it, or {names_near(end, links)}"
                 raise InputError(f"names a link '{end}' that is not there", where, hint)
         if child in parents:
-            raise InputError(f"link '{child}' hangs on a second joint", where, "keep one")
+            raise InputError(f"link '{child}' is the child of a second joint", where, "keep one")
         parents[child] = parent
     if repeated := sorted({name for name in links if links.count(name) > 1}):
         raise InputError(f"has two links '{repeated[0]}'", path, "rename one")
@@ -180,7 +180,9 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
         while place in parents and steps <= len(links):
             place, steps = parents[place], steps + 1
         if place != roots[0]:
-            raise InputError(f"link '{name}' hangs in a loop", path, "a leg is one tree")
+            raise InputError(
+                f"link '{name}' is part of a loop", path, "connect the links to one tree"
+            )
 
 
 def ends_of(joint: ElementTree.Element) -> tuple[str, str]:
@@ -287,7 +289,7 @@ def _check_order(
     for name in names:
         parent, child = ends_of(joints[name])
         if parent != place:
-            raise InputError(f"joint '{name}' hangs on '{parent}', not '{place}'", path, order)
+            raise InputError(f"joint '{name}' has parent '{parent}', not '{place}'", path, order)
         place = child
         origin = joints[name].find("origin")
         numbers = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])

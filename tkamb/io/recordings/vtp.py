@@ -159,7 +159,7 @@ class _PolyData:
         if count == 0:
             return b""
         if whole * (count - 1) + (last or whole) > FILE_LIMITS.mesh_bytes:
-            raise ValueError("it unpacks to more than is read")
+            raise ValueError("a block unpacks to more bytes than it states")
         packed, _ = self._taken(rest, sum(sizes), raw)
         blocks, start = [], 0
         for number, length in enumerate(sizes):

@@ -34,7 +34,7 @@ logger = logging.getLogger("tkamb")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What a run works on. Absent in the scene: None.
+    """The input of a run. Parts that the scene does not have are None.
 
     Args:
         scene: the scene, as its file has it.
@@ -52,7 +52,7 @@ class Case:
         emg: envelopes of the muscles' surface EMG.
         post: the insert's post, insert frame, where the scene asks for its contact.
         insert_placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin and
-            not mirrored, in the insert frame; None where nothing needs it.
+        not mirrored, in the insert frame; None if not needed.
     """
 
     scene: Scene
@@ -156,10 +156,10 @@ def _recordings(
 
 
 def _common_part(scene: Scene) -> "MotionRecording | None":
-    """Return the motion on the part that the ground reaction covers; None if that is no remedy.
+    """Return the part of the motion that the ground reaction covers; None if there is none.
 
-    A scene that states no interval means all that was recorded, and clocks of two files begin
-    and end a little apart.
+    A scene without an interval asks for the whole recording, but the clocks of two files may
+    begin and end at slightly different times.
     """
     if scene.ground_reaction is None or scene.motion.interval_s or scene.motion.cycle_s:
         return None
@@ -190,7 +190,7 @@ def load_case(scene: Scene) -> Case:
     """
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
-    # tables before meshes, which take longer: a mistake in them is told at once
+    # Tables before meshes, which take longer: a mistake in a table is reported at once.
     parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
     try:
         motion, tibia, ground = _recordings(scene, in_si(scene.motion), chain, parts)
@@ -253,7 +253,7 @@ def with_insert(case: Case, mesh: Path) -> Case:
 
 
 def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
-    """Return the motion with what follows from the surfaces: a seat, a roll with slip."""
+    """Return the motion with coordinates that follow from the surfaces (seat, roll and slip)."""
     table = scene.motion
     if motion.unrecorded or table.motion == "roll-slip":
         check_frames(motion.time, table.cutoff_Hz, table.frames)
@@ -342,7 +342,7 @@ class _Parts:
             return
         if wants_femoral:
             if not implant.femoral:
-                raise InputError("is missing", "[implant.femoral]", "the patella rides on it")
+                raise InputError("is missing", "[implant.femoral]", "the patella slides on it")
             self.femoral, self.femoral_mesh_in_femur = self._place(
                 "femoral component", implant.femoral
             )
@@ -352,7 +352,7 @@ class _Parts:
             self.patella, _ = self._place("patellar button", implant.patella)
 
     def _place_insert(self, scene: Scene) -> "Surface":
-        """Read the insert, keep where its mesh lies in its frame, and return it there."""
+        """Read the insert, store its mesh's place in the insert frame, and return it there."""
         from tkamb.geometry.flat_bottom import insert_placement
         from tkamb.io.recordings.meshes import axes_rotation, load_surface
 

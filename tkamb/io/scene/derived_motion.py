@@ -1,4 +1,4 @@
-"""Motions that nobody recorded as they are computed: seated on the insert, or rolled over it."""
+"""Motions that are partly computed: seated on the insert, or rolling and slipping over it."""
 
 from dataclasses import replace
 
@@ -17,12 +17,12 @@ from tkamb.knee.slip import condyle_slip, roll_slip_motion
 def seated_motion(
     motion: KneeMotion, femoral: Surface, insert: Surface, cutoff: Cutoff
 ) -> KneeMotion:
-    """Return the motion with a first guess for the coordinates that were not recorded.
+    """Return the motion with an initial guess of the coordinates that were not recorded.
 
     Rotations stay at zero. AP and ML bring the mean of the condyles' lowest points over the
     insert's origin, SI brings the femur down to first touch, all at the other coordinates.
-    They are where the search for the released coordinates begins in each frame; their rates,
-    which enter inertia and the direction of sliding, are those of this guess.
+    The search for the released coordinates begins there in each frame. Their rates, which enter
+    inertia and the direction of sliding, are those of this guess.
 
     Args:
         motion: as recorded; `motion.unrecorded` names what is missing.

@@ -9,7 +9,7 @@ from tkamb.io.scene.table import FORMAT, Number, SceneTable, TableFormat
 
 
 class MeasuredTable(SceneTable):
-    """Axial knee forces of an instrumented implant: held against the run, never used in it."""
+    """Axial knee forces of an instrumented implant: compared with the run, never used in it."""
 
     file: Path
     format: TableFormat | None = Field(None, description=FORMAT)
@@ -30,7 +30,7 @@ class MeasuredTable(SceneTable):
         if isinstance(self.columns.get("time"), dict):
             raise ValueError("'columns' time is one column, no sum")
         if any(column == {} for column in self.columns.values()):
-            raise ValueError("'columns' holds a sum of nothing")
+            raise ValueError("'columns' holds an empty sum")
         return self
 
 
@@ -38,7 +38,7 @@ Positive = Annotated[Number, Field(gt=0)]
 
 
 class EmgTable(SceneTable):
-    """Surface EMG: envelopes to hold the activations against, or to guide them by.
+    """Surface EMG: envelopes to compare the activations with, or to guide them.
 
     An envelope is the rectified signal, low-passed without phase shift, over its normalising
     value.
@@ -94,7 +94,7 @@ class EmgTable(SceneTable):
         own = self.normalised_by == "recording"
         by = "their largest values in that file" if own else "given values"
         use = {
-            "report": "they are held against the activations and used for nothing",
+            "report": "they are only compared with the activations",
             "target": f"the cost holds {self.weight} (a - e)^2 for each",
             "bounds": f"activations stay within {self.width} of them",
         }[self.use]

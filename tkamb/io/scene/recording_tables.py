@@ -21,7 +21,7 @@ from tkamb.io.scene.table import (
 
 
 class MarkerSegmentTable(SceneTable):
-    """A segment with skin markers: the shank, the thigh, or what hangs on one of them."""
+    """A segment with skin markers: the shank, the thigh, or a neighbour of one of them."""
 
     name: str = Field(description="'shank' and 'thigh' are the knee's; others are neighbours")
     markers_mm: dict[str, Vector] = Field(

@@ -29,8 +29,8 @@ def scaled_case(case: "Case") -> "Case":
     """Return the case with its scene's `[patient] scale`.
 
     Raises:
-        InputError: the scene has [muscles] or markers, which have models of their own size, or
-            [measured], which is another subject's.
+        InputError: the scene has [muscles] or markers, whose models have their own size, or
+        [measured], which belongs to the unscaled subject.
     """
     s = case.scene.patient.scale
     for place, table in (

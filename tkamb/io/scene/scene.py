@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 class Scene(SceneTable):
-    """Everything a run needs to know; see the tables."""
+    """The content of a scene file; see the tables."""
 
     base: str | None = Field(
         None,
@@ -76,7 +76,7 @@ class Scene(SceneTable):
 
     @property
     def identity_json(self) -> str:
-        """All that a run depends on, as JSON: what only `tkamb wear` reads is left out."""
+        """All that a run depends on, as JSON, without the keys that only `tkamb wear` reads."""
         unused = {"wear"} if self.material else {"wear", "material"}
         return self.model_dump_json(exclude=unused)
 
@@ -99,7 +99,7 @@ class Scene(SceneTable):
         return self._preset
 
     def __repr__(self) -> str:
-        """Return in a line whose knee it is, what moves and what presses."""
+        """Return patient, motion and contact model in one line."""
         contact = self.contact
         parts = [
             f"{self.patient.side} knee",
@@ -148,7 +148,7 @@ class Scene(SceneTable):
         if own_yield and "yield_stress_MPa" in self.output.model_fields_set:
             raise ValueError("[material] and [output] both give yield_stress_MPa: give one")
         if self.material and not contact:
-            raise ValueError("[material] needs [contact]: nothing else is pressed")
+            raise ValueError("[material] needs [contact], which uses it")
         if self.output.cycle_s and self.motion.cycle_s:
             raise ValueError("[motion] cycle_s is the cycle: drop [output] cycle_s")
         if self.tibia and self.motion.markers:
@@ -188,12 +188,12 @@ def load_scene(
 
 
 def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = None) -> Scene:
-    """Return a scene with a preset laid over it; what its own overrides set stays.
+    """Return a scene with a preset applied; its own overrides are kept.
 
     Args:
         scene: as read.
         preset: name of a preset (`tkamb.io.presets.registry`).
-        overrides: dotted key -> value that is laid over the preset.
+        overrides: dotted key -> value that replaces the preset's.
 
     Raises:
         InputError: no such preset, or the scene lacks what it needs.
@@ -207,7 +207,7 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
 
 
 def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
-    """Return a scene with overrides laid over it, as `load_scene` lays them over a file.
+    """Return a scene with overrides applied, as `load_scene` applies them to a file.
 
     Args:
         scene: as read; its own overrides and its preset stay.
@@ -222,7 +222,7 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
 
 
 def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
-    """Return the scene of a content with overrides laid over it."""
+    """Return the scene of a content with overrides applied."""
     for key, value in overrides.items():
         _override(content, key, value)
     try:
@@ -254,7 +254,7 @@ def _content(path: Path) -> dict[str, Any]:
         return content
     name = content["base"]
     if not isinstance(name, str) or name != Path(name).name:
-        raise InputError("'base' is no file name", path, "name a scene file in the same folder")
+        raise InputError("'base' is not a file name", path, "name a scene file in the same folder")
     base = _parse(path.parent / name)
     if "base" in base:
         raise InputError(f"its base {name} has a base itself", path, "name that one")
@@ -284,12 +284,12 @@ def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
     for name in tables:
         content = content.setdefault(name, {})
         if not isinstance(content, dict):
-            raise InputError(f"'{dotted}' does not lead through tables", "--set")
+            raise InputError(f"'{dotted}' names a key of something that is not a table", "--set")
     content[key] = value
 
 
 def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) -> InputError:
-    """Return what to mend first: an unknown key may be the missing one, misspelt."""
+    """Return the mistake to correct first: an unknown key may be a misspelt missing one."""
     result = error.errors()
     rank = {"extra_forbidden": 0, "missing": 2}
     first = min(result, key=lambda one: rank.get(one["type"], 1))
@@ -306,7 +306,7 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
         return InputError(f"missing key '{key}'", where, advice)
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] in ("float_type", "int_type", "bool_type"):
-        message += f", {_shown(first['input'])} is none"
+        message += f", not {_shown(first['input'])}"
     if first["type"] in ("tuple_type", "list_type"):
         message = _as_list(key, first["input"], option == key)
     return InputError(f"'{key}': {message}" if key else message, where, advice)
@@ -320,7 +320,7 @@ def _as_list(key: str, value: Any, from_command_line: bool) -> str:
     written = (
         f"--set '{key}=[{words}]'" if from_command_line else f"{key.split('.')[-1]} = [{words}]"
     )
-    return f"{words} is no list; in brackets it is one: {written}"
+    return f"{words} is not a list; write it in brackets: {written}"
 
 
 def _shown(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Tables of a scene in SI: the unit leaves a key's name, and the number comes along."""
+"""Tables of a scene in SI: the unit is removed from the key and the number is converted."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -12,7 +12,7 @@ from tkamb.io.scene.table import SceneTable
 from tkamb.units import DEGREE, MILLIMETRE
 
 SCALES = {"_mm": MILLIMETRE, "_deg": DEGREE, "_Hz": 1.0, "_s": 1.0, "_N": 1.0, "_kg": 1.0}
-"""Unit at the end of a key -> what one of it is in SI."""
+"""Unit at the end of a key -> its value in SI."""
 
 CLASSES: dict[type[SceneTable], type] = {
     tables.PatientTable: recordings.Patient,
@@ -31,9 +31,9 @@ NAMES = {"neutral_mm": "neutral_translation", "neutral_deg": "neutral_rotation"}
 
 
 def in_si(table: SceneTable) -> Any:
-    """Return what stands for a table below the scene, see `CLASSES`.
+    """Return the SI object of a table, see `CLASSES`.
 
-    Keys that the class does not have concern the scene alone.
+    Keys that the class does not have are left out.
     """
     kind = CLASSES[type(table)]
     names = {one.name for one in fields(kind)}

@@ -1,4 +1,4 @@
-"""What the tables of the scene file are made of: their base, units, numbers and limits."""
+"""Building blocks of the scene's tables: base class, units, numbers and limits."""
 
 from typing import Annotated, Any, Literal
 
@@ -7,7 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Strict
 LengthUnit = Literal["m", "cm", "mm", "inch"]
 AngleUnit = Literal["rad", "deg"]
 Number = Annotated[float, Strict()]
-"""Neither `true` nor a number in quotes is one."""
+"""A number; `true` or a number in quotes is refused."""
 Count = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]

@@ -1,4 +1,4 @@
-"""The scene's table [uncertainty]: by how much each input errs, as a standard deviation.
+"""The scene's table [uncertainty]: the standard deviation of the error of each input.
 
 Every key is one standard deviation of a normal distribution in the key's unit; those called
 relative are of a positive factor of mean 1 (lognormal). Zero: that input does not vary.
@@ -68,9 +68,10 @@ class SkinMarkerErrorSettings:
     axial_rotation_deg: float = 2.2
     """deg; an assumption: half the largest error of Benoit et al."""
     adduction_deg: float = 2.2
-    """deg; likewise."""
+    """deg; an assumption: half the largest error of Benoit et al."""
     flexion_deg: float = 2.2
-    """deg; likewise. A run of bands has it from the markers, if the scene takes it from them."""
+    """deg; an assumption: half the largest error of Benoit et al. Not used if flexion comes from
+    markers: their own deviation then counts."""
     thigh_mm: float = 10.0
     """mm, of each thigh marker in each direction; an assumption: a rigid fit of three markers
     240 mm apart is then off by 3 deg and 6 mm, a third of the largest errors in PMC8631460."""

@@ -20,7 +20,7 @@ def lay_out(directory: Path, person: "Person | None" = None) -> Path:
 
     Args:
         directory: the folder.
-        person: whose leg the files shall be; None: a man of 75 kg and 1.75 m, right knee.
+        person: the patient; None: a man of 75 kg and 1.75 m, right knee.
 
     Raises:
         InputError: the folder holds something, or cannot be written.
@@ -28,8 +28,8 @@ def lay_out(directory: Path, person: "Person | None" = None) -> Path:
     directory = Path(directory)
     try:
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            hint = "give a new folder: nothing of yours is overwritten"
-            raise InputError("is there already and not empty", directory, hint)
+            hint = "give a new folder: tkamb does not overwrite your files"
+            raise InputError("exists already and is not empty", directory, hint)
         directory.parent.mkdir(parents=True, exist_ok=True)
         with (
             as_file(files("tkamb.io.starter") / "files") as source,
@@ -70,7 +70,7 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _person(options: argparse.Namespace) -> "Person | None":
-    """Return whose leg is asked for; None: the usual one."""
+    """Return the patient of the options; None: the default one."""
     given = {
         "side": options.side,
         "mass": options.mass_kg,

@@ -39,17 +39,19 @@ class LegProportionSettings:
     thigh: float = 0.245
     """Knee to hip centre over body height; Winter (2009)."""
     insert_below_knee: float = 0.018662
-    """m; the insert's bottom below the knee's centre, as in the shipped patient."""
+    """m: depth of the insert's bottom below the knee's centre. Chosen: as in the shipped
+    patient."""
     hip_below_thigh_end: float = 0.004367
-    """m; the femoral component's origin lies so much above the knee's centre, likewise."""
+    """m: height of the femoral component's origin above the knee's centre, as in the shipped
+    patient."""
     lightest: float = 20.0
-    """kg; lightest body that is accepted."""
+    """kg; lightest body that is accepted. Chosen: it leaves out masses in other units."""
     heaviest: float = 300.0
-    """kg; heaviest body that is accepted."""
+    """kg; heaviest body that is accepted. Chosen: it leaves out masses in other units."""
     shortest: float = 1.0
-    """m; smallest height that is accepted."""
+    """m; smallest height that is accepted. Chosen: it leaves out heights in other units."""
     tallest: float = 2.3
-    """m; greatest height that is accepted."""
+    """m; greatest height that is accepted. Chosen: it leaves out heights in other units."""
 
 
 LEG_PROPORTIONS = LegProportionSettings()
@@ -57,7 +59,7 @@ LEG_PROPORTIONS = LegProportionSettings()
 
 @dataclass(frozen=True)
 class Person:
-    """Whose leg the starter's files are.
+    """The patient of the starter's files.
 
     Args:
         side: of the knee.
@@ -108,7 +110,7 @@ def write_person(folder: Path, person: Person) -> None:
 
     Args:
         folder: with the files of `tkamb new`.
-        person: whose leg they shall be.
+        person: the patient.
     """
     urdf, scene = folder / "patient.urdf", folder / "scene.toml"
     urdf.write_text(patient_urdf(urdf.read_text(encoding="utf-8"), person), encoding="utf-8")
@@ -176,7 +178,7 @@ def scene_text(text: str, person: Person) -> str:
         if match["link"] == "tibia":
             y += knee_up  # every attachment on the tibia is near the knee
         elif match["link"] == "femur" and y > LEG_PROPORTIONS.insert_below_knee * 1e3:
-            y *= thigh  # on the shaft; nearer the joint it belongs to the implant's place
+            y *= thigh  # on the shaft; points near the joint move with the implant instead
         z = mirror * z + 0.0
         return f'link = "{match["link"]}", point_mm = [{x:g}, {round(y, 3):g}, {z:g}]'
 

@@ -58,7 +58,7 @@ def press_adjusted(
         return _flagged(result, adjustment), adjustment, start
     checked, restore, doubts = _check(query, adjustment, result)
     if restore:
-        # At the recorded rotation the limit of the turn decides nothing any more.
+        # At the recorded rotation the limit of the turn has no effect.
         pose, translation, flags = moved_to_touch(query, checked.recorded, checked.settings)
         checked = replace(checked, pose=pose, translation=translation, restored=True, flags=flags)
         result, start = model.press_from(state, load, pose, start)
@@ -83,8 +83,8 @@ def _check(
     deeper = penetration - abs(adjustment.translation)
     angle_excess = (abs(angle) - abs(adjustment.coronal_angle)) * distance
     margin = settings.input_change
-    # Where the angle passes the turn, the turn is as small as the angle: if the mesh calls that
-    # level, restoring changes nothing.
+    # Where the final angle is about as large as the turn and both are below what a mesh resolves,
+    # restoring the rotation changes nothing.
     tilted = abs(angle) * distance > settings.level_difference
     outcomes = {
         _restored(settings.restore_when, *exceeded)
@@ -95,8 +95,9 @@ def _check(
     doubts: tuple[str, ...] = ()
     if len(outcomes) > 1:
         doubts = (
-            f"femoral adjustment: {margin / MILLIMETRE:g} mm of the recorded pose decides whether "
-            "the recorded rotation is restored, and the split with it",
+            f"femoral adjustment: a change of the recorded pose by {margin / MILLIMETRE:g} mm "
+            f"decides "
+            "whether the recorded rotation is restored; the medial-lateral split depends on it",
         )
     restore = _restored(settings.restore_when, deeper > 0, angle_excess > 0)
     checked = replace(adjustment, penetration=penetration, final_angle=angle)

@@ -7,11 +7,11 @@ by the trapezoidal rule, against what K predicts,
 
     W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2 :
 
-forces that have a potential lower it by W, so that with W > 0 in every step the energy falls.
-A trial that overshoots into a stiff contact costs work and is taken back. Where loads that follow
-the motion leave K unsymmetric, stable but not positive definite, work is no measure; a step then
-goes along Newton's direction, in which |r| falls, and is judged by that. A search that ends nowhere
-so is tried once more with none but whole Newton steps judged by |r|, all shorter ones by work.
+forces with a potential lower it by W, so that the energy falls if W > 0 in every step. A trial
+that overshoots into a stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric:
+it may be stable but not positive definite, and work is then no measure. The step then goes along
+Newton's direction, in which |r| falls, and is judged by |r|. A search that does not converge is
+repeated once; then only whole Newton steps are judged by |r|, and shorter ones by work.
 
 Everything is in metres and newtons: rotations are scaled by a lever arm.
 
@@ -34,26 +34,31 @@ class BalanceSettings:
     """The iteration that finds the released coordinates."""
 
     force_tolerance: float = 0.05
-    """N (moments are divided by the lever arm): residual below which a coordinate has
-    converged. The noise of the forces counts instead where it is larger."""
+    """N (moments are divided by the lever arm): residual below which a coordinate has converged;
+    the noise of the forces counts instead where it is larger. Chosen: far below what is
+    reported."""
     step_tolerance: float = 2e-6
-    """m: Newton step below which a coordinate has converged."""
+    """m: Newton step below which a coordinate has converged. Chosen: below the size at which a
+    force changes by more than its tolerance."""
     least_stiffness: float = 100.0
-    """N/m: a state with a smaller stiffness is indeterminate; it gives way by more than 10 mm
+    """N/m: a state with a smaller stiffness is indeterminate. Chosen: it moves by more than 10 mm
     per newton."""
     narrow_radius: float = 1e-6
-    """m: trust radius below which an approximate stiffness is replaced by finite differences,
-    because the steps that it proposes do not reduce the residual."""
+    """m: trust radius below which an approximate stiffness is replaced by finite differences.
+    Chosen: the steps that it proposes do not reduce the residual."""
     max_travel: float = 20e-3
-    """m: a coordinate this far from its initial guess is held by nothing."""
+    """m: largest distance of a coordinate from its initial guess; beyond it the search ends.
+    Chosen: no load holds a coordinate that moves as far."""
     difference_step: float = 2e-6
-    """m: step of the finite differences where the stiffness is not given."""
+    """m: step of the finite differences where the stiffness is not given. Chosen: the same as the
+    tolerance of a step."""
     max_prediction_error: float = 0.5
-    """1: an approximate stiffness is not used along a step if the change of force differs from
-    the predicted one by more than this share."""
+    """1: an approximate stiffness is not used along a step if the change of force differs from the
+    predicted one by more than this share. Chosen: at half of the change the step would no longer
+    reduce the residual reliably."""
     max_steps: int = 200
-    """Steps at most. A lightly loaded knee that slides 16 mm over lattice cells of 2 mm needs
-    80."""
+    """Steps at most. Chosen: a lightly loaded knee that slides 16 mm over lattice cells of 2 mm
+    needs 80."""
 
 
 BALANCE = BalanceSettings()
@@ -80,7 +85,8 @@ class Trial:
     Args:
         force: (n,) N, drives each coordinate along its positive direction; NaN if unknown.
         stiffness: (n, n) N/m, -d force / d coordinates; None: by finite differences.
-        exact: it is that; else a guide, and what it misses is learnt from step to step.
+        exact: whether `stiffness` is the exact tangent. If not, it is an approximation, which the
+        search corrects from step to step.
         force_noise: N, error of the force; a smaller force counts as zero.
     """
 
@@ -96,14 +102,14 @@ class Balance:
 
     Args:
         coordinates: (n,) m.
-        force: (n,) N, what is left.
+        force: (n,) N, residual.
         stiffness: (n, n) N/m.
         status: how it ended.
         steps: Newton steps, taken or taken back.
-        trials: how often the forces were computed.
+        trials: number of evaluations of the forces.
         smallest_stiffness: N/m, smallest real part of the stiffness' eigenvalues.
         work: N·m done by the forces along each step taken, all positive.
-        at_rest: to the tolerances; else only as near as was asked for.
+        at_rest: whether it has converged to the tolerances; if not, only to `residual_share`.
     """
 
     coordinates: Array
@@ -132,16 +138,17 @@ def find_balance(
     Args:
         forces: the trial at coordinates (n,), m.
         start: (n,) m.
-        stiffness: (n, n) N/m of an earlier search near by, a guess that saves trials where
-            `forces` does not bring its own.
+        stiffness: (n, n) N/m of an earlier search near by. It is an initial guess that saves trials
+        where `forces` does not give a stiffness.
         residual_share: share of the distance from the initial guess that may remain, for a search
             that is repeated under other forces; 0: the tolerances alone decide.
-        reach: m, such a search ends where a coordinate is farther from the initial guess.
+        reach: m, a repeated search ends where a coordinate is farther than this from the initial
+        guess.
     """
     result = _Search(forces, np.array(start, float), stiffness, residual_share, reach).run()
     if result.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
         return result
-    # Newton's direction may lead off over the facets of a contact; the way downhill may not.
+    # Newton's direction may lead away over the facets of a contact. Descent of energy does not.
     again = _Search(
         forces, np.array(start, float), stiffness, residual_share, reach, downhill=True
     ).run()
@@ -240,7 +247,7 @@ class _Search:
                 self._guide, self.stiffness = trial.stiffness, trial.stiffness + self._missing
 
     def _next(self) -> tuple[Array, float]:
-        """Return the next step, and what part it is of Newton's where |r| judges it; else 0."""
+        """Return the next step, and its share of Newton's step if |r| judges it; else 0."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
         if symmetric > 0 or smallest_stiffness <= 0 or self._refused:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
@@ -275,9 +282,9 @@ class _Search:
     def _learn(self, step: Array, trial: Trial) -> None:
         """Correct the stiffness along a step (Broyden 1965, doi:10.2307/2003941).
 
-        With guides at both ends it is what their mean misses that is learnt; a step that they do
-        not describe at all (contact was made or lost on the way) teaches nothing: all is forgotten,
-        unless it has just been looked at by differences.
+        With an approximate stiffness at both ends, the update corrects their mean. If a step
+        differs too much from the prediction (contact was made or lost on the way), all updates are
+        dropped, unless finite differences have just been computed.
         """
         expected = self.stiffness @ step
         if self._guide is not None and trial.stiffness is not None:
@@ -305,7 +312,7 @@ class _Search:
         return float(np.abs(self.x - self._start).max())
 
     def _near(self) -> bool:
-        """Return whether the step that is left is short against the way from the start."""
+        """Return whether the remaining step is small against the distance travelled so far."""
         way = self._left * float(np.linalg.norm(self.x - self._start))
         if way == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
             return False
@@ -344,7 +351,7 @@ class _Search:
 
 
 def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
-    """Return the Newton step (n,), or within the radius the one that descends.
+    """Return the Newton step (n,), or a descending step within the radius.
 
     Args:
         stiffness: (n, n) N/m, need not be symmetric.
@@ -382,7 +389,7 @@ def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def _smallest_eigenvalues(entries: bytes, count: int) -> tuple[float, float]:
-    """Return those of one stiffness: each step of a search asks more than once."""
+    """Return the same for one stiffness, cached: each step of a search needs it several times."""
     stiffness = np.frombuffer(entries).reshape(count, count)
     # The stiffness of contact with a moving normal is not symmetric. Its symmetric part decides
     # about a descent direction, its own eigenvalues about stability.

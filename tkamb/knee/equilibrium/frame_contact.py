@@ -29,15 +29,13 @@ class FrameContact:
         seconds: computing time.
         problem: why there is no result, or empty.
         flags: plain words that a reader must know.
-        iterations: of body and contact, until they agreed; 0 if not coupled.
-        load_change: N, by the last of them.
-        point_change: m, likewise, of the centres of pressure.
+        iterations: iterations between body and contact until convergence; 0 if not coupled.
+        load_change: N, change of the load in the last iteration.
+        point_change: m, change of the centres of pressure in the last iteration.
         equilibrium: the search for the released coordinates, if there are any.
         sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
             adduction is released, or there is one condyle.
         start: where a contact of the next frame may begin; None where there is no result.
-        turned: the start that came with the contact at a little more adduction, from which the
-            sensitivity was found; None if it was not.
         triangles: (k, 3) of the map.
         post: cam and post, where the scene asks for their contact.
     """
@@ -54,7 +52,6 @@ class FrameContact:
     equilibrium: "KneeEquilibrium | None" = None
     sensitivity: float = NAN
     start: WarmStart | None = None
-    turned: WarmStart | None = None
     triangles: NDArray[np.int64] | None = None
     post: "PostContact | None" = None
 

@@ -1,4 +1,4 @@
-"""The post of a case: prepared where the scene asks for it, and looked at at a pose."""
+"""Cam and post of a case: prepared if the scene asks for them, and evaluated at a pose."""
 
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -21,8 +21,8 @@ class PostSideSettings:
     """On which side of the post the cam is."""
 
     pose_error: float = 0.5 * MILLIMETRE
-    """m: error of a position from fluoroscopy. A deeper overlap of cam and post becomes a
-    question to the user."""
+    """m: error of a position from fluoroscopy; a deeper overlap of cam and post becomes a question
+    to the user. Chosen: above its usual error."""
 
 
 POST_SIDE = PostSideSettings()
@@ -55,7 +55,7 @@ def cam_on_post(
 def post_contact(
     cam_post: "CamPost | None", pose: "Array", table: "ContactTable"
 ) -> "PostContact | None":
-    """Return cam and post at a pose (4, 4), asked about where a recorded AP makes them overlap.
+    """Return cam and post at a pose (4, 4), with a question if a recorded AP makes them overlap.
 
     None where the scene does not ask for them.
     """

@@ -1,18 +1,18 @@
-"""Muscle forces that a search for equilibrium holds for a while: between the last and the new.
+"""Relaxation of the muscle forces that a search for equilibrium holds constant.
 
-The sharing answers to where the knee rests, and the knee to the sharing. Where a light load
-leaves the knee soft, either overshoots the other, and taken in turn they would go round in a
-circle. So the forces go only a part omega of the way from those held, f, to those asked for, f',
+The muscle sharing depends on the knee's equilibrium, and the equilibrium on the sharing. Under a
+light load the knee is compliant, and computing both in turn would oscillate. The forces f are
+therefore changed only by a part omega of the difference to the required ones, f',
 
     f <- f + omega (f' - f),   omega <- -omega d . (d' - d) / |d' - d|²,
 
-d and d' the last two f' - f: Aitken's secant for a vector. At the end f' itself is held.
+with d and d' the last two differences f' - f: Aitken's secant for a vector. At the end f = f'.
 
-How the knee yields to the muscles decides their arms, and hangs itself on where the knee rests. It
-is taken as found in the first passes; then it goes only half of the way to what is found, and a
-quarter, so that it comes to rest where the contact's stiffness changes fast with the pose. Where
-even that goes on and on (a condyle about to lift, whose pose jumps), it is kept at last. `doubt`
-says what of it is left open.
+The compliance of the knee to the muscles decides the muscles' arms, and depends itself on the
+equilibrium. In the first passes the measured compliance is used. Later it is changed only by half
+of the difference to the measured one, then by a quarter, so that it converges where the contact's
+stiffness changes fast with the pose. If it still does not converge (a condyle is about to lift and
+the pose jumps), it is kept constant. `doubt` is the difference that remains.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -35,8 +35,9 @@ class MuscleIterationSettings:
     """The iteration between muscle forces and knee equilibrium."""
 
     muscle_force_tolerance: float = 1.0
-    """N: largest difference, over the muscles, of the force that is needed from the force that
-    is applied, at which the iteration has converged."""
+    """N: largest difference, over the muscles, of the force that is needed from the force that is
+    applied, at which the iteration has converged. Chosen: it is a thousandth of a usual muscle
+    force."""
 
 
 MUSCLE_ITERATION = MuscleIterationSettings()
@@ -46,7 +47,7 @@ LEAST, MOST = 0.05, 1.0
 
 
 STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
-"""Until so many passes are made, how the knee yields goes that part of the way to what is found."""
+"""Up to this number of passes, the compliance is changed by this share of the difference."""
 TURNS = np.array(
     [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
 )
@@ -57,9 +58,8 @@ class Relaxation:
     """The muscles' forces over the passes of one search.
 
     Attributes:
-        settled: what was asked for last agrees with what was held, and is held now.
-        doubt: share by which the knee yields otherwise, as last found, than it is taken to; 0:
-            it is as found.
+        settled: whether the required forces agree with the applied ones, so that they are applied.
+        doubt: relative difference of the measured compliance from the one that is used; 0: none.
     """
 
     def __init__(self) -> None:
@@ -70,10 +70,10 @@ class Relaxation:
         self._passes, self.doubt = 0, 0.0
 
     def yielding(self, measured: Array | None) -> Array | None:
-        """Return how the knee is taken to yield.
+        """Return the compliance of the knee that is used in the next pass.
 
         Args:
-            measured: how it does where it rests, see `ReleasedForces.tension_per_wrench`.
+            measured: compliance at the last equilibrium, see `ReleasedForces.tension_per_wrench`.
         """
         self._passes, self.doubt = self._passes + 1, 0.0
         last, self._yields = self._yields, measured
@@ -88,10 +88,10 @@ class Relaxation:
         return relaxed
 
     def mixed(self, required: "MuscleShare") -> "MuscleShare":
-        """Return the forces to hold next.
+        """Return the forces of the next pass.
 
         Args:
-            required: the sharing where the knee rested under those held before.
+            required: the sharing at the equilibrium under the forces of the last pass.
         """
         applied, self._held, self.settled = self._held, required, False
         if applied is None:

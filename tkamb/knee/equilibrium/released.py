@@ -1,18 +1,18 @@
-"""Released knee coordinates: where contact, ligaments and muscle line leave them at rest.
+"""Released knee coordinates: their equilibrium under contact, ligaments and muscles.
 
-Flexion is as recorded. The superior-inferior position always follows from the contact;
-adduction, axial rotation, anterior-posterior and medial-lateral position do so if the scene
-releases them, else they are kept as recorded, and what keeps them is a residual of the
-equations of motion.
+Flexion is as recorded. The superior-inferior position always follows from the contact.
+Adduction, axial rotation, anterior-posterior and medial-lateral position follow from equilibrium
+if the scene releases them. If not, they are kept as recorded, and the force or moment that keeps
+them is a residual of the equations of motion.
 
-Within one search the patella rides on the femur, and its ligament turns with it, while the other
-muscles' forces stay; patella and lines are then found anew at the solved pose, and the load shared
-anew among the muscles with the contact found there, until that moves the knee no more. At rest
-the sharing's tension of the extensor group is therefore that of the knee's equations. Inertia and
-sliding speed are those of the recorded rates: for the released coordinates all is
-quasi-static. Friction is Coulomb's, mu times each condyle's resultant against the recorded
-sliding, on the line of action of the resultant; without it nothing but follower loads keeps
-the forces from having a potential.
+Within one search the patella is fixed to the femur, its ligament turns with it, and the other
+muscles' forces are constant. Then the patella and the lines are solved again at the new pose, and
+the load is shared again among the muscles with the new contact, until the knee no longer moves. In
+equilibrium the sharing's tension of the extensor group is therefore that of the knee's equations.
+Inertia and sliding speed are those of the recorded rates: the released coordinates are
+quasi-static. Friction is Coulomb's: mu times each condyle's resultant, against the recorded
+sliding, on the line of action of the resultant. Without friction, the forces have a potential
+except for follower loads.
 
 The contact comes as a probe; this file does not know the models.
 """
@@ -47,28 +47,32 @@ class ReleasedKneeSettings:
     """The knee with released coordinates and its patella."""
 
     knee_tolerance: float = 2e-6
-    """m: the iteration between knee and patella has converged when the knee moves by less."""
+    """m: the iteration between knee and patella has converged when the knee moves by less. Chosen:
+    the same as the tolerance of the knee's own step."""
     contact_force_tolerance: float = 0.1
-    """N: and when the contact force changes by less than this, or by less than
-    `contact_force_share` of it."""
+    """N: it must also change the contact force by less than this, or by less than
+    `contact_force_share` of it. Chosen: a ten-thousandth of a usual contact force."""
     contact_force_share: float = 2e-4
-    """1: see `contact_force_tolerance`. The patella's changes from facet to facet alter the
+    """1: see `contact_force_tolerance`. Chosen: the patella's changes from facet to facet alter the
     force by about as much."""
     max_passes: int = 24
-    """Passes between knee and patella at most; each halves the remaining change where the knee
-    is soft."""
+    """Passes between knee and patella at most. Chosen: each halves the remaining change where the
+    knee is soft."""
     inner_tolerance_share: float = 0.1
-    """1: share of its own change that a pass may leave to the next one. Muscles make it a few
-    passes anyway."""
+    """1: residual of a pass as a share of its own change. Chosen: with muscles a few passes are
+    needed in any case, so that a pass need not converge further."""
     muscle_force_range: float = 3e-3
     """m: distance from a contact like the last frame's within which extrapolated muscle forces
-    hold."""
+    hold. Chosen: contacts move by less from frame to frame."""
     slack_force: float = 1e-3
-    """N: an extensor group with a smaller tension is slack."""
+    """N: an extensor group with a smaller tension is slack. Chosen: far below any force that
+    matters."""
     initial_load_error: float = 0.5
-    """1: largest relative difference between the load at an initial guess and the last frame's."""
+    """1: largest relative difference between the load at an initial guess and the load of the last
+    frame. Chosen: from there the search converges."""
     max_height_steps: int = 4
-    """Heights at most that are tried to reach it."""
+    """Largest number of heights that are tried to bring the load within `initial_load_error`.
+    Chosen: each costs one contact."""
 
 
 RELEASED_KNEE = ReleasedKneeSettings()
@@ -78,7 +82,7 @@ SUPERIOR = KNEE_COORDINATES.index("si")
 
 @dataclass(frozen=True, eq=False)
 class KneeEquilibrium:
-    """One frame with its released coordinates at rest.
+    """One frame with its released coordinates in equilibrium.
 
     Args:
         coordinates: (6,) m and rad.
@@ -86,8 +90,8 @@ class KneeEquilibrium:
         patella: where it is; None if not modelled.
         contact: the contact there.
         balance: the last search.
-        passes: how often patella and lines were found anew.
-        trials: how often the contact was computed.
+        passes: number of solutions of patella and lines.
+        trials: number of evaluations of the contact.
         change: N, what the last pass changed in the contact force.
         problem: why this is no result, or empty.
         doubt: see `Relaxation`.
@@ -111,7 +115,7 @@ def released_indices(names: Sequence[str]) -> tuple[int, ...]:
 
 
 class Body(Protocol):
-    """What the search asks of a body, frame by frame: of a whole motion, or of one instant."""
+    """What the search needs from the body, frame by frame: of a whole motion, or of one instant."""
 
     friction: float
     extensor: Any
@@ -122,7 +126,7 @@ class Body(Protocol):
 
     @property
     def muscles(self) -> "SharedMuscles | None":
-        """Those that share the load; None if the quadriceps alone acts."""
+        """Muscles that share the load; None if the quadriceps alone acts."""
 
     @property
     def sides(self) -> set[str]:
@@ -165,7 +169,7 @@ class ReleasedKnee:
         self.muscles = mechanics.muscles is not None
         self.released = released_indices(names)
         self._external: tuple[int, Array] | None = None
-        """Of the last frame, and which it was."""
+        """Index and external wrench of the last frame."""
 
     def find(
         self,
@@ -174,7 +178,7 @@ class ReleasedKnee:
         points: dict[str, Array] | None = None,
         before: KneeEquilibrium | None = None,
     ) -> KneeEquilibrium:
-        """Return frame k at rest.
+        """Return frame k in equilibrium.
 
         Args:
             k: frame.
@@ -203,7 +207,8 @@ class ReleasedKnee:
             middle = _middle(knee.contact, points, place)
             ways.append(max(travel, np.abs(middle - last).max() if self._keeps else 0.0))
             if pushes:
-                # a line that pushes drives the knee away: slack, it begins where this began
+                # A line that would push drives the knee away: slack, it begins from the same
+                # initial guess.
                 slack, knee, touch = True, before, None
                 place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
                 ways = [np.inf, np.inf]
@@ -219,12 +224,12 @@ class ReleasedKnee:
             ):
                 return replace(knee, doubt=mixing.doubt)
         assert knee is not None
-        return replace(knee, problem="knee and patella do not settle together")
+        return replace(knee, problem="the iteration between knee and patella does not converge")
 
     def _carrying(
         self, place: Array, like: "ProbedContact"
     ) -> "tuple[Array, ProbedContact | None]":
-        """Return the place, raised or lowered until it carries about what another contact does.
+        """Return the place, raised or lowered to about the contact force of another contact.
 
         Returns:
             Coordinates (6,) and the contact there; None if the same condyles do not carry, or the
@@ -263,7 +268,7 @@ class ReleasedKnee:
         mixing: Relaxation,
         reach: float,
     ) -> tuple[KneeEquilibrium, bool]:
-        """Return the knee at rest with the patella as at `place`, and whether it would push."""
+        """Return the equilibrium with the patella at `place`; say if its ligament would push."""
         patella = self._patella(k, place, before.patella if before else None)
         geometry = self._mechanics.geometry(k, place, patella)
         joint = self._joint(k, geometry, middle, slack)
@@ -309,20 +314,19 @@ class ReleasedKnee:
         applied: "MuscleShare | None",
         mixing: Relaxation,
     ) -> "MuscleShare":
-        """Return what each muscle carries, the released coordinates yielding to it.
+        """Return the force of each muscle; the released coordinates yield to the muscles.
 
-        Where no contact is known yet, or the contact model has no tangent, contact points stay;
-        where these make the first equations singular the knee's forces pass through the femoral
-        origin.
+        Contact points are kept if no contact is known yet, or if the contact model has no tangent.
+        If they make the equations singular, the knee's forces pass through the femoral origin.
 
         Args:
             k: frame.
             geometry: the frame without its contact.
             joint: its equations, the extensor mechanism taut.
-            touch: the contact there; None where the search begins without one like the last
-                frame's.
-            applied: what was held last, in this frame or the one before.
-            mixing: keeps how the knee yields.
+            touch: the contact there; None where the search begins without a contact like that of
+            the last frame.
+            applied: sharing of the last pass, in this frame or the one before.
+            mixing: relaxation of forces and compliance.
 
         Raises:
             ComputationError: no muscle forces carry the frame.
@@ -386,14 +390,14 @@ class ReleasedKnee:
 
 
 def ahead(ways: Sequence[float]) -> float:
-    """Return how far a search of ever shorter passes still goes, per way of its last pass.
+    """Return the distance that converging passes still have to go, per distance of the last pass.
 
-    With q the greater of the last two ratios of successive passes, the geometric series of what
-    would follow is q / (1 - q). Where a pass did not at least halve the way of the one before,
-    or there were less than three: 1, so that the last pass itself has to be short.
+    With q the larger of the last two ratios of successive distances, the geometric series that
+    remains is q / (1 - q). It is 1 where a pass did not at least halve the distance of the one
+    before, or where there were fewer than three passes: the last pass itself must then be short.
 
     Args:
-        ways: m, by which the last three passes moved; inf where there was none.
+        ways: m, distances of the last three passes; inf where there was none.
     """
     first, second, last = ways
     if not 0.0 < second <= 0.5 * first < np.inf or last > 0.5 * second:

@@ -1,4 +1,4 @@
-"""What drives free knee coordinates at trial places, in a leg or in a machine."""
+"""Generalised forces on free knee coordinates at trial places, of a leg or of a simulator."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,10 +21,11 @@ class ReleasedForceSettings:
     """The forces on released coordinates."""
 
     lever_arm: float = 0.025
-    """m: arm that makes rotations comparable to translations; half the usual distance of the
-    condyles."""
+    """m: arm that makes rotations comparable to translations. Chosen: half the usual distance of
+    the condyles."""
     difference_step: float = 1e-7
-    """m: step of the finite differences of joint axes and ligaments."""
+    """m: step of the finite differences of joint axes and ligaments. Chosen: far above rounding,
+    far below a curvature's radius."""
 
 
 RELEASED_FORCE = ReleasedForceSettings()
@@ -41,7 +42,7 @@ def _no_sliding(place: Array, point: Array) -> Array:
 
 
 class Joint(Protocol):
-    """What pushes the free coordinates beside the contact: of a leg, or of a simulator."""
+    """Loads on the free coordinates beside the contact, of a leg or of a simulator."""
 
     @property
     def released(self) -> tuple[int, ...]:
@@ -51,17 +52,17 @@ class Joint(Protocol):
         """Return the generalised forces (..., n) at coordinates (..., 6) and a contact (6,)."""
 
     def contact_gain(self, coordinates: Array) -> Array:
-        """Return how they follow the contact's wrench on the insert, (n, 6)."""
+        """Return their derivative by the contact's wrench on the insert, (n, 6)."""
 
 
 J = TypeVar("J", bound=Joint)
 
 
 class FreeForces(Generic[J]):
-    """What drives the free coordinates of a joint at trial places.
+    """Generalised forces on the free coordinates of a joint at trial places.
 
     Args:
-        joint: what acts beside the contact.
+        joint: loads beside the contact.
         probe: of the contact model.
         place: (6,) knee coordinates; those not free stay.
         friction: Coulomb coefficient.
@@ -93,12 +94,12 @@ class FreeForces(Generic[J]):
     def balance(
         self, stiffness: Array | None = None, residual_share: float = 0.0, reach: float = np.inf
     ) -> Balance:
-        """Return where the free coordinates come to rest, from the given place.
+        """Return the equilibrium of the free coordinates, with the given place as initial guess.
 
         Args:
             stiffness: (n, n) N/m of a search near by.
-            residual_share: share of the way that may be left, see `find_balance`.
-            reach: m, likewise, how far it may go.
+            residual_share: see `find_balance`.
+            reach: m, see `find_balance`.
         """
         return find_balance(self.trial, self._start, stiffness, residual_share, reach)
 
@@ -153,21 +154,21 @@ class FreeForces(Generic[J]):
 
 
 class ReleasedForces(FreeForces[JointEquilibrium]):
-    """What drives the released coordinates of a leg, the patella held on the femur."""
+    """Generalised forces on the released coordinates of a leg, its patella fixed to the femur."""
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
         """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.
 
-        The released coordinates yield to it by dq and stay at rest: with K = -df/dq of the
+        The released coordinates move by dq to the new equilibrium. With K = -df/dq of the
         generalised forces f = -J w of contact, ligaments and muscles,
 
             -J dw - K dq - J B dy = 0
 
-        for dq and what keeps the other coordinates dy, the tension of the patellar ligament
-        among it. None where the contact model does not know its tangent.
+        gives dq and the change dy of the loads that keep the other coordinates; the tension of the
+        patellar ligament is one of them. None where the contact model does not know its tangent.
 
         Args:
-            contact: at the place where the search begins, the knee at rest.
+            contact: at the place where the search begins, in equilibrium.
         """
         place = self._place
         wrench, stiffness = self._with_friction(place, contact)
@@ -185,9 +186,9 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 
     def tension_at_rest(self, contact: "ProbedContact", per_wrench: Array) -> float:
-        """Return the tension (N) by which the patellar ligament balances flexion near by, at rest.
+        """Return the tension (N) of the patellar ligament at the equilibrium near by.
 
-        A wrench that the place leaves unbalanced counts as one more that the knee yields to.
+        A residual wrench at the place counts as a further wrench to which the knee yields.
 
         Args:
             contact: at the place where the search begins.

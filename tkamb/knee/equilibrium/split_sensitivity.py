@@ -1,4 +1,4 @@
-"""How the split between the condyles answers to the adduction, at a constant load."""
+"""Change of the medial-lateral split with adduction, at a constant load."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -19,9 +19,9 @@ class SplitSensitivitySettings:
     """How the medial share of the force changes with adduction."""
 
     adduction_step: float = 0.02 * DEGREE
-    """rad: step of the finite difference. It is small against the 0.2 to 0.5 deg that unload a
-    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to
-    0.1 deg agree within 5 to 15 %."""
+    """rad: step of the finite difference. Chosen: small against the 0.2 to 0.5 deg that unload a
+    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to 0.1 deg
+    agree within 5 to 15 %."""
 
 
 SPLIT_SENSITIVITY = SplitSensitivitySettings()
@@ -34,31 +34,25 @@ def split_sensitivity(
     probe: "Probe",
     result: ContactResult,
     start: WarmStart | None = None,
-    like: tuple[WarmStart, WarmStart] | None = None,
-) -> tuple[float, tuple[ContactResult, WarmStart] | None]:
+) -> float:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
-    Zero where one condyle carries everything: it then holds only until the other touches. NaN
-    where the turned press does not succeed.
+    Zero where one condyle carries everything: the value then holds until the other condyle touches.
+    NaN where the press with more adduction fails.
 
     Args:
         probe: of the contact model.
         result: a contact; the load is what it carries along -y.
         start: that came with it.
-        like: the starts of another contact and of its turned one, which may save time.
-
-    Returns:
-        The change, and the contact with the adduction turned, and its start; None where that
-        does not succeed.
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
     place[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
     begin = WarmStart.after(result) if start is None else start
-    rotated, end = probe.pressed(load, knee_pose(place), begin, like)
+    rotated, _ = probe.pressed(load, knee_pose(place), begin)
     if rotated.status is not ContactStatus.OK:
-        return float("nan"), None
-    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step, (rotated, end)
+        return float("nan")
+    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:

@@ -25,7 +25,7 @@ class CalculixDeckSettings:
     """What a deck for CalculiX states."""
 
     penalty: float = 1e5
-    """N/mm³; contact stiffness. At 30 MPa surfaces overlap by 0.3 µm."""
+    """N/mm³; contact stiffness. Chosen: at 30 MPa surfaces overlap by 0.3 µm."""
 
 
 CALCULIX_DECK = CalculixDeckSettings()

@@ -29,7 +29,8 @@ class FebioDeckSettings:
     """What a deck for FEBio states."""
 
     load_steps: int = 10
-    """Steps in which the displacement is applied; FEBio halves them by itself where one fails."""
+    """Steps in which the displacement is applied. Chosen: FEBio halves them by itself where one
+    fails."""
 
 
 FEBIO_DECK = FebioDeckSettings()

@@ -27,9 +27,11 @@ class DeckSettings:
     """Which nodes of a deck may touch."""
 
     touchable_depths: float = 2.0
-    """Nodes whose gap at first touch is within this many times the guessed depth can be touched."""
+    """Multiple of the guessed depth: nodes whose gap at first touch is smaller can be touched.
+    Chosen: the guess is off by less."""
     largest_normal_y: float = -0.3
-    """Largest y of a femoral normal that takes part."""
+    """Largest y of a femoral normal that takes part. Chosen: faces that look farther sideways do
+    not press on the insert."""
 
 
 DECK = DeckSettings()

@@ -43,7 +43,8 @@ class HillSettings:
     passive_strain: float = 0.6
     """Strain beyond the optimal length at which the passive force is F_max."""
     longest_fibre_ratio: float = 1.8
-    """Fibre length over the optimal one beyond which the curves say nothing (f_p(1.6) is 1)."""
+    """Fibre length over the optimal one beyond which the curves do not hold. Chosen: f_p(1.6) is 1
+    already."""
 
 
 HILL = HillSettings()

@@ -31,7 +31,8 @@ class ModelMatchSettings:
     """When two muscle lines are the same."""
 
     tolerance: float = 1e-6
-    """Relative, or m; strengths, lengths and points that differ by less are the same."""
+    """Relative, or m: strengths, lengths and points that differ by less are the same. Chosen: above
+    the rounding of files."""
 
 
 MODEL_MATCH = ModelMatchSettings()

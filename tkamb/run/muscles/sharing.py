@@ -19,8 +19,8 @@ class SharingSettings:
     """When a solution of the static optimisation is accepted."""
 
     kkt_tolerance: float = 1e-8
-    """Relative; largest violation of the optimality conditions (Karush, Kuhn and Tucker) with which
-    a frame is kept."""
+    """Relative: largest violation of the optimality conditions (Karush, Kuhn and Tucker) with which
+    a frame is kept. Chosen: above what the solver leaves."""
 
 
 SHARING = SharingSettings()

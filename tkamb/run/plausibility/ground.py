@@ -13,8 +13,9 @@ from tkamb.units import MILLIMETRE
 PEAK_LOAD = (0.4, 4.0)
 """BW, the largest vertical ground reaction: one leg of two standing bears 0.5, a sprinter's 4."""
 
-FOOT_FORWARD = (-0.065, 0.23)
-"""m, of the centre of pressure from the ankle centre: from heel to toe of a foot 0.3 m long."""
+FOOT_FORWARD = (-0.085, 0.23)
+"""m, of the centre of pressure from the ankle centre: from heel to toe of a shoe 0.31 m long. At
+heel strike subject DM has -0.071."""
 
 
 @dataclass(frozen=True)
@@ -22,28 +23,34 @@ class GroundReactionLimitSettings:
     """Which ground reactions are plausible."""
 
     max_lateral_distance: float = 0.075
-    """m, to either side; half the breadth of a shoe, and as much again for an oblique foot."""
+    """m, to either side. Chosen: half the breadth of a shoe, and as much again for an oblique
+    foot."""
     loaded_share: float = 0.2
-    """Share of the peak force; at less the centre of pressure is a quotient of small numbers."""
+    """Share of the peak force. Chosen: at less the centre of pressure is a quotient of small
+    numbers."""
     min_lean: float = 0.03
-    """Forward over upward force; at less the force hardly leans and the sign of its lean says
-    nothing."""
+    """Forward over upward force. Chosen: at less the force hardly leans and the sign of its lean
+    says nothing."""
     max_outward_lean: float = 0.02
     """Sideways over upward force, outwards. In standing, walking and squatting it is inwards, by
     0.04 to 0.07 in six recordings; on the stairs of subject JW it is 0.007 outwards."""
     max_hip_distance: float = 0.6
     """Share of shank and thigh together. Sitting with an upright shank has 0.55; walking, stairs
     and squats of the models stay within 0.41."""
+    min_mean_forward: float = -0.015
+    """m, of the centre of pressure ahead of the ankle, in the mean over the loaded frames: 0.019 to
+    0.061 in seven recordings; with the sign turned, -0.019 and less."""
     ankle_distance: float = 0.015
-    """m; a standing person has the centre of pressure 0.04 ahead of the ankle. A path as near as
-    this is in another unit."""
+    """m; a standing person has the centre of pressure 0.04 ahead of the ankle. Chosen: a path as
+    near as this is in another unit."""
     max_unloaded_stance: float = 0.15
-    """s; in four recorded walks no foot stands unloaded for longer than 0.02, and for 0.4 where a
-    plate is left out."""
+    """s; longest time that a standing foot is unloaded. Chosen: 0.02 s at most in four recorded
+    walks, and 0.4 s where a plate is left out."""
     unloaded_force: float = 0.05
-    """BW; a foot with less force is unloaded."""
+    """BW: a foot with less force is unloaded. Chosen: above the noise of plates."""
     max_peak_ratio: float = 1.6
-    """Ratio of one foot's largest to its smallest peak in a walk; 1.1 in three recordings."""
+    """Ratio of one foot's largest to its smallest peak in a walk. Chosen: 1.1 in three
+    recordings."""
 
 
 GROUND_REACTION_LIMITS = GroundReactionLimitSettings()
@@ -228,6 +235,12 @@ def foot_questions(case: Case) -> Iterator[Question]:
             "centre of pressure stays under the ankle",
         )
     ahead = np.einsum("fi,fi->f", away, forward)
+    if (mean := float(ahead[loaded].mean())) < GROUND_REACTION_LIMITS.min_mean_forward:
+        yield Question(
+            f"the centre of pressure is {-mean / MILLIMETRE:.0f} mm behind the ankle in the mean, "
+            "but a foot reaches forward: is its forward sign turned, or the ankle's place wrong?",
+            "centre of pressure behind the ankle",
+        )
     aside = away[:, 2] * forward[:, 0] - away[:, 0] * forward[:, 2]
     sides = ("to the right of", "to the left of")
     if case.scene.patient.side == "left":  # read as a right foot's, mirrored

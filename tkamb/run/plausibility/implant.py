@@ -21,27 +21,27 @@ class ImplantShapeLimitSettings:
 
     flange_height_share: float = 0.15
     """Share of the component's height at which the anterior flange is looked for, above the
-    posterior condyles."""
+    posterior condyles. Chosen: the flange is the only part there."""
     min_flange_position: float = 0.35
-    """Share of the component's length, from behind. Eleven components have their top at 0.92 to
-    0.97, one without a flange at 0.5, one back to front below 0.1."""
+    """Share of the component's length, from behind. Chosen: eleven components have their top at
+    0.92 to 0.97, one without a flange at 0.5, one back to front below 0.1."""
     min_opening_share: float = 0.05
-    """Share of the largest extent, from the centroid of the surface to the centre of the bounding
-    box: 0.09 to 0.14 in ten components, none in a sphere."""
+    """Share of the largest extent: least distance from the centroid of the surface to the centre of
+    the bounding box. Chosen: 0.09 to 0.14 in ten components, none in a sphere."""
     max_opening_angle: float = 60.0 * DEGREE
-    """rad, from superior; the same ten components open within 27 deg of it."""
+    """rad, from superior. Chosen: the same ten components open within 27 deg of it."""
     min_flatness_ratio: float = 2.0
-    """Ratio of the flat area of the bone side of a patellar button to that of its joint side; 15 at
-    least in real ones."""
+    """Ratio of the flat area of the bone side of a patellar button to that of its joint side.
+    Chosen: 15 at least in real ones."""
     min_notch_share: float = 0.02
-    """Share of an insert's length by which it is cut out more in front than behind; ten inserts are
-    cut out more behind, by 0.05 to 0.3."""
+    """Share of an insert's length by which it is cut out more in front than behind. Chosen: ten
+    inserts are cut out more behind, by 0.05 to 0.3."""
     max_friction: float = 0.25
-    """Coulomb coefficient of metal on polyethylene; lubricated joints have 0.01 to 0.1, dry ones
-    0.2."""
+    """Coulomb coefficient of metal on polyethylene. Chosen: lubricated joints have 0.01 to 0.1, dry
+    ones 0.2."""
     outline_offset: float = 0.25
     """Share of an insert's width, to either side, at which its outline is looked at: under the
-    condyles."""
+    condyles. Chosen: it lies under the condyles."""
 
 
 IMPLANT_SHAPE_LIMITS = ImplantShapeLimitSettings()

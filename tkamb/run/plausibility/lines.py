@@ -24,12 +24,14 @@ class LineLimitSettings:
     """Strain; ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al.
     1986)."""
     min_strain: float = -0.4
-    """Strain; a bundle that is never nearer to being taut has no effect in this movement."""
+    """Strain. Chosen: a bundle that is never nearer to being taut has no effect in this
+    movement."""
     max_attachment_distance: float = 0.16
-    """m, from the insert's centre; the superficial MCL, the farthest, ends 0.06 to 0.12 below
-    it."""
+    """m, from the insert's centre. Chosen: the superficial MCL, the farthest, ends 0.06 to 0.12
+    below it."""
     max_overlap: float = 0.03
-    """m; of a tibial end above the insert's bottom, or of a femoral end below the flexion axis."""
+    """m; of a tibial end above the insert's bottom, or of a femoral end below the flexion axis.
+    Chosen: attachments of a knee overlap by less."""
     min_anterior_offset: float = 0.01
     """m; of the quadriceps origin ahead of the line from hip to knee, 0.029 to 0.044 in three
     models. Vasti begin on the front of a shaft that is bowed forward, the rectus femoris ahead of
@@ -37,8 +39,8 @@ class LineLimitSettings:
     max_patella_distance: float = 0.06
     """m; of the ends of both lines from the patella's origin. A patella is 0.045 long."""
     max_tendon_change: float = 0.15
-    """Share of its mean length by which the patellar ligament may change between recorded ends; it
-    strains by a few per cent."""
+    """Share of its mean length by which the patellar ligament may change between recorded ends.
+    Chosen: it strains by a few per cent."""
 
 
 LINE_LIMITS = LineLimitSettings()
@@ -67,8 +69,8 @@ def attachment_questions(case: Case) -> Iterator[Question]:
     far = [name for name, end in ends if not _belongs(*_on_carrier(case, end))]
     if far:
         yield Question(
-            f"{some(far)} ends more than {LINE_LIMITS.max_attachment_distance / MILLIMETRE:.0f} mm "
-            "from the knee, or beyond the joint: is its point_mm, sign or link another one?",
+            f"{some(far)}: more than {LINE_LIMITS.max_attachment_distance / MILLIMETRE:.0f} mm "
+            "from the knee, or beyond the joint; is point_mm, its sign or the link another one?",
             "attachment far from its place",
         )
     for muscle in case.muscles:
@@ -83,7 +85,7 @@ def attachment_questions(case: Case) -> Iterator[Question]:
     tiny = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
     if tiny:
         yield Question(
-            f"{some(tiny)} lies within 1 mm of its link's origin: is point_mm in metres?",
+            f"{some(tiny)}: within 1 mm of the link's origin; is point_mm in metres?",
             "attachment within 1 mm of its link's origin",
         )
 
@@ -169,8 +171,8 @@ def strain_questions(
     ]
     if loose:
         yield Question(
-            f"{some(loose)} is never within {-100 * LINE_LIMITS.min_strain:.0f} % of "
-            "being taut: is an attachment or slack_length_mm in another unit?",
+            f"{some(loose)}: never within {-100 * LINE_LIMITS.min_strain:.0f} % of being taut; "
+            "is an attachment, slack_length_mm or [motion] length_unit in another unit?",
             "ligament far from taut throughout",
         )
 
@@ -216,7 +218,7 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
             off.append(name)
     if off:
         yield Question(
-            f"{some(off)} lies where no such line ends: is its point_mm, sign or link another one?",
+            f"{some(off)}: no such line ends there; is point_mm, its sign or the link another one?",
             "extensor line ends off its bone",
         )
     ends = [transform(poses[e.link], e.position) for e in (ligament.proximal, ligament.distal)]

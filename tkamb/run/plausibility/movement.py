@@ -18,13 +18,16 @@ class MovementLimitSettings:
     """Which movements are plausible."""
 
     max_flexion_as_radians: float = 3.3
-    """deg; a bend of more than 10 deg that is stored in radians but read as degrees stays below
-    this."""
+    """deg; largest flexion that may be stored in radians but read as degrees. Chosen: a bend of
+    more than 10 deg stays below this."""
     max_marker_residual: float = 12.0 * MILLIMETRE
     """m; root mean square in the median frame. Skin moves by up to 10 mm in a cluster, 5 mm on the
     stairs of subject JW."""
     min_duration: float = 0.15
     """s; no movement of a leg is shorter."""
+    min_translation: float = 0.1 * MILLIMETRE
+    """m; the femur of a knee that bends by 20 deg moves by more than this on the insert.
+    Millimetres that are metres in the file stay below."""
 
 
 MOVEMENT_LIMITS = MovementLimitSettings()
@@ -93,10 +96,34 @@ def motion_questions(case: Case) -> Iterator[Question]:
                 "patella where none is",
                 far,
             )
+    yield from _translation_questions(case)
+    if motion.time[0] == 0.0 and motion.time[-1] == 100.0:
+        yield Question(
+            "the time runs from 0 to 100 s: is it in per cent of a cycle? Rewrite the column in "
+            "seconds; velocities and accelerations follow from it",
+            "time may be in per cent",
+        )
     lasting = float(motion.time[-1] - motion.time[0])
     if lasting < MOVEMENT_LIMITS.min_duration:
         yield Question(
             f"the motion lasts {lasting:.3g} s: is its time in seconds?", "motion too brief"
+        )
+
+
+def _translation_questions(case: Case) -> Iterator[Question]:
+    """Whether recorded translations change by more than nothing; constant ones are given."""
+    motion = case.motion
+    names = ("ap", "si", "ml")
+    if motion.unrecorded or motion.markers is not None:
+        return
+    columns = [KNEE_COORDINATES.index(name) for name in names]
+    largest = float(np.ptp(motion.coordinates[:, columns], axis=0).max())
+    bend = float(np.ptp(motion.coordinates[:, KNEE_COORDINATES.index("flexion")]))
+    if bend > 20.0 * DEGREE and 1e-9 < largest < MOVEMENT_LIMITS.min_translation:
+        yield Question(
+            f"ap, si and ml change by {largest / MILLIMETRE:.2g} mm at most in a bend of "
+            f"{bend / DEGREE:.0f} deg: is [motion] length_unit another one?",
+            "translations hardly change",
         )
 
 
@@ -147,12 +174,18 @@ def sample_questions(case: Case) -> Iterator[Question]:
 def _odd_text(
     samples: Sequence[OddSample], worst: OddSample, ground: GroundReactionTable | None
 ) -> str:
-    """Return the question about a file's odd samples; a C3D file has no cells, but plates."""
+    """Return the question about a file's odd samples; a C3D file has no cells."""
     more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
-    of_plates = ground is not None and worst.path == ground.file and bool(ground.plates)
+    of_plates = (
+        ground is not None
+        and worst.path == ground.file  # a C3D file holds the markers too
+        and bool(ground.plates)
+        and "force" in worst.what
+    )
     numbers = ", ".join(map(str, ground.plates)) if ground and of_plates else ""
     what = f"{worst.what} of plates {numbers}" if of_plates else worst.what
-    mistake = "is it a spike" if of_plates else "is a cell mistyped"
+    in_c3d = worst.path.suffix.lower() == ".c3d"
+    mistake = "is it a spike" if in_c3d else "is a cell mistyped"
     return (
         f"{worst.path.name}: {what} at {worst.time:.4g} s{more} lies {worst.away:.3g} "
         f"{worst.unit} off its neighbours' curve: {mistake}, or is it noise? cutoff_Hz filters "

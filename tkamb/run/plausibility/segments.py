@@ -23,11 +23,11 @@ class SegmentLimitSettings:
     max_patella_offset: float = 0.05
     """m; of the patella's centre of mass from its origin."""
     max_insert_rotation: float = 20.0 * DEGREE
-    """rad; from the tibia's axes. The slope is up to 10 deg, and the axis of a shank may be laid
-    through other points."""
+    """rad; from the tibia's axes. Chosen: the slope is up to 10 deg, and the axis of a shank may be
+    laid through other points."""
     max_centre_offset: float = 0.12
-    """Share of a segment's length by which its centre of mass may lie beside its axis; with the
-    foot, which points forward, twice as much."""
+    """Share of a segment's length by which its centre of mass may lie beside its axis. Chosen: with
+    the foot, which points forward, twice as much."""
 
 
 SEGMENT_LIMITS = SegmentLimitSettings()

@@ -26,15 +26,15 @@ class SignSettings:
     """When a sign is asked about."""
 
     frames: int = 15
-    """Looked at, evenly over the motion; more change the spreads by some per cent."""
+    """Looked at, evenly over the motion. Chosen: more change the spreads by some per cent."""
     ap_spread: float = 0.6 * MILLIMETRE
     """M, of the mean gap, below which AP is not asked about. Fluoroscopy of subject DM has 0.3 mm,
     and 1.3 mm with the sign turned."""
     ap_share: float = 0.5
     """Of that spread, what is left with the sign turned: 0.25 for DM."""
     turn_spread: float = 0.1 * MILLIMETRE
-    """M, of the difference between the condyles' gaps, below which rotation is not asked about: a
-    mesh of 1 mm facets makes 0.05 mm."""
+    """m: spread of the difference between the condyles' gaps below which rotation is not asked
+    about. Chosen: a mesh of 1 mm facets makes 0.05 mm."""
     turn_share: float = 0.7
     """Of that spread, what is left with the sign turned: 0.43 to 0.62 for the two readings of DM;
     1.6 and more where the signs are right."""

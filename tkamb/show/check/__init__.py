@@ -1,1 +1,1 @@
-"""`tkamb check`: what a scene gives and what it asks, before anything is computed."""
+"""`tkamb check`: content of a scene and questions about it, before anything is computed."""

@@ -1,4 +1,4 @@
-"""What each file of a scene gave, in a line: frames, durations, ranges, sizes."""
+"""Content of each file of a scene, one line each: frames, durations, ranges, sizes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,8 @@ class InventorySettings:
     """What `tkamb check` lists."""
 
     high_strain: float = 0.1
-    """Strain from which a bundle is named; ligaments of the knee tear at 12 to 20 %."""
+    """1: strain from which a bundle is listed. Chosen: ligaments of the knee rupture at 12 to 20
+    %."""
 
 
 INVENTORY = InventorySettings()
@@ -43,7 +44,7 @@ class Entry:
     Args:
         part: what it is, as its table is called.
         file: where it was read from; None: the scene itself.
-        found: what it gave.
+        found: its content.
     """
 
     part: str
@@ -57,7 +58,7 @@ class Entry:
 
 
 def inventory(mechanics: Mechanics) -> tuple[Entry, ...]:
-    """Return what every file and table of a case gave."""
+    """Return the content of every file and table of a case."""
     case = mechanics.case
     result = [_patient(case), _motion(case)]
     if case.scene.tibia or case.motion.markers:
@@ -87,7 +88,7 @@ def _patient(case: Case) -> Entry:
     masses = ", ".join(f"{link} {chain.segment(link)[0]:.2f} kg" for link in ("tibia", "femur"))
     text = (
         f"{patient.side} knee, {patient.mass_kg:g} kg (1 BW is {case.body_weight:.0f} N); "
-        f"with all that is fixed to them: {masses}"
+        f"masses with everything fixed to the link: {masses}"
     )
     return Entry("patient", patient.urdf, text)
 
@@ -106,9 +107,26 @@ def _motion(case: Case) -> Entry:
             ranges.append(_range(name, values / MILLIMETRE, "mm", 1))
     text = (
         f"{len(motion.time)} frames, {motion.time[0]:.3g} to {motion.time[-1]:.3g} s, "
-        f"{rate:.0f} a second; {', '.join(reversed(ranges))}"
+        f"{rate:.0f} a second; {', '.join(reversed(ranges))}{_in_words(case)}"
     )
     return Entry("motion", table.file, text)
+
+
+def _in_words(case: Case) -> str:
+    """Return what the signs of AP and axial rotation mean, between least and most flexion."""
+    motion = case.motion
+    if {"ap", "axial_rotation"} & set(motion.unrecorded):
+        return ""
+    values = dict(zip(KNEE_COORDINATES, motion.coordinates.T, strict=True))
+    flexion = values["flexion"] / DEGREE
+    first, last = int(flexion.argmin()), int(flexion.argmax())
+    ap = (values["ap"][last] - values["ap"][first]) / MILLIMETRE
+    turn = (values["axial_rotation"][last] - values["axial_rotation"][first]) / DEGREE
+    return (
+        f"; from {flexion[first]:.0f} to {flexion[last]:.0f} deg of flexion the femur moves "
+        f"{abs(ap):.1f} mm {'forward' if ap > 0 else 'backward'} on the insert and turns "
+        f"{abs(turn):.1f} deg {'outward' if turn > 0 else 'inward'}"
+    )
 
 
 def _shank(case: Case) -> Entry:
@@ -157,7 +175,7 @@ def _surface(surface: Surface) -> str:
 
 
 def _ligaments(mechanics: Mechanics) -> Entry:
-    """Return the bundles, and which are torn where: the strains that the report prints."""
+    """Return the bundles, and those with a high strain and where: the strains of the report."""
     strains = mechanics.strains
     torn = [
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
@@ -200,7 +218,7 @@ def _contact(case: Case) -> Entry:
 
 
 def _measured(measured: "MeasuredForce", weight: float) -> Entry:
-    """Return what an instrumented implant measured: held against a run, never used in it."""
+    """Return what an instrumented implant measured: compared with a run, never used in it."""
     forces = [
         _range(name, values[np.isfinite(values)] / weight, "BW", 2)
         for name, values in measured.force.items()

@@ -2,8 +2,8 @@
 
 Rows: the whole leg from its lateral side and from the front, and the knee from both. Each is
 labelled anterior and posterior, or medial and lateral; the last row names the ligaments.
-The laboratory's y is up; ahead is where the insert's x points, on the mean over the three frames.
-A left knee is mirrored at input and drawn mirrored back.
+The laboratory's y is up; forward is the mean direction of the insert's x over the three frames.
+A left knee is mirrored at input and mirrored back in the picture.
 """
 
 from contextlib import suppress
@@ -41,11 +41,11 @@ class LegPictureSettings:
     """Sizes in the picture of a leg."""
 
     arrow_metres_per_BW: float = 0.35
-    """Length of the force's arrow."""
+    """m per body weight: length of the force's arrow. Chosen: it fits beside the leg."""
     knee_half_width: float = 0.085
-    """m, that the picture of the knee shows around its middle."""
+    """m: half width of the picture of the knee around its middle. Chosen: a total knee fits."""
     margin: float = 0.08
-    """m, around what is shown."""
+    """m: margin around what is shown. Chosen: labels fit."""
 
 
 LEG_PICTURE = LegPictureSettings()
@@ -141,7 +141,7 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, st
         segments.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
         named.add(name)
     if mechanics.extensor is not None:
-        with suppress(ComputationError):  # a patella that is lost there: the run says so
+        with suppress(ComputationError):  # no patella at this frame: the run reports it
             quadriceps, ligament = mechanics.extensor.paths(state)
             segments.append((quadriceps.points, QUADRICEPS, ""))
             segments.append((ligament.points, PATELLAR_LIGAMENT, ""))
@@ -150,7 +150,7 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, st
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What is to the right of the page and what comes out of it; the laboratory's y is up.
+    """Directions of a picture: to the right of the page and out of it; the laboratory's y is up.
 
     Args:
         across: (3,) horizontal, to the right of the page; turned over for a left knee, which

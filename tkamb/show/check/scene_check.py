@@ -1,4 +1,4 @@
-"""A scene read whole and looked at, before anything is run."""
+"""Check of a whole scene, before anything is run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,17 +17,18 @@ from tkamb.show.check.inventory import Entry, inventory
 
 @dataclass(frozen=True, eq=False)
 class SceneCheck:
-    """What a scene gives, leaves out and makes one ask.
+    """Content of a scene, parts that are not modelled, and questions.
 
     Args:
         scene: its file.
         mechanics: the case, prepared.
-        entries: what each file and table gave.
-        not_modelled: what the scene leaves out.
-        assumptions: what the numbers would rest on.
-        questions: what is unlikely about it, with the likely mistake.
-        answered: of these, what the scene answers.
-        missing: packages that a run would need and that are not installed, with the remedy.
+        entries: content of each file and table.
+        not_modelled: parts that the scene leaves out.
+        assumptions: assumptions of the results.
+        questions: unlikely values, with the likely mistake.
+        answered: questions that the scene answers.
+        missing: packages that a run needs and that are not installed, with the command to install
+        them.
     """
 
     scene: Path
@@ -41,7 +42,7 @@ class SceneCheck:
 
     def lines(self) -> list[str]:
         """Return the check as lines of text."""
-        nothing = ["none: nothing unlikely was found; that is no proof"]
+        nothing = ["none: nothing unlikely was found, which does not prove that all is right"]
         return [
             *(f"missing: {sentence}" for sentence in self.missing),
             f"{self.scene}: can be run{' when that is installed' if self.missing else ''}",
@@ -76,14 +77,14 @@ def check_scene(
     overrides: dict[str, Any] | None = None,
     begin: Callable[[str], None] = lambda stage: None,
 ) -> SceneCheck:
-    """Read every file of a scene and ask what is unlikely about it; nothing is run.
+    """Read every file of a scene and ask about unlikely values; nothing is run.
 
     The contact model is made, but not prepared: a mesh that it cannot use is found by a run.
 
     Args:
         path: of the scene.
         overrides: dotted key -> value, as `tkamb.load_scene` takes them.
-        begin: is told each stage as it begins.
+        begin: called with the name of each stage.
 
     Raises:
         InputError: what `tkamb run` would refuse of the scene and its files.
@@ -96,7 +97,7 @@ def check_scene(
     case = load_case(scene)
     begin("placing leg, patella and muscles")
     mechanics = Mechanics(case)
-    begin("looking for what is unlikely")
+    begin("checking for unlikely values")
     plausibility = Plausibility(mechanics)
     return SceneCheck(
         Path(path),
@@ -120,7 +121,7 @@ def _missing(case: Case) -> tuple[str, ...]:
 
 
 def _beyond(case: Case) -> list[str]:
-    """Return what tkamb has no table for, as far as it matters to this scene."""
+    """Return the parts that no table of a scene can model, as far as they concern this scene."""
     others = [] if case.scene.muscles else ["muscles other than the quadriceps"]
     patella = ["out-of-plane motion of the patella"] if case.scene.patella else []
     post = [] if case.post is not None else ["cam–post contact"]

@@ -1,1 +1,1 @@
-"""`tkamb compare`: folders of results beside each other on one axis."""
+"""`tkamb compare`: folders of results side by side on one axis."""

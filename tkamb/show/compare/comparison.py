@@ -1,4 +1,4 @@
-"""Folders of results read, held against each other, and what about them is not the same."""
+"""Comparison of folders of results, and of the settings in which they differ."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.errors import InputError
+from tkamb.run import metrics
 from tkamb.run.columns import KINDS
 from tkamb.run.metrics import failed
 from tkamb.run.plug_ins import CONTACT_CODE
@@ -29,7 +30,7 @@ SETTINGS = {
     "not_modelled": "not modelled",
     "assumptions": "assumptions",
 }
-"""Keys of summary.json that are said where they differ."""
+"""Keys of summary.json that are reported where they differ."""
 VERSIONS = "identity"
 
 
@@ -38,7 +39,7 @@ class CompareSettings:
     """How many runs are compared."""
 
     max_runs: int = 8
-    """Number of runs that a picture can tell apart by colour."""
+    """Number of runs in a picture. Chosen: so many can be told apart by colour."""
 
 
 COMPARE = CompareSettings()
@@ -53,7 +54,7 @@ class Run:
         folder: where it was read from.
         results: what it holds.
         axis: on which it is drawn.
-        pairing: where the first run's frames lie in it; None: nowhere without two answers.
+        pairing: the places of the first run's frames in it; None: they are not unique.
     """
 
     label: str
@@ -92,12 +93,12 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Runs beside each other; the first is what the others are held against.
+    """Runs side by side; the others are compared with the first.
 
     Args:
         runs: at least two.
         kind: of the axis: "flexion", "cycle" or "time".
-        notes: what is not the same, or could not be compared, a sentence each.
+        notes: differences of the runs' settings, and what could not be compared, a sentence each.
         differences: of every run but the first, column by column.
     """
 
@@ -120,6 +121,7 @@ class Comparison:
                     "frames": len(run.results),
                     "failed_frames": int(failed(run.results).sum()),
                     "peaks_BW": peaks_of(run.results.summary),
+                    "peak_pressure": metrics.peak_pressure(run.results),
                     "paired": _pairing_word(run.pairing),
                 }
                 for run in self.runs
@@ -133,7 +135,7 @@ class Comparison:
 
 
 def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> Comparison:
-    """Read folders of results and hold the others against the first.
+    """Read folders of results and compare the others with the first.
 
     Args:
         folders: two to eight that `tkamb run` wrote.
@@ -144,8 +146,8 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
             ask for different axes.
     """
     if not 2 <= len(folders) <= COMPARE.max_runs:
-        what = f"{len(folders)} folders of results"
-        raise InputError(what, "compare", f"give two to {COMPARE.max_runs}")
+        what = f"needs two to {COMPARE.max_runs} folders of results, not {len(folders)}"
+        raise InputError(what, "compare", "name each folder that `tkamb run` wrote")
     paths = [Path(folder) for folder in folders]
     read = [read_results(path) for path in paths]
     for path, results in zip(paths, read, strict=True):
@@ -171,7 +173,7 @@ def _common_axis(paths: Sequence[Path], read: Sequence[Results]) -> str:
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """Return the folders' names, with as many of their parents as tell them apart."""
+    """Return the folders' names, with as many parent folders as make them unique."""
     parts = [path.resolve().parts for path in paths]
     for count in range(1, max(map(len, parts)) + 1):
         labels = ["/".join(part[-count:]) for part in parts]
@@ -238,11 +240,11 @@ def _unlike(runs: Sequence[Run], words: str, values: Sequence[Any]) -> list[str]
         shared = set(values[0]).intersection(*values)
         values = [[item for item in value if item not in shared] for value in values]
     listed = "; ".join(f"{run.label}: {_shown(v)}" for run, v in zip(runs, values, strict=True))
-    return [f"Not the same {words}. {listed}."]
+    return [f"The runs differ in {words}. {listed}."]
 
 
 def _whole(value: Any) -> Any:
-    """Return a list of names as one text, in an order of its own: all of it is said."""
+    """Return a list of names as one sorted text."""
     return (", ".join(sorted(value)) or "nothing") if isinstance(value, list) else value
 
 
@@ -267,16 +269,19 @@ def _frames_note(first: Run, run: Run) -> list[str]:
     if run.pairing is None:
         return [
             *notes,
-            f"{run.label}: no differences from {first.label}: other frames, and the "
-            f"{run.axis.kind} does not rise or fall throughout, so that a place has two answers; "
-            "try --axis time or cycle.",
+            f"{run.label}: not compared with {first.label}: its frames are others, and the "
+            f"{run.axis.kind} does not rise or fall throughout, so that places on the axis are not "
+            "unique; try --axis time or cycle.",
         ]
     without = int((run.pairing.lower < 0).sum())
     if without:
-        notes.append(f"{run.label}: {without} frames of {first.label} have no partner in it.")
+        notes.append(
+            f"{run.label}: {without} frames of {first.label} have no matching frame in it."
+        )
     if not run.pairing.exact:
         notes.append(
-            f"{run.label}: other frames than {first.label}'s; it is interpolated linearly between "
+            f"{run.label}: its frames differ from those of {first.label}; it is interpolated "
+            f"between "
             "neighbouring frames."
         )
     return notes

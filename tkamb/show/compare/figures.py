@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 5.4, 2.7
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
-"""So that runs that lie on each other, and readers who see no colour, tell them apart."""
+"""Line styles, so that runs can be distinguished without colour and where they coincide."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class CompareFigureSettings:
     """Pictures of compared runs."""
 
     failed_row_height: float = 0.03
-    """Share of a picture's height; of the crosses of failed frames above the bottom, and from one
-    run to the next."""
+    """1: height of the crosses of failed frames above the bottom, and their distance from run to
+    run, as a share of the picture's height. Chosen by looks."""
 
 
 COMPARE_FIGURE = CompareFigureSettings()
@@ -38,7 +38,7 @@ COMPARE_FIGURE = CompareFigureSettings()
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """What one picture shows of every run.
+    """Quantity of one picture.
 
     Args:
         title: what it is.

@@ -1,10 +1,11 @@
-"""A comparison as one page that stands by itself."""
+"""A comparison as one self-contained page."""
 
 import math
 from collections.abc import Sequence
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.run import metrics
 from tkamb.run.metrics import failed
 from tkamb.show.axis import UNITS
 from tkamb.show.compare.comparison import Comparison, Difference
@@ -29,11 +30,11 @@ FIRST = (
     "medial_cop_ap_mm", "lateral_cop_ap_mm", "quadriceps_N", "patellar_ligament_N",
     "patellofemoral_N", "approach_mm",
 )  # fmt: skip
-"""Columns of the table that is printed and shown first; all others are below it in the page."""
+"""Columns of the table that is printed and shown first; the page has the others below it."""
 
 
 def headline(comparison: Comparison) -> list[Difference]:
-    """Return the differences of the columns that are looked at first."""
+    """Return the differences of the most important columns."""
     return [one for name in FIRST for one in comparison.differences if one.column == name]
 
 
@@ -53,7 +54,7 @@ def check_frame(comparison: Comparison, frame: int | None) -> int:
 
 
 def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
-    """Return the page: what is not the same, curves, maps at a frame, differences.
+    """Return the page: different settings, curves, maps at a frame, differences.
 
     Raises:
         InputError: the first run has no such frame.
@@ -70,7 +71,8 @@ def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
         title=" and ".join(run.label for run in comparison.runs),
         kind=comparison.kind,
         runs=[_run(comparison, number) for number in range(len(comparison.runs))],
-        notes=[*peak_lines(comparison), *comparison.notes],
+        peaks=peak_lines(comparison),
+        notes=comparison.notes,
         plots=_plots(comparison),
         maps=None if maps is None else svg_text(maps, "maps"),
         first=_rows(comparison, first),
@@ -121,13 +123,18 @@ def _rows(comparison: Comparison, differences: Sequence[Difference]) -> list[lis
 
 
 def peak_lines(comparison: Comparison) -> list[str]:
-    """Return each run's peak total, medial and lateral force with its bands, a line per run."""
+    """Return each run's peak forces with their bands, and its peak pressure, a line each."""
     lines = []
     for run in comparison.runs:
         peaks = peaks_of(run.results.summary)
         if peaks:
             words = ", ".join(f"{name} {peak_words(one)}" for name, one in peaks.items())
             lines.append(f"{run.label}: peak {words} BW, {peak_legend(peaks)}")
+        if pressure := metrics.peak_pressure(run.results):
+            words = f"peak pressure {pressure['MPa']:.1f} MPa, {pressure['side']}"
+            words += f", at {pressure['time_s']:.4g} s"
+            words += f", where {pressure['doubt']}" if pressure["doubt"] else ""
+            lines.append(f"{run.label}: {words}")
         limits = muscle_limits(run.results)
         lines += [f"{run.label}: {limits.line()}"] if limits is not None else []
     return lines

@@ -1,4 +1,4 @@
-"""Which place of one run belongs to a frame of another: the same frame, or between two frames."""
+"""The place in one run that matches a frame of another: the same frame, or between two frames."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -17,7 +17,8 @@ class PairingSettings:
     """When frames of two runs are the same instant."""
 
     tolerance: float = 1e-6
-    """deg, per cent or s; frames nearer on the axis are the same instant of one recording."""
+    """deg, per cent or s: frames nearer on the axis are the same instant of one recording. Chosen:
+    above the rounding of files."""
 
 
 PAIRING = PairingSettings()
@@ -57,10 +58,10 @@ def pair_frames(
 ) -> Pairing | None:
     """Pair the frames of two runs.
 
-    Frames at the same time and at the same place on the axis belong together, if all frames of
-    the shorter run find such a partner: two runs of one recording. Else the other run is
-    interpolated linearly between neighbouring frames, within its range; that needs axes that rise,
-    or fall, throughout. None where they do not: a place would have two answers.
+    If all frames of the shorter run have a match at the same time and place on the axis, the runs
+    are of one recording and these frames are paired. Otherwise the other run is interpolated
+    linearly between neighbouring frames, within its range. That needs axes that rise, or fall,
+    throughout. None where they do not, because places are then not unique.
     """
     same = _same_frames(first["time_s"], first_axis.values, other["time_s"], other_axis.values)
     if same is not None:

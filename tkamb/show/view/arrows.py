@@ -24,7 +24,7 @@ class ArrowSettings:
     """Arrows of the viewer."""
 
     contact_point_radius: float = 0.6 * MILLIMETRE
-    """m; radius of the sphere at a centre of pressure."""
+    """m; radius of the sphere at a centre of pressure. Chosen: it is seen and hides little."""
 
 
 ARROW = ArrowSettings()
@@ -106,7 +106,7 @@ def _hip(geometry: KneeGeometry) -> Array:
 
 
 def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Arrow]:
-    """Return the tendons' pulls, and what the femur presses on the patella."""
+    """Return the forces of the tendons, and the force of the femur on the patella."""
     arrows = []
     for name, column, meaning in (
         ("quadriceps", "quadriceps_N", "on the patella"),

@@ -8,6 +8,7 @@ origin as recorded. It is computed by the same code as a frame of a run, so that
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,15 +52,18 @@ class BenchLimitSettings:
     axial_rotation_deg: float = 60.0
     """deg; largest axial rotation either way, likewise."""
     length_mm: float = 60.0
-    """mm; largest translation of the knee that is accepted."""
+    """mm; largest translation of the knee that is accepted. Chosen: the femur is then beside the
+    insert."""
     placement_deg: float = 20.0
-    """deg; largest change of a component's orientation."""
+    """deg; largest change of a component's orientation. Chosen: no component is placed as far
+    off."""
     placement_mm: float = 20.0
     """mm; largest change of a component's position."""
     load_N: float = 15_000.0
     """N; largest axial load. With the shank's weight it stays below what a force plate may read."""
     slack_percent: float = 20.0
-    """%; largest change of the ligaments' slack length, either way."""
+    """%; largest change of the ligaments' slack length, either way. Chosen: ligaments of the knee
+    rupture at 12 to 20 %."""
     finest_mm: float = 0.5
     """mm; finest map."""
     coarsest_mm: float = 10.0
@@ -69,7 +73,8 @@ class BenchLimitSettings:
     kept_models: int = 8
     """Prepared contact models that are kept: of a lattice each takes 0.1 to 0.5 GB."""
     first_penetration: float = 5e-5
-    """m; penetration at which a search for released coordinates begins."""
+    """m; penetration at which a search for released coordinates begins. Chosen: as in
+    `initial_pose.first_penetration`."""
 
 
 BENCH_LIMIT = BenchLimitSettings()
@@ -227,11 +232,24 @@ class Bench:
 
     Args:
         case: with [contact]; as a run reads it.
-        bundles: its ligaments with their slack lengths.
+        ligaments: its ligaments with their slack lengths.
     """
 
     case: Case
-    bundles: "tuple[Ligament, ...]"
+    ligaments: "tuple[Ligament, ...]"
+
+    @cached_property
+    def bundles(self) -> "tuple[Ligament, ...]":
+        """The ligaments, with both ends on femur or tibia itself."""
+        return tuple(
+            replace(one, proximal=self._carried(one.proximal), distal=self._carried(one.distal))
+            for one in self.ligaments
+        )
+
+    def _carried(self, end: LinkPoint) -> LinkPoint:
+        chain = self.case.chain
+        link = chain.carrier(end.link)
+        return LinkPoint(link, transform(chain.link_in(end.link, link), end.position))
 
     def case_of(self, request: BenchRequest, height: Any = None, like: Case | None = None) -> Case:
         """Return the case that stands still as a request says.
@@ -324,14 +342,13 @@ class Bench:
         )
 
     def _end(self, end: LinkPoint, request: BenchRequest) -> LinkPoint:
-        chain = self.case.chain
-        link = chain.carrier(end.link)
-        position = transform(chain.link_in(end.link, link), end.position)
-        if link == "femur":
-            position = transform(inverse(request.femoral.matrix()), position)
-        elif link == "tibia":
-            position = transform(self._bone(request), position)
-        return LinkPoint(link, position)
+        if end.link == "femur":
+            position = transform(inverse(request.femoral.matrix()), end.position)
+        elif end.link == "tibia":
+            position = transform(self._bone(request), end.position)
+        else:
+            return end
+        return LinkPoint(end.link, position)
 
 
 def still_motion(coordinates: Array) -> KneeMotion:

@@ -29,7 +29,7 @@ class FilmSettings:
     """The film of the viewer."""
 
     max_frame_rate: float = 50.0
-    """Frames per second; screens show 60."""
+    """Frames per second. Chosen: screens show 60."""
 
 
 FILM = FilmSettings()

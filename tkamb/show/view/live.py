@@ -1,4 +1,4 @@
-"""The knee live: what `tkamb live` computes and answers, apart from its page."""
+"""The computations of `tkamb live`, apart from its page."""
 
 import argparse
 import shutil
@@ -207,7 +207,7 @@ class LiveKnee:
             InputError: the folder holds something, or cannot be written.
         """
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError("is there already and not empty", folder, "give a new folder")
+            raise InputError("exists already and is not empty", folder, "give a new folder")
         try:
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".tkamb-live-") as beside:

@@ -1,4 +1,4 @@
-"""The window of `tkamb live`: its page, its server and what they say to each other."""
+"""The window of `tkamb live`: its page, its server and the messages between them."""
 
 import json
 import math
@@ -167,9 +167,10 @@ class LiveWindow:
     def _error_words(self, request: BenchRequest) -> str:
         error = self.knee.known_error(request)
         if isinstance(error, str):
-            return f"how far it is off was {error} at this spacing"
+            return f"its error is {error} at this spacing"
         return (
-            f"on the studied cases off by at most {100 * error['peak_pressure']:.2g} % in peak "
+            f"on the studied cases its error is at most {100 * error['peak_pressure']:.2g} % in "
+            f"peak "
             f"pressure, {100 * error['area']:.2g} % in area"
         )
 

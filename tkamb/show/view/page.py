@@ -40,7 +40,7 @@ class PageSettings:
     """Pictures that a browser takes of the viewer page."""
 
     timeout: float = 120.0
-    """s; a browser that takes longer has failed."""
+    """s; a browser that takes longer has failed. Chosen: a usual page takes some seconds."""
 
 
 PAGE = PageSettings()

@@ -47,14 +47,15 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class ViewPayloadSettings:
-    """What the viewer's page is given."""
+    """Settings of the data for the viewer's page."""
 
     arrow_metres_per_body_weight: float = 0.03
-    """Length of an arrow of one body weight."""
+    """m per body weight: length of an arrow. Chosen: it fits beside the knee."""
     pressure_levels: int = 32767
-    """Steps from no pressure to the largest."""
+    """Number of steps from no pressure to the largest. Chosen: no steps are seen."""
     most_coloured_triangles: int = 100_000
-    """Triangles of a surface that its colours divide: merged ones would blur them."""
+    """Largest number of triangles of a surface that shows wear. Chosen: merged triangles would
+    blur its colours."""
 
 
 VIEW_PAYLOAD = ViewPayloadSettings()
@@ -64,7 +65,7 @@ WHITE = "#ffffff"
 """Of a material whose vertices have colours of their own."""
 
 FRONT = 0
-"""three.js: triangles are seen from outside only, which spares half of them."""
+"""three.js: only the outer side of triangles is drawn, which saves half of them."""
 
 TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": np.uint32}
 
@@ -92,12 +93,12 @@ class Block:
         self._size += len(padded)
         return span
 
-    def compress(self, header: dict[str, Any]) -> bytes:
-        """Return header and arrays, compressed."""
+    def compress(self, header: dict[str, Any], level: int = 6) -> bytes:
+        """Return header and arrays, compressed at a level of gzip's."""
         text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         return gzip.compress(
-            struct.pack("<I", len(text)) + text + b"".join(self._parts), 6, mtime=0
+            struct.pack("<I", len(text)) + text + b"".join(self._parts), level, mtime=0
         )
 
 
@@ -133,7 +134,8 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
 def packed_map(pressure_map: PressureMap, peak: float, words: str) -> bytes:
     """Return one map alone, on the scale of a page that is open, with words about it."""
     block = Block()
-    return block.compress({"map": _map(block, pressure_map, peak), "words": words})
+    # On one machine the fastest level is the fastest way.
+    return block.compress({"map": _map(block, pressure_map, peak), "words": words}, 1)
 
 
 def packed_lattice(lines: Array) -> bytes:
@@ -245,7 +247,7 @@ def _insert_transform(root: str, side: str) -> SetTransform:
 
 
 def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[Any]:
-    """Return what hangs a solid into the scene; wear colours it on a scale up to `deepest` mm."""
+    """Return the commands that add a solid; wear colours it on a scale up to `deepest` mm."""
     colours, colour = None, solid.colour
     if solid.wear is not None:
         nearest = cKDTree(solid.surface.vertices).query(shape.vertices)[1]

@@ -1,4 +1,4 @@
-"""What there is to see: a results folder and its scene, or a scene that is run first."""
+"""Runs for the viewer: a results folder and its scene, or a scene that is run first."""
 
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -42,11 +42,11 @@ class CaseResults:
     frames: tuple[int, ...]
 
     def geometries(self, progress: Progress = lambda frames: frames) -> list[KneeGeometry]:
-        """Return what the equations of every frame worked on.
+        """Return the geometry of the equations of every frame.
 
-        Where condyles and patella touch stands in the maps of the run, or is looked for again.
-        Where body and contact were made to agree, both are solved again: the places where forces
-        act come from the contact.
+        The contact points of condyles and patella are in the maps of the run, or are computed
+        again. Where body and contact are coupled, both are solved again, because the points of
+        action come from the contact.
         """
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
@@ -64,7 +64,7 @@ class CaseResults:
         return result
 
     def _geometry(self, k: int, row: int | None) -> KneeGeometry:
-        """Return what the equations of a frame of the motion worked on.
+        """Return the geometry of the equations of a frame.
 
         Args:
             k: frame.
@@ -90,7 +90,7 @@ class CaseResults:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What a path names, its files read once: results and their case, or a case to be run.
+    """Content of a path, its files read once: results and their case, or a case to be run.
 
     Args:
         path: a folder that `tkamb run` wrote, or a scene file.
@@ -132,7 +132,7 @@ class Source:
 
 
 def read_source(path: str | Path, contact: str | None = None) -> Source:
-    """Return what stands behind a results folder or a scene file; nothing is run.
+    """Return the content of a results folder or a scene file; nothing is run.
 
     A scene whose results stand in its output folder need not be run again.
 
@@ -193,7 +193,7 @@ def check_frame(sources: Sequence[Source], frame: int) -> None:
 
 
 def no_frame(frame: int, most: int) -> InputError:
-    """Return the refusal of a frame where the longest run has `most`."""
+    """Return the error for a frame that is beyond the longest run's `most` frames."""
     return InputError(f"there is no frame {frame}", "--frame", f"0 to {most - 1}")
 
 

@@ -1,4 +1,4 @@
-"""The live window: its server, and another contact model on one frame while one looks at it.
+"""The server of the live window, and contact of one frame by another model on request.
 
 The server is for this machine only, and gives nothing but the page and its data. Other
 users of the machine reach the port too: every address starts with a random token, which only the
@@ -37,13 +37,14 @@ class ViewServerSettings:
     """Limits of the viewer's local server."""
 
     most_request_bytes: int = 10_000
-    """Bytes of a request; a longer one is refused."""
+    """Bytes of a request; a longer one is refused. Chosen: the page's own requests are far
+    shorter."""
     idle_seconds: float = 15.0
     """s: without a byte from a client that is connected, before it is cut off."""
     longest_line: int = 2000
     """Characters of an answer in words; a longer one is cut."""
     token_bytes: int = 18
-    """Random bytes of the token in the address."""
+    """Random bytes of the token in the address. Chosen: it cannot be guessed."""
 
 
 VIEW_SERVER = ViewServerSettings()
@@ -71,7 +72,7 @@ class ContactSwitch:
         peak: MPa, top of the colour scale of the page.
 
     Attributes:
-        stage: what is being done, in words; empty when nothing is.
+        stage: the current step, in words; empty when idle.
     """
 
     def __init__(self, run: CaseResults, peak: float) -> None:
@@ -108,7 +109,7 @@ class ContactSwitch:
                 self.stage = ""
 
     def cancel(self) -> int:
-        """End what was asked before; return the number of the next question."""
+        """Cancel earlier questions; return the number of the next question."""
         with self._counting:
             self._latest += 1
             return self._latest
@@ -163,7 +164,7 @@ class ContactSwitch:
 
 
 class NotYet(TkambError):
-    """What is asked for is being prepared; ask again."""
+    """The result is still being prepared; the page asks again."""
 
 
 class ViewServer:
@@ -234,7 +235,7 @@ class _QuietServer(ThreadingHTTPServer):
     """A server whose clients may leave at any moment: a browser that is closed is no error."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say in one line what nobody foresaw; nothing of a client that has gone."""
+        """Report an unexpected error in one line; ignore clients that have disconnected."""
         error = sys.exception()
         if isinstance(error, Exception) and not isinstance(error, ConnectionError | TimeoutError):
             say(unforeseen_words(error, argparse.Namespace()))

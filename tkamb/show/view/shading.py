@@ -1,4 +1,4 @@
-"""Surfaces as the graphics card wants them: few enough triangles, smooth but with sharp edges."""
+"""Surfaces for the graphics card: few triangles, smooth shading, sharp edges."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,14 +16,14 @@ class ShadingSettings:
     """How surfaces of the viewer are simplified."""
 
     max_triangles: int = 6_000
-    """Triangles per surface; a finer one is decimated before it is drawn. With two of that size and
-    the smaller parts a frame takes less than 100 ms without a graphics card."""
+    """Triangles per surface; a finer one is decimated before it is drawn. Chosen: with two of that
+    size and the smaller parts a frame takes less than 100 ms without a graphics card."""
 
 
 SHADING = ShadingSettings()
 
 AGGRESSIVENESS = range(5, 11)
-"""How soon far vertices may be merged: tried until few enough triangles are left."""
+"""Values of the simplifier's aggressiveness, tried in turn until few enough triangles remain."""
 
 
 @dataclass(frozen=True, eq=False)

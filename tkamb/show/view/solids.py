@@ -1,9 +1,9 @@
 """The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-A scene holds no bone meshes but one that a muscle may wrap, which is drawn; the other
-bones are stand-ins of about the right size between the joint centres: they orient the eye and
-carry no load. Nobody measured the foot: it hangs at the ankle, level with the floor and pointing
-where the shank does, so that the arrow of the ground reaction does not hang in the air.
+A scene has no bone meshes except one that a muscle may wrap, which is drawn. The other bones are
+stand-ins of about the right size between the joint centres, for orientation only; they carry no
+load. The pose of the foot is not measured: it is drawn level with the floor and pointing forward
+with the shank, so that the arrow of the ground reaction starts at a foot.
 """
 
 from collections.abc import Sequence
@@ -63,9 +63,10 @@ class ViewSolidSettings:
     """Sizes of what the viewer draws beside the implant."""
 
     ankle_radius_mm: float = 20.0
-    """mm."""
+    """mm: radius of the ball that is drawn at the ankle. Chosen: it looks like an ankle."""
     plate_centre: float = 60.0 * MILLIMETRE
-    """m, anterior of the ankle."""
+    """m: distance of the floor's centre in front of the ankle. Chosen: the middle of a foot lies in
+    front of the ankle."""
 
 
 VIEW_SOLID = ViewSolidSettings()

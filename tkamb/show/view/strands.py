@@ -39,13 +39,16 @@ class ViewStrandSettings:
     """How muscles and ligaments are drawn."""
 
     muscle_radius: float = 2.0 * MILLIMETRE
-    """m; radius of a muscle's tube."""
+    """m; radius of a muscle's tube. Chosen: it is seen well in the view."""
     slack_force: float = 1.0
-    """N."""
+    """N: a tendon or muscle with a smaller force is drawn grey. Chosen: far below forces that
+    matter."""
     least_activation: float = 0.1
-    """Upper end of the colour scale, where no muscle is more active."""
+    """1: smallest upper end of the colour scale of activations. Chosen: small activations then look
+    small."""
     many_bundles: int = 20
-    """Ligament bundles from which on they are drawn thinner."""
+    """Ligament bundles from which on they are drawn thinner. Chosen: thick ones would cover each
+    other."""
 
 
 VIEW_STRAND = ViewStrandSettings()

@@ -1,4 +1,4 @@
-"""What a cohort writes: one table, its runs, its groups, its provenance and its report."""
+"""Output of a cohort: table of frames, runs, groups, provenance and report."""
 
 import json
 import sys
@@ -69,7 +69,7 @@ def write_cohort(
 def frame_table(
     cohort: Cohort, outcomes: Mapping[int, Outcome], identity: Mapping[str, Any]
 ) -> pa.Table:
-    """Return a row per frame of every run that gave results: who, what of which, and numbers.
+    """Return a row per frame of every run with results: labels, provenance and numbers.
 
     The columns are those of results.csv that any run has, null where a run has none; before them
     stand the labels, and the scene's SHA-256, overrides, contact model and resolution.

@@ -1,4 +1,4 @@
-"""One run of a cohort: through the whole pipeline, and what of it is kept."""
+"""One run of a cohort: through the whole pipeline, reduced to the results that are kept."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,7 @@ from tkamb.run.status import FAILED
 from tkamb.studies.cohort.plan import CohortRun, CohortWearTable
 
 TIMES = "_seconds"
-"""Ending of computing times: the only columns that another computer finds otherwise."""
+"""Ending of the columns of computing times, which differ between computers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class PressureMap:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one run gave.
+    """Results of one run.
 
     Args:
         reason: why the run failed as a whole; "" if it did not.
@@ -123,7 +123,7 @@ class CohortWorker:
         self._frames, self._map_flexion, self._wear = frames, map_flexion, wear
 
     def __call__(self, number: int, run: CohortRun) -> Outcome:
-        """Return what a run gives: what `tkamb run` would, or why it cannot."""
+        """Return the results of a run, as `tkamb run` would compute them, or why there are none."""
         try:
             return self._outcome(run)
         finally:

@@ -29,7 +29,8 @@ from tkamb.run.summary import files_in
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])
 MOST_RUNS = 20_000
-"""Scenes are read at 5 ms each, before anything is computed; a run takes a minute."""
+"""Largest number of runs. Scenes are read at 5 ms each before the first run; a run takes a
+minute."""
 Name = Annotated[str, Field(pattern=r"^[\w .+-]{1,60}$")]
 Overrides = Annotated[
     dict[str, Any],
@@ -38,7 +39,7 @@ Overrides = Annotated[
 
 
 class SubjectTable(SceneTable):
-    """One person: what of the trials' scenes is another for them."""
+    """One person: changes of the trials' scenes for this person."""
 
     name: Name
     scale: Annotated[Number, Field(ge=0.7, le=1.4)] = Field(
@@ -195,7 +196,7 @@ class Cohort:
         return _slice(self.table.frames, self.path)
 
     def identity(self) -> dict[str, Any]:
-        """Return what makes two cohorts the same but for the code: runs, files, frames."""
+        """Return the content that identifies a cohort, apart from the code: runs, files, frames."""
         runs = [[run.labels, run.scene_hash] for run in self.runs]
         files = sorted({path for run in self.runs for path in files_in(run.scene.model_dump())})
         return {
@@ -311,6 +312,8 @@ def _complaint(error: ValidationError, path: Path) -> InputError:
     rank = {"extra_forbidden": 0, "missing": 2}
     first = min(error.errors(), key=lambda one: rank.get(one["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
+    if {one["loc"][:1] for one in error.errors()} >= {("motion",), ("implant",)}:
+        return InputError("is a scene, not a cohort", path, "docs/cohort.md shows a cohort file")
     if first["type"] == "extra_forbidden":
         near = names_near(str(first["loc"][-1]), _keys_beside(first["loc"]))
         return InputError(f"unknown key '{key}'", path, f"remove it, or rename it: {near}")

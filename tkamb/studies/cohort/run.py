@@ -1,4 +1,4 @@
-"""All runs of a cohort: over workers, kept as they are finished, then made one table."""
+"""All runs of a cohort: computed by workers, stored when finished, then combined in one table."""
 
 import os
 from collections.abc import Iterator
@@ -41,7 +41,7 @@ class Part:
     def __post_init__(self) -> None:
         if not 1 <= self.index <= self.count <= MOST_SHARDS:
             raise InputError(
-                f"{self.index}/{self.count} is no part",
+                f"{self.index}/{self.count} is not a part",
                 "--shard",
                 "give 1/n to n/n, n at most 10000",
             )
@@ -129,7 +129,7 @@ def _identity(cohort: Cohort) -> dict[str, Any]:
 
 @contextmanager
 def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Path]]:
-    """Hold the folders of all parts, whose runs are gathered; none while one computes."""
+    """Lock the folders of all parts and yield them, to gather runs; none while one computes."""
     with ExitStack() as stack:
         result = []
         if part is None and resume:

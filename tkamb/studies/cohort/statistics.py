@@ -30,7 +30,8 @@ class CohortStatisticsSettings:
     """Statistics over the runs of a cohort."""
 
     bin_tolerance: float = 1e-9
-    """Share of a bin; 60 deg, which radians make 59.99999999999999, begins the bin from 60 on."""
+    """Share of a bin. Chosen: 60 deg, which radians make 59.99999999999999, begins the bin from 60
+    on."""
 
 
 COHORT_STATISTICS = CohortStatisticsSettings()
@@ -38,13 +39,13 @@ COHORT_STATISTICS = CohortStatisticsSettings()
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Runs that differ in nothing that makes groups.
+    """Runs with the same labels of grouping.
 
     Args:
         labels: what they have in common.
         numbers: of the runs that gave results.
         failed: how many gave none.
-        axis: what its bins divide: "flexion_deg", or "cycle_percent" of a cycle.
+        axis: quantity that its bins divide: "flexion_deg", or "cycle_percent" of a cycle.
         edges: (b + 1,) of the bins, in the axis's unit.
         bins: column -> (r, b) mean of each run in each bin; NaN where it has none there.
         peaks: column -> (r,) the largest of each run.
@@ -91,7 +92,7 @@ class Spread:
 
 
 def spread(values: Array) -> Spread:
-    """Return what runs (r, ...) have in common; NaN where a run has no number."""
+    """Return mean, standard deviation and range over runs (r, ...), without their NaN."""
     count = np.isfinite(values).sum(axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # bins that no run reaches: NaN, as wanted
@@ -144,7 +145,7 @@ def _group(
 def _computed(outcome: Outcome) -> dict[str, Array]:
     """Return a run's columns; NaN in frames that failed, but for the bins' axes.
 
-    Such a frame holds its motion as it was recorded, where that of the others may be solved.
+    A failed frame has only its recorded motion, while that of other frames may be solved.
     """
     failures = np.array([status.startswith(FAILED) for status in outcome.status], bool)
     return {

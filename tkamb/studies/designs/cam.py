@@ -19,15 +19,17 @@ class CamSettings:
     """The cam of a posterior-stabilised design."""
 
     sides: int = 96
-    """Facets around a cam: their chords leave out 0.05 % of the radius."""
+    """Number of facets around a cam. Chosen: their chords leave out 0.05 % of the radius."""
     stations: int = 13
-    """Rings of vertices along it."""
+    """Number of rings of vertices along the cam. Chosen: triangles are then about as long as
+    wide."""
     flange_mm: float = 1.0
-    """mm from the wall of the box to the cylinder."""
+    """mm from the wall of the box to the cylinder. Chosen: it keeps the cylinder clear of the
+    wall."""
     window_deg: float = 22.0
     """deg about the origin on either side of the cam: what of the wall holds it."""
     wall_tolerance_mm: float = 1e-6
-    """mm; vertices this near the plane of a wall lie in it."""
+    """mm; vertices this near the plane of a wall lie in it. Chosen: above rounding."""
 
 
 CAM = CamSettings()

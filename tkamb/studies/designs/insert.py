@@ -19,7 +19,8 @@ class InsertBlendSettings:
     """Inserts with dishes of unequal radii."""
 
     blend_half_width: float = 8.0
-    """mm; unequal dishes blend within this distance of the middle."""
+    """mm; unequal dishes blend within this distance of the middle. Chosen: contacts lie farther
+    out."""
 
 
 INSERT_BLEND = InsertBlendSettings()

@@ -19,11 +19,13 @@ class RadiusSettings:
     """Where the radii of a design are measured."""
 
     coronal_reach_mm: float = 6.0
-    """mm on either side of the ridge or the low line."""
+    """mm on either side of the ridge or the low line over which a radius is fitted. Chosen: about a
+    contact's width."""
     dish_reach_mm: float = 14.0
-    """mm in front of and behind the low point."""
+    """mm in front of and behind the low point over which a radius is fitted. Chosen: the flat part
+    of a dish."""
     arc_margin_deg: float = 1.5
-    """Left out at both ends of an arc, where the facets of two arcs meet."""
+    """deg that are left out at both ends of an arc. Chosen: facets of two arcs meet there."""
 
 
 RADIUS = RadiusSettings()

@@ -22,9 +22,10 @@ class DesignTouchSettings:
     """Search for the pose at which a design's condyles touch."""
 
     halvings: int = 18
-    """Halvings of the bracket around the adduction; 18 leave 3e-7 rad."""
+    """Halvings of the bracket around the adduction. Chosen: 18 leave 3e-7 rad."""
     largest_adduction: float = 0.04
-    """rad, about a guess."""
+    """rad: largest distance of the adduction from the initial guess. Chosen: both condyles touch
+    within it."""
 
 
 DESIGN_TOUCH = DesignTouchSettings()

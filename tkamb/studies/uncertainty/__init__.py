@@ -1,1 +1,1 @@
-"""How sure a run's numbers are: its inputs are varied, every output gets a band."""
+"""Uncertainty of a run's results: its inputs are varied, and every result gets a band."""

@@ -1,4 +1,4 @@
-"""From samples to bands and to which input moves what."""
+"""From samples to bands, and to each input's share in the variance of each result."""
 
 import re
 import warnings
@@ -24,9 +24,9 @@ ENDS = ("p05", "p95")
 TOTALS_N = ("force_si_N", "force_total_N")
 """Columns of results.csv with the total force, of which the first that is there is taken."""
 ROUND_OFF = 1e-9
-"""Standard deviation over magnitude: a result that varies less does not vary."""
+"""1: a result with a smaller standard deviation over magnitude counts as constant."""
 SAMPLES_PER_INPUT = 6
-"""Fewer per input leave a regression undetermined: its shares would be those of chance."""
+"""Smallest number of samples per input for a regression; with fewer its shares would be random."""
 NUMBER = re.compile(r"[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 MOST_CAUSES = 3
 
@@ -69,14 +69,14 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
     """Return how the nominal peak lies among its samples; None: no frame has a number.
 
     Args:
-        nominal: (f,) of the run as its inputs stand; its largest value's frame is looked at.
+        nominal: (f,) of the run with the inputs as given; the frame of its largest value counts.
         values: (n, f) of the samples, NaN where one has none.
         failed: (n, f) which frames of which samples failed.
 
     Returns:
-        frame, nominal, samples, failed_samples (of them, there), median, p05, p95 (None: no
-        band), nominal_percentile: per cent of the samples below the nominal value, those equal to
-        it by half; and all that in words.
+        frame, nominal, samples, failed_samples (at that frame), median, p05, p95 (None: no band),
+        nominal_percentile (per cent of the samples below the nominal value; equal ones count half),
+        and the same in words.
     """
     if not np.isfinite(nominal).any():
         return None
@@ -107,7 +107,8 @@ def _peak_words(peak: Mapping[str, Any]) -> str:
         return failed
     outside = not peak["p05"] <= peak["nominal"] <= peak["p95"]
     return (
-        f"{peak['nominal']:.2f} BW as the inputs stand, at the {peak['nominal_percentile']:.0f}th "
+        f"{peak['nominal']:.2f} BW with the inputs as given, at the "
+        f"{peak['nominal_percentile']:.0f}th "
         f"percentile of the samples{', outside the band' if outside else ''}; {failed}"
     )
 
@@ -204,8 +205,8 @@ def causes(problems: np.ndarray) -> dict[str, float]:
     """Return why frames failed: cause -> its share of those that did, the most frequent first.
 
     Args:
-        problems: text, why a frame failed; empty where it did not. The last of its clauses says
-            most; numbers in it differ from frame to frame and are left out.
+        problems: text, why a frame failed; empty where it did not. Only the last clause of a text
+        is used, without the numbers in it, which differ from frame to frame.
     """
     last = [text.rsplit("; ", 1)[-1] for text in problems.ravel() if text]
     count = Counter(NUMBER.sub("…", text) for text in last)
@@ -215,12 +216,12 @@ def causes(problems: np.ndarray) -> dict[str, float]:
 def measured_inside(
     columns: Mapping[str, Any], bands: Mapping[str, Array], compared: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Return of each force that was measured in how many frames it lies from p05 to p95.
+    """Return, for each measured force, the share of frames in which it lies within the band.
 
     Args:
         columns: of results.csv, `measured_<name>_N` among them.
         bands: of bands.csv.
-        compared: force -> what it is held against, as in the summary's `measured`.
+        compared: force -> what it is compared with, as in the summary's `measured`.
 
     Returns:
         Force -> frames that have both, and the share of them inside, NaN of none: in the band of
@@ -242,11 +243,11 @@ def measured_inside(
 
 @dataclass(frozen=True)
 class Influence:
-    """What one input does to one result.
+    """Influence of one input on one result.
 
     Args:
         result: column of results.csv.
-        name: of the input; "rest" for what no function of one input explains.
+        name: of the input; "rest" for the variance that no function of one input explains.
         share: of the result's variance over samples, all frames together.
         change: of the result per standard deviation of the input, its linear part, where the
             result's median is largest; NaN for the rest.
@@ -264,14 +265,14 @@ def influences(
     """Return the tornado table: each input's share in each result's variance, largest first.
 
     Regression: at each frame y = a + sum_i (b_i x_i + c_i x_i²) + e by least squares, x_i the
-    errors in standard deviations; the square is for what rises either way, as a force does up
-    either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), for independent inputs
-    b_i² var(x_i) + c_i² var(x_i²); that of an input which errs with others has what it does with
-    them in it, and may be negative (Li et al. 2010). Parts and variances are summed
-    over the frames. What is left is the rest: kinks, interactions and chance. A result that does
-    not vary beyond round-off has no rows. With fewer than `SAMPLES_PER_INPUT` samples per input
-    each input is regressed on alone, and of its part is taken off what chance explains of n
-    samples, 2/(n - 1) of the variance.
+    errors in standard deviations. The square covers results that rise in both directions, as a
+    force does on either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), which for
+    independent inputs is b_i² var(x_i) + c_i² var(x_i²). For correlated inputs it includes their
+    joint effect and may be negative (Li et al. 2010). Parts and variances are summed over the
+    frames. The rest is due to kinks, interactions and chance. A result that varies by round-off
+    only has no rows. With fewer than `SAMPLES_PER_INPUT` samples per input, each input is
+    regressed alone, and the share that chance explains in n samples, 2/(n - 1) of the variance, is
+    subtracted from its part.
 
     Args:
         results: (m,) names.
@@ -318,7 +319,7 @@ def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
 
 
 def _one_by_one(y: Array, x: Array) -> tuple[Array, Array, float]:
-    """Return the same of each input by itself: too few samples to regress on all of them."""
+    """Return the same for each input alone, if there are too few samples for a joint regression."""
     variance, slopes, parts = float(y.var()), np.zeros(x.shape[1]), np.zeros(x.shape[1])
     for i, column in enumerate(x.T):
         terms: Any = np.column_stack([column, column**2])

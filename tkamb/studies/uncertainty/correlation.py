@@ -20,7 +20,7 @@ from tkamb.io.scene.uncertainty import CorrelationTable
 
 TABLE = "[[uncertainty.correlation]]"
 ROUNDING = 1e-10
-"""An eigenvalue, or what is left of a variance, above minus this is not negative."""
+"""An eigenvalue, or a remaining variance, above minus this counts as not negative."""
 
 
 def correlation_root(tables: Sequence[CorrelationTable], names: Sequence[str]) -> Array:
@@ -42,7 +42,7 @@ def correlation_root(tables: Sequence[CorrelationTable], names: Sequence[str]) -
     least = float(np.linalg.eigvalsh(matrix)[0])
     if least < -ROUNDING:
         raise InputError(
-            f"make no correlation matrix (smallest eigenvalue {least:.3g})",
+            f"do not give a correlation matrix (smallest eigenvalue {least:.3g})",
             TABLE,
             "give smaller coefficients, or those of the other pairs too",
         )

@@ -15,7 +15,7 @@ RESAMPLED = 200
 
 @dataclass(frozen=True)
 class SobolIndex:
-    """What share of a result's variance an input has.
+    """Share of an input in a result's variance.
 
     Args:
         result: column of results.csv.

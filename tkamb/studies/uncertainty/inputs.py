@@ -1,4 +1,4 @@
-"""Which inputs of a case vary, by how much, and what one sample makes of them."""
+"""The inputs of a case that vary, their standard deviations, and their errors in one sample."""
 
 from dataclasses import dataclass
 
@@ -196,7 +196,7 @@ def _places(name: str, axes: tuple[str, ...], deviation: float) -> list[VariedIn
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """What one sample makes of the inputs.
+    """The errors of the inputs in one sample.
 
     Args:
         inputs: those that vary.

@@ -1,4 +1,4 @@
-"""All samples of a scene: over worker processes, kept as they are finished, then made bands."""
+"""All samples of a scene: computed by workers, stored when finished, then turned into bands."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -44,27 +44,27 @@ TORNADO_RESULTS = (
     *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
 )
 PEAK = "force_total_BW"
-"""Whose peak is the headline."""
+"""Column whose peak is the headline."""
 NO_BAND = (
     *("time_s", "cycle_percent", "iterations", "coupling_iterations", "coupling_change_N"),
     *("coupling_change_mm", "contact_trials", "split_determined", "condition_number"),
     *("medial_force_per_adduction_N_per_deg", "adjust_restored"),
 )
-"""What is no result of the knee, or is not computed for a sample."""
+"""Columns that are not results of the knee, or are not computed for a sample."""
 NOT_SAMPLED = ("_seconds", "_slip_mm", "_velocity_mm_per_s")
-"""Endings: computing time, and what adds up over frames that a sample does not compute."""
+"""Endings of columns without a band: computing times, and sums over frames that a sample skips."""
 RECORDED = ("measured_", "envelope_")
 """Beginnings: what was recorded beside the run."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What `estimate_uncertainty` found.
+    """Result of `estimate_uncertainty`.
 
     Args:
-        results: of the scene as it stands; its summary says what varied.
+        results: of the scene as given; its summary says what varied.
         bands: columns of bands.csv.
-        tornado: which input moves what.
+        tornado: influence of each input on each result.
         names: columns of results.csv that have a band.
         inputs: those that varied.
         samples: in the order of their numbers; those of Saltelli's design after the others.
@@ -189,7 +189,7 @@ class _Job:
 
     @property
     def design(self) -> str:
-        """Return what makes sample n the same: not how many there are, but for a design."""
+        """Return what identifies sample n: the method and, for a design, the number of samples."""
         return (
             f"{self.method}, Saltelli's design of {self.crossed}" if self.crossed else self.method
         )

@@ -1,7 +1,7 @@
 """One sample of a scene: the varied case through body and contact, its results as one array.
 
-Meshes, their search trees and the prepared contact are those of the scene as it stands: no
-input that varies changes them, but the insert's modulus, for which the contact is prepared anew.
+Meshes, their search trees and the prepared contact are those of the scene as given. The only
+varying input that changes them is the insert's modulus, for which the contact is prepared again.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ from tkamb.studies.uncertainty.varied_case import thinnable, thinned, varied_cas
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What one sample gives.
+    """Results of one sample.
 
     Args:
         values: (names, frames) in the order asked for; NaN where a frame failed or has no number.
@@ -63,7 +63,7 @@ class Sampler:
 
     Attributes:
         names: as given.
-        case: as it stands.
+        case: as given.
         inputs: that vary.
 
     Raises:
@@ -94,7 +94,7 @@ class Sampler:
         per_frame = noise_of_point(point, range(count), self._time, table.correlation_s, table.seed)
         if len(self.case.motion.time) < len(self._time):
             per_frame = per_frame[list(self._chosen)]
-        if point.noise_of is None:  # one input at a time: whatever errs with it stays
+        if point.noise_of is None:  # one input at a time: correlated inputs stay
             return Draw(self.inputs, point.normal, per_frame, 1.0)
         noise = per_frame @ self._root[:count, :count].T
         return Draw(self.inputs, self._root @ point.normal, noise, table.constant_share)
@@ -113,7 +113,7 @@ class Sampler:
             case = self._varied(draw)
             mechanics = Mechanics(case, self._known(draw))
             side = self._contact(case, mechanics, draw)
-        except TkambError as error:  # the moved inputs cannot be used: no frame has a number
+        except TkambError as error:  # the varied inputs cannot be used: no frame has a number
             return Sample(values, np.full(len(self._frames), str(error)), errors)
         problems: list[str] = []
         before: list[FrameContact] = []
@@ -135,7 +135,7 @@ class Sampler:
         return case
 
     def _contact(self, case: Case, mechanics: Mechanics, draw: Draw) -> ContactSide | None:
-        """Return the contact side, with the contact that is prepared already where it serves."""
+        """Return the contact side, with the scene's prepared contact where it is still valid."""
         if self._side is None:
             return None
         factor = draw.factor("young_modulus")
@@ -148,7 +148,7 @@ class Sampler:
 
 
 class BandWorker:
-    """Computes samples; prepared before it is known which columns have a band.
+    """Computes samples; it is prepared before the columns with a band are known.
 
     Args:
         scene: the scene.
@@ -158,7 +158,7 @@ class BandWorker:
     def __init__(self, scene: Scene, frames: range) -> None:
         self._scene, self._frames = scene, frames
         self._sampler: Sampler | None = None
-        with suppress(TkambError):  # the run of the scene as it stands says what is wrong
+        with suppress(TkambError):  # the run of the scene as given reports the error
             self._sampler = Sampler(scene, frames, ())
 
     def __call__(self, number: int, job: tuple[Point, list[str]]) -> Sample:

@@ -1,4 +1,4 @@
-"""Samples of standard normal inputs, each found by its number alone.
+"""Samples of standard normal inputs; each depends only on its number.
 
 Sample number n is the same whatever the count of samples and whoever asks for it, so adding
 samples keeps the old ones and the order in which workers finish does not matter.
@@ -19,9 +19,10 @@ Method = Literal["lhs", "sobol"]
 BLOCK = 64
 """Samples of one Latin hypercube; the next ones make the next hypercube."""
 SMALLEST_TAIL = 1e-9
-"""Of a normal distribution: Sobol' points may be 0, whose quantile is not finite."""
+"""Smallest probability that is mapped to a normal quantile: Sobol' points may be 0, whose quantile
+is not finite."""
 NOISE = 1
-"""Tells the seeds of the noise from those of the hypercubes."""
+"""Number that separates the seeds of the noise from those of the hypercubes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""A quick look at which input moves what: one input at a time, by one deviation either way."""
+"""Screening of the inputs: one input at a time, changed by one standard deviation either way."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ SCREENING = ScreeningSettings()
 
 @dataclass(frozen=True)
 class Screened:
-    """What one input does to one result where the result is largest.
+    """Effect of one input on one result at the frame where the result is largest.
 
     Args:
         result: column of results.csv.
@@ -66,8 +66,8 @@ def screen(
 ) -> list[Screened]:
     """Move one input at a time by one standard deviation and return what that changes.
 
-    2 d + 1 samples of d inputs. A pose is moved as a whole, without noise per frame. What two
-    inputs do together does not show; `estimate_uncertainty` has that.
+    2 d + 1 samples of d inputs. A pose is moved as a whole, without noise per frame. Interactions
+    of inputs do not show; `estimate_uncertainty` includes them.
 
     Args:
         scene: the scene.
@@ -110,7 +110,7 @@ def _of_result(
         Screened(result, float(values[0]), float(flexion), one, float(minus), float(plus))
         for one, (minus, plus) in zip(inputs, changes.reshape(-1, 2), strict=True)
     ]
-    # an input that makes the frame fail moves it the most
+    # An input that makes the frame fail counts as the largest change.
     return sorted(
         rows, key=lambda row: -max(np.nan_to_num(abs(np.array([row.minus, row.plus])), nan=np.inf))
     )
@@ -146,8 +146,8 @@ def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
             )
     if any(not np.isfinite([row.minus, row.plus]).all() for row in rows):
         lines.append(
-            "failed: with the input so far off the frame has no result, often a pose that no load "
-            "balances; what it would change is not known, so it stands first"
+            "failed: with this error of the input the frame has no result, often because no load "
+            "balances the pose; the change is not known, so the input is listed first"
         )
     return lines
 
@@ -162,7 +162,7 @@ def _change(value: float) -> str:
 
 
 def _bar(row: Screened, largest: float, width: int) -> str:
-    """Return the reach to both sides of the nominal value."""
+    """Return the bar to both sides of the nominal value."""
     changes = [one for one in (row.minus, row.plus) if np.isfinite(one)]
     scale = width / largest if largest > 0 else 0.0
     below, above = (round(scale * max([0.0, *(sign * c for c in changes)])) for sign in (-1, 1))

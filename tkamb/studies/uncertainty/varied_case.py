@@ -1,11 +1,11 @@
-"""A case with its inputs moved as one sample has them, errors of its skin markers among them.
+"""A case with the errors of one sample in its inputs, including those of its skin markers.
 
-All of it happens on what was read, in SI and as a right knee's: no file is read again.
+The errors are applied to the case in SI, as a right knee's: no file is read again.
 
-A skin marker sits off where its segment has it by an error that is the same in all frames. The
-rigid fit of the segment's markers is then off by the pose that best carries their places to the
-places with the errors: the reading `method = "segments"`. A chain's joints spread the same errors
-over more segments.
+A skin marker is displaced from its place on its segment by an error that is the same in all frames.
+The rigid fit of the segment's markers is then off by the pose that best maps their true places to
+the displaced ones (`method = "segments"`). A chain's joints spread the same errors over more
+segments.
 """
 
 from dataclasses import fields, replace
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 def varied_case(case: Case, draw: Draw) -> Case:
-    """Return the case with its inputs moved; rates and accelerations stay as recorded.
+    """Return the case with varied inputs; rates and accelerations stay as recorded.
 
     The insert's modulus and the shared muscles are not in a case:
     `tkamb.studies.uncertainty.sample` varies them.
@@ -174,14 +174,15 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
 def thinnable(case: Case) -> bool:
     """Say whether a frame needs no other frame of the motion.
 
-    A solved patella is differentiated in time, and a reference strain looks for its pose.
+    It needs others if a solved patella is differentiated in time, or if a reference strain refers
+    to another frame.
     """
     solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
     return not solved and all(np.isfinite(one.slack_length) for one in case.ligaments)
 
 
 def thinned(case: Case, frames: range) -> Case:
-    """Return the case with these frames of its motion alone."""
+    """Return the case with only these frames of its motion."""
     count, chosen = len(case.motion.time), list(frames)
 
     def at_frames(recording: Any) -> Any:
@@ -206,7 +207,7 @@ def thinned(case: Case, frames: range) -> Case:
 def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Array]":
     """Return the shank, and the knee coordinates (f, 6), with the markers' errors in them.
 
-    Of the coordinates those change that are taken from the markers.
+    Only coordinates that are taken from the markers change.
 
     Args:
         case: the case.

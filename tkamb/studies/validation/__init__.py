@@ -1,1 +1,1 @@
-"""Published numbers as data, and what tkamb makes of the same cases."""
+"""Published numbers as data, and tkamb's results for the same cases."""

@@ -36,7 +36,7 @@ class BenchmarkSettings:
     sensel: float = 1.27 * MILLIMETRE
     """m; edge of a sensel of the pressure film in the publications."""
     resolution_mm: float = 2.0
-    """mm; resolution of every press on an implant, so that the whole page takes minutes."""
+    """mm: resolution of every press on an implant. Chosen: the whole page takes minutes."""
 
 
 BENCHMARK = BenchmarkSettings()
@@ -302,7 +302,7 @@ def conformity(designs: Path) -> Values:
 
 
 def thickness_and_plane(designs: Path) -> Values:
-    """Return how peak pressure answers to thickness and to the plane of conformity, 60 deg.
+    """Return how peak pressure depends on thickness and on the plane of conformity, 60 deg.
 
     Conformity r/R is raised by a tenth, across from 0.85 and along from 0.5.
     """

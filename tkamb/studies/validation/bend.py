@@ -1,4 +1,4 @@
-"""The shipped deep knee bend beside what the dissertation reports of its subjects' forces."""
+"""The shipped deep knee bend compared with the forces that the dissertation reports."""
 
 from dataclasses import dataclass
 from pathlib import Path

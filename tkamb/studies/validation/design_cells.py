@@ -1,8 +1,9 @@
 """One cell of tables D-3 to D-6: a condyle of a design pressed at the table's own force.
 
-Each condyle is pressed alone, so that it carries the table's force whatever the split. What the
-source does not publish is an assumption with a range: flexion at a percentage of the bend, where
-the condyle stands on its dish, axial rotation of the femur on the insert, size of the implant.
+Each condyle is pressed alone, so that it carries the table's force whatever the medial-lateral
+split. Inputs that the source does not publish are assumptions with a range: flexion at a percentage
+of the bend, AP position of the condyle on its dish, axial rotation of the femur on the insert, and
+size of the implant.
 """
 
 from collections.abc import Iterable
@@ -39,7 +40,7 @@ a family differ by about 7 %."""
 
 @dataclass(frozen=True)
 class Assumption:
-    """What the source does not say about one knee.
+    """Assumed inputs of one knee that the source does not publish.
 
     Args:
         flexion_start: rad, at 0 % of the bend.
@@ -58,7 +59,7 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Cell:
-    """What a pressed condyle has.
+    """Results of a pressed condyle.
 
     Args:
         area: m², in contact.

@@ -39,7 +39,7 @@ class DesignTableSettings:
     """Tables of designs."""
 
     samples: int = 6
-    """Samples besides the nominal case."""
+    """Number of samples besides the nominal case. Chosen: the table takes hours, not days."""
 
 
 DESIGN_TABLE = DesignTableSettings()

@@ -1,8 +1,8 @@
 """The dissertation's tables D-1 to D-12 (Sharma 2008), and what was found wrong in them.
 
 The tables are kept as printed. `corrected` gives table D-12 with the two NKII columns exchanged,
-which is the one change that any comparison needs. What else was found is data beside the tables
-(`dissertation_findings.toml`) and can be computed anew from them by the functions here.
+which is the one change that a comparison needs. Other findings are data beside the tables
+(`dissertation_findings.toml`); the functions here compute them from the tables.
 """
 
 import tomllib

@@ -1,4 +1,4 @@
-"""A virtual pressure film: what a sensor of finite cells reads of a pressure field.
+"""A virtual pressure film: the reading of a sensor with finite cells in a pressure field.
 
 Each cell reports the pressure at its centre, as a matrix sensor reports one number for the sensel.
 Force, area and mean pressure then are sums over cells; their errors depend on where the grid lies
@@ -21,7 +21,7 @@ Field = Callable[[Array, Array], Array]
 
 @dataclass(frozen=True)
 class FilmReading:
-    """What the film reads.
+    """Reading of the film.
 
     Args:
         force: N, pressures times the area of a cell, summed.

@@ -1,4 +1,4 @@
-"""How sure a worn volume is: samples of the simulation, and bands beside its rows.
+"""Uncertainty of a worn volume: samples of the simulation, and bands of its rows.
 
 Sampling, inputs and percentiles are those of `tkamb uncertainty`.
 """
@@ -31,9 +31,10 @@ class WearBandSettings:
     """Bands of wear from samples."""
 
     samples: int = 32
-    """Samples unless the user asks for another number."""
+    """Number of samples unless the user asks for another. Chosen: the 5th and 95th percentiles are
+    then inside the sample."""
     max_samples: int = 10_000
-    """Largest number of samples that is accepted."""
+    """Largest number of samples that is accepted. Chosen: more take too long."""
 
 
 WEAR_BAND = WearBandSettings()
@@ -107,7 +108,7 @@ class WearBands:
 
 @dataclass(frozen=True)
 class Sampling:
-    """What samples there are: sample n is the same however many, and whoever computes it.
+    """The samples of a simulation; sample n does not depend on their number or on the worker.
 
     Args:
         inputs: that vary.
@@ -146,10 +147,10 @@ class Sampling:
         shards: Shards | None = None,
         progress: Progress = lambda samples, count: samples,
     ) -> WearBands:
-        """Simulate with moved inputs and return bands at the rows of a table.
+        """Simulate with varied inputs and return bands at the rows of a table.
 
         Args:
-            simulation: the case as it stands, cycles, and updates of the geometry.
+            simulation: the case as given, cycles, and updates of the geometry.
             rows: of that case.
             crew: who computes; default: this process.
             shards: where samples are kept.

@@ -19,8 +19,8 @@ class LogarithmicCreep:
         strain(t) = p (c + b log10(t / t_ref)),        depth = strain times thickness
 
     p the time-mean pressure of the cycle. Before the time at which the bracket is zero the
-    strain is zero. Where the pressure changes from block to block each block adds what the law
-    gives between its own two times (time hardening).
+    strain is zero. Where the pressure changes from block to block, each block adds the strain of
+    the law between its own two times (time hardening).
 
     Args:
         compliance_per_MPa: c, strain per MPa at the reference time.

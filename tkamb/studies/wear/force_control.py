@@ -1,7 +1,8 @@
-"""Force control of the virtual simulator: poses at which applied forces, springs and contact rest.
+"""Force control of the virtual simulator: equilibrium of applied forces, springs and contact.
 
-Of the knee coordinates q (`tkamb.geometry.frames`) flexion and whatever the profile prescribes are
-given. The others, the superior-inferior one always among them, are where nothing drives them:
+Of the knee coordinates q (`tkamb.geometry.frames`), flexion and the ones that the profile
+prescribes are given. The others, always including the superior-inferior one, follow from
+equilibrium:
 
     r_i(q) = F_i - S_i(q_i) - J_i(q) . w_contact(q) = 0
 
@@ -39,13 +40,13 @@ UNITS = {
 
 @dataclass(frozen=True, eq=False)
 class ForceDrive:
-    """What a force-controlled machine does to the knee, profile row by row.
+    """Loads of a force-controlled machine on the knee, for each row of the profile.
 
     Args:
         coordinates: (f, 6) m and rad; the free ones are where the first search begins.
         applied: (f, 6) N and N·m on the femoral component, along each free coordinate.
         free: indices of the free coordinates, the superior-inferior one among them.
-        zero: (6,) m and rad, from where AP, ML and the springs count.
+        zero: (6,) m and rad, origin of AP, ML and the springs.
         springs: of the machine; None: it has none.
         percent: (f,) of the cycle at each row; None: the rows are evenly spaced.
     """
@@ -109,7 +110,7 @@ class ForceDrive:
 
 @dataclass(frozen=True, eq=False)
 class MachineJoint:
-    """What pushes the free coordinates at one row beside the contact; see the module.
+    """Loads on the free coordinates at one row, beside the contact; see the module.
 
     Args:
         released: indices of the n free coordinates.

@@ -1,4 +1,4 @@
-"""What is done of a wear simulation, kept in its folder so that a kill loses one block."""
+"""Finished blocks of a wear simulation, stored in its folder, so that a kill loses one block."""
 
 import hashlib
 import json
@@ -28,7 +28,7 @@ UNREADABLE = (
 
 
 def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -> str:
-    """Return what makes two simulations the same: bodies, motion, laws, numbers, code."""
+    """Return the hash that identifies a simulation: bodies, motion, laws, numbers, code."""
     digest = hashlib.sha256()
     bodies = (setup.engine.femoral, case.articular.surface)
     arrays = [array for body in bodies for array in (body.vertices, body.faces)]
@@ -90,7 +90,7 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
         raise _damaged(path, str(error)) from None
     numbers = (state.cycles, state.step, state.volume, state.creep_volume, state.map_error)
     if not (whole and all(isinstance(one, float) and math.isfinite(one) for one in numbers)):
-        raise _damaged(path, "its numbers are none")
+        raise _damaged(path, "its values are not numbers")
     arrays = (state.wear, state.creep, state.fall)
     if not all(isinstance(one, np.ndarray) and one.shape == (count,) for one in arrays):
         raise _damaged(path, f"its arrays are not of {count} vertices")

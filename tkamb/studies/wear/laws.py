@@ -1,4 +1,5 @@
-"""Wear laws: what a cycle's pressures and sliding take off each point of the insert.
+"""Wear laws: depth that the pressures and the sliding of a cycle remove at each point of the
+insert.
 
 A law is a frozen dataclass of its parameters. `wear_law` finds it by name, the built-in ones and
 those of other packages:
@@ -48,7 +49,7 @@ class WearLaw(ABC):
     name: ClassVar[str]
     assumes: ClassVar[str]
     geometry: ClassVar[str] = "the law does not say how its volume follows the insert's geometry"
-    """How the worn volume follows the insert's geometry, in words that are printed beside it."""
+    """How the worn volume depends on the insert's geometry, in words that are printed beside it."""
 
     @abstractmethod
     def depth(self, history: SlidingHistory) -> Array:
@@ -151,7 +152,7 @@ class PressureCrossShear(WearLaw):
         shape = (len(self.cross_shear), len(self.pressure_MPa))
         if len(table) != shape[0] or any(len(row) != shape[1] for row in table):
             raise InputError(
-                f"is no table of {shape[0]} rows and {shape[1]} columns",
+                f"is not a table of {shape[0]} rows and {shape[1]} columns",
                 "wear_factor_mm3_per_Nm",
                 "give a row per cross-shear ratio and a column per pressure",
             )

@@ -1,4 +1,4 @@
-"""What the insert is made of as far as wear goes: laws with parameters, density, creep."""
+"""Wear properties of the insert's material: laws with parameters, density, creep."""
 
 import math
 import tomllib
@@ -25,10 +25,10 @@ class WearMaterial:
     """A wear material with where its numbers come from.
 
     Args:
-        name: what to call it.
+        name: name in messages.
         text: in words.
         density_kg_per_m3: turns volume into mass.
-        law: the law that is taken unless another is asked for.
+        law: the default law.
         laws: law -> its parameters.
         sources: one line per number.
         caution: what a reader must know before using the numbers; may be empty.
@@ -79,7 +79,7 @@ class WearMaterial:
                 )
             parameters[key] = wear_factor
         elif name not in self.laws:
-            law_class(name)  # a name that there is not is another mistake
+            law_class(name)  # an unknown name is another mistake, with its own message
             raise InputError(
                 f"material '{self.name}' has no parameters for the law '{name}'",
                 hint=f"it has: {', '.join(self.laws)}; give the others in a material file",
@@ -130,7 +130,7 @@ def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial
             f"density_kg_per_m3 cannot be {density}", where, f"give {low:g} to {high:g}"
         )
     if not (isinstance(laws, dict) and all(isinstance(table, dict) for table in laws.values())):
-        raise InputError("laws are no tables", where, "write [laws.archard] and its parameters")
+        raise InputError("laws are not tables", where, "write [laws.archard] and its parameters")
     for law, parameters in laws.items():
         wear_law(law, parameters, where)
     if content["law"] not in laws:
@@ -169,7 +169,9 @@ def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]
 
 def _sources(value: Any, where: object) -> tuple[str, ...]:
     if not (isinstance(value, list) and value and all(isinstance(line, str) for line in value)):
-        raise InputError("sources is no list of texts", where, "say where each number comes from")
+        raise InputError(
+            "sources is not a list of texts", where, "say where each number comes from"
+        )
     return tuple(value)
 
 

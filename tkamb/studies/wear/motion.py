@@ -23,21 +23,21 @@ class CycleMotionSettings:
     """How the motion of a wear cycle is read."""
 
     lever_arm: float = 0.025
-    """m; displacement of a condyle per rotation, to compare rotations with translations. Half the
-    distance of the condyles."""
+    """m; displacement of a condyle per rotation, to compare rotations with translations. Chosen:
+    half the distance of the condyles."""
     notable_gap: float = 0.1
-    """Share of the motion's extent; where the ends of a cycle lie farther apart the user is asked.
-    The cycle stays as it is."""
+    """1: share of the motion's extent. If the ends of a cycle lie farther apart, the report
+    mentions it; the cycle is not changed. Chosen: recorded cycles close better."""
 
 
 CYCLE_MOTION = CycleMotionSettings()
 
 
 class Path(NamedTuple):
-    """The way of the femoral component in more poses than there are frames.
+    """Path of the femoral component, with more poses than frames.
 
     Args:
-        poses: (g, 4, 4) pose_femoral_in_insert; y is not used, the load finds it.
+        poses: (g, 4, 4) pose_femoral_in_insert; y is not used, it follows from the load.
         place: (g,) of each pose among the frames: 2.5 is midway between frames 2 and 3.
     """
 
@@ -60,14 +60,14 @@ class CycleMotion:
         poses: (f, 4, 4) pose_femoral_in_insert; the press keeps rotation, x and z.
         load: (f,) N along -y.
         duration: s of a cycle.
-        passes: how often the frames are gone through in a cycle: 1 for a closed cycle, 2 where
-            the way back is the way out.
+        passes: how often a cycle passes the frames: 1 for a closed cycle, 2 for a motion there and
+        back.
         notes: what a reader must know about it.
-        drive: finds the poses anew on every insert, from forces; None: they are prescribed. Those
-            of a driven motion are where its first search begins.
+        drive: finds the poses on every insert from forces; None: they are prescribed. The poses
+        of a driven motion are initial guesses.
         seconds: (f - 1,) duration of each step in one pass; None: all steps are equally long.
-        path: poses at the frames and between them, where more of the motion is known than its
-            frames; None: it is a screw motion from frame to frame.
+        path: poses at the frames and between them, if the motion is known there; None: a screw
+        motion from frame to frame.
         closing: how the recorded frames became a cycle; empty: it is a simulator's profile.
         questions: what a reader must decide before using the numbers.
     """
@@ -146,15 +146,15 @@ class CycleMotion:
         extent = max(distance(poses[0], pose) for pose in poses)
         apart = f"the motion's ends are {gap / MILLIMETRE:.3g} mm apart"
         if closing == "as recorded":
-            notes.append(f"a cycle is the frames as recorded; {apart}, and nothing leads across")
+            notes.append(f"a cycle is the frames as recorded; {apart}, and the gap is not closed")
             return cls(
                 poses, load, span, 1, tuple(notes), seconds=steps, path=path, closing=closing
             )
         if gap > CYCLE_MOTION.notable_gap * extent:
             questions.append(
                 f"{apart}, {gap / extent:.0%} of its extent; the cycle closes by one screw motion "
-                "from the last frame to the first: is that meant? (--close there-and-back, or "
-                "'as recorded')"
+                "from the last frame to the first; check that this is meant (otherwise --close "
+                "there-and-back, or 'as recorded')"
             )
         longest = max(distance(a, b) for a, b in pairwise(poses))
         pieces = 1 if longest == 0 else max(1, int(np.ceil(gap / longest - 1e-9)))

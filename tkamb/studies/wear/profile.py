@@ -47,11 +47,12 @@ class WearProfileSettings:
     """Which load profiles of a simulator are accepted."""
 
     max_force: float = 1e4
-    """N; fifteen body weights."""
+    """N: largest force. Chosen: fifteen body weights."""
     step_tolerance: float = 1e-9
-    """Share of a step by which it may exceed the longest one."""
+    """Share of a step by which it may exceed the longest one. Chosen: above rounding."""
     closure_tolerance: float = 0.01
-    """Share of a column's range by which its last row may differ from its first."""
+    """Share of a column's range by which its last row may differ from its first. Chosen: noise of a
+    profile is smaller."""
 
 
 WEAR_PROFILE = WearProfileSettings()
@@ -90,7 +91,7 @@ class Profile:
         return knee_pose(self.coordinates + zero_at(dwell))
 
     def drive(self, dwell: tuple[float, float], springs: Springs | None) -> ForceDrive | None:
-        """Return what force control does, counted from `dwell` (x, z), m; None: it is none.
+        """Return the force control, with `dwell` (x, z), m, as origin; None: displacement control.
 
         Raises:
             InputError: a spring on a coordinate that is not found from a force.
@@ -154,7 +155,7 @@ def read_profile(path: str | Path, frames: int) -> Profile:
     load = np.interp(rows, percent, columns[LOAD])
     if free and not (columns[LOAD] > 0).all():
         row = int(np.flatnonzero(columns[LOAD] <= 0)[0])
-        what = f"'{LOAD}' is 0 in data row {row + 1}: no contact to find a position by"
+        what = f"'{LOAD}' is 0 in data row {row + 1}: without contact there is no equilibrium"
         raise InputError(what, path, "force control needs more than 0 N in each row")
     coordinates, applied = np.zeros((2, len(rows), 6))
     applied[:, SI] = -load

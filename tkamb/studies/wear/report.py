@@ -1,4 +1,4 @@
-"""What a wear simulation writes: table, summary, maps, the worn insert, a picture."""
+"""Output of a wear simulation: table, summary, maps, the worn insert, a picture."""
 
 import json
 import math
@@ -28,23 +28,24 @@ MILLION = 1e6
 SAMPLES_NAME = ".wear_samples"
 """Folder of the finished samples while a simulation is under way."""
 FIRST = (
-    "Worn volume, mass and depth follow the wear factor, which differs by a factor of two and more "
-    "between laboratories."
+    "Worn volume, mass and depth are proportional to the wear factor, which differs by a factor of "
+    "two and more between laboratories."
 )
-"""What is said before any number."""
+"""Sentence before all numbers."""
 PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
-"""Columns that follow the wear factor in proportion, but for what the worn shape changes."""
+"""Columns that are proportional to the wear factor, apart from the effect of the worn shape."""
 
 
 @dataclass(frozen=True)
 class WearReportSettings:
-    """What a wear report asks about."""
+    """Limits from which a wear report adds a question."""
 
     max_frame_change: float = 0.02
-    """Share of a cycle's volume by which it may change with half as many frames; beyond that the
-    frames are too few."""
+    """1: share of a cycle's volume by which it may change with half as many frames; beyond that the
+    report says that the frames are too few. Chosen: smaller than the error of a wear law."""
     max_map_correction: float = 0.05
-    """Share of a map's force; where its correction is larger the map is too coarse."""
+    """1: share of a map's force that its correction may have; beyond that the report says that the
+    map is too coarse. Chosen: smaller than the error of a wear law."""
     max_published_ratio: float = 3.0
     """Times the published rates; a higher rate is asked about."""
 
@@ -198,8 +199,8 @@ class WearReport:
             )
         if self.state.unsettled:
             questions.append(
-                f"in {self.state.unsettled} blocks the pressure moved away from what it wore, "
-                "however short they were: take more --updates"
+                f"in {self.state.unsettled} blocks the pressure moved away from the worn places, "
+                "even in the shortest block: take more --updates"
             )
         low, high = PUBLISHED_RATES
         if (
@@ -209,7 +210,7 @@ class WearReport:
         ):
             questions.append(
                 f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
-                f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): does the wear factor suit it?"
+                f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): check the wear factor"
             )
         most = max(row.get("failed_rows", 0.0) for row in self.state.rows)
         if most:

@@ -1,4 +1,4 @@
-"""A wear simulation from what a user says to what is written."""
+"""A wear simulation, from the user's options to the written files."""
 
 import math
 from collections.abc import Callable
@@ -64,7 +64,7 @@ class WearRun:
         Args:
             folder: where the state is kept after each block; None: nowhere.
             resume: go on with the state that the folder keeps.
-            progress: is told the cycles that are done.
+            progress: called with the number of finished cycles.
             crew: who computes the samples; default: this process.
             sample_progress: wraps the samples as they come.
 
@@ -119,7 +119,7 @@ class WearRun:
         except KeyboardInterrupt:
             kept = None
             if folder is not None:
-                with suppress(InputError):  # what another simulation left is not ours to tell of
+                with suppress(InputError):  # the state of another simulation is not reported
                     kept = kept_state(folder, identity, count)
             if kept is None:
                 raise
@@ -129,7 +129,7 @@ class WearRun:
 
 @dataclass(eq=False)
 class _Asked:
-    """Material and law: what the call asks for, else what the scene's [wear] says.
+    """Material and law: of the call, otherwise of the scene's [wear].
 
     Args:
         law: name; None: not asked for.
@@ -196,7 +196,7 @@ def prepare_wear(
         raise InputError(f"{period} s", "--period", "give 0.05 to 3600 s a cycle")
     asked = _Asked(law, material, wear_factor)
     if material is not None:
-        asked.check(WearTable(), Path())  # as early as can be
+        asked.check(WearTable(), Path())  # as early as possible
     ready = wear_setup(path, period=period, check=asked.check, **setup)
     made_of, chosen = asked.material_and_law
     case = _case(ready, made_of, chosen)
@@ -209,7 +209,7 @@ def prepare_wear(
 def wear_of_results(
     scene: Scene, path: Path, results: Results, *, cycles: int, updates: int, frames: int
 ) -> WearReport:
-    """Return the wear of an insert by the motion of results that are at hand.
+    """Return the wear of an insert by the motion of results in memory.
 
     Material, law and closing of the cycle are those of the scene's [wear].
 

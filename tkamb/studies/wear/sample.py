@@ -1,8 +1,8 @@
-"""One sample of a wear simulation: the case with its inputs moved by what they may be off.
+"""One sample of a wear simulation: the case with errors in its inputs.
 
-What varies: the wear factor, the constants of creep, the insert's modulus, and the place of the
-whole cycle (the constant part of each pose error; noise per frame has no mean over millions of
-cycles). Loads stay as they are.
+Varied inputs: the wear factor, the constants of creep, the insert's modulus, and the place of the
+whole cycle (the constant part of each pose error; noise per frame averages out over millions of
+cycles). Loads do not vary.
 """
 
 import math
@@ -136,6 +136,6 @@ class WearSampler:
         draw = Draw(self._inputs, normal, np.zeros((1, 0)), self._share)
         try:
             state, _ = simulate_wear(moved_case(case, draw), cycles, updates)
-        except InputError:  # the moved femur lies beside the insert
+        except InputError:  # the displaced femur lies beside the insert
             return {}
         return {key: np.array([row[key] for row in state.rows]) for key in ("cycles", *BANDED)}

@@ -1,4 +1,4 @@
-"""From a scene, a folder of results or a simulator's profile to what is worn by what."""
+"""From a scene, a folder of results or a simulator's profile to the inputs of a wear simulation."""
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,7 +33,7 @@ from tkamb.units import MILLIMETRE
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 AFTER_A_RUN = ("wear",)
-"""Tables of a scene that no run reads: a folder of results takes other keys of them."""
+"""Tables of a scene that a run does not read; they may be changed for a folder of results."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def wear_setup(
     check: Callable[[WearTable, Path], None] = lambda table, path: None,
     progress: Progress = lambda indices: indices,
 ) -> WearSetup:
-    """Return what is worn.
+    """Return the bodies, the motion and the contact of a wear simulation.
 
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
@@ -93,8 +93,8 @@ def wear_setup(
         springs: a file of its springs (`tkamb.studies.wear.springs`), for force control.
         contact: contact model, in place of the scene's.
         resolution_mm: in place of the scene's.
-        frames: most frames of a recorded cycle, fewest of a simulator's; they never change what
-            the cycle is.
+        frames: largest number of frames of a recorded cycle, smallest of a simulator's; the cycle
+        itself does not depend on it.
         period: s of a simulator's cycle.
         close: how recorded frames become a cycle (`tkamb.studies.wear.motion`), in place of the
             scene's [wear] close.
@@ -110,7 +110,7 @@ def wear_setup(
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
     path = Path(path)
     if springs is not None and simulator is None:
-        raise InputError("springs without a simulator", "--springs", "give --simulator too")
+        raise InputError("springs without a simulator", "--springs", "also give --simulator")
     given_keys = dict(overrides or {})
     if close is not None:
         if simulator is not None:

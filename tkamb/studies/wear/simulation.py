@@ -1,4 +1,4 @@
-"""Many cycles in blocks: contact, wear and creep on the insert as the block before has left it."""
+"""Many cycles in blocks: contact, wear and creep on the insert after the last block."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -24,23 +24,26 @@ class WearSimulationSettings:
     """The simulation of wear over many cycles."""
 
     max_cycles: float = 10**9
-    """Largest number of cycles that is accepted: a thousand years of walking."""
+    """Largest number of cycles that is accepted. Chosen: a thousand years of walking."""
     max_updates: int = 10_000
-    """Largest number of updates of the surface that is accepted."""
+    """Largest number of updates of the surface that is accepted. Chosen: files of results stay
+    readable."""
     min_thickness: float = 1e-4
-    """m; an insert that is thinner counts as worn through."""
+    """m; an insert that is thinner counts as worn through. Chosen: no contact model holds for a
+    thinner layer."""
     min_depth: float = 1e-9
-    """m; less depth is no wear."""
+    """m: a smaller depth counts as no wear. Chosen: above the rounding of a mesh."""
     max_pattern_change: float = 0.2
-    """Share of the worn volume that may lie elsewhere after a block of cycles; a block with more is
-    halved."""
+    """1: share of the worn volume that may lie elsewhere after a block of cycles; a block with more
+    is halved. Chosen: smaller than the error of a wear law."""
     max_block_division: int = 256
-    """Ratio of the longest block to the shortest one that is tried."""
+    """Ratio of the longest block to the shortest one that is tried. Chosen: eight halvings."""
     min_row_share: float = 0.5
-    """Share of the rows of a force-controlled profile that must be computed for a cycle to
-    count."""
+    """Share of the rows of a force-controlled profile that must be computed for a cycle to count.
+    Chosen: with less, the cycle is not known."""
     min_improvement: float = 1.1
-    """Factor by which halving a block has to lessen the change for another halving."""
+    """Factor by which halving a block has to lessen the change for another halving. Chosen: with
+    less, more halvings do not help."""
 
 
 WEAR_SIMULATION = WearSimulationSettings()
@@ -51,7 +54,7 @@ MEND = "check load and poses, or another contact model"
 
 
 class Maps(Protocol):
-    """What gives the pressure maps of a cycle: `tkamb.studies.wear.engine.ContactEngine`."""
+    """Source of the pressure maps of a cycle: `tkamb.studies.wear.engine.ContactEngine`."""
 
     def maps(self, insert: Surface, motion: CycleMotion) -> CycleMaps:
         """Return the maps of a motion's frames on an insert."""
@@ -59,7 +62,7 @@ class Maps(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class WearCase:
-    """What is worn, by what.
+    """Bodies, motion and laws of a wear simulation.
 
     Args:
         engine: gives pressure maps.
@@ -91,7 +94,7 @@ class WearState:
         volume: m³, worn off.
         creep_volume: m³, displaced by creep.
         map_error: largest relative correction of a map's force.
-        unsettled: blocks whose pressures changed by more than they should, however short.
+        unsettled: blocks whose pressures changed too much even at the shortest length.
         rows: the table so far, one row per block.
         end: why it ended before the last cycle; empty: it did not.
     """
@@ -116,7 +119,7 @@ class WearState:
 
 @dataclass(frozen=True, eq=False)
 class CycleWear:
-    """What one cycle does to the insert as it is. Arrays are per articular vertex.
+    """Wear of one cycle on the present insert. Arrays are per articular vertex.
 
     Args:
         rate: (n,) m a cycle, along the normal.
@@ -172,19 +175,19 @@ def simulate_wear(
 
     A block takes the maps of the insert as it is at the block's begin and adds their depth per
     cycle times the block's cycles (explicit Euler, first order in the block). No block is longer
-    than cycles / updates. One after which there is no contact, or more than `most_change` of the
-    worn volume lies elsewhere, is taken back and tried at half its length: where a block wears
-    off more than the contact is compressed by, the pressure leaves the place that it wore, and
-    returns to it in the next. The simulation ends early, with the reason in `end`, where the
-    insert is worn through or its contact is lost.
+    than cycles / updates. A block is rejected and repeated at half its length if there is no
+    contact after it, or if more than `most_change` of the worn volume lies elsewhere. (If a block
+    removes more than the compression of the contact, the pressure leaves the worn place and returns
+    to it in the next block.) The simulation ends early, with the reason in `end`, if the insert is
+    worn through or its contact is lost.
 
     Args:
         case: what is worn.
         cycles: at least 1.
         updates: smallest number of blocks.
         state: where an earlier simulation of the same case stopped.
-        keep: is given the state after each block.
-        most_change: 0.5 of the sum of absolute changes over the sum; 1 never takes back.
+        keep: called with the state after each block.
+        most_change: half the sum of absolute changes over the sum; 1: never reject a block.
 
     Raises:
         InputError: impossible numbers, or no contact before or after the shortest first block.
@@ -230,7 +233,7 @@ def simulate_wear(
 
 
 def _cycle(case: WearCase, state: WearState) -> CycleWear | str:
-    """Return what a cycle does to the insert as it is; a text: why it has no contact."""
+    """Return the wear of a cycle on the present insert; a text: why it has no contact."""
     insert = case.articular.lowered(state.fall)
     maps = case.engine.maps(insert, case.motion)
     rows = _rows(maps, case.motion)
@@ -238,7 +241,7 @@ def _cycle(case: WearCase, state: WearState) -> CycleWear | str:
 
 
 def _worn_by(case: WearCase, insert: Surface, maps: CycleMaps, rows: list[int]) -> CycleWear:
-    """Return what a cycle through some rows of the maps does to an insert."""
+    """Return the wear of a cycle through some rows of the maps on an insert."""
     points = insert.vertices[case.articular.vertices]
     normals, area = case.articular.normals_and_areas(insert)
     pressure = maps.pressure[rows] @ interpolation(maps.points, points).T
@@ -258,7 +261,7 @@ def _worn_by(case: WearCase, insert: Surface, maps: CycleMaps, rows: list[int]) 
 
 @dataclass(frozen=True, eq=False)
 class FirstCycle:
-    """What is found out about the first cycle, on the unworn insert.
+    """Checks of the first cycle, on the unworn insert.
 
     Args:
         frames_change: by how much half as many steps change the cycle's volume, relative to it.
@@ -297,8 +300,8 @@ def first_cycle(case: WearCase, laws: Mapping[str, WearLaw]) -> FirstCycle:
 def _rows(maps: CycleMaps, motion: CycleMotion) -> list[int] | str:
     """Return the frames that the cycle goes through; a text: why there is none.
 
-    Rows of a force-controlled profile that failed are left out, and the cycle closed by the first
-    that is left. Frames of a prescribed motion have all to be there.
+    Failed rows of a force-controlled profile are left out, and the first remaining row closes the
+    cycle. Of a prescribed motion every frame is needed.
     """
     every = range(len(motion))
     good = [k for k in every if k not in maps.failed]

@@ -45,7 +45,7 @@ def step_sliding(poses: Array, points: Array, normals: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SlidingHistory:
-    """What the points of the insert see in one cycle, step by step.
+    """Pressure and sliding at the points of the insert in one cycle, step by step.
 
     Args:
         pressure: (s, n) Pa, mean of both ends of each step; zero: no contact.

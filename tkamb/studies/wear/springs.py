@@ -56,7 +56,7 @@ def read_springs(path: str | Path) -> Springs:
     content = read_toml(path, what="springs")
     sources = content.pop("sources", None)
     if not (isinstance(sources, list) and sources and all(isinstance(s, str) for s in sources)):
-        raise InputError("sources is no list of texts", path, "say where each number comes from")
+        raise InputError("sources is not a list of texts", path, "say where each number comes from")
     if not content:
         raise InputError("has no spring", path, f"give {' or '.join(f'[{k}]' for k in KINDS)}")
     springs = {name: _spring(name, table, path) for name, table in content.items()}

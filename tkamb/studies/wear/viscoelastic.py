@@ -18,9 +18,9 @@ class ViscoelasticBedSettings:
     """The press into a viscoelastic bed."""
 
     max_approach: float = 5e-3
-    """m; farthest that a load may press the femoral component into the bed in one step."""
+    """m: largest approach in one step. Chosen: half a usual insert's thickness."""
     approach_tolerance: float = 1e-9
-    """m; tolerance of the approach that carries a load."""
+    """m; tolerance of the approach that carries a load. Chosen: far below what changes a force."""
 
 
 VISCOELASTIC_BED = ViscoelasticBedSettings()
@@ -100,7 +100,7 @@ class ViscoelasticBed:
 
     Each column of the bed (`tkamb.contact.samples`) has the linear foundation's pressure p = M d/h
     with M relaxing as a Prony series. A column that the femur leaves carries nothing and creeps
-    back: its strain is then what makes its stress zero. The load acts along -y.
+    back: its strain is then the one at which its stress is zero. The load acts along -y.
 
     Limits: as the linear elastic foundation; one modulus, relaxing in volume and shape alike.
 

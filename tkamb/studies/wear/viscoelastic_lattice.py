@@ -5,8 +5,8 @@ insert moves by its elastic compliance C_0 and a hereditary integral,
 
     C_0 f(t) = integral of M(t - s)/M_0 du(s),
 
-at every node, whatever the contact did before: nodes that the femoral component has left carry
-nothing and creep back by the same equation. Over a step in which u is linear in time it reads
+at every node. Nodes that the femoral component has left carry no force and creep back by the same
+equation. Over a step in which u is linear in time it reads
 C_0 f' = slope u' + carried, `carried` the part of the history (`PronySeries.response`). A step is
 therefore the elastic contact with the compliance C_0/slope on a surface that is displaced by
 -carried/slope already: the solver of `lattice-linear` finds it.
@@ -73,7 +73,7 @@ class ViscoelasticLattice:
 
         Raises:
             InputError: a load that cannot be, or the femoral component is not over the insert.
-            ComputationError: the contact does not come to rest.
+            ComputationError: the contact does not converge.
         """
         check_load(load)
         return self._step(load, pose, step)
@@ -134,12 +134,12 @@ class ViscoelasticLattice:
     ) -> Solution:
         """Solve with growing sets of candidates until they cover the approach."""
         (gaps, planes), state = rest, self._state
-        sunk = -float(offset[:, 1].min())  # what crept lies deeper than the gaps say
+        sunk = -float(offset[:, 1].min())  # crept nodes lie deeper than their gaps
         depth = -float(gaps.min())
         if load is not None:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load / slope) + sunk
         for _ in range(self._settings.max_expansions):
-            guess = initial_guess(state.compliance, gaps, planes, depth, load is None, None, None)
+            guess = initial_guess(state.compliance, gaps, planes, depth, load is None)
             result = solve(state.problem, pose, load, _softer(guess, slope, offset), self._settings)
             if not result.converged:
                 break
@@ -147,10 +147,10 @@ class ViscoelasticLattice:
             if covered or result.forces.approach * REACH <= guess.reach:
                 return result
             depth = 1.1 * result.forces.approach
-        raise ComputationError("the contact does not come to rest", "viscoelastic")
+        raise ComputationError("the contact does not converge", "viscoelastic")
 
 
 def _softer(guess: InitialGuess, slope: float, offset: Array) -> InitialGuess:
-    """Return where the solver begins on springs that are softer, and displaced already."""
+    """Return the initial guess of the solver on softer, already displaced springs."""
     response = replace(guess.response, compliance=guess.response.compliance / np.float32(slope))
     return replace(guess, response=response, offset=offset[guess.candidates])

@@ -22,12 +22,13 @@ class WornSurfaceSettings:
     """The surface from which wear is removed."""
 
     min_normal_y: float = 0.1
-    """Smallest y component of the normal of a face that can be worn from above: 84 deg from the
-    horizontal."""
+    """1: smallest y component of the normal of a face that can be worn from above. Chosen: 84 deg
+    from the horizontal."""
     ray_offset: float = 1e-6
-    """m; rays through the insert start so far below its surface."""
+    """m; rays through the insert start so far below its surface. Chosen: above the rounding of a
+    mesh."""
     max_halvings: int = 12
-    """Halvings of an edge; one of a metre ends at a quarter of a millimetre."""
+    """Halvings of an edge. Chosen: one of a metre ends at a quarter of a millimetre."""
 
 
 WORN_SURFACE = WornSurfaceSettings()
@@ -35,13 +36,13 @@ WORN_SURFACE = WornSurfaceSettings()
 
 @dataclass(frozen=True, eq=False)
 class ArticularSurface:
-    """The vertices of the insert that face upwards, and what of the surface each stands for.
+    """The vertices of the insert that face upwards, with their tributary areas.
 
     A vertex owns a third of each of its triangles. Its normal n is the direction of the summed
-    area vectors of those that face upwards, its area the sum of the y components of all over
+    area vectors of those that face upwards. Its area is the sum of the y components of all, over
     n_y: a rim has the normal of the surface, not of the wall. A depth h along the normal is
-    taken off by moving the vertex down by h/n_y. x and z of no vertex change, and the volume of
-    a closed surface is linear in y then, so that
+    removed by moving the vertex down by h/n_y. x and z do not change, and the volume of a closed
+    surface is then linear in y, so that
 
         volume removed = sum over vertices of h times area
 

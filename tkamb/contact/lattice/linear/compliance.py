@@ -15,9 +15,10 @@ class ComplianceSettings:
     """The stored compliance of candidate nodes."""
 
     max_nodes: int = 1500
-    """Nodes of the stored compliance. Its matrix then takes 80 MB."""
+    """Nodes of the stored compliance. Chosen: its matrix then takes 80 MB."""
     spare_nodes: int = 100
-    """Nodes that may be added before the arrays have to grow. It trades memory against copies."""
+    """Nodes that may be added before the arrays have to grow. Chosen: it trades memory against
+    copies."""
 
 
 COMPLIANCE = ComplianceSettings()

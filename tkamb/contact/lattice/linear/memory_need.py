@@ -21,7 +21,8 @@ class MemoryNeedSettings:
     """The estimate of a lattice's memory before it is made."""
 
     unknowns_per_node: int = 3
-    """Unknowns of a node: each boundary is counted as if all of its displacements were free."""
+    """Unknowns of a node. By definition: each boundary is counted as if all of its displacements
+    were free."""
     cell_bytes: int = 20_000
     """Bytes of a cell while its stiffness is put into the global matrix. Measured: 9 to 22 kB."""
     entry_bytes: int = 36
@@ -29,13 +30,14 @@ class MemoryNeedSettings:
     order; the rest stands for what the compliance is made of meanwhile. Measured: without
     it the estimate is 12 % low."""
     safety_factor: float = 1.1
-    """1: factor for what the estimate leaves out."""
+    """1: factor for what the estimate leaves out. Chosen: a proposal that fits is better than one
+    that nearly fits."""
     memory_exponent: float = 3.0
     """1: memory falls at least with this power of the cell size. Measured: 3.7."""
     cell_size_step: float = 0.05e-3
-    """m: proposed cell sizes are multiples of it."""
+    """m: proposed cell sizes are multiples of it. Chosen: proposals are round numbers."""
     largest_cell_size: float = 5e-3
-    """m: larger cells are not proposed, as a condyle's contact would be two cells wide."""
+    """m: larger cells are not proposed. Chosen: a condyle's contact would be two cells wide."""
 
 
 MEMORY_NEED = MemoryNeedSettings()

@@ -33,7 +33,7 @@ class OperatorSettings:
     """Seed of the random vectors by which the operator's error is measured. Fixed, so that a
     run repeats."""
     max_fronts_ahead: int = 128
-    """Fronts by which the factorisation may be ahead of the compliance; they stay whole in
+    """Fronts by which the factorisation may be ahead of the compliance. Chosen: they stay whole in
     memory for so long."""
 
 

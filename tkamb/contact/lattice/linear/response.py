@@ -32,10 +32,11 @@ class ResponseSettings:
     """Products of the factor with columns of forces."""
 
     gathered_columns: int = 512
-    """Columns that are copied for BLAS at a time, 3 MB: about the size of a processor's cache."""
+    """Columns that are copied for BLAS at a time. Chosen: 3 MB, about the size of a processor's
+    cache."""
     few_columns: int = 12
-    """Columns up to which products are taken in place, because a copy for BLAS costs more than
-    it gains."""
+    """Columns up to which products are taken in place. Chosen: a copy for BLAS costs more than it
+    gains."""
 
 
 RESPONSE = ResponseSettings()

@@ -22,19 +22,20 @@ class ColumnSettings:
     """The columns of nodes that a lattice stands on."""
 
     tie: float = 1e-6
-    """Cells: a distance this near half a cell counts as half a cell, so that rounding does not
+    """Cells: a distance this near half a cell counts as half a cell. Chosen: rounding does not
     decide."""
     side_tolerance: float = 0.02
-    """Cells: vertices this near the bounding box lie on its side; the difference is noise of
-    the mesh."""
+    """Cells: vertices this near the bounding box lie on its side. Chosen: the difference is noise
+    of the mesh."""
     wall_normal_y: float = 0.05
-    """1: a triangle whose normal has a smaller superior component (87 deg) belongs to a wall."""
+    """1: a triangle whose normal has a smaller superior component (87 deg) belongs to a wall.
+    Chosen: no surface that carries is as steep."""
     wall_inset: float = 0.02
-    """Cells: distance that a node stays inside a wall, because rays along y miss a wall at its
+    """Cells: distance that a node stays inside a wall. Chosen: rays along y miss a wall at its
     hit."""
     max_height_change: float = 0.75
-    """Cells: a surface whose height changes by more from one column to the next is another
-    surface."""
+    """Cells: a surface whose height changes by more from one column to the next is another surface.
+    Chosen: a slope that a column of cells can follow changes by less."""
 
 
 COLUMN = ColumnSettings()

@@ -18,10 +18,11 @@ class ContactMapSettings:
     """Which triangle of the insert a contact node lies on."""
 
     ray_start_height: float = 1e-4
-    """m: height above a node at which the ray that looks for its triangle begins."""
+    """m: height above a node at which the ray that looks for its triangle begins. Chosen: above the
+    rounding of a mesh, below the next surface."""
     on_mesh_distance: float = 1e-6
-    """m: a node this near to a triangle lies on it. Meshes in single precision round by some
-    1e-9 m."""
+    """m: a node this near to a triangle lies on it. Chosen: meshes in single precision round by
+    some 1e-9 m."""
 
 
 CONTACT_MAP = ContactMapSettings()

@@ -39,19 +39,20 @@ class GridSettings:
     """The regular grid of a lattice."""
 
     max_edge_ratio: float = 1.4
-    """1: longest over shortest edge of a grid cell. Flatter hexahedra are too stiff in
+    """1: longest over shortest edge of a grid cell. Chosen: flatter hexahedra are too stiff in
     bending."""
     bottom_tolerance: float = 5e-5
-    """m: nodes this near the plane of the flat bottom lie in it. It is what meshes of flat
+    """m: nodes this near the plane of the flat bottom lie in it. Chosen: what meshes of flat
     bottoms vary by."""
     max_cells: int = 1_000_000
-    """Cells of a grid over the bounding box: a knee's at 0.35 mm, which takes more than fifty
-    gigabytes."""
+    """Cells of a grid over the bounding box. Chosen: a knee's at 0.35 mm, which takes more than
+    fifty gigabytes."""
     least_jacobian: float = 0.05
-    """1: a surface cell with a smaller scaled Jacobian is left out; its stiffness would be
+    """1: a surface cell with a smaller scaled Jacobian is left out. Chosen: its stiffness would be
     ill-conditioned."""
     least_edge: float = 0.2
-    """Share of the spacing, 1: a surface cell with a shorter edge is left out."""
+    """Share of the spacing, 1: a surface cell with a shorter edge is left out. Chosen: its
+    stiffness would be ill-conditioned."""
 
 
 GRID = GridSettings()

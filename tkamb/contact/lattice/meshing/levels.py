@@ -26,11 +26,14 @@ class LayerSettings:
     """The layers of cells below the articular surface."""
 
     max_edge_ratio: float = 1.4
-    """1: longest over shortest edge of a cell before its nodes are moved onto the surface."""
+    """1: longest over shortest edge of a cell before its nodes are moved onto the surface. Chosen:
+    flatter hexahedra are too stiff in bending."""
     max_slope: float = 1.0
-    """1: steepest slope, rise over run, that the layers follow (45 deg)."""
+    """1: steepest slope, rise over run, that the layers follow (45 deg). Chosen: steeper layers
+    would shear the cells."""
     max_low_share: float = 0.01
-    """1: largest share of the columns that may be too low for the layers."""
+    """1: largest share of the columns that may be too low for the layers. Chosen: a few columns at
+    the rim."""
 
 
 LAYER = LayerSettings()

@@ -19,16 +19,16 @@ class NotchSettings:
     """Nodes that are moved into notches of the surface."""
 
     corner_margin: float = 0.1
-    """1: share of the way that a node stays short of the line between its neighbours. On the
-    line the cell's corner would be flat."""
+    """1: share of the way that a node stays short of the line between its neighbours. Chosen: on
+    the line the cell's corner would be flat."""
     corner_inset: float = 1e-3
-    """1: share of the way inwards by which a node stays inside its corner, so that rays along
-    y hit."""
+    """1: share of the way inwards by which a node stays inside its corner. Chosen: rays along y
+    hit."""
     ray_start_cells: float = 0.1
-    """Cells below a node on the top, or above one underneath, at which rays ask what is
-    inside."""
+    """Cells below a node on the top, or above one underneath, at which rays ask what is inside.
+    Chosen: above the rounding of a mesh, within the cell."""
     max_move_diagonals: float = 0.75
-    """Diagonals of a cell's face: largest move of a node. A larger one would turn the cell
+    """Diagonals of a cell's face: largest move of a node. Chosen: a larger one would turn the cell
     inside out."""
 
 

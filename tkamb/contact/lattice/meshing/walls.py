@@ -24,10 +24,11 @@ class WallSettings:
     """Nodes that are moved onto side walls."""
 
     wall_inset: float = 1e-6
-    """Cells: distance that a node stays inside the wall it is moved to, so that rays along y
-    still hit."""
+    """Cells: distance that a node stays inside the wall it is moved to. Chosen: rays along y still
+    hit."""
     ray_start_cells: float = 0.1
-    """Cells: depth below the node's surface at which rays sideways begin."""
+    """Cells: depth below the node's surface at which rays sideways begin. Chosen: above the
+    rounding of a mesh, within the cell."""
 
 
 WALL_NODE = WallSettings()

@@ -60,16 +60,12 @@ class BbarHexahedra(Solid):
         force = self._per_cell_forces(strain, None) + self.bulk_force(displacement)
         return self.scatter.sum(force)
 
-    def nonlinear_residual(
-        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
         # The residual is what the elastic operator has too much: (mu - mu_s) times the deviatoric
         # strain.
         softened = self.material.shear_modulus - self.curve.modulus(equivalent)
-        if lost is not None:
-            lost[:] = self.curve.lost(equivalent).mean(axis=1)
         strain *= (softened * elements_of(self.weights, chosen))[..., None]
         return self._per_cell_forces(strain, chosen)
 

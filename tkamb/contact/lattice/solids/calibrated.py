@@ -28,13 +28,11 @@ from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS
 from tkamb.contact.lattice.solids.cell_loops import (
     cell_forces,
     deviatoric_matrices,
-    largest_pull,
     shear_forces,
     softened_forces,
-    strained_cells,
 )
 from tkamb.contact.lattice.solids.curve import STRESS_CURVE, ShearCurve
-from tkamb.contact.lattice.solids.solid import SOLID, ScreenedElements, Solid, chunks
+from tkamb.contact.lattice.solids.solid import Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
@@ -146,14 +144,10 @@ class CalibratedNetwork(Solid):
         force *= self.material.shear_modulus
         return self.scatter.sum(force + self.bulk_force(displacement))
 
-    def nonlinear_residual(
-        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return (mu - mu_s) K_d u of the cells, N, (k, 24); see `Solid`."""
         cells = np.arange(len(self.cells)) if chosen is None else chosen
-        lost = np.empty(len(cells)) if lost is None else lost
         if self.curve.spline is None:
-            lost[:] = 0.0
             return np.zeros((len(cells), 24))
         curve = (
             self.curve.shear_modulus,
@@ -165,7 +159,7 @@ class CalibratedNetwork(Solid):
 
         def softened(some: slice) -> None:
             shapes, where = self._shapes, (self.cells, cells[some], displacement)
-            softened_forces(*shapes, *curve, *where, forces[some], lost[some])
+            softened_forces(*shapes, *curve, *where, forces[some])
 
         in_halves(softened, len(cells))
         return forces
@@ -190,38 +184,6 @@ class CalibratedNetwork(Solid):
 
         (first, work), (second, more) = in_halves(added, len(self.cells))
         return first + second, residuals, work + more
-
-    def noticeable(self, displacement: Array, share: float) -> ScreenedElements | None:
-        """Return the cells whose share of h may exceed `share`, N; see `Solid`.
-
-        |(mu - mu_s) K_d u| <= (mu - mu_s) e (3 V lambda)^½, lambda the largest eigenvalue of K_d.
-        """
-        if self.curve.spline is None:
-            return None
-        corners, gradients, volume, _ = self._shapes
-        strain = min(
-            self.curve.strain_that_softens(share / self._largest), SOLID.always_checked_strain
-        )
-
-        def noticed(some: slice) -> tuple[Index, Array]:
-            shapes = corners[some], gradients[some], volume[some], self._stiffest
-            limits = strain, 3 * SOLID.always_checked_strain
-            numbers, norms = strained_cells(*shapes, self.cells[some], displacement, *limits)
-            return numbers + some.start, norms
-
-        both = in_halves(noticed, len(self.cells))
-        return ScreenedElements(*(np.concatenate(parts) for parts in zip(*both, strict=True)))
-
-    @cached_property
-    def _stiffest(self) -> float:
-        """Twice the largest sum of the springs of one node, m."""
-        return float(2 * np.bincount(PAIRS.ravel(), np.repeat(self.springs, 2)).max())
-
-    @cached_property
-    def _largest(self) -> float:
-        """A bound of (3 V lambda)^½ of all cells, m²."""
-        corners, gradients, volume, _ = self._shapes
-        return largest_pull(corners, gradients, volume, self._stiffest)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""

@@ -90,88 +90,6 @@ def _along(one: Array, other: Array) -> float:
 
 
 @compiled
-def largest_pull(corners: Array, gradients: Array, volumes: Array, stiffest: float) -> float:
-    """Return a bound of (3 V lambda)^½ of all cells, m², lambda the largest eigenvalue of K_d.
-
-    lambda <= 2 V |g|² + `stiffest` |P|²; P = I - x gᵀ is a projection as x gᵀ is, whose norms are
-    the same and no larger than |x| |g|. See `strained_cells` for the arguments.
-    """
-    largest = 0.0
-    for cell in range(len(corners)):
-        shape = _square_norm(gradients[cell])
-        lambda_ = 2 * volumes[cell] * shape + stiffest * _square_norm(corners[cell]) * shape
-        largest = max(largest, 3 * volumes[cell] * lambda_)
-    return np.sqrt(largest)
-
-
-@compiled
-def _square_norm(matrix: Array) -> float:
-    """Return a bound of the squared spectral norm of a matrix (3, 8) less its rows' means."""
-    mean, largest = np.zeros(3), 0.0
-    for a in range(3):
-        for i in range(8):
-            mean[a] += matrix[a, i] / 8
-    for a in range(3):
-        row = 0.0
-        for b in range(3):
-            row += abs(_along(matrix[a], matrix[b]) - 8 * mean[a] * mean[b])
-        largest = max(largest, row)
-    return largest
-
-
-@compiled
-def strained_cells(
-    corners: Array,
-    gradients: Array,
-    volumes: Array,
-    stiffest: float,
-    nodes: Index,
-    displacement: Array,
-    strain: float,
-    dilatation: float,
-) -> tuple[Index, Array]:
-    """Return the cells whose strain or dilatation may exceed its limit, and their mean strains.
-
-    The other cells are certain to be below. The mean strain is the norm of sym G.
-
-    With the parts G x and r of the displacement, uᵀ K_d u is 2 V |dev sym G|² and what the springs
-    store of r. That is no more than `stiffest` |r|²: K_spr is no larger than the Laplacian of the
-    same springs without directions, and that no larger than twice its largest diagonal entry.
-
-    Args:
-        corners: (c, 3, 8) m.
-        gradients: (c, 3, 8) 1/m.
-        volumes: (c,) m³.
-        stiffest: m, twice the largest sum of the springs of one node.
-        nodes: (c, 8) of the cells.
-        displacement: (n, 3) m.
-        strain: limit of the equivalent strain e, e² = uᵀ K_d u / (3 V).
-        dilatation: limit of |tr G|.
-    """
-    numbers, norms, count = np.empty(len(nodes), np.int64), np.empty(len(nodes)), 0
-    u, rest = np.empty((3, 8)), np.empty((3, 8))
-    for cell in range(len(nodes)):
-        xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(
-            corners[cell], gradients[cell], nodes[cell], displacement, u, rest
-        )
-        mean = (xx + yy + zz) / 3
-        shear = ((xy + yx) ** 2 + (xz + zx) ** 2 + (yz + zy) ** 2) / 2
-        shear += (xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2
-        size = 0.0
-        for a in range(3):
-            square = total = 0.0
-            for i in range(8):
-                square += rest[a, i] * rest[a, i]
-                total += rest[a, i]
-            size += square - total * total / 8
-        small = 2 * volumes[cell] * shear + stiffest * size <= 3 * volumes[cell] * strain**2
-        if not (small and abs(3 * mean) <= dilatation):  # NaN is not small
-            numbers[count], norms[count] = cell, np.sqrt(shear + 3 * mean**2)
-            count += 1
-    return numbers[:count].copy(), norms[:count].copy()
-
-
-@compiled
 def _shear_force(
     x: Array,
     g: Array,
@@ -275,11 +193,8 @@ def softened_forces(
     chosen: Index,
     displacement: Array,
     forces: Array,
-    lost: Array,
 ) -> None:
-    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`, 1 - mu_t/mu (k,) into `lost`.
-
-    See `shear_forces`.
+    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`; see `shear_forces`.
 
     Args:
         corners: (c, 3, 8) m.
@@ -294,7 +209,6 @@ def softened_forces(
         chosen: (k,) cells.
         displacement: (n, 3) m.
         forces: (k, 24).
-        lost: (k,).
     """
     u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
     for k in range(len(chosen)):
@@ -306,8 +220,6 @@ def softened_forces(
         y = strain - knots[part]
         stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
         softened = shear_modulus - stress / (3 * strain)
-        slope = (3 * cubic[0, part] * y + 2 * cubic[1, part]) * y + cubic[2, part]
-        lost[k] = 1 - slope / (3 * shear_modulus)
         for i in range(8):
             for a in range(3):
                 forces[k, 3 * i + a] = softened * force[a, i]

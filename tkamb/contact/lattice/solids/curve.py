@@ -10,7 +10,6 @@ E/(9 K) = (1 - 2 nu)/3 < 1. Strains are engineering strains of the undeformed sh
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -24,8 +23,8 @@ class StressCurveSettings:
     """A measured stress-strain curve."""
 
     least_strain: float = 1e-9
-    """1: below this strain the secant modulus is that at this strain, because stress over
-    strain is 0/0 at zero."""
+    """1: below this strain the secant modulus is that at this strain. Chosen: above zero, where
+    stress over strain is 0/0."""
 
 
 STRESS_CURVE = StressCurveSettings()
@@ -65,29 +64,6 @@ class ShearCurve:
             return np.full_like(equivalent, self.shear_modulus)
         floored = np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1])
         return self.spline(floored) / (3 * floored)
-
-    def strain_that_softens(self, stress: float) -> float:
-        """Return an equivalent strain e up to which (mu - mu_s) e stays below a stress, Pa.
-
-        It grows with e, as q' never exceeds 3 mu.
-        """
-        assert self.spline is not None
-        beyond = self._softened >= stress
-        first = int(beyond.argmax()) if beyond.any() else len(beyond)
-        return float(self.spline.x[max(first - 1, 0)])
-
-    @cached_property
-    def _softened(self) -> Array:
-        """Return (mu - mu_s) e = mu e - q(e)/3, Pa, at the spline's knots."""
-        assert self.spline is not None
-        return self.shear_modulus * self.spline.x - self.spline(self.spline.x) / 3
-
-    def lost(self, equivalent: Array) -> Array:
-        """Return the lost share of the tangent, 1 - (dq/de)/(3 mu), at strains e >= 0."""
-        if self.spline is None:
-            return np.zeros_like(equivalent)
-        slope = self.spline(np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1]), 1)
-        return np.asarray(1 - slope / (3 * self.shear_modulus))
 
     def softening(self, equivalent: Array) -> Array:
         """Return (d mu_s / d e) / e, Pa, at equivalent strains e >= 0: never positive."""

@@ -23,8 +23,6 @@ class SolidSettings:
 
     cells_at_once: int = 2000
     """Cells whose matrices are in memory at once, 9 MB."""
-    always_checked_strain: float = 0.1
-    """1: elements with a larger strain are always checked for yield."""
 
 
 SOLID = SolidSettings()
@@ -188,19 +186,6 @@ def _mean_strains(cells: Index, gradients: Array, displacement: Array, chosen: I
     return strains
 
 
-@dataclass(frozen=True, eq=False)
-class ScreenedElements:
-    """Elements that a bound does not rule out.
-
-    Args:
-        elements: (k,) increasing.
-        strain: (k,) norms of their mean strains.
-    """
-
-    elements: Index
-    strain: Array
-
-
 class Solid(ABC):
     """Cells of eight nodes with a material, small strain.
 
@@ -247,15 +232,12 @@ class Solid(ABC):
         """Linear stiffness (3n, 3n), N/m; assembled anew, it is as large as half of the factor."""
 
     @abstractmethod
-    def nonlinear_residual(
-        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear forces minus the material's own, N, of elements of `scatter` (k, 3p).
 
         Args:
             displacement: (n, 3) m; only the chosen elements' nodes are used.
             chosen: (k,) elements; all by default.
-            lost: (k,) output: lost share of each element's tangent stiffness, 0 to 1.
         """
 
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
@@ -274,19 +256,6 @@ class Solid(ABC):
         beyond = self.linear_force(further) - self.residual_force(further)
         work = float(np.vdot(displacement, beyond - internal)) / DIFFERENCE
         return internal, residuals, work
-
-    def noticeable(self, displacement: Array, share: float) -> ScreenedElements | None:
-        """Return the elements whose contribution to h may matter; None: all may.
-
-        Every other element has a norm of `nonlinear_residual` of at most `share`, N, and principal
-        strains of the mean gradient within ±2 `SOLID.always_checked_strain`.
-
-        Args:
-            displacement: (n, 3) m.
-            share: N.
-        """
-        del displacement, share
-        return None
 
     def residual_force(self, displacement: Array) -> Array:
         """Return h = K u - f(u), N, (n, 3): linear forces minus the material's own."""
@@ -307,27 +276,20 @@ class Solid(ABC):
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
 
-    def least_principal_strain(
-        self, displacement: Array, some: ScreenedElements | None = None
-    ) -> float:
-        """Return the smallest principal strain of the mean gradients of cells, by default of all.
+    def least_principal_strain(self, displacement: Array) -> float:
+        """Return the smallest principal strain of the mean gradients of all cells.
 
         A principal strain is no smaller than minus the norm of its tensor. Where the cell of
         largest norm is compressed, only cells whose norm exceeds that compression are evaluated.
         """
-        if some is None:
-            strain = self.strain(displacement)
-            norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
-            some = ScreenedElements(np.arange(len(strain)), norms)
-        if not len(some.elements):
-            return 0.0
-        most = int(some.strain.argmax())
-        largest = self.strain(displacement, some.elements[[most]])
+        strain = self.strain(displacement)
+        norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
+        most = int(norms.argmax())
         # The norm of a strain bounds its principal values, so that elements with a smaller norm
         # than the compression found already cannot have more.
-        near = some.strain >= -np.linalg.eigvalsh(largest)[0, 0]
-        near[most] = True  # under compression along one axis norm and compression may be equal
-        return float(np.linalg.eigvalsh(self.strain(displacement, some.elements[near])).min())
+        near = norms >= -np.linalg.eigvalsh(strain[most])[0]
+        near[most] = True  # compressed along one axis its norm is its compression, but for rounding
+        return float(np.linalg.eigvalsh(strain[near]).min())
 
     def bulk(self, cells: slice) -> Array:
         """Return K V g gᵀ of some cells (k, 24, 24), N/m, g · u their mean dilatation."""

@@ -23,6 +23,7 @@ from tkamb.contact.lattice.active_set import ContactForces
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.model import CellContact
+from tkamb.contact.lattice.nonlinear_balance import Residual
 from tkamb.contact.lattice.problem import ContactProblem, Direction, TangentPlanes
 from tkamb.contact.lattice.report import PressureRule
 from tkamb.contact.lattice.settings import LatticeSolverSettings
@@ -254,7 +255,7 @@ def _solution(
     ended = ContactForces(
         forces.force, forces.gap, forces.approach, forces.active, forces.sets, converged
     )
-    residual = max(missed, pressed.residual)
+    residual = Residual(max(missed, pressed.residual))
     return Solution(
         guess.candidates, ended, planes, pressed.field[nodes], pressed.field, None, loops, residual
     )

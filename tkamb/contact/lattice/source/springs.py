@@ -92,9 +92,7 @@ class SourceNetwork(Solid):
         k = np.full(len(self.springs), self.material.young_modulus * self.factor)
         return self.tangent_force(Tangent(k, self._straight), displacement)
 
-    def nonlinear_residual(
-        self, displacement: Array, chosen: Index | None = None, lost: Array | None = None
-    ) -> Array:
+    def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
         springs = slice(None) if chosen is None else chosen
         strain, direction = self._state(displacement, springs)
@@ -106,8 +104,6 @@ class SourceNetwork(Solid):
         # network.
         now = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
         softened = self.factor * (linear - now)
-        if lost is not None:
-            lost[:] = 1 - self.material.tangent(strain) / self.material.young_modulus
         return np.hstack([-softened, softened])
 
     def internal_force(self, displacement: Array) -> Array:

@@ -41,6 +41,7 @@ class Bench {
     this.state = structuredClone(request.start);
     this.count = {asked: 0, shown: 0, dropped: 0};
     this.inputs = {};
+    this.maps = {};
     this.addChoices();
     for (const [group, rows] of Object.entries(SLIDERS)) {
       SLIDERS[group] = rows.filter(([key]) => this.applies(key));
@@ -160,7 +161,7 @@ class Bench {
   // One request is under way at most; the newest state waits, and is asked next.
   ask(moving) {
     clearTimeout(this.timer);
-    if (moving) this.timer = setTimeout(() => this.ask(false), SETTLE_MS);
+    this.timer = moving ? setTimeout(() => this.ask(false), SETTLE_MS) : 0;
     const request = structuredClone(this.state);
     if (moving) [request.contact, request.resolution_mm] = this.coarse;
     if (this.waiting) this.count.dropped++;
@@ -252,12 +253,11 @@ class Bench {
 
   drawMap(map, answer) {
     const view = tkamb.views[0], key = answer.map;
-    if (this.mapKey === key) {
-      view.map.levels = map.levels;
-    } else {
-      this.mapKey = key;
-      view.runMap = map;
-      tkamb.showMap(view, map);
+    const known = this.maps[key] = this.maps[key] || map;
+    known.levels = map.levels;
+    if (view.map !== known) {
+      view.runMap = known;
+      tkamb.showMap(view, known);
     }
     if (tkamb.data.peak_MPa !== answer.scale_MPa) {
       tkamb.data.peak_MPa = answer.scale_MPa;

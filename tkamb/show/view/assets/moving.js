@@ -174,8 +174,7 @@ function placeMarker(marker, k) {
 tkamb.colourMap = function (view, k) {
   const map = view.map;
   if (!map) return;
-  const mesh = tkamb.node(`${view.root}/pressure map/map/<object>`).object;
-  const {level} = mesh.geometry.attributes, start = map === view.runMap ? k * map.count : 0;
+  const {level} = map.geometry.attributes, start = map === view.runMap ? k * map.count : 0;
   for (let i = 0; i < map.count; i++) level.array[i] = map.levels[start + i] / 32767;
   level.needsUpdate = true;
 };

@@ -157,10 +157,18 @@ function scaleTexture(colours) {
 tkamb.showMap = function (view, map) {
   view.map = map;
   if (!map) return;
-  const {THREE} = MeshCat, geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(map.points, 3));
-  geometry.setAttribute("level", new THREE.BufferAttribute(new Float32Array(map.count), 1));
-  geometry.setIndex(new THREE.BufferAttribute(map.triangles, 1));
+  const {THREE} = MeshCat;
+  if (!map.geometry) {
+    map.geometry = new THREE.BufferGeometry();
+    map.geometry.setAttribute("position", new THREE.BufferAttribute(map.points, 3));
+    map.geometry.setAttribute("level", new THREE.BufferAttribute(new Float32Array(map.count), 1));
+    map.geometry.setIndex(new THREE.BufferAttribute(map.triangles, 1));
+  }
+  if (view.mapMesh) {  // a new material would be compiled again
+    view.mapMesh.geometry.dispose();
+    view.mapMesh.geometry = map.geometry;
+    return;
+  }
   const material = new THREE.ShaderMaterial({
     uniforms: {scale: {value: tkamb.scale}},
     vertexShader: `attribute float level; varying float shade;
@@ -172,9 +180,9 @@ tkamb.showMap = function (view, map) {
         gl_FragColor = texture2D(scale, vec2(shade * 255.0 / 256.0 + 0.5 / 256.0, 0.5)); }`,
     side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -8,
   });
-  const mesh = new THREE.Mesh(geometry, material);
-  mesh.frustumCulled = false;
-  tkamb.viewer.set_object(tkamb.split(`${view.root}/pressure map/map`), mesh);
+  view.mapMesh = new THREE.Mesh(map.geometry, material);
+  view.mapMesh.frustumCulled = false;
+  tkamb.viewer.set_object(tkamb.split(`${view.root}/pressure map/map`), view.mapMesh);
 };
 
 function addMarker(viewer, marker) {

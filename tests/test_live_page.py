@@ -1,0 +1,120 @@
+"""The page of `tkamb live` in a headless browser: keys, sliders, states that fail, what is kept."""
+
+import pytest
+
+import tkamb
+from headless import Page
+from scenes import MODEL
+
+IDLE = "tkamb.bench && !tkamb.bench.busy && !tkamb.bench.waiting"
+
+
+@pytest.fixture(scope="module")
+def page(chromium, tmp_path_factory):
+    changes = {"contact.model": "foundation", "contact.resolution_mm": 3.0}
+    knee, motion, _ = tkamb.read_scene(tkamb.load_scene(MODEL / "scene.toml", changes))
+    server = knee.live(motion.q[60], load=800.0, folder=tmp_path_factory.mktemp("kept"))
+    page = Page(chromium).open(server.url)
+    page.wait(f"{IDLE} && tkamb.bench.reference")
+    yield page
+    page.close()
+    server.close()
+
+
+def at_rest(page, action):
+    """Do something, and return the state of the page when all is answered."""
+    page.evaluate(action)
+    page.wait(f"{IDLE} && !tkamb.bench.timer")
+    return page.evaluate(
+        """() => ({mark: document.getElementById("mark").textContent,
+          stale: document.body.classList.contains("stale"),
+          request: tkamb.bench.answer.request, numbers: tkamb.bench.answer.numbers,
+          shown: document.querySelector("[data-name=medial_force_N]").textContent})"""
+    )
+
+
+def change(group, key, value):
+    return f"() => tkamb.bench.change('{group}', '{key}', {value}, false)"
+
+
+def test_a_knee_object_has_a_page_without_frames(page):
+    assert page.problems == []
+    assert page.evaluate("() => document.getElementById('pose-frame')") is None
+    assert page.evaluate("() => tkamb.bench.answer.request.load_N") == 800.0
+    assert page.evaluate("() => document.getElementById('pose-thickness_mm')") is None
+
+
+def test_a_key_moves_a_slider_and_the_fine_model_answers(page):
+    page.evaluate("() => document.getElementById('pose-flexion_deg').focus()")
+    before = page.evaluate("() => tkamb.bench.state.flexion_deg")
+    page.press("ArrowRight")
+    page.wait(f"{IDLE} && tkamb.bench.answer.request.flexion_deg > {before}")
+    page.wait(f"{IDLE} && tkamb.bench.answer.request.resolution_mm === 3")
+    assert page.evaluate("() => document.getElementById('mark').className") == ""
+
+
+def test_a_state_without_an_answer_says_why_and_keeps_the_last_one_grey(page):
+    good = at_rest(page, change("pose", "ap_mm", 0.0))
+    assert not good["stale"]
+    lost = at_rest(page, change("pose", "ap_mm", 55.0))
+    assert lost["stale"] and "does not lie over the insert" in lost["mark"]
+    assert (lost["shown"], lost["request"]) == (good["shown"], good["request"])
+    odd = at_rest(page, change("pose", "ap_mm", 70.0))
+    assert odd["stale"] and "-60 to 60" in odd["mark"]
+    page.forgive("400")
+    assert not at_rest(page, change("pose", "ap_mm", 0.0))["stale"]
+
+
+def test_ticking_a_coordinate_releases_it(page):
+    held = at_rest(page, change("pose", "adduction_deg", 0.5))
+    free = at_rest(page, "() => tkamb.bench.inputs['release adduction_deg'].click()")
+    assert free["request"]["released"] == ["si", "adduction"]
+    assert free["numbers"]["adduction_deg"] != pytest.approx(0.5, abs=0.01)
+    assert free["numbers"]["medial_share"] != pytest.approx(held["numbers"]["medial_share"], abs=1)
+    at_rest(page, "() => tkamb.bench.inputs['release adduction_deg'].click()")
+
+
+def test_what_is_kept_stands_in_a_row_and_runs(page):
+    at_rest(page, change("tibial", "slope_deg", 4.0))
+    page.evaluate("() => document.getElementById('keep').click()")
+    page.wait("document.getElementById('saved').textContent.startsWith('saved: ')")
+    path = page.evaluate("() => document.getElementById('saved').textContent").split(": ")[1]
+    row = page.evaluate("() => document.getElementById('kept').rows[1].innerText").split()
+    peak = tkamb.simulate(path, frames=slice(0, 1))["medial_peak_pressure_MPa"][0]
+    assert f"{peak:.1f}" in row
+    assert page.problems == []
+
+
+def test_every_text_has_enough_contrast(page):
+    """WCAG 2.2, success criterion 1.4.3: 4.5 to 1, disabled and hidden elements left out."""
+    assert page.evaluate(CONTRAST) == []
+
+
+CONTRAST = """() => {
+  const numbers = (text) => text.match(/[0-9.]+/g).map(Number);
+  const light = ([r, g, b]) => [r, g, b].map((x) => x / 255)
+    .map((x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, x, k) => sum + [0.2126, 0.7152, 0.0722][k] * x, 0);
+  const ground = (element) => {
+    for (let one = element; one; one = one.parentElement) {
+      const rgba = numbers(getComputedStyle(one).backgroundColor);
+      if (rgba.length === 3 || rgba[3] > 0.5) return rgba.slice(0, 3);
+    }
+    return [255, 255, 255];
+  };
+  const weak = [];
+  for (const way of ["", "stale"]) {
+    if (way) document.body.classList.add(way);
+    for (const element of document.querySelectorAll("body *")) {
+      const own = [...element.childNodes].some((node) => node.nodeType === 3 && node.data.trim());
+      if (!own || !element.checkVisibility() || ["SCRIPT", "STYLE"].includes(element.tagName)) {
+        continue;
+      }
+      const [a, b] = [light(numbers(getComputedStyle(element).color)), light(ground(element))];
+      const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+      if (ratio < 4.5) weak.push(`${element.tagName} ${element.textContent} ${ratio.toFixed(2)}`);
+    }
+    if (way) document.body.classList.remove(way);
+  }
+  return weak;
+}"""
