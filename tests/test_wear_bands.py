@@ -59,7 +59,7 @@ def test_a_plate_has_the_band_of_its_wear_factor():
 def test_creep_has_the_band_of_its_constants_and_none_of_the_wear_factor():
     law = LogarithmicCreep(3e-3, 8e-4, 1.0)
     inputs = (VariedInput("creep", 0.2, "relative"),)
-    bands, _ = sampled(small_case(0.0, law), inputs, samples=32)
+    bands, _ = sampled(small_case(0.0, law), inputs, samples=64)
     low, high = (bands.rows[-1][f"creep_depth_mm_{end}"] for end in ("p05", "p95"))
     spread = np.sqrt(np.log1p(0.2**2))
     assert high / low == pytest.approx(np.exp(2 * spread * norm.ppf(0.95)), rel=0.05)
