@@ -24,11 +24,12 @@ S²/2/(n + 1); with n = 0 the activity is like any other. Then d has the varianc
 
     A + V,   A = S²/2 (1 + 1/(n + 1)).
 
-Variances from few trials are not well known themselves, so that d is Student's t. A is known from
-as many numbers as there are trials, V from all frames that are independent of each other. The
-degrees of freedom of the sum are those of Welch and Satterthwaite,
+Variances from few trials are not well known themselves, so that d is Student's t. A + V is a mean
+over the trials i and what was published, each with its part A_i + V_i. A_i is one number; V_i is
+known from the frames ν_i that are independent of each other; what was published, T, from as many
+numbers n_T as there are. The degrees of freedom are those of Welch and Satterthwaite,
 
-    ν = (A + V)²/(A²/ν_A + V²/ν_V).
+    ν = (T + Σ (A_i + V_i))² / (T²/n_T + Σ (A_i² + V_i²/ν_i)).
 
 Biases and scatters hold what the inputs err by as well, so that the square of the inputs'
 deviation is taken off the variance. A share of the load says something of another subject, whose
@@ -90,6 +91,12 @@ class DiscrepancySettings:
     Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255)."""
     published_lateral_BW: float = 0.43
     """BW: likewise of the lateral force: the middle of 238 to 326 N."""
+    published_total_numbers: int = 1
+    """Errors that were published of the total force: of one model."""
+    published_medial_numbers: int = 4
+    """Likewise of the medial force: of four winners."""
+    published_lateral_numbers: int = 4
+    """Likewise of the lateral force."""
     fewest_frames: int = 5
     """Frames of a trial below which its bias and scatter say too little. Chosen: a standard
     deviation of fewer is itself uncertain by more than a third."""
@@ -228,19 +235,21 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     own = [one.bias for one in chosen if one.activity == activity]
     biases = np.array([one.bias**2 for one in chosen])
     scatters = np.array([one.scatter**2 for one in chosen])
-    published = float(getattr(DISCREPANCY, f"published_{force}_BW")) / DISCREPANCY.walking_load_BW
-    published **= 2
     share = float(biases.sum() / max((biases + scatters).sum(), np.finfo(float).tiny))
-    offset = float(np.mean([share * published, *biases]))
-    scatter = float(np.mean([(1.0 - share) * published, *scatters]))
+    published = float(getattr(DISCREPANCY, f"published_{force}_BW")) / DISCREPANCY.walking_load_BW
+    weight = 0.5 * (1.0 + 1.0 / (len(own) + 1))  # of S² in A
+    of_published = (weight * share + 1.0 - share) * published**2
+    of_trials = weight * biases + scatters
+    frames = np.array([max(1.0, one.independent_frames - 1.0) for one in chosen])
+    numbers = float(getattr(DISCREPANCY, f"published_{force}_numbers"))
+    uncertain = of_published**2 / numbers
+    uncertain += float(((weight * biases) ** 2 + scatters**2 / frames).sum())
+    total = of_published + float(of_trials.sum())
     inputs = float(np.mean([one.inputs**2 for one in chosen]))
-    of_trial = offset / 2 * (1 + 1 / (len(own) + 1))
-    frames = sum(max(1.0, one.independent_frames - 1.0) for one in chosen)
-    freedom = (of_trial + scatter) ** 2 / (of_trial**2 / (len(chosen) + 1) + scatter**2 / frames)
     return Discrepancy(
         mean=sum(own) / (len(own) + 1),
-        deviation=float(np.sqrt(max(0.0, of_trial + scatter - inputs))),
-        freedom=float(freedom),
+        deviation=float(np.sqrt(max(0.0, total / (len(chosen) + 1) - inputs))),
+        freedom=total**2 / max(uncertain, np.finfo(float).tiny),
         own_trials=len(own),
         trials=len(chosen),
     )

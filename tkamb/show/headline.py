@@ -157,7 +157,7 @@ def _peaks(results: "Results") -> Card | None:
         bands += [f"{name} {band.removesuffix(')').replace('; ', ' and ')}"] if band else []
     value = ", ".join(values) + " BW"
     detail = peak_legend(peaks) + (": " + ", ".join(bands) if bands else "")
-    detail += "; each at the frame where it is largest as the inputs stand"
+    detail += "; each at its own frame of the largest value"
     detail += "; total along the insert's axis, as an instrumented tray measures it"
     return Card("Peak total, medial and lateral force", value, detail)
 
