@@ -15,6 +15,9 @@ from tkamb.moved import FOLDERS, MODULES, new_name
         ("tkamb.inputs.c3d", "tkamb.io.recordings.c3d", "read_c3d"),
         ("tkamb.scene", "tkamb.io.scene", "load_scene"),
         ("tkamb.simulation", "tkamb.run.simulation", "simulate"),
+        ("tkamb.equilibrium.mechanics", "tkamb.run.mechanics", "Mechanics"),
+        ("tkamb.muscles.leg", "tkamb.run.muscles.leg", "leg_muscles"),
+        ("tkamb.wear.command", "tkamb.commands.wear", "add_wear"),
     ],
 )
 def test_an_old_path_gives_the_same_object_and_warns(old, new, name):
@@ -45,5 +48,6 @@ def test_every_new_place_exists():
 def test_what_has_not_moved_is_left_alone():
     assert new_name("tkamb.contact.hertz") is None
     assert new_name("tkamb.bodyguard") is None
+    assert new_name("tkamb.studies.stability") is None
     with pytest.raises(ModuleNotFoundError):
         import_module("tkamb.nowhere")

@@ -24,6 +24,14 @@ FOLDERS = {
     "tkamb.cohort": "tkamb.studies.cohort",
     "tkamb.wear": "tkamb.studies.wear",
     "tkamb.designs": "tkamb.studies.designs",
+    "tkamb.check": "tkamb.show.check",
+    "tkamb.compare": "tkamb.show.compare",
+    "tkamb.view": "tkamb.show.view",
+    "tkamb.datasets": "tkamb.io.datasets",
+    "tkamb.starter": "tkamb.io.starter",
+    "tkamb.decks": "tkamb.run.decks",
+    "tkamb.muscles": "tkamb.run.muscles",
+    "tkamb.plausibility": "tkamb.run.plausibility",
 }
 """Folder of release 0.1 -> where its modules are."""
 MODULES = {
@@ -32,6 +40,31 @@ MODULES = {
     "tkamb.results_folder": "tkamb.run.results_folder",
     "tkamb.columns": "tkamb.run.columns",
     "tkamb.press": "tkamb.run.press",
+    "tkamb.guard": "tkamb.run.guard",
+    "tkamb.known_errors": "tkamb.run.known_errors",
+    "tkamb.plug_ins": "tkamb.run.plug_ins",
+    "tkamb.equilibrium.contact_side": "tkamb.run.contact_side",
+    "tkamb.equilibrium.known": "tkamb.run.read_scene",
+    "tkamb.equilibrium.mechanics": "tkamb.run.mechanics",
+    "tkamb.equilibrium.shared_muscles": "tkamb.run.muscles.shared_muscles",
+    "tkamb.output.maps": "tkamb.run.maps",
+    "tkamb.output.metrics": "tkamb.run.metrics",
+    "tkamb.output.vtk": "tkamb.io.vtk",
+    "tkamb.activities": "tkamb.io.activities",
+    "tkamb.claim": "tkamb.io.claim",
+    "tkamb.defaults": "tkamb.io.defaults",
+    "tkamb.mesh_files": "tkamb.io.mesh_files",
+    "tkamb.occupants": "tkamb.io.occupants",
+    "tkamb.compiled": "tkamb.geometry.compiled",
+    "tkamb.threads": "tkamb.geometry.threads",
+    "tkamb.named_classes": "tkamb.contact.named_classes",
+    "tkamb.cohort.report": "tkamb.show.cohort_report",
+    "tkamb.studies.tradeoff_report": "tkamb.show.tradeoff_report",
+    "tkamb.scene_options": "tkamb.commands.scene_options",
+    "tkamb.export_command": "tkamb.commands.export",
+    "tkamb.mesh_command": "tkamb.commands.mesh",
+    "tkamb.importing.command": "tkamb.commands.import_model",
+    "tkamb.studies.command": "tkamb.commands.studies",
 }
 """Module of release 0.1 -> its new name."""
 
@@ -40,6 +73,9 @@ def new_name(name: str) -> str | None:
     """Return where a module of release 0.1 is now; None for one that has not moved."""
     if name in MODULES:
         return MODULES[name]
+    part = name.removeprefix("tkamb.").removesuffix(".command")
+    if name == f"tkamb.{part}.command" and f"tkamb.{part}" in FOLDERS:
+        return f"tkamb.commands.{part}"
     for old, new in FOLDERS.items():
         if name == old or name.startswith(f"{old}."):
             return new + name[len(old) :]
