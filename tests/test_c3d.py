@@ -256,7 +256,7 @@ REFUSED = {
     ),
     "no units": (lambda d: written(d, units=[""] * 6), "unit"),
     "pounds": (lambda d: written(d, units=["lbf"] * 6), "lbf"),
-    "inches": (lambda d: written(d, point_unit="in"), "'in'"),
+    "furlongs": (lambda d: written(d, point_unit="fur"), "'fur'"),
     "no surface": (lambda d: written(d, plate={"corners": 0 * AMTI_CORNERS}), "corners"),
     "type 4, no matrix": (lambda d: written(d, plate={"type": 4}, units=["V"] * 6), "CAL_MATRIX"),
     "type 3 with six channels": (lambda d: written(d, plate={"type": 3}), "channels"),

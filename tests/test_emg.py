@@ -14,8 +14,7 @@ from tkamb.errors import InputError
 from tkamb.io.recordings.emg import Envelopes, envelope, load_envelopes
 from tkamb.io.scene.measured import EmgTable
 from tkamb.io.scene.si import in_si
-from tkamb.run.muscles.emg import EmgGuide
-from tkamb.run.muscles.sharing import SHARING
+from tkamb.run.muscles.sharing import SHARING, EmgGuide
 from tkamb.run.recorded import compare_emg, fitted_normalisation
 
 RATE = 1200.0

@@ -32,7 +32,7 @@ def quick_case(monkeypatch):
     """Scenes are read, and their bodies built, once."""
     from tkamb.run import frames, simulation
 
-    parts = ((simulation, "load_case", Scene.model_dump_json), (frames, "Mechanics", id))
+    parts = ((simulation, "load_case", Scene.model_dump_json), (frames, "mechanics_of", id))
     for module, name, key_of in parts:
         kept = {}
 

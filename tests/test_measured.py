@@ -9,10 +9,9 @@ from tkamb.errors import InputError
 from tkamb.io.recordings.measured_force import load_measured_force
 from tkamb.io.scene.measured import MeasuredTable
 from tkamb.io.scene.si import in_si
-from tkamb.run.recorded import compare_measured, measured_column
+from tkamb.run.recorded import compare_measured, comparison_words, measured_column
 from tkamb.run.results import Results
 from tkamb.show.axis import horizontal_axis
-from tkamb.show.comparison import comparison_words
 from tkamb.show.headline import cards
 from tkamb.show.panels import panels
 

@@ -29,12 +29,12 @@ def equilibrium(place, force=1000.0, problem=""):
 class Wells:
     """A knee that comes to rest in the nearest of some places along AP."""
 
-    released, muscles = (0, 1), False
+    released = (0, 1)
 
     def __init__(self, *places):
         self.places, self.searches = places, 0
 
-    def find(self, k, start, points=None, before=None):
+    def find(self, instant, start, points=None, before=None):
         self.searches += 1
         nearest = min(self.places, key=lambda x: abs(x - start[0]))
         return equilibrium([nearest, *start[1:]], 1000.0 + 1e5 * nearest)
@@ -43,8 +43,9 @@ class Wells:
 def found(knee, recorded, *previous):
     """Return where a frame comes to rest that was recorded at an AP place, m."""
     pair = SimpleNamespace(first_touch_height=lambda pose: 0.0)
-    poses = InitialPoses(np.array([[recorded, 0, 0, 0, 0, 0.0]]), knee, pair, None)
-    return poses.rest(0, [equilibrium([place, 0, 0, 0, 0, 0.0]) for place in previous], {})
+    instant = SimpleNamespace(coordinates=np.array([recorded, 0, 0, 0, 0, 0.0]), muscles=None)
+    poses = InitialPoses(knee, pair, None)
+    return poses.rest(instant, [equilibrium([place, 0, 0, 0, 0, 0.0]) for place in previous], {})
 
 
 def test_a_search_that_follows_the_last_frame_is_not_repeated():

@@ -14,7 +14,7 @@ from tkamb.errors import InputError
 from tkamb.io.recordings.samples import OddSample
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.knee.ligament_sides import check_collateral_sides
+from tkamb.knee.ligaments import check_collateral_sides
 from tkamb.run.plausibility.ground import direction_questions, foot_questions, load_questions
 from tkamb.run.plausibility.movement import motion_questions, sample_questions
 from tkamb.run.plausibility.signs import sign_questions

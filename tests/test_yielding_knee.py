@@ -97,8 +97,8 @@ def test_what_a_lost_patella_leaves_unknown_is_asked_for_again(monkeypatch):
     asked = iter([np.full(6, np.nan), np.ones(6)])
     monkeypatch.setattr(released, "external_wrench", lambda *given: next(asked))
     monkeypatch.setattr(released, "joint_equilibrium", lambda *given: given[-1])
-    knee = ReleasedKnee(SimpleNamespace(muscles=None, ligaments=()), None, ())
+    knee, instant = ReleasedKnee(None, ()), SimpleNamespace(ligaments=())
     geometry = SimpleNamespace(coordinates=np.zeros(6))
-    lost, found, again = (knee._joint(7, geometry, np.zeros(3), False) for _ in range(3))
+    lost, found, again = (knee._joint(instant, geometry, np.zeros(3), False) for _ in range(3))
     assert np.isnan(lost).all()
     assert np.array_equal(found, np.ones(6)) and found is again

@@ -2,9 +2,9 @@
 made."""
 
 from deep_knee_bend import dimensions as d
+from tkamb.studies.designs.design import Articulation
 from tkamb.studies.designs.femoral import FemoralComponent
 from tkamb.studies.designs.insert import Insert
-from tkamb.studies.designs.touch import Articulation
 
 FEMORAL = FemoralComponent(
     medial_arcs=d.SAGITTAL_ARCS,

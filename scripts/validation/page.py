@@ -32,7 +32,7 @@ MADE = """\
 Made by `{command}` on {date}, tkamb {version}, in {cpu_minutes:.0f} minutes of processor time.
 Nothing here is typed: numbers of others stand in `scripts/validation/*.toml` with their
 source, ours in `scripts/data/validation.json`. The designs' radii were chosen before the first
-press and left alone. Two benchmarks were set up anew after a first look, which made hits of four
+press and left alone. Two benchmarks were set up again after a first look, which made hits of four
 misses: the load on the bonded layer (60 N made a contact two cells wide), and how malrotation is
 measured (a difference about the knee's middle, not a ratio about one condyle's axis)."""
 COUNTED = """\

@@ -16,11 +16,11 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.sections import sagittal_outline
 from tkamb.knee.load import LinkPoint, PointForces
-from tkamb.knee.wrapping import TautPath, path_in_link
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
     from tkamb.knee.chain import Chain
+    from tkamb.knee.wrapping import TautPath
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Line:
     points: tuple[LinkPoint, ...]
     wrap: Wrap | None = None
 
-    def path(self, poses: Mapping[str, Array]) -> TautPath:
+    def path(self, poses: Mapping[str, Array]) -> "TautPath":
         """Return the taut path in the insert frame, at one frame of the motion.
 
         Args:
@@ -136,6 +136,8 @@ class Line:
         Raises:
             ComputationError: an end of the wrapped stretch lies inside the outline.
         """
+        from tkamb.knee.wrapping import TautPath, path_in_link  # imports numba
+
         places = [transform(poses[point.link], point.position) for point in self.points]
         stretches = []
         for i, (start, end) in enumerate(pairwise(places)):
@@ -155,7 +157,7 @@ class Line:
             sum(stretch.wrap_angle for stretch in stretches),
         )
 
-    def loads(self, path: TautPath) -> tuple[PointForces, ...]:
+    def loads(self, path: "TautPath") -> tuple[PointForces, ...]:
         """Return the forces of a unit tension on the links: zero force and moment in sum.
 
         Both ends are pulled along the path; every point between, and every corner of the

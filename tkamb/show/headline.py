@@ -265,7 +265,7 @@ def _measured(results: "Results") -> Card | None:
     """Return the difference from the forces of an instrumented implant, with [measured]."""
     if not results.summary.get("measured"):
         return None
-    from tkamb.show.comparison import comparison_words
+    from tkamb.run.recorded import comparison_words
 
     value, detail, incomplete = comparison_words(results.summary["measured"])
     return Card("Compared with the measured force", value, detail, incomplete)

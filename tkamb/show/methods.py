@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.knee.generic_ligaments import BUNDLES
 
 
 @dataclass(frozen=True)
@@ -269,6 +268,8 @@ def _ligaments(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterato
 
 
 def _generic_words(chosen: Sequence[str]) -> Iterator[str]:
+    from tkamb.knee.generic_ligaments import BUNDLES
+
     for name, bundle in BUNDLES.items():
         if name.split("_")[0] in chosen:
             yield (

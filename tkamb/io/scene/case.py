@@ -293,7 +293,7 @@ def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, 
     bundles: tuple[Ligament, ...] = ()
     if scene.ligament:
         from tkamb.io.scene import lines
-        from tkamb.knee.ligament_sides import check_collateral_sides
+        from tkamb.knee.ligaments import check_collateral_sides
 
         bundles = lines.ligaments(scene)
         check_collateral_sides(bundles, chain, scene.patient.side)

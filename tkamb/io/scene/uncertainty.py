@@ -178,7 +178,7 @@ class UncertaintyTable(SceneTable):
     )
     young_modulus: Share = Field(
         0.0,
-        description="relative, of the insert; each sample then prepares its contact anew, so that "
+        description="relative, of the insert; each sample then prepares its contact again, so that "
         "it does not vary by default; of the forces it moves next to nothing",
     )
     yield_stress: Share = Field(

@@ -17,10 +17,9 @@ from tkamb.io.scene.tables import MusclesTable
 from tkamb.knee.crossing import CrossingLines, MuscleShare
 from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.knee.extensor_response import FlexionRow, flexion_row, yielding_flexion_row
-from tkamb.run.muscles.emg import EmgGuide
 from tkamb.run.muscles.knee_trial import KneeTrial
 from tkamb.run.muscles.recording import LegRecording, group_names, load_knee_trial
-from tkamb.run.muscles.sharing import Sharing
+from tkamb.run.muscles.sharing import EmgGuide, Sharing
 from tkamb.units import MILLIMETRE
 
 

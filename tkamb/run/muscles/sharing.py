@@ -1,7 +1,7 @@
 """How muscles share the load: the options, and each frame's problem made of them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,9 +9,46 @@ import numpy as np
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.opensim.lines import Muscle
-from tkamb.run.muscles.emg import EmgGuide
 from tkamb.run.muscles.hill import HILL
 from tkamb.run.muscles.static_optimisation import LoadSharing, share_load
+
+
+@dataclass(frozen=True, eq=False)
+class EmgGuide:
+    """What envelopes e ask of the activations a.
+
+    - "target" adds Σ_i W (a_i - e_i)² to the cost, W the weight;
+    - "bounds" holds a_i within e_i ± width, as far as that lies within the bounds of all.
+
+    Args:
+        envelope: (f, m) normalised; NaN for muscles without EMG.
+        use: which of the two.
+        size: W, or the width.
+    """
+
+    envelope: Array
+    use: Literal["target", "bounds"]
+    size: float
+
+    def only(self, k: int) -> "EmgGuide":
+        """Return that of frame k alone."""
+        return replace(self, envelope=self.envelope[k : k + 1])
+
+    def applied(self, problem: LoadSharing, k: int) -> LoadSharing:
+        """Return the problem of frame k with its envelopes in it."""
+        finite, expected = np.isfinite(self.envelope[k]), np.nan_to_num(self.envelope[k])
+        if self.use == "target":
+            spread = np.where(finite, self.size**-0.5, np.inf)
+            return replace(problem, expected=expected, spread=spread)
+        low, high = (
+            np.clip(expected + sign * self.size, problem.lowest, problem.highest)
+            for sign in (-1.0, 1.0)
+        )
+        return replace(
+            problem,
+            lowest=np.where(finite, low, problem.lowest),
+            highest=np.where(finite, high, problem.highest),
+        )
 
 
 @dataclass(frozen=True)

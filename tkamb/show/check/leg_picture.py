@@ -200,7 +200,7 @@ def draw_leg(case: Case, mechanics: Mechanics) -> Figure:
         words = [f"{part}, {place}" for part in ("leg", "knee") for place in places]
         for row, label in zip(grid, words, strict=True):
             row[0].set_ylabel(label)
-        knee = f"{mechanics.case.scene.patient.side.capitalize()} knee. "
+        knee = f"{case.scene.patient.side.capitalize()} knee. "
         figure.supxlabel(knee + LEGEND, fontsize=8)
     return figure
 
