@@ -14,6 +14,7 @@ from tkamb.geometry.frames import knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee import extensor
+from tkamb.knee.chain import ChainMotion
 from tkamb.knee.patella import ExtensorMechanism, PatellaStatus
 from tkamb.knee.patella_search import solve_patella
 from tkamb.run.read_scene import SharedState, _extensor_frames, mechanics_of
@@ -170,6 +171,28 @@ def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
     recorded = _extensor_frames(replace(case, scene=scene), plain.knee, plain.poses, known)
     for k in (0, 10):
         np.testing.assert_array_equal(recorded.joints(k)[0], case.motion.patella[k])
+
+
+def test_thigh_and_patella_move_as_recorded_and_filtered():
+    """The scene's own chain, asked without tkamb.Knee: same place, same inertial forces."""
+    case = load_case(load_scene(MODEL / "scene.toml", FEW | {"motion.cutoff_Hz": 1.0}))
+    mechanics, motion, tibia = mechanics_of(case), case.motion, case.tibia
+    for k in (3, 8):
+        knee = np.stack([motion.coordinates[k], motion.velocity[k], motion.acceleration[k]])
+        patella = mechanics.extensor.joints(k)
+        found = mechanics.extensor.states[k].coordinates
+        assert np.abs(patella[0] - found).max() > 1e-5  # m, rad: the filter moves it
+        joints = np.hstack([knee, patella])
+        shank = (tibia.pose[k], tibia.velocity[k], tibia.acceleration[k])
+        recorded, state = case.chain.at(ChainMotion(*shank, joints)), mechanics.geometry(k).state
+        for link in ("femur", "patella"):
+            np.testing.assert_allclose(state.pose(link), recorded.pose(link), rtol=0, atol=1e-9)
+        forces = [
+            one.inertial[one.chain.knee_columns() + one.chain.patella_columns()]
+            for one in (state, recorded)
+        ]
+        np.testing.assert_allclose(*forces, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(mechanics.instant(k).coordinates, motion.coordinates[k])
 
 
 def test_the_moments_of_three_lines_on_the_patella_add_up_to_nothing(plain):

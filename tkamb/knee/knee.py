@@ -647,6 +647,7 @@ class Knee:
             self.contact is not None and self.contact.pair.split is not None,
             None if external is None else bridge.on_shank(pin_data, external),
             muscles,
+            self._finds_patella,
         )
 
     def _check(self, values: Array, name: str, size: int) -> Array:

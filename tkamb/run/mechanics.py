@@ -156,6 +156,10 @@ class Mechanics:
             patella=None if self.extensor is None else self.extensor.at(k),
             muscles=None if self.muscles is None else self.muscles.frame(k),
         )
+        # As recorded to the last digit: what is kept stays exactly. Joint placements round.
+        joints = instant.motion.joints.copy()
+        joints[0, :6] = motion.coordinates[k]
+        instant = replace(instant, motion=replace(instant.motion, joints=joints))
         if self.ground is None or instant.ground is None:
             return instant
         insert = instant.motion.tibia @ self.knee.chain.insert_in_tibia
