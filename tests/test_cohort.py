@@ -22,7 +22,7 @@ from tkamb.io.claim import claimed_directory, settle
 from tkamb.memory import give_back
 from tkamb.run.simulation import simulate
 from tkamb.run.workers import PoolOptions
-from tkamb.show.cohort_report import _told_apart, cohort_html, draw_groups
+from tkamb.show.cohort_report import _split_into_plots, cohort_html, draw_groups
 from tkamb.show.design_figure import design_bars, draw_designs, run_error
 from tkamb.studies.cohort.folder import frame_table, write_cohort
 from tkamb.studies.cohort.outcome import Outcome, chosen_map
@@ -285,17 +285,17 @@ def test_groups_too_many_for_one_plot_are_divided_by_a_label_and_keep_one_scale(
         return Group(labels, (0,), 0, "flexion_deg", np.array([0.0, 10.0, 20.0]), bins, bins)
 
     groups = [group(f"d{k}", model, k + 1.0) for k in range(6) for model in ("one", "two")]
-    plots = _told_apart(groups)
+    plots = _split_into_plots(groups)
     assert [words for words, _ in plots] == ["one", "two"]
     for words, part in plots:
         assert list(part) == [f"d{k}" for k in range(6)]
         assert {one.labels["contact"] for one in part.values()} == {words}
         figure = draw_groups(part, "force_total_BW", 6.0)
         assert figure.axes[0].get_ylim() == pytest.approx((0.0, 6.3))
-    (whole,) = _told_apart(groups[:8])
+    (whole,) = _split_into_plots(groups[:8])
     assert whole[0] == "" and list(whole[1])[:2] == ["d0, one", "d0, two"]
     lonely = [group(f"d{k}", "one", 1.0) for k in range(11)]  # no label divides them
-    assert [len(part) for _, part in _told_apart(lonely)] == [8, 3]
+    assert [len(part) for _, part in _split_into_plots(lonely)] == [8, 3]
 
 
 def test_what_only_refers_to_itself_is_freed_between_runs():

@@ -110,7 +110,7 @@ def add_import(commands: Any) -> None:
 
 
 def _add_inferred(p: argparse.ArgumentParser) -> None:
-    """Add the options that stand instead of what is inferred."""
+    """Add the options that replace what is inferred from the files."""
     p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
     p.add_argument(
         "--plates", type=_numbers, metavar="2,3", help="force plates under this foot, or none"
@@ -175,7 +175,7 @@ def _add_poses(p: argparse.ArgumentParser) -> None:
         type=_names,
         default=(),
         metavar="ROLES",
-        help="those whose sign is turned: rotation_1, …",
+        help="angles and places whose sign is reversed: rotation_1, …",
     )
     p.add_argument(
         "--stride",

@@ -18,7 +18,8 @@ QUICK_FRAMES = 11
 LEAST_SHOWN = 0.01
 """Smallest share of a result's variance that is printed."""
 TERMS = 2
-"""Of each input in the regression, its value and its square: each explains 1/n by chance."""
+"""Regressors per input: its value and its square. By chance alone each explains a share 1/n of the
+variance of n samples."""
 NOTABLE_FAILED = 0.05
 """Share of failed samples above which the bands are cut off at one end."""
 

@@ -14,9 +14,9 @@ class ContactAreaSettings:
     """Contact area from nodal pressures and gaps."""
 
     unknown_edge_share: float = 0.5
-    """Share of a cell side, 1: where the edge of contact is put if the femoral surface ends, or
-    rises more than it goes along, before the neighbour. Chosen: contact may then end anywhere
-    between the two nodes, so the middle is taken."""
+    """1: share of a cell side that counts as in contact where the edge of contact between its two
+    nodes is unknown: the femoral surface ends between them, or is steeper than 45 deg. Chosen: the
+    middle, because contact may end anywhere between the nodes."""
     least_gap: float = 1e-12
     """m: smallest gap of a node that is not in contact. Chosen: it keeps a division from zero; gaps
     that matter are above 1e-7 m."""
@@ -107,10 +107,11 @@ def _share(
 def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:
     """Return the area (m²) where the pressure exceeds a level.
 
-    On each triangle q = p² is linear between the corners, plus the mean by which a curved q
-    rises over that, sum over edges of (g_i - g_j).(x_j - x_i) / 24 for gradients g at the
-    corners: exact in the mean for a Hertzian pressure, whose square is quadratic in place.
-    The area grows steadily with the pressures, where whole nodes would come and go.
+    On each triangle q = p² is interpolated linearly between the corners. A constant is added to
+    it: the mean difference between a quadratic q and its linear interpolation. It is the sum over
+    the edges of (g_i - g_j).(x_j - x_i) / 24, with the gradients g of q at the corners. For a
+    Hertzian pressure the mean of q is exact, because q is then quadratic in the position.
+    The area is a continuous function of the pressures; a count of nodes would jump.
 
     Args:
         points: (n, 3) m.
@@ -168,7 +169,10 @@ def _area_above(points: Array, triangles: Index, square: Array, level: float) ->
 
 @compiled_as_written
 def _shape(points: Array, corners: Index, edges: Array, across: Array) -> float:
-    """Return a triangle's area; write its edges (3, 3), opposite each corner, and their product."""
+    """Return a triangle's area; write its edges (3, 3) and the cross product of two of them.
+
+    Edge i is opposite to corner i.
+    """
     for i in range(3):
         for axis in range(3):
             edges[i, axis] = points[corners[(i + 2) % 3], axis] - points[corners[(i + 1) % 3], axis]

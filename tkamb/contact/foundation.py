@@ -37,9 +37,8 @@ class FoundationSettings:
     """m: distance of two approaches between which a reaction is taken as constant. Chosen: with a
     stiffness of some 1e8 N/m it changes by 0.1 N."""
     reached_share: float = 0.99
-    """1: a reaction below this share of the load, less `reached_force`, does not reach the load
-    within `approach_step`. Chosen: a jump of the reaction, as map points come into contact, is
-    smaller."""
+    """1: a reaction below `reached_share` * load - `reached_force` cannot rise to the load within
+    `approach_step`. Chosen: the reaction jumps by less when map points come into contact."""
     reached_force: float = 1.0
     """N: see `reached_share`. Chosen: ten times what `approach_step` changes."""
 
@@ -51,7 +50,7 @@ OVER_THE_EDGE = (
     "the femoral component reaches over the insert's edge, deeper than half of its thickness there"
 )
 WIDEST_EDGE = NEAR
-"""m: largest change of the gap across a column that is counted."""
+"""m: upper limit of the change of the gap across one column (`FoundationProbe.smoothed`)."""
 SUMS = 46
 """Count of the sums over the columns of one condyle; see `_add_up`."""
 
@@ -76,9 +75,9 @@ class ElasticFoundation(ContactModel):
     pressure it carries: M is scaled with the secant modulus E_s of the uniaxial curve at
     the stress p, p = (M/E) E_s(p) eps, as in Bei & Fregly (2004); since sigma = E_s(sigma)
     * eps this is the curve itself at (M/E) eps. A truly confined column would hardly yield,
-    its stress being nearly hydrostatic; under a contact patch as wide as the insert is
-    thick it is not confined, and this choice stands for that. With a linear material it is
-    Blankevoort's law p = -M ln(1 - d/h).
+    because its stress is nearly hydrostatic. But a contact patch of a knee is only as wide as
+    the insert is thick, so its columns are not confined; hence they soften here. With a linear
+    material it is Blankevoort's law p = -M ln(1 - d/h).
 
     Limits: neighbours do not help to carry, so that pressure ends at the edge of the
     overlap and peaks at rims are too high. A penetration of half the thickness or more, along y
@@ -141,11 +140,12 @@ class ElasticFoundation(ContactModel):
         return press_by_search(self, state, load, pose, guess)
 
     def _holds(self, nearby: "_NearColumns", load: float) -> bool:
-        """Say whether the whole bed, too, goes out of range before it carries the load.
+        """Return whether the whole bed, too, goes out of range before it carries the load.
 
-        The near columns are a part of the bed. Where they are out of range the bed is, too. The
-        reaction rises with the approach: if the bed carries less than the load just before that
-        place, it carries less everywhere before. One evaluation there replaces a search.
+        The near columns are a part of the bed: where they are out of range, so is the bed. The
+        reaction rises with the approach. So one evaluation of the bed is enough, at the largest
+        approach that is in range: if it carries less than the load there, it
+        carries less at every approach in range.
         """
         if nearby.beyond - nearby.within > FOUNDATION.approach_step:
             return False

@@ -24,8 +24,8 @@ class FlatBottomSettings:
     """1: a flat whose area is at least this share of the largest may be the bottom, too. Chosen: a
     smaller flat is a recess."""
     clear_share: float = 0.9
-    """Between two flats that face down, the larger wins below this ratio of areas. Chosen: two
-    flats that differ by less are asked about."""
+    """1: of two flats that face down, the larger one is the bottom if the other has less than this
+    share of its area. Chosen: where their areas differ by less, the user has to decide."""
     uneven_noise: float = 1e-6
     """m: a rougher bottom gets a notice: its mesh is noisy, or it is not flat. Chosen: a mesh in
     single precision rounds by less."""

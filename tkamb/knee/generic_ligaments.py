@@ -97,9 +97,11 @@ def generic_ligaments(
 def condylar_axis(femoral: Surface) -> Array:
     """Return the centre (3,) of the circle that the posterior condyles roll on, m.
 
-    The support of the component in the direction u that faces down at a flexion phi,
-    h(u) = max over the vertices of u . p, is u . c + r on a circle: least squares over
-    20-100 deg of flexion. z is the middle of the component's width.
+    It is a point of the condylar axis, which is parallel to z. At a flexion phi let u be the
+    direction of the femur that faces down. The support of the component in this direction is
+    h(u) = max over the vertices p of u . p. For a circle of centre c and radius r it is
+    u . c + r. c and r are fitted by least squares to the supports at 20 to 100 deg of flexion. z is
+    the middle of the component's width.
 
     Args:
         femoral: in the femur's frame.

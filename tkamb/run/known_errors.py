@@ -2,10 +2,10 @@
 
 The errors are relative, against converged references: the largest over the cases on which a
 setting was measured. They hold for these cases, and are no bound for others. The cases are
-those of the trade-off study and half of the pairs of bodies of `error_cases`; the
-other half is held out, and shows how many of its errors are within the stated ones
-(docs/known_errors.md). `run/known_errors.json` is written by `scripts/make_tradeoff_table`. What
-was not measured is said to be so, never interpolated.
+those of the trade-off study and half of the pairs of bodies of `error_cases`. The other half is
+held out: it is used to check which share of new errors stays within the stated ones
+(docs/known_errors.md). `run/known_errors.json` is written by `scripts/make_tradeoff_table`. A
+setting that was not measured is reported as "not measured"; no error is interpolated.
 """
 
 import json
@@ -62,7 +62,7 @@ class KnownError:
 
 
 def setting_label(model: str, options: Mapping[str, Any]) -> str:
-    """Return a model's name with those of its options that are given, as the study writes it."""
+    """Return the label of a setting in the trade-off study: the model's name and given options."""
     own = ",".join(f"{key}={value}" for key, value in options.items() if key not in SAME_ANSWER)
     return f"{model}[{own}]" if own else model
 
@@ -85,8 +85,8 @@ def known_error(
     """Return by how much a setting is known to err; None where it was not measured.
 
     Args:
-        model: name of the contact model; another package's was not measured.
-        resolution_mm: spacing of its map points; only those of the study were measured.
+        model: name of the contact model. Models of other packages were not measured.
+        resolution_mm: spacing of its map points. Only the spacings of the study were measured.
         material: of the insert; polyethylene and polyethylene-linear were measured.
         options: the model's own.
     """

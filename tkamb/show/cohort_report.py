@@ -207,17 +207,18 @@ def _plots(groups: Sequence[Group]) -> Any:
         for axis in dict.fromkeys(group.axis for group in groups):
             own = [group for group in groups if group.axis == axis and name in group.bins]
             highest = max(_highest(group, name) for group in own) if own else 0.0
-            for place, (words, part) in enumerate(_told_apart(own)):
+            for place, (words, part) in enumerate(_split_into_plots(own)):
                 title = ", ".join(filter(None, (SHOWN[name][0], words)))
                 svg = svg_text(draw_groups(part, name, highest), f"{name}-{axis}-{place}")
                 yield {"title": title, "unit": SHOWN[name][1], "svg": svg}
 
 
-def _told_apart(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
-    """Return plots: the common labels of their groups, and name -> group.
+def _split_into_plots(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
+    """Return the plots: for each, the label that its groups share, and name -> group.
 
-    If there are too many groups for one plot, they are divided by the label with the fewest values
-    that makes them few enough; if no label does, in their order.
+    If there are too many groups for one plot, each plot shows one value of a label. It is the label
+    with the fewest values that leaves few enough groups in each plot. If there is none, the groups
+    are divided in their order.
     """
     if len(groups) > AT_ONCE:
         values = {
@@ -281,7 +282,7 @@ def _maps(
     return {
         "svg": svg_text(draw_group_maps(cohort, outcomes, with_map), "maps"),
         "frame": frame,
-        "whose": "one run in all groups alike but for the group's own labels, that with the peak "
+        "whose": "runs that differ in nothing but the labels of their groups, those with peak "
         "forces nearest to the groups' medians"
         if alike
         else "the run whose peak force is its group's median",
@@ -294,9 +295,10 @@ def _typical(
 ) -> tuple[list[tuple[Group, int]], bool]:
     """Return each group's run to show, and whether the runs differ in the groups' labels alone.
 
-    Of the subjects, trials and so on that every group has, those whose peak forces are nearest
-    to the groups' medians: maps of one person beside each other. Where no such set is in all
-    groups, each group's own median. Runs without a map are left out.
+    Maps of one person beside each other are easier to compare. So the runs agree in all labels
+    that do not make the groups (subject, trial and so on), if every group has such a run. Of
+    several, those are returned whose peak forces are nearest to the groups' medians. Otherwise
+    each group shows the run of its own median. Runs without a map are left out.
     """
     peaks = [
         {

@@ -152,7 +152,9 @@ def _range(indices: NDArray[np.int64]) -> slice:
 def _covered(
     corners: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Return which points of a grid triangles cover: triangle, flat place and weights of each pair.
+    """Return each pair of a triangle and a grid point that it covers.
+
+    A pair is the triangle's index, the point's flat index and its three barycentric weights.
 
     Args:
         corners: (k, 3, 2) rows and columns, in steps of the grid.

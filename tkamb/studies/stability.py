@@ -112,10 +112,10 @@ def _row_key(case: Case, longest: float) -> str:
 
 
 class _Judges:
-    """Cases put to processes that may crash or hang, a new one for each case.
+    """Judges each case in a new process, because a case may crash or hang.
 
-    They are forked from a server process that has only imported the modules, so that a new one
-    costs milliseconds. Each computes with one thread.
+    The processes are forked from a server process that has only imported the modules, so that a new
+    one costs milliseconds. Each computes with one thread.
     """
 
     def __init__(self, longest: float, rows: KeptRows | None) -> None:
@@ -194,7 +194,7 @@ def _leave_interrupts_to_parent() -> None:
 
 def _send_verdict(case: Case, sender: Connection) -> None:
     """Judge a case: send `PRESSED` once the model has answered, then the verdict."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the study's to answer
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     sender.send(judge_safely(case, lambda: sender.send(PRESSED)))
 
 

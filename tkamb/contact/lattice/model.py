@@ -67,8 +67,8 @@ class CellContact(ContactModel):
 
     Args:
         resolution: m, edge of the cells.
-        tolerance: scales the tolerances of `LatticeSolverSettings`, which are those of 1e-3: the
-            relative error of the approach is half of it at most.
+        tolerance: the three tolerances of `LatticeSolverSettings` are multiplied by
+            tolerance / 1e-3. The relative error of the approach is at most half of `tolerance`.
         pressure_rule: "tributary" (force over the node's own area) or "source" (force over
             total area by number of nodes, Sharma 2008, section 4.5.6).
         newton: solve by full Newton steps (slow; the reference).

@@ -18,16 +18,18 @@ pass of the iteration is a modified Newton step with the factorised linear stiff
 
 Passes look at the region of the elements that have softened. When the residual there is within
 the tolerances, the residual of the whole solid is measured at u: r from the law of every element,
-without any factor; the gap at the displaced nodes, with rays fired anew. Only these stop the
+without any factor; the gap at the displaced nodes, with rays fired anew. These stop the
 iteration, and these are reported:
 
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
     |gamma| / max |u| <= gap_tolerance        of active nodes, and overlap of the others
 
-The work of the residual estimates the relative error of the approach: for an error du = e u,
-r = e K_T u. The load and lambda >= 0 hold to rounding in every pass. When no pass gets there,
-Newton's method with a refactorised tangent goes on (`newton.py`).
+The last pass (`max_passes`, or a residual force above `DIVERGED`) stops it in any case. It counts
+as converged with a gap of up to force_tolerance. The work of the residual estimates the relative
+error of the approach: for an error du = e u, r = e K_T u. The load and lambda >= 0 hold to rounding
+in every pass. When no pass gets there, Newton's method with a refactorised tangent goes on
+(`newton.py`).
 """
 
 from dataclasses import dataclass, replace

@@ -27,8 +27,8 @@ class ModelFitSettings:
     """How the poses of a model are fitted to markers."""
 
     block_frames: int = 128
-    """Frames that are fitted in one call. Chosen: it trades memory for speed and changes no
-    result."""
+    """Frames that are fitted in one call. Chosen: their arrays fit into the processor's cache. It
+    changes no result."""
     coarse_stride: int = 8
     """Frames between those that are fitted first; the others begin from their poses. Chosen: it
     changes the initial guesses only."""
@@ -157,8 +157,9 @@ class ModelChain:
     def _free_part(self, values: Array, state: Array) -> Array:
         """Return rows, and columns of a square matrix, by the free coordinates.
 
-        What follows a free coordinate is added to it, by the chain rule; the last in a chain of
-        followers first.
+        By the chain rule, the rows (and columns) of a follower, times the slope of its coupler,
+        are added to those of the coordinate that it follows. The end of a chain of followers is
+        added first.
         """
         square, free = values.shape[1] == values.shape[2], len(self.free)
         for dependent, independent, coordinate, function in reversed(self._after):
@@ -184,11 +185,13 @@ class ModelChain:
 
 
 def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
-    """Return which markers hang on a coordinate's joint (n, m), and which coordinate is above.
+    """Return which markers each coordinate moves, and which coordinates each one moves.
 
-    The second (n, n) is 1 at i, j where i turns the axis of j, and 1/2 where i is j. Within a
-    joint the translations come first, for they are along axes of its inner frame; in one that
-    is passed backwards the order is turned round.
+    Returns:
+        (n, m), 1 where the joint of coordinate i carries marker j, else 0; and (n, n), 1 where
+        coordinate i moves the axis of coordinate j, 1/2 on the diagonal, else 0. Within a joint
+        the translations come before the rotations, because they are along axes of its parent
+        frame; a joint that the chain passes backwards has the reverse order.
     """
     model, bodies = kinematics.model, kinematics.bodies
     hanging: dict[Joint, set[int]] = {}  # bodies outboard of each joint
@@ -266,7 +269,7 @@ def fit_model(
 def fit_in_blocks(
     chain: ModelChain, measured: Array, weights: Array, start: Array
 ) -> ChainFit[Array]:
-    """Return `fit_chain` of many frames, so many at once as the processor's cache holds."""
+    """Return `fit_chain` of many frames, computed in blocks of `block_frames`."""
     parts = [
         slice(k, k + MODEL_FIT.block_frames)
         for k in range(0, len(measured), MODEL_FIT.block_frames)

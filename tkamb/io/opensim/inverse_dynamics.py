@@ -1,7 +1,7 @@
 """Generalised forces that an OpenSim model's motion takes, from its bodies' momentum.
 
 With the twist J_b of body b per unit of the coordinates (in ground, at ground's origin), its
-momentum h_b there, gravity g at its centre of mass c and what else acts on it,
+momentum h_b there, gravity g at its centre of mass c and the other wrenches w_b that act on it,
 
     τ = Σ_b J_bᵀ (dh_b/dt - (c × m g, m g) - w_b).
 
@@ -67,18 +67,18 @@ def required_wrenches(
     """
     twists = np.einsum("fbin,fn->fbi", motion.twists, rates)
     result = np.zeros_like(twists)
-    spins = _accelerations(kinematics, motion, twists, q, rates, accelerations)
+    twist_rates = _accelerations(kinematics, motion, twists, q, rates, accelerations)
     for name, body in kinematics.model.bodies.items():
         b = kinematics.bodies[name]
         rotation = motion.poses[:, b, :3, :3]
         centre = rotation @ body.centre + motion.poses[:, b, :3, 3]
         tensor = rotation @ body.inertia @ np.swapaxes(rotation, -1, -2)
-        omega, alpha = twists[:, b, :3], spins[:, b, :3]
+        omega, alpha = twists[:, b, :3], twist_rates[:, b, :3]
         speed = twists[:, b, 3:] + np.cross(omega, centre)
-        pull = spins[:, b, 3:] + np.cross(alpha, centre) + np.cross(omega, speed)
-        force = body.mass_kg * (pull - kinematics.model.gravity)
-        spin = np.einsum("fij,fj->fi", tensor, omega)
-        moment = np.einsum("fij,fj->fi", tensor, alpha) + np.cross(omega, spin)
+        acceleration = twist_rates[:, b, 3:] + np.cross(alpha, centre) + np.cross(omega, speed)
+        force = body.mass_kg * (acceleration - kinematics.model.gravity)
+        angular_momentum = np.einsum("fij,fj->fi", tensor, omega)
+        moment = np.einsum("fij,fj->fi", tensor, alpha) + np.cross(omega, angular_momentum)
         result[:, b] = np.hstack([np.cross(centre, force) + moment, force])
         if wrenches is not None and name in wrenches:
             result[:, b] -= wrenches[name]
@@ -90,7 +90,7 @@ def _accelerations(
 ) -> Array:
     """Return the rate (f, b, 6) of each body's twist."""
     result = np.zeros_like(twists)
-    speeds, pulls = kinematics.axis_rates(q, rates, second)
+    speeds, axis_accelerations = kinematics.axis_rates(q, rates, second)
     first = 0
     for joint in kinematics.model.joints:
         count = len(joint.rotations)
@@ -101,7 +101,7 @@ def _accelerations(
         # Translations lie in the parent frame, beneath the rotations.
         for a in (*range(first + count, last), *range(first, first + count)):
             axis, speed = motion.axes[:, a], speeds[:, a, None]
-            total += axis * pulls[:, a, None] + _cross(carrier, axis) * speed
+            total += axis * axis_accelerations[:, a, None] + _cross(carrier, axis) * speed
             carrier = carrier + axis * speed
         sign = -1.0 if joint.backwards else 1.0
         result[:, outboard] = result[:, inboard] + sign * total

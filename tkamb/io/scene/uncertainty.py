@@ -49,8 +49,8 @@ class FluoroscopyErrorSettings:
 class SkinMarkerErrorSettings:
     """Standard deviations of a pose from skin markers, and of the markers themselves.
 
-    Coordinates that the scene takes from the markers vary with the markers. The pose's own
-    values hold for the others, which nobody recorded.
+    A coordinate that is computed from the markers varies with them (`thigh_mm`, `shank_mm`). The
+    other fields are used for the coordinates that were not recorded.
 
     References: doi:10.1016/j.gaitpost.2005.04.012 (Benoit et al. 2006, eight men with pins in
     femur and tibia: knee rotations off by up to 4.4 deg and translations by up to 13 mm in
@@ -92,8 +92,8 @@ class CorrelationTable(SceneTable):
         "['ligament_strain.LCL', 'ligament_strain.MCL_deep']; both must vary"
     )
     coefficient: Annotated[Number, Field(ge=-1, le=1)] = Field(
-        description="of correlation between the normal errors; those of positive factors are "
-        "normal before the exponential"
+        description="correlation coefficient of the two errors; for a relative input, of the "
+        "logarithm of its factor"
     )
 
     @model_validator(mode="after")
@@ -154,15 +154,15 @@ class UncertaintyTable(SceneTable):
     )
     muscle_attachment_mm: Length = Field(
         3.0,
-        description="AP, SI and ML each: either end of the lines that pull the patella, and of "
-        "the muscles of [muscles] that cross the knee where they leave shank and thigh, each "
-        "group by itself" + _ASSUMED,
+        description="AP, SI and ML each: both ends of the lines that pull the patella, and the "
+        "points where muscles of [muscles] that cross the knee leave shank and thigh; each group "
+        "of muscles by itself" + _ASSUMED,
     )
     tendon_band_mm: Length = Field(
         3.0,
-        description="of band_mm of each wrapped tendon by itself, which stays at or above 0: how "
-        "wide the lamina is whose sections the line wraps. An assumption, without a source: bands "
-        "of 5 to 15 mm are all defensible, and move the quadriceps by up to 9 % in deep flexion",
+        description="of band_mm, the width of a wrapped tendon; each tendon by itself; a sample's "
+        "width is never negative. An assumption, without a source: widths of 5 to 15 mm are all "
+        "defensible, and change the quadriceps by up to 9 % in deep flexion",
     )
     ligament_stiffness: Share = Field(0.3, description="relative, each bundle by itself" + _TISSUE)
     ligament_strain: Annotated[Number, Field(ge=0, le=0.1)] = Field(
@@ -178,8 +178,8 @@ class UncertaintyTable(SceneTable):
     )
     young_modulus: Share = Field(
         0.0,
-        description="relative, of the insert; each sample then prepares its contact again, so that "
-        "it does not vary by default; of the forces it moves next to nothing",
+        description="relative, of the insert; 0 by default, because otherwise each sample has to "
+        "prepare its contact again, and the modulus hardly changes the forces",
     )
     yield_stress: Share = Field(
         0.0,

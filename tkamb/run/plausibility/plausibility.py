@@ -48,14 +48,14 @@ class Plausibility:
 
     Args:
         case: the case.
-        mechanics: its body side, prepared.
+        mechanics: the case's multibody model, prepared.
 
     Attributes:
         questions: those that the scene does not answer.
         answered: question and answer, each in words.
 
     Raises:
-        InputError: an answer is empty, or to a question that nobody asks.
+        InputError: an answer is empty, or answers none of the questions.
     """
 
     def __init__(self, case: Case, mechanics: "Mechanics") -> None:
@@ -101,11 +101,11 @@ class Plausibility:
 def _answered(
     questions: Sequence[Question], answers: Mapping[str, str]
 ) -> tuple[tuple[Question, ...], tuple[str, ...]]:
-    """Return the questions without an answer, and those with one in words.
+    """Return the questions without an answer, and one sentence for each question with one.
 
     Args:
         questions: all questions of the scene.
-        answers: words of a question's text -> its answer.
+        answers: some words of a question's text -> its answer.
     """
     unanswered, text = list(questions), []
     for words, answer in answers.items():

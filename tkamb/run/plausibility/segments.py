@@ -17,9 +17,9 @@ class SegmentLimitSettings:
     """Which masses and positions of the segments of a leg are plausible."""
 
     max_mass_ratio: float = 1.6
-    """Ratio, or its inverse, of a segment's mass to de Leva's share of the body's. It differs by
-    1.35 at most between cadaver studies and by 1.3 with obesity; pounds read as kilograms give
-    2.2."""
+    """1: largest ratio, either way, of a segment's mass to that of de Leva for the same body mass.
+    The ratio is up to 1.35 between cadaver studies and up to 1.3 with obesity; pounds read as
+    kilograms give 2.2."""
     max_patella_offset: float = 0.05
     """m; of the patella's centre of mass from its origin."""
     max_insert_rotation: float = 20.0 * DEGREE
@@ -38,7 +38,8 @@ PATELLA_RADII = (0.005, 0.04)
 """m, of gyration: a bone 45 mm wide and 20 mm thick has 9 to 13 mm."""
 
 SHANK_SHARE, THIGH_SHARE = (0.19, 0.30), (0.19, 0.31)
-"""Of body height: 0.246 and 0.245 (Drillis & Contini 1966) and a fourth more or less."""
+"""Least and largest length, as shares of body height: 0.246 and 0.245 (Drillis & Contini 1966),
+about a quarter less or more."""
 RADII = ((0.15, 0.45), (0.05, 0.30))
 """Of gyration over segment length, across and along it: de Leva's are 0.24 to 0.37 and 0.09 to
 0.16; a foot makes the shank's larger."""

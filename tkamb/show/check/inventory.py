@@ -177,7 +177,7 @@ def _surface(surface: Surface) -> str:
 def _ligaments(mechanics: Mechanics) -> Entry:
     """Return the bundles, and those with a high strain and where: the strains of the report."""
     strains = mechanics.strains
-    torn = [
+    strained = [
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
         for name, values in strains.items()
         for flexion, value in zip(STRAIN_FLEXIONS, values, strict=True)
@@ -187,7 +187,9 @@ def _ligaments(mechanics: Mechanics) -> Entry:
     finite = np.array([v for values in strains.values() for v in values if np.isfinite(v)])
     if len(finite):
         text += f"; {_range('strain', 100 * finite, '%', 1)} at the recorded pose"
-    return Entry("ligaments", None, text + (f"; over 10 %: {', '.join(torn)}" if torn else ""))
+    return Entry(
+        "ligaments", None, text + (f"; over 10 %: {', '.join(strained)}" if strained else "")
+    )
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -120,9 +120,10 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
 
 
 def shown_frame(comparison: Comparison) -> int:
-    """Return the first run's frame of the largest contact force, where most runs have a map.
+    """Return the frame of the first run whose maps are shown.
 
-    0 where no frame has a force.
+    It is the frame with the largest contact force among those at which most runs have a map; 0 if
+    no frame has a force.
     """
     force = comparison.runs[0].results["force_total_BW"]
     finite = np.isfinite(force)

@@ -1,9 +1,10 @@
 """A knee on a bench: one pose, an axial load, placement and ligaments changed by hand.
 
 What `tkamb live` computes. A `BenchRequest` is turned into a case that stands still: no muscles,
-no patella; the axial load presses along the tibia's long axis through the place of the insert's
-origin as recorded. It is computed by the same code as a frame of a run, so that the scene which
-`bench_scene.write_bench` writes gives the same numbers by `tkamb run`.
+no patella. The axial load acts along the tibia's long axis. Its line passes through the origin of
+the insert as the scene places it, also when the insert is moved by hand. The case is computed by
+the same code as a frame of a run, so that the scene which `bench_scene.write_bench` writes gives
+the same numbers by `tkamb run`.
 """
 
 from collections.abc import Mapping
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from tkamb.knee.ligaments import Ligament
 
 ROWS = 6
-"""Equal rows of the tables: accelerations need as many."""
+"""Rows of the tables, all equal: computing accelerations needs at least so many."""
 
 
 @dataclass(frozen=True)
@@ -327,9 +328,10 @@ class Bench:
         return GroundReaction(forces, points, moments, np.ones(ROWS, bool))
 
     def _bone(self, request: BenchRequest) -> Array:
-        """Return the pose (4, 4) of the tibia as recorded in the tibia of the moved insert.
+        """Return the pose (4, 4) of the tibial bone in the link "tibia" of the case.
 
-        The case keeps the insert where it is on the link "tibia"; all else moves the other way.
+        An insert that is moved by hand keeps its place on the link "tibia". The bone, and all that
+        is attached to it, moves the opposite way instead.
         """
         insert = self.case.chain.insert_in_tibia
         return insert @ inverse(request.tibial.matrix()) @ inverse(insert)

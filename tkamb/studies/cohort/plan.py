@@ -87,7 +87,10 @@ class ContactModelTable(SceneTable):
 
 
 class CohortWearTable(SceneTable):
-    """Wear of every run's insert by its own motion; closing, material and law by its [wear]."""
+    """Wear of every run's insert under the run's own motion.
+
+    How the cycle is closed, the wear material and the wear law are those of the run's [wear].
+    """
 
     cycles: Annotated[Count, Field(ge=1, le=10**9)] = 1_000_000
     updates: Annotated[Count, Field(ge=1, le=1000)] = Field(2, description="of the geometry")

@@ -1,4 +1,4 @@
-"""The sagittal J-curve: circular arcs, tangent continuous, run through by their normal."""
+"""The sagittal J-curve: circular arcs with common tangents, parametrised by the normal's angle."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -19,7 +19,8 @@ def normal(phi: ArrayLike) -> Array:
 class SagittalProfile:
     """A chain of circular arcs that meet with a common tangent.
 
-    c_{i+1} = c_i + (R_i - R_{i+1}) n(phi_i), phi_i the normal where arcs i and i+1 meet.
+    Their centres are c_{i+1} = c_i + (R_i - R_{i+1}) n(phi_i), where phi_i is the angle of the
+    normal at which arcs i and i + 1 meet.
 
     Args:
         arcs: (from deg, to deg, radius mm) in turn, each starting where the last one ends.

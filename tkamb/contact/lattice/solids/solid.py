@@ -67,7 +67,7 @@ class Pattern:
         """Return the sum (3n, 3n) of the elements' matrices.
 
         Args:
-            matrices: some elements' (k, 3p, 3p) after the other's, in their order.
+            matrices: (k, 3p, 3p) of consecutive groups of elements, in the elements' order.
         """
         blocks, at = np.zeros((len(self.indices), 3, 3)), 0
         for some in matrices:
@@ -279,16 +279,15 @@ class Solid(ABC):
     def least_principal_strain(self, displacement: Array) -> float:
         """Return the smallest principal strain of the mean gradients of all cells.
 
-        A principal strain is no smaller than minus the norm of its tensor. Where the cell of
-        largest norm is compressed, only cells whose norm exceeds that compression are evaluated.
+        The norm of a strain tensor bounds the size of its principal values. So the cell with the
+        largest norm is evaluated first. Then only those cells are evaluated whose norm is at
+        least its compression.
         """
         strain = self.strain(displacement)
         norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
         most = int(norms.argmax())
-        # The norm of a strain bounds its principal values, so that elements with a smaller norm
-        # than the compression found already cannot have more.
         near = norms >= -np.linalg.eigvalsh(strain[most])[0]
-        near[most] = True  # compressed along one axis its norm is its compression, but for rounding
+        near[most] = True  # under uniaxial strain rounding may put its norm below its compression
         return float(np.linalg.eigvalsh(strain[near]).min())
 
     def bulk(self, cells: slice) -> Array:

@@ -31,13 +31,15 @@ VERTICAL = 1
 
 @dataclass(frozen=True)
 class ConjugateGradientSettings:
-    """When a linear system counts as solved."""
+    """When the linear system of a tangent step of Sharma's loops counts as solved."""
 
     tolerance: float = 0.02
-    """1: residual relative to the right-hand side. A Newton step need not be exact, because the
-    next step corrects its error."""
+    """1: residual relative to the right-hand side. Smaller: more iterations for each tangent step.
+    Larger: more tangent steps. A tangent step need not be exact, because the next one corrects its
+    error."""
     max_iterations: int = 60
-    """Largest number of iterations; the next Newton step then begins with what is reached."""
+    """Largest number of iterations for a tangent step; the solution so far is then used. Smaller:
+    more tangent steps. Larger: a step may take longer."""
 
 
 CONJUGATE_GRADIENT = ConjugateGradientSettings()

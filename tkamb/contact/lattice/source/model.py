@@ -37,23 +37,31 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How Sharma's loops begin and end."""
+    """How Sharma's loops begin and end (`lattice-source` with the option loops = "source").
+
+    The tolerances that they share with the other solvers are in `LatticeSolverSettings`.
+    """
 
     max_loops: int = 60
-    """Most changes of the contact set or of D."""
+    """Largest number of changes of the contact set or of D; then the press has not converged.
+    Smaller: more presses end so. Larger: a press that cannot converge takes longer."""
     max_steps: int = 30
-    """Most tangent steps at one D."""
+    """Largest number of tangent steps at one D; the next loop goes on from there. Smaller: loops
+    are cheaper, but there may be more of them. Larger: the residual at one D is brought further
+    down."""
     first_depth: float = 0.8
-    """First D, as a share of the depth that the candidates cover. Candidates reach a quarter
+    """1: first D, as a share of the depth that the candidates cover. Candidates reach a quarter
     deeper than the depth that is expected: 1 / 1.25."""
     load: float = 0.1
-    """1: error of the load, as a share of the tolerance, below which the loop ends. One more D
-    costs little, and an error of the whole tolerance changes the forces by as much."""
+    """1: largest relative error of the load, as a share of the solver's `force_tolerance`. Smaller:
+    more loops. Larger: fewer; an error of the whole tolerance changes the forces by as much."""
     balance: float = 0.01
-    """1: residual of the free nodes at one D, as a share of the error of the load (or of the
-    tolerance, if that is larger)."""
+    """1: the tangent steps at one D end when the residual of the free nodes is below this share of
+    the relative error of the load (or of the solver's `force_tolerance`, if that is larger).
+    Smaller: more tangent steps in each loop. Larger: fewer, but D is corrected by a less accurate
+    reaction."""
     smallest_step: float = 0.05
-    """1: a tangent step that raises the residual is halved, down to this share."""
+    """1: a tangent step that raises the residual is halved, down to about this share."""
 
 
 LOOP = LoopSettings()
