@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import tkamb
-from scenes import fast_scene, write_scene
+from scenes import MODEL, fast_scene, write_scene
 from tkamb import load_scene, simulate
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.result import ContactStatus
@@ -172,6 +172,16 @@ def test_body_weight_scales_everything_but_geometry(tmp_path):
 def test_frames_outside_the_motion_are_refused(frames):
     with pytest.raises(InputError, match="not in the motion"):
         simulate(fast_scene(), frames=frames)
+
+
+def test_the_refusal_of_frames_says_which_there_are():
+    with pytest.raises(InputError, match="it has frames 0 to 100; 0:101 are all of them"):
+        simulate(fast_scene(), frames=slice(0, 3000, 10))
+
+
+def test_a_folder_in_the_place_of_its_scene_is_refused_with_the_scene():
+    with pytest.raises(InputError, match=r"is a folder, not a file; give .*scene\.toml"):
+        simulate(MODEL)
 
 
 def test_a_frame_whose_contact_is_out_of_range_fails_and_says_so(monkeypatch):

@@ -278,7 +278,7 @@ def chosen_frames(frames: slice | range | None, count: int) -> range:
         raise InputError(
             f"frames {frames.start}:{frames.stop}:{frames.step} are not in the motion",
             "--frames",
-            f"it has frames 0 to {count - 1}",
+            f"it has frames 0 to {count - 1}; 0:{count} are all of them",
         )
     return chosen
 

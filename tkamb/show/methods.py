@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.run.summary import WITHOUT_MUSCLES
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,12 @@ def methods(summary: Mapping[str, Any]) -> Methods:
     sentences: list[str] = []
     for part in (_software, _patient, _motion, _ground, _equations, _ligaments, _extensor):
         sentences += part(tables, summary)
-    sentences += [*_contact(tables, summary), *_left_out(summary), *_changed(summary)]
+    sentences += [
+        *_contact(tables, summary),
+        *_left_out(summary),
+        *_changed(summary),
+        *_notes(summary),
+    ]
     text = " ".join(sentences)
     cited = [full for key, full in REFERENCES.items() if _is_cited(key, text)]
     return Methods(tuple(sentences), tuple(sorted(cited)))
@@ -199,7 +205,8 @@ def _motion(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[s
         )
     count, failed = summary.get("frames"), len(summary.get("failed_frames", ()))
     if count:
-        yield f"{count} frames were computed, of which {failed} failed and are left out."
+        lost = f"{failed} of them failed and are left out" if failed else "none of them failed"
+        yield f"{count} frames were computed; {lost}."
 
 
 def _weights(markers: Mapping[str, Any]) -> str:
@@ -392,3 +399,10 @@ def _changed(summary: Mapping[str, Any]) -> Iterator[str]:
     if changed:
         listed = ", ".join(f"{name} = {value}" for name, value in changed.items())
         yield f"Settings that differ from tkamb's defaults: {listed}."
+
+
+def _notes(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Return the scene's own notes: how its inputs were made, and what is assumed of them."""
+    for note in summary.get("notes") or ():
+        if not note.startswith(WITHOUT_MUSCLES):  # `_extensor` says the same in a paper's words
+            yield note if note.endswith((".", "!", "?")) else f"{note}."

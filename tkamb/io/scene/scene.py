@@ -174,6 +174,8 @@ def load_scene(
             preset, or a scene that lacks what the preset needs.
     """
     path = Path(path)
+    if (path / "scene.toml").is_file():
+        raise InputError("is a folder, not a file", path, f"give {path / 'scene.toml'}")
     content = _content(path)
     applied = None if preset is None else _apply_preset(content, preset, overrides or {}, path)
     _apply_overrides(content, overrides or {})

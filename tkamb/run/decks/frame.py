@@ -96,7 +96,7 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     results = read_results(folder)
     count = len(results)
     if not -count <= frame < count:
-        raise InputError(f"there is no frame {frame}", "--frame", f"0 to {count - 1}")
+        raise InputError(f"there is no frame {frame}", "--frame", f"give one of 0 to {count - 1}")
     frame %= count
     row, maps = map_rows(results).get(frame), results.maps
     if maps is None or row is None:
