@@ -4,6 +4,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+WITHOUT_MUSCLES = "Without [muscles]"
+"""How a note begins that holds only while the scene has no table [muscles]; `tkamb import` writes
+one."""
+
 Kind = Literal["number", "integer", "text"]
 
 

@@ -19,7 +19,15 @@ from tkamb.io.recordings.gait import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene, scene_files
 from tkamb.io.scene.tables import ContactTable, MusclesTable
-from tkamb.run.columns import ACTIVATION, JOINT_MOMENT, RESERVE, belongs, family_column, name_in
+from tkamb.run.columns import (
+    ACTIVATION,
+    JOINT_MOMENT,
+    RESERVE,
+    WITHOUT_MUSCLES,
+    belongs,
+    family_column,
+    name_in,
+)
 from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.known_errors import as_json, known_error, left_out
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
@@ -41,10 +49,6 @@ POST_HELD = (
     "Cam and post: the post is held at its anterior face, so that it does not bend at its root; "
     "friction as of the condyles; the column force_si_N and its like hold the post's force too."
 )
-
-WITHOUT_MUSCLES = "Without [muscles]"
-"""How a note begins that holds only while the scene has no table [muscles]; `tkamb import` writes
-one."""
 
 
 @dataclass(frozen=True)

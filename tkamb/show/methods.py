@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.run.summary import WITHOUT_MUSCLES
+from tkamb.run.columns import WITHOUT_MUSCLES
 
 
 @dataclass(frozen=True)

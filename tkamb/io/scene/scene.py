@@ -174,7 +174,7 @@ def load_scene(
             preset, or a scene that lacks what the preset needs.
     """
     path = Path(path)
-    if (path / "scene.toml").is_file():
+    if os.path.isfile(path / "scene.toml"):  # False too for a name that no file can have
         raise InputError("is a folder, not a file", path, f"give {path / 'scene.toml'}")
     content = _content(path)
     applied = None if preset is None else _apply_preset(content, preset, overrides or {}, path)
