@@ -248,15 +248,15 @@ class Knee:
     ) -> Any:
         """Return what contact, ligaments and muscles do to the bodies at q and v.
 
-        The contact follows from the overlap of the bodies at q, its friction from v. A tension of
-        the quadriceps is carried on by the patella, massless, to patellar ligament and femur.
+        The contact follows from the overlap of the bodies at q, its friction from v. The patella
+        has no mass here: it passes the quadriceps' tension on to patellar ligament and femur.
 
         Args:
             q: (nq,).
             v: (nv,).
-            tensions: muscle -> N; a number alone is the quadriceps'. What is missing is slack.
-                "patellar_ligament" -> N beside the quadriceps: then its tension is that, and the
-                patellofemoral force what the two leave, as in `KneeLoads.tensions`.
+            tensions: muscle -> N; a number alone is the quadriceps'. Muscles that are not named
+                are slack. With "patellar_ligament" -> N beside the quadriceps, as in
+                `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
             data: from `create_data`, to save time.
 
         Returns:
@@ -504,13 +504,12 @@ class Knee:
                 knee.geometry, knee.coordinates, knee.contact.condyles, points
             )
         loads = self._solved(instant, geometry, data)
-        left_over = knee.residual
         return Equilibrium(
             q_end,
             knee.coordinates,
             loads,
             result,
-            left_over,
+            knee.residual,
             knee.balance.stiffness,
             knee.problem,
             knee,
@@ -609,7 +608,7 @@ class Knee:
             external: see `inverse_dynamics`.
             tensions: see `inverse_dynamics`; among what is external.
             data: from `create_data`, to save time.
-            patella: finds the patella; None: by its place in q, or where the model has none anew.
+            patella: finds the patella; None: it is where q says, or found where q has none.
             muscles: those of the leg that share the load; None: the quadriceps alone acts.
 
         Raises:

@@ -159,6 +159,8 @@ class Mechanics:
         # As recorded to the last digit: what is kept stays exactly. Joint placements round.
         joints = instant.motion.joints.copy()
         joints[0, :6] = motion.coordinates[k]
+        if self.extensor is not None:
+            joints[0, 6:] = self.extensor.joints(k)[0]
         instant = replace(instant, motion=replace(instant.motion, joints=joints))
         if self.ground is None or instant.ground is None:
             return instant

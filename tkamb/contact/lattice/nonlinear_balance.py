@@ -27,6 +27,8 @@ from tkamb.geometry.frames import Array, Mask
 
 NEAR = 0.05
 """Relative residual from which on a region is chosen: a contact far off still grows."""
+LAST_GAP = 4.0
+"""Times the gap tolerance: gap that the last pass may leave, the model's own `tolerance`."""
 OUTSIDE = 0.8
 """Share of the force tolerance that may stay outside of the region: the rounding of the factor."""
 
@@ -66,7 +68,7 @@ class Residual:
 
     def within(self, settings: LatticeSolverSettings, last: bool = False) -> bool:
         """Say whether all are within their tolerances; NaN is not. The last pass allows more."""
-        gap = settings.force_tolerance if last else settings.gap_tolerance
+        gap = (LAST_GAP if last else 1.0) * settings.gap_tolerance
         balanced = self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
         return balanced and self.gap <= gap
 

@@ -26,7 +26,7 @@ class LatticeSolverSettings:
     """1: largest distance of an active node from the femoral surface (penetration of the others),
     relative to the largest displacement of an active node. Smaller: more passes where the femoral
     normal turns quickly. Larger: fewer passes, peaks at such places less accurate: at a rim a peak
-    is off by up to three times the gap. The last pass accepts `force_tolerance` instead."""
+    is off by up to three times the gap. The last pass accepts four times as much."""
     max_passes: int = 40
     """Passes after which the iteration stops, converged or not; knees take 1 to 8. Smaller: presses
     that converge slowly stop earlier, and take the slow full Newton iteration or end as not
