@@ -72,7 +72,7 @@ class InitialPoses:
         """Return the equilibrium from the first initial guess that converges.
 
         Where it lies farther than `INITIAL_POSE.max_continuation` from that start, the search is
-        repeated from the other starts; one that ends elsewhere is told in `second`.
+        repeated from the starts that are left; one that ends elsewhere is described in `second`.
 
         Args:
             instant: the knee.
@@ -84,7 +84,7 @@ class InitialPoses:
         """
         knee, failure = None, "the femoral component does not lie over the insert"
         recorded = instant.coordinates
-        starts = list(self._starts(recorded, [knee.coordinates for knee in previous]))
+        starts = self._starts(recorded, [knee.coordinates for knee in previous])
         for place in starts:
             if not np.isfinite(place).all():
                 continue
@@ -99,7 +99,7 @@ class InitialPoses:
             raise ComputationError(failure)
         if knee.problem or _apart(place, knee.coordinates) <= INITIAL_POSE.max_continuation:
             return knee
-        others = [one for one in starts[1:] if one is not place] or self._beside(instant)
+        others = list(starts) or self._beside(instant)
         return replace(knee, second=self._second(instant, knee, others, points))
 
     def _beside(self, instant: Instant) -> list[Array]:
@@ -116,7 +116,7 @@ class InitialPoses:
         starts: list[Array],
         points: dict[str, Array],
     ) -> str:
-        """Return in words where other starts lead that do not lead to an equilibrium; or empty."""
+        """Return in words another equilibrium to which other starts lead; empty: there is none."""
         for place in starts:
             if not np.isfinite(place).all():
                 continue
