@@ -58,7 +58,7 @@ class ErrorRow:
         material: name of the insert's material.
         contact: name of the contact model.
         resolution_mm: resolution of the pressure map, mm.
-        status: status of the press, or "too narrow" if the contact has that flag; such contacts have
+        status: status of the press, or "too narrow" after that flag; such contacts have
             no stated error.
         errors: relative errors of approach, mean and peak pressure and area; empty if the press
             failed.
