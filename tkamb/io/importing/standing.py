@@ -10,7 +10,7 @@ import numpy as np
 from tkamb.geometry.frames import MIRROR, Array, inverse, mirrored_pose, transform
 from tkamb.io.importing.markers import ModelSegment, facing, segments_of
 from tkamb.io.importing.scene_text import SceneText
-from tkamb.io.recordings.leg_chain import LegChain
+from tkamb.io.recordings.inverse_kinematics import LegChain
 from tkamb.io.recordings.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.io.recordings.markers import matched_labels, plain_label
 from tkamb.io.recordings.tables import Table, read_table, with_unit

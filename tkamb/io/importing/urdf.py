@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.io.importing.links import Links
-from tkamb.io.recordings.segments import RigidInertia, combined
+from tkamb.io.recordings.patient import RigidInertia, combined
 from tkamb.io.recordings.urdf_check import KNEE_JOINTS, PATELLA_JOINTS
 
 RESERVED = ("ground", "tibia", "femur", "patella", "hip")
