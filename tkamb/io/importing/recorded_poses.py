@@ -14,8 +14,7 @@ from tkamb.io.importing.links import Links
 from tkamb.io.importing.toml_text import toml_text
 from tkamb.io.recordings.meshes import axes_rotation
 from tkamb.io.recordings.motion import KneeMotion, load_motion
-from tkamb.io.scene.recording_tables import MotionTable
-from tkamb.io.scene.si import in_si
+from tkamb.io.recordings.recording_tables import MotionTable
 from tkamb.units import DEGREE
 
 ROLES = tuple(f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3))
@@ -133,14 +132,14 @@ def read_poses(
 
 def _motion_table(
     recording: PoseRecording, cutoff_Hz: float, interval: tuple[float, float] | None
-) -> Any:
+) -> MotionTable:
     keys = recording.keys() | {
         "file": recording.file,
         "cutoff_Hz": cutoff_Hz,
         "interval_s": interval,
     }
     keys["columns"] = dict(zip(ROLES, recording.columns, strict=True))
-    return in_si(MotionTable.model_validate(keys))
+    return MotionTable.model_validate(keys)
 
 
 def _in_stance(recording: PoseRecording, motion: KneeMotion) -> Array:

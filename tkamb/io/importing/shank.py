@@ -11,7 +11,6 @@ from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.io.importing.links import Links
 from tkamb.io.importing.markers import ModelSegment
 from tkamb.io.importing.toml_text import toml_markers, toml_mm, toml_text
-from tkamb.io.recordings.recordings import JointCentre
 from tkamb.units import MILLIMETRE
 
 
@@ -23,25 +22,22 @@ class ShankMarkers:
         path: of the recording.
         axes: the file's that point forward, up and right.
         points: label -> (3,) m in the tibia link.
-        centres: joint centres that complete them.
+        centres: joint centre that completes them -> its [[tibia.joint_centre]], line by line.
         said: lines on them.
     """
 
     path: Path
     axes: str
     points: dict[str, Array]
-    centres: tuple[JointCentre, ...]
+    centres: dict[str, list[str]]
     said: tuple[str, ...]
 
     def lines(self, path: str) -> list[str]:
         """Return the scene's [tibia]; `path` is the recording's, as TOML."""
         lines = ["[tibia]", 'kind = "markers"', f"file = {path}"]
         lines += [f'laboratory_axes = "{self.axes}"', f"markers_mm = {toml_markers(self.points)}"]
-        for centre in self.centres:
-            lines += ["", "[[tibia.joint_centre]]", f"name = {toml_text(centre.name)}"]
-            lines.append(f"markers_mm = {toml_markers(centre.markers)}")
-            lines.append(f"centre_mm = {toml_mm(centre.centre)}")
-            lines.append(f"tibia_mm = {toml_mm(centre.tibia)}")
+        for centre in self.centres.values():
+            lines += ["", *centre]
         return lines
 
 
@@ -68,7 +64,7 @@ def shank_markers(
         InputError: fewer than three points.
     """
     points = segments["shank"].points
-    centres: list[JointCentre] = []
+    centres: dict[str, list[str]] = {}
     text: list[str] = []
     if len(points) < 3:
         centres, text = _carried(links, segments, femur)
@@ -79,17 +75,20 @@ def shank_markers(
             recording,
             "three markers of the foot carry the ankle's centre, three of the thigh the knee's",
         )
-    return ShankMarkers(recording, axes, points, tuple(centres), tuple(text))
+    return ShankMarkers(recording, axes, points, centres, tuple(text))
 
 
 def _carried(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
-) -> tuple[list[JointCentre], list[str]]:
+) -> tuple[dict[str, list[str]], list[str]]:
     """Return the joint centres that foot and thigh carry, and lines on them."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
-    centres, text = [], []
+    centres: dict[str, list[str]] = {}
+    text = []
     if len(foot.points) >= 3 and foot.centre is not None:
-        centres.append(JointCentre("ankle_centre", foot.points, foot.centre, np.zeros(3)))
+        centres["ankle_centre"] = _centre_lines(
+            "ankle_centre", foot.points, foot.centre, np.zeros(3)
+        )
         text.append(f"shank: its ankle centre is carried by the foot's {len(foot.points)} markers")
     if len(thigh.points) >= 3:
         own = {name: transform(links.femur, point) for name, point in thigh.points.items()}
@@ -97,9 +96,22 @@ def _carried(
         places = transform(femur, centre)
         mean = places.mean(axis=0)
         apart = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
-        centres.append(JointCentre("knee_centre", own, centre, mean))
+        centres["knee_centre"] = _centre_lines("knee_centre", own, centre, mean)
         text.append(
             f"shank: its knee centre is carried by the thigh's {len(own)} markers, at the mean of "
             f"{len(places)} recorded poses ({apart:.1f} mm rms about it)"
         )
     return centres, text
+
+
+def _centre_lines(
+    name: str, markers: Mapping[str, Array], centre: Array, tibia: Array
+) -> list[str]:
+    """Return a [[tibia.joint_centre]]; markers and centre (3,) m are in the neighbour's frame."""
+    return [
+        "[[tibia.joint_centre]]",
+        f"name = {toml_text(name)}",
+        f"markers_mm = {toml_markers(markers)}",
+        f"centre_mm = {toml_mm(centre)}",
+        f"tibia_mm = {toml_mm(tibia)}",
+    ]
