@@ -11,9 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tkamb.atomic import claim_directory, replaced_file
 from tkamb.errors import InputError
-from tkamb.files import sha256_of
+from tkamb.files import claim_directory, replaced_file, sha256_of
 from tkamb.io.datasets.dataset import DataFile, Dataset
 
 TIMEOUT_S = 30

@@ -12,7 +12,7 @@ import scipy.sparse as sparse
 from tkamb.contact.lattice.linear.multifrontal import Dissection
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Index, Mask
-from tkamb.memory import available_memory
+from tkamb.geometry.memory import available_memory
 from tkamb.units import MILLIMETRE
 
 
