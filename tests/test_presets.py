@@ -12,8 +12,7 @@ from tkamb import load_scene, simulate
 from tkamb.cli import main
 from tkamb.contact import named_classes
 from tkamb.errors import InputError
-from tkamb.io.presets.preset import Preset
-from tkamb.io.presets.registry import find_preset, preset_names
+from tkamb.io.presets import Preset, find_preset, preset_names
 from tkamb.io.scene import with_preset
 from tkamb.io.scene.case import load_case
 from tkamb.run.rerun import case_of_results, run_again

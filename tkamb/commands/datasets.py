@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tkamb.io.datasets.dataset import NAMES, read_dataset
+from tkamb.io.datasets import NAMES, read_dataset
 
 
 def add_data(commands: Any) -> None:
@@ -29,7 +29,7 @@ def add_data(commands: Any) -> None:
 
 
 def _get(options: argparse.Namespace) -> int:
-    from tkamb.io.datasets.get import download, take_from
+    from tkamb.io.datasets import download, take_from
 
     dataset = read_dataset(options.name)
     to = options.to or dataset.folder

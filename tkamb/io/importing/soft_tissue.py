@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.io.importing.links import Links
-from tkamb.io.importing.urdf import body_link
-from tkamb.io.opensim.lines import Ligament, Path, PathPoint
+from tkamb.io.importing.links import Links, body_link
+from tkamb.io.opensim.model import Ligament, Path, PathPoint
 
 
 @dataclass(frozen=True)

@@ -5,5 +5,5 @@
 - `tkamb.io.opensim.kinematics`: `frame_poses(model, q)`; `Kinematics(model)` for many poses at
   once, `.motion(q).points(bodies, locations)` for points with their Jacobians.
 - `tkamb.io.opensim.paths`: `LineSet(kinematics).at(q)` for lengths and moment arms.
-- `tkamb.io.opensim.inverse_dynamics`: the generalised forces of a motion.
+- `tkamb.io.opensim.motion`: the generalised forces of a motion.
 """
