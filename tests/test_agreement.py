@@ -16,7 +16,7 @@ from tkamb.contact.result import ContactResult
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.knee.equilibrium.split_sensitivity import split_sensitivity, split_tangent
+from tkamb.knee.adjustment import split_sensitivity, split_tangent
 from tkamb.run.agreement import contradictions
 from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.show.axis import horizontal_axis

@@ -18,8 +18,8 @@ from interrupted_runs import broken_off, held_elsewhere
 from synthetic_run import make_run
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.geometry.memory import give_back
 from tkamb.io.claim import claimed_directory, settle
-from tkamb.memory import give_back
 from tkamb.run.simulation import simulate
 from tkamb.run.workers import PoolOptions
 from tkamb.show.cohort_report import _split_into_plots, cohort_html, draw_groups

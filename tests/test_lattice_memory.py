@@ -9,7 +9,6 @@ import scipy.sparse as sparse
 
 from lattice_blocks import block
 from lattice_bodies import box_insert, pair, sphere_cap
-from tkamb import memory
 from tkamb.contact.lattice.calibrated import CalibratedNetwork
 from tkamb.contact.lattice.linear import operator
 from tkamb.contact.lattice.linear.compliance import SINGLE
@@ -18,6 +17,7 @@ from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operat
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
+from tkamb.geometry import memory
 
 LINEAR = material("polyethylene-linear")
 

@@ -14,7 +14,7 @@ from types import ModuleType
 
 FOLDERS = {
     "tkamb.body": "tkamb.knee",
-    "tkamb.equilibrium": "tkamb.knee.equilibrium",
+    "tkamb.equilibrium": "tkamb.knee",
     "tkamb.scene": "tkamb.io.scene",
     "tkamb.inputs": "tkamb.io.recordings",
     "tkamb.importing": "tkamb.io.importing",
@@ -35,6 +35,8 @@ FOLDERS = {
 }
 """Folder of release 0.1 -> where its modules are."""
 MODULES = {
+    "tkamb.atomic": "tkamb.files",
+    "tkamb.memory": "tkamb.geometry.memory",
     "tkamb.simulation": "tkamb.run.simulation",
     "tkamb.results": "tkamb.run.results",
     "tkamb.results_folder": "tkamb.run.results_folder",
@@ -79,11 +81,14 @@ MODULES = {
     "tkamb.named_classes": "tkamb.contact.named_classes",
     "tkamb.cohort.report": "tkamb.show.cohort_report",
     "tkamb.studies.tradeoff_report": "tkamb.show.tradeoff_report",
-    "tkamb.scene_options": "tkamb.commands.scene_options",
-    "tkamb.export_command": "tkamb.commands.export",
+    "tkamb.scene_options": "tkamb.commands.options",
+    "tkamb.export_command": "tkamb.commands.results",
     "tkamb.mesh_command": "tkamb.commands.mesh",
     "tkamb.importing.command": "tkamb.commands.import_model",
     "tkamb.studies.command": "tkamb.commands.studies",
+    "tkamb.cohort.command": "tkamb.commands.studies",
+    "tkamb.compare.command": "tkamb.commands.results",
+    "tkamb.datasets.command": "tkamb.commands.import_model",
 }
 """Module of release 0.1 -> its new name."""
 

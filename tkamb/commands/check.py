@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.commands.scene_options import add_force, add_set
+from tkamb.commands.options import add_force, add_set
 from tkamb.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _write_picture(check: "SceneCheck", path: Path) -> None:
-    from tkamb.atomic import replaced_file, write_text
+    from tkamb.files import replaced_file, write_text
     from tkamb.show.check.leg_picture import draw_leg
 
     figure = draw_leg(check.case, check.mechanics)

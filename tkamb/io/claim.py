@@ -20,15 +20,17 @@ from pathlib import Path
 from typing import Any
 
 from tkamb import __version__
-from tkamb.atomic import (
+from tkamb.errors import InputError
+from tkamb.files import (
+    FILE_LIMITS,
     MARKER,
     claim_directory,
     finish_replacement,
     folder_token,
+    read_json,
+    read_text,
     replacement_pending,
 )
-from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_json, read_text
 
 WRITTEN = {
     "uncertainty": ("bands.csv",),

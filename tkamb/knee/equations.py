@@ -11,6 +11,7 @@ and three residuals. A smaller model has fewer unknowns:
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,10 +19,19 @@ from tkamb.geometry.frames import Array, cross
 from tkamb.knee import unknowns
 from tkamb.knee.chain import ChainState
 from tkamb.knee.contact_points import CondylePoint
-from tkamb.knee.crossing import MuscleShare
 from tkamb.knee.load import PointForces
-from tkamb.knee.load_state import LoadState, contradictions, load_states, wrong_signs
-from tkamb.knee.unknowns import Unknown, muscle_load, solve
+from tkamb.knee.unknowns import (
+    LoadState,
+    Unknown,
+    contradictions,
+    load_states,
+    muscle_load,
+    solve,
+    wrong_signs,
+)
+
+if TYPE_CHECKING:
+    from tkamb.knee.crossing import MuscleShare
 
 
 @dataclass(frozen=True)
@@ -90,7 +100,7 @@ class KneeGeometry:
     muscles: tuple[Unknown, ...] = ()
     coordinates: Array = field(default_factory=lambda: np.full(6, np.nan))
     tensions: dict[str, float] = field(default_factory=dict)
-    share: MuscleShare | None = None
+    share: "MuscleShare | None" = None
     post: tuple[PointForces, ...] = ()
     problems: tuple[str, ...] = ()
 
@@ -129,7 +139,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
     """Return all loads of one frame: those of the load state without a wrong sign.
 
     If several states have no wrong sign, the one that leaves out fewest loads is taken, and
-    `ambiguous` is true. If none has, the frame has no number. See `tkamb.knee.load_state`.
+    `ambiguous` is true. If none has, the frame has no number. See `tkamb.knee.unknowns`.
 
     Args:
         geometry: the frame.

@@ -26,7 +26,16 @@ from tkamb.geometry.frames import (
     sagittal_pose,
 )
 from tkamb.knee.anatomy import find_anatomy
-from tkamb.knee.assembly import (
+from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, mirrored_spatial, se3, summed
+from tkamb.knee.contact_points import NO_CONTACT
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.instant import Instant, PatellaAt, PatellaFinder, SharingMuscles
+from tkamb.knee.load import PointForces
+from tkamb.knee.loads import KneeLoads, knee_loads
+from tkamb.knee.muscles import Muscle, checked_tensions, tension_lines
+from tkamb.knee.parts import (
+    Extensor,
+    Implant,
     bundle_on_chain,
     crossing_and_others,
     extensor_lines,
@@ -34,15 +43,6 @@ from tkamb.knee.assembly import (
     prepared_contact,
     surfaces_of,
 )
-from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, mirrored_spatial, se3, summed
-from tkamb.knee.contact_points import NO_CONTACT
-from tkamb.knee.equations import KneeGeometry
-from tkamb.knee.instant import Instant, PatellaAt, PatellaFinder, SharingMuscles
-from tkamb.knee.load import PointForces
-from tkamb.knee.loads import KneeLoads, knee_loads
-from tkamb.knee.muscles import Muscle
-from tkamb.knee.parts import Extensor, Implant
-from tkamb.knee.tension import checked_tensions, tension_lines
 
 if TYPE_CHECKING:
     from tkamb.contact.model import ContactModel
@@ -51,10 +51,10 @@ if TYPE_CHECKING:
     from tkamb.contact.warm_start import Guess, WarmStart
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.knee.contact import KneeContact
-    from tkamb.knee.equilibrium.released import KneeEquilibrium
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
+    from tkamb.knee.released import KneeEquilibrium
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Its name among the tensions."""
@@ -482,7 +482,7 @@ class Knee:
                 few degrees of freedom to reach the pose.
             ComputationError: the femur does not lie over the insert.
         """
-        from tkamb.knee.equilibrium.released import ReleasedKnee
+        from tkamb.knee.released import ReleasedKnee
 
         contact, allowed = self._need_contact(), [n for n in KNEE_COORDINATES if n != "flexion"]
         for name in released:
@@ -754,7 +754,7 @@ class Knee:
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
         """Return the knee at rest, from first touch at the other coordinates of q."""
-        from tkamb.knee.equilibrium.starts import InitialPoses
+        from tkamb.knee.starts import InitialPoses
 
         pair = self._need_contact().pair
         if not np.isfinite(pair.first_touch_height(knee_pose(instant.coordinates))):

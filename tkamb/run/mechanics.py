@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ContactModel
     from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings
     from tkamb.geometry.closest import ClosestPointQuery
-    from tkamb.knee.adjustment_effect import AdjustmentEffect
+    from tkamb.knee.adjustment import AdjustmentEffect
     from tkamb.knee.extensor import ExtensorFrames
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
@@ -237,7 +237,7 @@ class Mechanics:
         """Return what the adjustment changed; None where either pose has no solution."""
         if loads.problems or recorded.problems:
             return None
-        from tkamb.knee.adjustment_effect import adjustment_effect
+        from tkamb.knee.adjustment import adjustment_effect
 
         recorded_geometry = replace(geometry, condyles=recorded.condyles, lifted=recorded.lifted)
         before = solve_knee(recorded_geometry, self.friction)

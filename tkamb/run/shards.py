@@ -20,9 +20,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from tkamb.atomic import replaced_file, write_text
 from tkamb.errors import InputError
-from tkamb.files import read_bytes, read_json
+from tkamb.files import read_bytes, read_json, replaced_file, write_text
 from tkamb.geometry.frames import Array
 
 FOLDER = ".frames"

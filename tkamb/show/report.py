@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.atomic import write_text
+from tkamb.files import write_text
 from tkamb.geometry.frames import Array
 from tkamb.run.metrics import body_weight, failed, flagged
 from tkamb.show.axis import LABELS, HorizontalAxis, horizontal_axis

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from tkamb.atomic import replaced_file
 from tkamb.errors import ComputationError, InputError, not_installed
+from tkamb.files import replaced_file
 from tkamb.show.view.page import SOFTWARE_GRAPHICS, find_browser
 from tkamb.show.view.run import Progress
 

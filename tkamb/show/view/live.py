@@ -18,7 +18,7 @@ from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.si import in_si
 from tkamb.knee.chain import Chain
-from tkamb.knee.equilibrium.frame_contact import FrameContact
+from tkamb.knee.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
 from tkamb.run.guard import unforeseen_words
 from tkamb.run.known_errors import as_json, known_error

@@ -53,7 +53,7 @@ class CaseResults:
         if contact is None or (contact.coupling == "none" and not contact.released):
             rows = map_rows(self.results)
             return [self._geometry(k, rows.get(row)) for row, k in enumerate(progress(self.frames))]
-        from tkamb.knee.equilibrium.frame_contact import FrameContact
+        from tkamb.knee.frame_contact import FrameContact
 
         side, result = contact_side(self.case, self.mechanics), list[KneeGeometry]()
         touched: list[FrameContact] = []

@@ -10,8 +10,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tkamb.atomic import replaced_file, write_text
 from tkamb.errors import InputError
+from tkamb.files import replaced_file, write_text
 from tkamb.show.view import CAMERAS
 from tkamb.show.view.draw import draw
 from tkamb.show.view.drawing import Drawing

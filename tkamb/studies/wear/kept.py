@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.atomic import replaced_file
-from tkamb.code_identity import code_identity
+from tkamb import code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes, replaced_file
 from tkamb.run.plug_ins import foreign_code
 from tkamb.run.shards import UNREADABLE
 from tkamb.studies.wear.setup import WearSetup

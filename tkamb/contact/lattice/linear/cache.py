@@ -36,7 +36,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.code_identity import code_identity
+from tkamb import code_identity
 from tkamb.contact.lattice.linear.compliance import HalfResponse
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error

@@ -1,6 +1,7 @@
-"""The contact side of one frame, as the run records it."""
+"""The contact of one frame as a run records it: both condyles, and cam and post."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,10 +11,74 @@ from tkamb.contact.area import area_above
 from tkamb.contact.result import ContactResult
 from tkamb.contact.warm_start import WarmStart
 from tkamb.geometry.adjustment import Adjustment
+from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.contact.cam_post import PostContact
-    from tkamb.knee.equilibrium.released import KneeEquilibrium
+    from tkamb.contact.cam_post import CamPost, PostContact
+    from tkamb.contact.materials import Material
+    from tkamb.contact.model import ContactModel
+    from tkamb.contact.pair import ContactPair
+    from tkamb.geometry.frames import Array
+    from tkamb.geometry.surface import Surface
+    from tkamb.knee.released import KneeEquilibrium
+
+
+@dataclass(frozen=True)
+class PostSideSettings:
+    """On which side of the post the cam is."""
+
+    pose_error: float = 0.5 * MILLIMETRE
+    """m: error of a position from fluoroscopy; a deeper overlap of cam and post becomes a question
+    to the user. Chosen: above its usual error."""
+
+
+POST_SIDE = PostSideSettings()
+
+
+def cam_on_post(
+    model: "ContactModel",
+    pair: "ContactPair",
+    post: "Surface",
+    material: "Material",
+    ready: "CamPost | None" = None,
+) -> "CamPost":
+    """Return cam and post, prepared.
+
+    Args:
+        model: the contact model.
+        pair: femoral component and insert.
+        post: of the insert, insert frame.
+        material: of the insert.
+        ready: the same prepared already, perhaps of another material.
+
+    Raises:
+        InputError: see `CamPost`.
+    """
+    if ready is not None:
+        return ready if ready.material == material else ready.of_material(material)
+    from tkamb.contact.cam_post import CamPost
+
+    return CamPost(model, pair.femoral, post, pair.split, material)
+
+
+def post_contact(
+    cam_post: "CamPost | None", pose: "Array", released: Sequence[str]
+) -> "PostContact | None":
+    """Return cam and post at a pose (4, 4), with a question if a recorded AP makes them overlap.
+
+    None where they are not modelled.
+    """
+    if cam_post is None:
+        return None
+    post = cam_post.at(pose)
+    if "ap" in released or post.problem or not post.gap < -POST_SIDE.pose_error:
+        return post
+    question = (
+        f"cam and post overlap by {-post.gap / MILLIMETRE:.1f} mm as recorded, which makes "
+        f"{np.linalg.norm(post.force):.0f} N: release ap"
+    )
+    return replace(post, flags=(*post.flags, question))
+
 
 NAN = float("nan")
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.knee.equilibrium.released_forces import RELEASED_FORCE
+from tkamb.knee.released_forces import RELEASED_FORCE
 
 if TYPE_CHECKING:
     from tkamb.knee.crossing import MuscleShare

@@ -25,12 +25,17 @@ import numpy as np
 
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_pose
+from tkamb.knee.balance import Balance, BalanceStatus
 from tkamb.knee.equations import KneeGeometry
-from tkamb.knee.equilibrium.balance import Balance, BalanceStatus
-from tkamb.knee.equilibrium.relaxation import Relaxation
-from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
 from tkamb.knee.instant import Instant
-from tkamb.knee.joint_equilibrium import JointEquilibrium, external_wrench, joint_equilibrium
+from tkamb.knee.relaxation import Relaxation
+from tkamb.knee.released_forces import (
+    SCALE,
+    JointEquilibrium,
+    ReleasedForces,
+    external_wrench,
+    joint_equilibrium,
+)
 
 if TYPE_CHECKING:
     from tkamb.contact.probe import Probe, ProbedContact

@@ -10,10 +10,10 @@ import numpy as np
 from tkamb.contact.pair import ContactPair
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
-from tkamb.knee.equilibrium.balance import BalanceStatus
-from tkamb.knee.equilibrium.released import KneeEquilibrium, ReleasedKnee
-from tkamb.knee.equilibrium.released_forces import SCALE
+from tkamb.knee.balance import BalanceStatus
 from tkamb.knee.instant import Instant
+from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
+from tkamb.knee.released_forces import SCALE
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
