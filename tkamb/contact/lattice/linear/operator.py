@@ -29,7 +29,7 @@ from tkamb.contact.pair import Bearing
 from tkamb.errors import ComputationError
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index, Mask
-from tkamb.memory import available_memory
+from tkamb.geometry.memory import available_memory
 from tkamb.units import MILLIMETRE
 
 
