@@ -16,8 +16,7 @@ from tkamb.geometry.polygons import triangulated
 from tkamb.geometry.repair import Repair, repair
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import Body, BoundaryLoop, connected_parts, separate_bodies
-from tkamb.io.recordings.polygon_files import read_obj, read_ply
-from tkamb.io.recordings.stl import read_binary_stl
+from tkamb.io.recordings.polygon_files import read_binary_stl, read_obj, read_ply
 from tkamb.io.recordings.vtp import read_vtp
 from tkamb.units import LENGTH, MILLIMETRE
 
