@@ -268,15 +268,6 @@ BUILT_IN = {
 PRESETS = NamedClasses("preset", Preset, "tkamb.io.presets", BUILT_IN)
 
 
-def preset_names() -> tuple[str, ...]:
-    """Return the names of all presets, built-in ones first.
-
-    Raises:
-        InputError: two packages offer the same name.
-    """
-    return PRESETS.names()
-
-
 def find_preset(name: str) -> Preset:
     """Return the preset of that name.
 

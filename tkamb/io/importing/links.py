@@ -94,15 +94,11 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
 
 
 def quarter_turn(rotation: Array) -> tuple[Array, float]:
-    """Return the nearest rotation (3, 3) by quarter turns, and how far (rad) it is."""
-    best = np.zeros((3, 3))
-    rest = np.abs(rotation).copy()
-    for _ in range(3):
-        i, j = np.unravel_index(int(np.argmax(rest)), (3, 3))
-        best[i, j] = np.sign(rotation[i, j])
-        rest[i, :], rest[:, j] = -1.0, -1.0
-    angle = np.arccos(np.clip((np.trace(best.T @ rotation) - 1.0) / 2.0, -1.0, 1.0))
-    return best, float(angle)
+    """Return the nearest rotation (3, 3) by quarter turns, and the angle (rad) to it."""
+    turns = Rotation.create_group("O")
+    angles = (turns.inv() * Rotation.from_matrix(rotation)).magnitude()
+    nearest = int(np.argmin(angles))
+    return np.round(turns[nearest].as_matrix()), float(angles[nearest])
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +219,7 @@ def _anatomical(
     assert frame.pose is not None
     pose = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(pose[:3, :3])
-    angle = np.arccos(np.clip((np.trace(pose[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+    angle = Rotation.from_matrix(pose[:3, :3]).magnitude()
     if not np.allclose(nearest, np.eye(3)) or angle > LINK_FIT.max_implant_rotation:
         raise InputError(
             f"the {part} stands turned by {angle / DEGREE:.0f} deg on '{body}' with these axes "

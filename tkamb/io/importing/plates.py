@@ -294,7 +294,7 @@ def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
     for one in forces:
         middles = {s: _interpolated(m, feet.time, one.time) for s, m in feet.middles.items()}
         point = one.point
-        for first, last in _runs(one.loaded):
+        for first, last in uninterrupted_runs(one.loaded):
             if one.time[last] - one.time[first] >= FOOT_CONTACT.min_duration:
                 part = slice(first, last + 1)
                 own = {side: middle[part] for side, middle in middles.items()}
@@ -415,9 +415,3 @@ def _interpolated(values: Array, time: Array, at: Array) -> Array:
     """Return values (n, 3) at other times; NaN outside the recording."""
     columns = [np.interp(at, time, values[:, k], left=np.nan, right=np.nan) for k in range(3)]
     return np.stack(columns, axis=1)
-
-
-def _runs(loaded: np.ndarray) -> list[tuple[int, int]]:
-    """Return first and last index of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], loaded, [False]]).astype(int)))
-    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]

@@ -196,6 +196,7 @@ def _name_muscles(links: Links, remarks: list[str]) -> None:
         )
 
 
-def some_names(names: list[str], most: int = 8) -> str:
-    """Return the first names, and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+def some_names(names: list[str]) -> str:
+    """Return the first eight names, and how many more there are."""
+    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    return ", ".join(names[:8]) + more

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, Index
 from tkamb.io.opensim.kinematics import Kinematics, Motion
 from tkamb.io.opensim.model import ConditionalPathPoint, Ligament, MovingPathPoint, Muscle, Path
-from tkamb.io.opensim.wrapping import Index, WrappedStrings, strings_over
+from tkamb.io.opensim.wrapping import WrappedStrings, strings_over
 
 
 @dataclass(frozen=True, eq=False)

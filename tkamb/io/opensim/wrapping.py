@@ -29,9 +29,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array, inverse
+from tkamb.geometry.frames import Array, Index, Mask, inverse
 from tkamb.io.opensim.geodesic import dot, shortest_strings, unit
 from tkamb.io.opensim.model import WrapObject
 
@@ -49,10 +48,6 @@ class WrapSettings:
 
 
 WRAP = WrapSettings()
-
-
-Mask = NDArray[np.bool_]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
