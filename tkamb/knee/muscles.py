@@ -14,7 +14,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, transform
-from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.polygons import sagittal_outline
 from tkamb.knee.load import LinkPoint, PointForces
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tkamb.contact.flags import narrow_flags
 from tkamb.contact.lattice.problem import LatticeState, SurfaceFromBelow
 from tkamb.contact.lattice.solver import Solution
-from tkamb.contact.narrow import narrow_flags
 from tkamb.contact.pressing import PRESS
 from tkamb.contact.result import ContactResult, medial_points
 from tkamb.geometry.frames import Array

@@ -19,8 +19,7 @@ from itertools import product
 from typing import Any
 
 from tkamb.contact.model import ContactModel
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.warm_start import Guess, WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart
 from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, touches
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.units import MILLIMETRE

@@ -33,7 +33,7 @@ from tkamb.knee.instant import Instant
 from tkamb.knee.joint_equilibrium import JointEquilibrium, external_wrench, joint_equilibrium
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import Probe, ProbedContact
+    from tkamb.contact.model import Probe, ProbedContact
     from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.patella import PatellaState
 

@@ -13,7 +13,7 @@ from tkamb.knee.joint_equilibrium import JointEquilibrium
 from tkamb.knee.load import wrench_of
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import Probe, ProbedContact
+    from tkamb.contact.model import Probe, ProbedContact
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, WarmStart
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_axes, knee_coordinates, knee_pose
 from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import Probe
+    from tkamb.contact.model import Probe
 
 
 @dataclass(frozen=True)
