@@ -14,7 +14,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
-from tkamb.geometry.inner_walls import find_inner_wall
+from tkamb.geometry.repair import find_inner_wall
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.meshes import load_surface
 

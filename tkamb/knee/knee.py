@@ -45,10 +45,8 @@ from tkamb.knee.parts import (
 )
 
 if TYPE_CHECKING:
-    from tkamb.contact.model import ContactModel
-    from tkamb.contact.probe import ProbedContact
-    from tkamb.contact.result import ContactResult
-    from tkamb.contact.warm_start import Guess, WarmStart
+    from tkamb.contact.model import ContactModel, ProbedContact
+    from tkamb.contact.result import ContactResult, Guess, WarmStart
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorLines
@@ -395,7 +393,7 @@ class Knee:
         instant = self.instant(q, v, a, external, tensions, data)
         geometry, points = instant.geometry(), NO_CONTACT
         if contact is not None:
-            from tkamb.contact.probe import condyle_wrenches
+            from tkamb.contact.model import condyle_wrenches
 
             wrenches = condyle_wrenches(contact, self._need_contact().pair.split)
             geometry = instant.touching(geometry, instant.coordinates, wrenches, {})

@@ -41,12 +41,10 @@ from tkamb.contact.lattice.settings import LATTICE_SOLVER, LatticeSolverSettings
 from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.lattice.solver import Solution, solve, solve_by_newton
 from tkamb.contact.materials import LinearElastic, Material
-from tkamb.contact.model import ContactModel
+from tkamb.contact.model import ContactModel, Probe
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load, within_insert
-from tkamb.contact.probe import Probe
-from tkamb.contact.result import ContactResult
-from tkamb.contact.warm_start import Guess, WarmStart
+from tkamb.contact.result import ContactResult, Guess, WarmStart
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE

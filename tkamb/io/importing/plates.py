@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tkamb.io.recordings.gait_cycle import uninterrupted_runs
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.recordings.c3d import Recording
