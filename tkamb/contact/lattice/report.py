@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.area import covered_areas
+from tkamb.contact.flags import narrow_flags
 from tkamb.contact.lattice.problem import (
     LEAST_NORMAL_Y,
     LatticeState,
@@ -22,7 +23,6 @@ from tkamb.contact.lattice.problem import (
     tangent_planes,
 )
 from tkamb.contact.lattice.solver import Solution
-from tkamb.contact.narrow import narrow_flags
 from tkamb.contact.pressing import PRESS
 from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.geometry.frames import Array, Index, Mask
