@@ -4,8 +4,16 @@ import numpy as np
 
 from tkamb.geometry.frames import pose
 from tkamb.io.opensim.functions import Linear
-from tkamb.io.opensim.lines import Muscle, Path, PathPoint
-from tkamb.io.opensim.model import Body, Coordinate, Joint, JointAxis, OpenSimModel
+from tkamb.io.opensim.model import (
+    Body,
+    Coordinate,
+    Joint,
+    JointAxis,
+    Muscle,
+    OpenSimModel,
+    Path,
+    PathPoint,
+)
 
 Z = np.array([0.0, 0.0, 1.0])
 THIGH, SHANK = 0.4, 0.42

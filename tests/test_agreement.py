@@ -9,8 +9,8 @@ import pytest
 from joints import HALF, flat_joint
 from scenes import write_scene
 from tkamb import simulate
-from tkamb.contact.narrow import TOO_NARROW
-from tkamb.contact.probe import Probe
+from tkamb.contact.flags import TOO_NARROW
+from tkamb.contact.model import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose

@@ -21,7 +21,7 @@ from joints import (
     settle,
 )
 from tkamb.contact.foundation import LinearFoundation
-from tkamb.contact.probe import Probe
+from tkamb.contact.model import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.geometry.frames import knee_axes, knee_pose, knee_twist
 from tkamb.knee.balance import BalanceStatus, Trial, find_balance

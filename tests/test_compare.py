@@ -9,7 +9,7 @@ import pytest
 from kept_runs import keep
 from synthetic_run import make_run
 from tkamb.cli import main
-from tkamb.contact.articular_edge import AT_EDGE
+from tkamb.contact.flags import AT_EDGE
 from tkamb.run.metrics import peak_pressure
 from tkamb.run.results import Results
 from tkamb.show.compare import page

@@ -13,8 +13,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from headless import Page
 from synthetic_run import MASS_KG, make_run
-from tkamb.contact.articular_edge import AT_EDGE
-from tkamb.contact.narrow import TOO_NARROW
+from tkamb.contact.flags import AT_EDGE, TOO_NARROW
 from tkamb.errors import InputError
 from tkamb.run import metrics
 from tkamb.run.metrics import map_rows

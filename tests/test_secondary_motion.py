@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.contact.probe import condyle_wrenches
+from tkamb.contact.model import condyle_wrenches
 from tkamb.geometry.frames import knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case

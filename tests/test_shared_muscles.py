@@ -161,7 +161,7 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
     own = (
         "tkamb.run.muscles",
         "tkamb.io.opensim",
-        "tkamb.io.recordings.emg",
+        "tkamb.io.recordings.measured",
         "tkamb.io.recordings.measured",
         "tkamb.run.recorded",
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tkamb.errors import InputError
 from tkamb.io.activities import Activity
-from tkamb.io.datasets.dataset import NAMES, read_dataset
+from tkamb.io.datasets import NAMES, read_dataset
 from tkamb.units import ANGLE, LENGTH
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def add_data(commands: Any) -> None:
 
 
 def _get(options: argparse.Namespace) -> int:
-    from tkamb.io.datasets.get import download, take_from
+    from tkamb.io.datasets import download, take_from
 
     dataset = read_dataset(options.name)
     to = options.to or dataset.folder

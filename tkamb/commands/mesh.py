@@ -7,7 +7,7 @@ from typing import Any
 
 from tkamb.commands.options import add_force
 from tkamb.errors import InputError
-from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.io import CONTACT_MODEL
 from tkamb.run.guard import say
 from tkamb.units import LENGTH
 

@@ -8,8 +8,7 @@ from typing import Any
 import trimesh
 
 from tkamb.contact.lattice.meshing.grid import Lattice
-from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality
-from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality, whole_lattice
 from tkamb.contact.registry import MAP_GRID
 from tkamb.errors import InputError
 from tkamb.files import replaced_file

@@ -28,8 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.contact.model import ContactModel
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.warm_start import Guess, WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart
 from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, touches
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_axes, knee_coordinates, knee_pose
@@ -38,7 +37,7 @@ from tkamb.knee.equations import KneeLoads
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import Probe
+    from tkamb.contact.model import Probe
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from tkamb.knee.parts import (
 )
 
 if TYPE_CHECKING:
-    from tkamb.contact.model import ContactModel
-    from tkamb.contact.probe import ProbedContact
+    from tkamb.contact.model import ContactModel, ProbedContact
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorLines

@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_coordinates, transform
-from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.polygons import sagittal_outline
 from tkamb.geometry.surface import Surface
 from tkamb.knee.chain import Chain
 from tkamb.knee.equations import Extensor

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.area import area_above
-from tkamb.contact.result import ContactResult
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.result import ContactResult, WarmStart
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.units import MILLIMETRE
 

@@ -19,7 +19,7 @@ from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
 from tkamb.knee.load import PointForces
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import CondyleWrench
+    from tkamb.contact.model import CondyleWrench
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.knee.chain import ChainState
     from tkamb.knee.crossing import MuscleShare

@@ -30,10 +30,9 @@ from tkamb.knee.load import PointForces
 from tkamb.knee.loads import KneeLoads, knee_loads
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import ProbedContact
-    from tkamb.contact.result import ContactResult
-    from tkamb.contact.warm_start import Guess, WarmStart
-    from tkamb.knee.released import KneeEquilibrium
+    from tkamb.contact.model import ProbedContact
+    from tkamb.contact.result import ContactResult, Guess, WarmStart
+        from tkamb.knee.released import KneeEquilibrium
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +240,7 @@ class Knee(AssembledKnee):
         instant = self.instant(q, v, a, external, tensions, data)
         geometry, points = instant.geometry(), NO_CONTACT
         if contact is not None:
-            from tkamb.contact.probe import condyle_wrenches
+            from tkamb.contact.model import condyle_wrenches
 
             wrenches = condyle_wrenches(contact, self._need_contact().pair.split)
             geometry = instant.touching(geometry, instant.coordinates, wrenches, {})

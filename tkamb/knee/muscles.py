@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import Array, cross, transform
-from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.polygons import sagittal_outline
 from tkamb.knee.anatomy import Anatomy, Place
 from tkamb.knee.load import LinkPoint, PointForces, link_point
 

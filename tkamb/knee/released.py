@@ -38,7 +38,7 @@ from tkamb.knee.released_forces import (
 )
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import Probe, ProbedContact
+    from tkamb.contact.model import Probe, ProbedContact
     from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.patella import PatellaState
 

@@ -31,7 +31,7 @@ from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.load import wrench_of
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import Probe, ProbedContact
+    from tkamb.contact.model import Probe, ProbedContact
     from tkamb.knee.ligaments import BundleArrays, Ligament
 
 

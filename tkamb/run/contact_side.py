@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.contact.model import condyle_wrenches
 from tkamb.contact.pressing import within_insert
-from tkamb.contact.probe import condyle_wrenches
-from tkamb.contact.result import ContactResult, ContactStatus, medial_points
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, WarmStart, medial_points
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose

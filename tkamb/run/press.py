@@ -26,7 +26,7 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import MIRROR, Array, Index, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.geometry.memory import peak_rss
-from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.io import CONTACT_MODEL
 from tkamb.io.given_material import (
     material_as_json,
     material_in_words,

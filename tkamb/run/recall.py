@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.probe import ProbedContact
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.model import ProbedContact
+from tkamb.contact.result import WarmStart
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.knee.balance import Balance, BalanceStatus
 from tkamb.knee.frame_contact import FrameContact

@@ -54,7 +54,7 @@ def simulate(
         contact: contact model, instead of the scene's.
         resolution_mm: spacing of the map points, instead of the scene's.
         preset: name of a study whose choices are laid over the scene, as by `tkamb run --as`
-            (`tkamb.io.presets.registry`); contact and resolution_mm still hold.
+            (`tkamb.io.presets`); contact and resolution_mm still hold.
         frames: which frames, a slice or a range; default all.
         directory: folder where the finished frames are kept, see `tkamb.run.recorder`; None
             keeps them in memory.

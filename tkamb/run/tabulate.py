@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
-from tkamb.io.recordings.gait import cycle_percent
+from tkamb.io.recordings.gait_cycle import cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.knee.crossing import condyle_contributions
 from tkamb.knee.equations import dome_sensitivity

@@ -19,8 +19,7 @@ from typing import Any
 
 from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_class, contact_model
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, WarmStart
 from tkamb.errors import TkambError
 from tkamb.geometry import threads
 from tkamb.geometry.memory import peak_rss

@@ -8,26 +8,27 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.io.importing.force_columns import TableForce, table_forces
 from tkamb.io.importing.plates import (
     Feet,
     Load,
     RecordedForce,
+    TableForce,
     common_surface,
     feet_loads,
     known_interval,
     own_plates,
     plate_forces,
+    table_forces,
     unmeasured,
 )
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import GroundFile
 from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.force_plates import PLATE_LOAD, around_load, unloaded_level
 from tkamb.io.recordings.ground_reaction import (
     recorded_wrench,
     summed_reaction,
 )
-from tkamb.io.recordings.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.io.recordings.recordings import ForceRecording
 from tkamb.io.recordings.tables import Table, read_table
 

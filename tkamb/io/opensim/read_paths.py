@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.io.opensim.elements import Document, Element
+from tkamb.io.opensim.document import Document, Element
 from tkamb.io.opensim.functions import Function
-from tkamb.io.opensim.lines import (
+from tkamb.io.opensim.model import (
     AnyPathPoint,
     ConditionalPathPoint,
+    Coordinate,
     Ligament,
     MovingPathPoint,
     Muscle,
@@ -20,7 +21,6 @@ from tkamb.io.opensim.lines import (
     Shape,
     WrapObject,
 )
-from tkamb.io.opensim.model import Coordinate
 from tkamb.io.opensim.read_joints import Frames, offset_pose
 
 MUSCLES = (

@@ -36,7 +36,7 @@ from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.io.toml_text import read_toml
 
 if TYPE_CHECKING:
-    from tkamb.io.presets.preset import AppliedPreset
+    from tkamb.io.presets import AppliedPreset
 
 
 class Scene(SceneTable):
@@ -167,7 +167,7 @@ def load_scene(
     Args:
         path: a TOML file; paths inside it are relative to its folder.
         overrides: dotted key ("contact.model") -> value, applied before validation.
-        preset: name of a preset (`tkamb.io.presets.registry`), applied before the overrides.
+        preset: name of a preset (`tkamb.io.presets`), applied before the overrides.
 
     Raises:
         InputError: unreadable file, unknown key, missing unit, value out of range, no such
@@ -194,7 +194,7 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
 
     Args:
         scene: as read.
-        preset: name of a preset (`tkamb.io.presets.registry`).
+        preset: name of a preset (`tkamb.io.presets`).
         overrides: dotted key -> value that replaces the preset's.
 
     Raises:
@@ -257,7 +257,7 @@ def _drop(content: dict[str, Any], table: str, key: str) -> None:
 def _apply_preset(
     content: dict[str, Any], name: str, overrides: dict[str, Any], where: object
 ) -> "AppliedPreset":
-    from tkamb.io.presets.registry import find_preset
+    from tkamb.io.presets import find_preset
 
     return find_preset(name).apply(content, overrides, where)
 

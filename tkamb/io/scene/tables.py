@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from tkamb.io import CONTACT_MODEL
 from tkamb.io.activities import Activity
-from tkamb.io.defaults import CONTACT_MODEL
 from tkamb.io.scene.measured import EmgTable
 from tkamb.io.scene.table import (
     DEFAULT_CLOSING,

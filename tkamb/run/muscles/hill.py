@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.io.opensim.lines import Muscle
+from tkamb.io.opensim.model import Muscle
 
 BELLS = (
     (0.8150671134243542, 1.055033428970575, 0.162384573599574, 0.063303448465465),

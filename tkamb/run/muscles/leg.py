@@ -9,8 +9,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.importing.anatomy import Leg, find_leg
-from tkamb.io.opensim.lines import AnyPathPoint, Muscle, PathPoint
-from tkamb.io.opensim.model import Joint, OpenSimModel
+from tkamb.io.opensim.model import AnyPathPoint, Joint, Muscle, OpenSimModel, PathPoint
 from tkamb.io.recordings.ground_reaction import GroundReaction
 
 EXTENSORS = "knee extensors"

@@ -8,7 +8,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
-from tkamb.io.opensim.lines import Muscle
+from tkamb.io.opensim.model import Muscle
 from tkamb.run.muscles.hill import HILL
 from tkamb.run.muscles.static_optimisation import LoadSharing, share_load
 

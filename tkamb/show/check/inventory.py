@@ -21,7 +21,7 @@ from tkamb.run.read_scene import STRAIN_FLEXIONS
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.io.recordings.measured_force import MeasuredForce
+    from tkamb.io.recordings.measured import MeasuredForce
 
 ANGLES = ("flexion", "adduction", "axial_rotation")
 

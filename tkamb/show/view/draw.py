@@ -116,7 +116,7 @@ def lattice_lines(case: Case) -> Array:
     if case.scene.contact is None or case.insert is None:
         return np.empty((0, 2, 3))
     from tkamb.contact.lattice.meshing.cells import FACES
-    from tkamb.contact.lattice.meshing.whole import whole_lattice
+    from tkamb.contact.lattice.meshing.quality import whole_lattice
 
     lattice = whole_lattice(case.insert, case.scene.contact.resolution_mm * MILLIMETRE)
     faces = lattice.cells[:, FACES].reshape(-1, 4)

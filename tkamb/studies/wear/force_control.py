@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.model import ContactModel
-from tkamb.contact.result import ContactStatus
-from tkamb.contact.warm_start import Guess
+from tkamb.contact.result import ContactStatus, Guess
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_coordinates, knee_pose
 from tkamb.knee.balance import BalanceStatus
 from tkamb.knee.released_forces import FreeForces

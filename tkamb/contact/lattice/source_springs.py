@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from tkamb.contact.lattice.meshing.cells import DIRECTIONS
-from tkamb.contact.lattice.solids.solid import Pattern, Scatter, Solid
+from tkamb.contact.lattice.solid import Pattern, Scatter, Solid
 from tkamb.contact.materials import Material
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index

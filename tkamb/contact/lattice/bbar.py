@@ -10,8 +10,14 @@ import numpy as np
 import scipy.sparse as sparse
 
 from tkamb.contact.lattice.meshing.cells import gauss_gradients
-from tkamb.contact.lattice.solids.curve import ShearCurve
-from tkamb.contact.lattice.solids.solid import DEVIATORIC, Solid, chunks, elements_of, strain_matrix
+from tkamb.contact.lattice.solid import (
+    DEVIATORIC,
+    ShearCurve,
+    Solid,
+    chunks,
+    elements_of,
+    strain_matrix,
+)
 from tkamb.contact.materials import Material
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
