@@ -33,7 +33,7 @@ from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, t
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_axes, knee_coordinates, knee_pose
 from tkamb.knee.contact_points import CondylePoint
-from tkamb.knee.equations import KneeLoads
+from tkamb.knee.equations import SolvedLoads
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -139,8 +139,8 @@ class AdjustmentEffect:
 
 
 def adjustment_effect(
-    adjusted: KneeLoads,
-    recorded: KneeLoads,
+    adjusted: SolvedLoads,
+    recorded: SolvedLoads,
     points_adjusted: Mapping[str, CondylePoint],
     points_recorded: Mapping[str, CondylePoint],
 ) -> AdjustmentEffect:
@@ -165,13 +165,13 @@ def adjustment_effect(
     return AdjustmentEffect(total - before, share, cause)
 
 
-def _share(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> float:
+def _share(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> float:
     normal = {side: loads.values.get(f"{side}_normal", 0.0) for side in points}
     total = sum(normal.values())
     return normal["medial"] / total if total > 0 else float("nan")
 
 
-def _name_carriers(loads: KneeLoads, points: Mapping[str, CondylePoint]) -> str:
+def _name_carriers(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> str:
     sides = [side for side in points if side not in loads.lifted]
     return "both condyles carry" if len(sides) > 1 else f"the {sides[0]} condyle alone carries"
 

@@ -43,7 +43,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.knee import unknowns
-from tkamb.knee.equations import KneeGeometry, KneeLoads, KneeSystem
+from tkamb.knee.equations import KneeGeometry, KneeSystem, SolvedLoads
 from tkamb.knee.load import PointForces, wrench_of
 from tkamb.knee.unknowns import LoadState
 
@@ -266,7 +266,7 @@ modelled; the extensor group."""
 
 
 def condyle_contributions(
-    geometry: KneeGeometry, loads: KneeLoads, friction: float
+    geometry: KneeGeometry, loads: SolvedLoads, friction: float
 ) -> dict[str, dict[str, float]]:
     """Return side -> load -> what it adds to the side's normal force, N; the sum is that force.
 

@@ -106,7 +106,7 @@ class KneeGeometry:
 
 
 @dataclass(frozen=True, eq=False)
-class KneeLoads:
+class SolvedLoads:
     """Loads from the equations of one frame; NaN where they are singular.
 
     Args:
@@ -135,7 +135,7 @@ class KneeLoads:
     problems: tuple[str, ...]
 
 
-def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
+def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     """Return all loads of one frame: those of the load state without a wrong sign.
 
     If several states have no wrong sign, the one that leaves out fewest loads is taken, and
@@ -169,7 +169,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
     return replace(admissible[0].loads(), ambiguous=len(admissible) > 1)
 
 
-def solved_unknowns(geometry: KneeGeometry, loads: KneeLoads, friction: float) -> list[Unknown]:
+def solved_unknowns(geometry: KneeGeometry, loads: SolvedLoads, friction: float) -> list[Unknown]:
     """Return the unknown loads of one frame in the load state that was found.
 
     Args:
@@ -182,15 +182,15 @@ def solved_unknowns(geometry: KneeGeometry, loads: KneeLoads, friction: float) -
     return KneeSystem(geometry, friction, LoadState(loads.lifted, slack)).unknowns
 
 
-def unsolved(problems: Iterable[str]) -> KneeLoads:
+def unsolved(problems: Iterable[str]) -> SolvedLoads:
     """Return a frame without a number, and why."""
     nan = np.nan
     state = (frozenset[str](), False, False)
-    return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
+    return SolvedLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
 
 
 def dome_sensitivity(
-    geometry: KneeGeometry, loads: KneeLoads, friction: float
+    geometry: KneeGeometry, loads: SolvedLoads, friction: float
 ) -> tuple[float, float] | None:
     """Return the change of muscle and patellofemoral force as the button sits higher, N/m.
 
@@ -271,11 +271,11 @@ class KneeSystem:
         """Sides that carry load."""
         return [side for side in self.geometry.condyles if side not in self.lifted]
 
-    def loads(self) -> KneeLoads:
+    def loads(self) -> SolvedLoads:
         """Return the loads of this set."""
         values = self.solution.values
         flexion, adduction = self.external_moments()
-        return KneeLoads(
+        return SolvedLoads(
             values | dict.fromkeys(self._zero_loads(), 0.0),
             self.contact_force(values),
             flexion,

@@ -15,7 +15,7 @@ from tkamb.geometry.frames import SIDES, Array, cross, knee_pose, knee_twist
 from tkamb.knee.canonical import canonical_state
 from tkamb.knee.chain import Chain, ChainMotion
 from tkamb.knee.contact_points import CondylePoint, ContactPoints, contact_points
-from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
 from tkamb.knee.load import PointForces
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class SharingMuscles(Protocol):
     def tension(self, share: "MuscleShare") -> float:
         """Return what the extensor group pulls with, N."""
 
-    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, KneeLoads]:
+    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
         """Return the geometry with the muscles' forces in it, and all loads."""
 
 
@@ -187,7 +187,7 @@ class Instant:
         """Return where the undeformed condyles meet the insert at a pose (4, 4), with its rates."""
         return contact_points(query, pose, lambda point: self.sliding(self.coordinates, point))
 
-    def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, KneeLoads]:
+    def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
         """Return a geometry with the muscles' shares in it, and its loads.
 
         Args:

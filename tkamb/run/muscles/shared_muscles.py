@@ -21,7 +21,7 @@ from tkamb.knee.crossing import (
     flexion_row,
     yielding_flexion_row,
 )
-from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
 from tkamb.run.muscles.knee_trial import KneeTrial
 from tkamb.run.muscles.recording import LegRecording, group_names, load_knee_trial
 from tkamb.run.muscles.sharing import EmgGuide, Sharing
@@ -136,7 +136,7 @@ class FrameMuscles:
         """Return the tension of the extensor group, N."""
         return float(share.force[self.trial.extensor].sum())
 
-    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, KneeLoads]:
+    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
         """Return the geometry with the muscles' forces in it, and all loads.
 
         Contact points and lines stay, so the sharing is exact at once; again where a condyle
