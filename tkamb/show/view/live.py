@@ -119,7 +119,7 @@ class LiveKnee:
         motion, table = self.case.motion, self.case.scene.contact
         if not 0 <= frame < len(motion.time):
             raise InputError(
-                f"there is no frame {frame}", "--frame", f"give one of 0 to {len(motion.time) - 1}"
+                f"there is no frame {frame}", "frame", f"give one of 0 to {len(motion.time) - 1}"
             )
         assert table is not None
         values = dict(zip(KNEE_COORDINATES, motion.coordinates[frame].tolist(), strict=True))
