@@ -206,7 +206,9 @@ def _unforeseen(error: Exception, options: argparse.Namespace) -> int:
 
 
 def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
-    """Return one line on an error that nobody foresaw; its traceback goes into a file.
+    """Return one line on an error that tkamb does not raise itself; its traceback goes into a file.
+
+    An error of a plug-in names the plug-in.
 
     Args:
         error: what was raised.
@@ -216,7 +218,10 @@ def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
     reason = " ".join(str(error).split())[:200]
     what = "not enough memory: take a coarser resolution or fewer frames"
     if not isinstance(error, MemoryError):
-        what = f"this was not foreseen: {name}{': ' if reason else ''}{reason}"
+        from tkamb.run.plug_ins import raised_in
+
+        plug_in, told = raised_in(error), f"{name}{': ' if reason else ''}{reason}"
+        what = f"{plug_in} raised {told}" if plug_in else f"this was not foreseen: {told}"
     log = _write_log(error, options)
     return f"{what}; {'no log could be written' if log is None else f'details are in {log}'}"
 
