@@ -32,7 +32,7 @@ from tkamb.knee.loads import KneeLoads, knee_loads
 if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
     from tkamb.contact.result import ContactResult, Guess, WarmStart
-        from tkamb.knee.released import KneeEquilibrium
+    from tkamb.knee.released import KneeEquilibrium
 
 
 @dataclass(frozen=True, eq=False)
