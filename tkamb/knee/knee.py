@@ -540,7 +540,7 @@ class Knee:
         Raises:
             InputError: no contact model, or one without a name (`tkamb.contact_model`).
         """
-        return import_module("tkamb.show.view.knee_on_bench").live_knee(self, q, load, folder)
+        return import_module("tkamb.show.view.live_window").live_knee(self, q, load, folder)
 
     def at(self, q: Array, data: KneeData) -> KneePlace:
         """Return where the knee is at q, and bring the placements in `data` up to date."""
