@@ -17,12 +17,12 @@ from tkamb.io.recordings.vtp import read_vtp, read_vtp_values
 from tkamb.io.vtk import write_triangles
 from tkamb.run.results_folder import read_results
 from tkamb.show.report import report_html
-from tkamb.show.view.colours import INSERT, rgb, wear_colours, wear_scale
+from tkamb.show.sections import OTHER, wear_section
+from tkamb.show.view.drawing import INSERT, rgb, wear_colours, wear_scale
 from tkamb.show.view.payload import pack
 from tkamb.show.view.run import open_run
 from tkamb.show.view.show import Show
 from tkamb.show.view.solids import worn_insert
-from tkamb.show.wear import OTHER, wear_section
 from viewed import shipped_run
 
 PIXEL = bytes.fromhex(
