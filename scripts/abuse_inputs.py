@@ -282,7 +282,7 @@ def options(folder: Path, chance: random.Random) -> list[str]:
     The folder `precious` holds another program's files, which must not change.
     """
     from tkamb.cli import _parser
-    from tkamb.commands.option_rules import leaf_parsers
+    from tkamb.commands.options import leaf_parsers
 
     results, scene = os.environ["TKAMB_ABUSE_RESULTS"], str(MODEL / "scene.toml")
     precious = folder / PRECIOUS

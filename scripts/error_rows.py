@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from error_cases import ErrorCase, error_cases
-from tkamb.contact.narrow import TOO_NARROW
+from tkamb.contact.flags import TOO_NARROW
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import InputError
 from tkamb.studies.quantities import Quantities, errors, quantities

@@ -21,7 +21,7 @@ NEEDED = (
     "tkamb.run.maps",
     "tkamb.contact.lattice.model",
     "tkamb.contact.foundation",
-    "tkamb.knee.equilibrium.released",
+    "tkamb.knee.released",
     "tkamb.show.report",
     "tkamb.show.view.show",
     "tkamb.studies.uncertainty.run",

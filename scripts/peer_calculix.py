@@ -24,11 +24,11 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from lattice_cases import two_condyles  # noqa: E402
-from tkamb.atomic import claim_directory, write_text  # noqa: E402
 from tkamb.contact.materials import material  # noqa: E402
 from tkamb.contact.pair import ContactPair  # noqa: E402
 from tkamb.contact.registry import contact_model  # noqa: E402
-from tkamb.memory import peak_rss  # noqa: E402
+from tkamb.files import claim_directory, write_text  # noqa: E402
+from tkamb.geometry.memory import peak_rss  # noqa: E402
 from tkamb.studies.calculix import find_program  # noqa: E402
 from tkamb.studies.cases import StudyCase  # noqa: E402
 from tkamb.studies.kept_rows import KeptRows, row_key  # noqa: E402

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.io.importing.force_columns import table_forces
+from tkamb.io.importing.plates import table_forces
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.tables import read_table
 

@@ -14,10 +14,9 @@ from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import inverse
 from tkamb.io.importing.anatomy import find_leg
-from tkamb.io.importing.links import find_links, quarter_turn
+from tkamb.io.importing.links import find_links, link_inertias, patient_urdf, quarter_turn
 from tkamb.io.importing.model_fit import ModelChain, fit_model
 from tkamb.io.importing.soft_tissue import soft_tissue
-from tkamb.io.importing.urdf import link_inertias, patient_urdf
 from tkamb.io.opensim.read import read_osim
 from tkamb.io.recordings.markers import matched_labels
 from tkamb.io.recordings.meshes import axes_rotation, load_surface

@@ -9,8 +9,7 @@ from scenes import fast_scene
 from synthetic_run import make_run
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.io.claim import claimed_directory
-from tkamb.io.occupants import BESIDE, WRITTEN, occupants
+from tkamb.io.claim import BESIDE, WRITTEN, claimed_directory, occupants
 from tkamb.run.results_folder import write_results
 from tkamb.studies.kept_rows import KeptRows
 

@@ -5,7 +5,7 @@ import pytest
 
 from opensim_models import PUBLISHED, kinematics
 from opensim_references import references
-from tkamb.io.opensim.inverse_dynamics import inverse_dynamics
+from tkamb.io.opensim.motion import inverse_dynamics
 
 TOLERANCE = {"JW": 1e-8, "gait2392": 1e-8, "DM": 5e-3, "Rajagopal2016": 0.05}
 """N and N·m. Where splines turn a joint OpenSim's own differ by that much: see the next test."""

@@ -10,10 +10,9 @@ from opensim_models import OWN, PUBLISHED, kinematics
 from opensim_references import references
 from tkamb.errors import InputError
 from tkamb.io.opensim.geodesic import shortest_strings
-from tkamb.io.opensim.lines import WrapObject
+from tkamb.io.opensim.model import WrapObject
 from tkamb.io.opensim.paths import LineSet
-from tkamb.io.opensim.strings import strings_over
-from tkamb.io.opensim.wrapping import touch
+from tkamb.io.opensim.wrapping import strings_over, touch
 
 RIGHT_LEG = ("hip", "knee", "ankle", "subtalar", "pf_", "patfem")
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jw_gait import gait, needs_jw
-from tkamb.io.opensim.inverse_dynamics import inverse_dynamics
+from tkamb.io.opensim.motion import inverse_dynamics
 from tkamb.io.opensim.read import read_osim
 from tkamb.io.recordings.filtering import differentiate_coordinates
 from tkamb.run.muscles import Sharing, solve_trial

@@ -12,8 +12,7 @@ from tkamb import load_scene, simulate
 from tkamb.cli import main
 from tkamb.contact import named_classes
 from tkamb.errors import InputError
-from tkamb.io.presets.preset import Preset
-from tkamb.io.presets.registry import find_preset, preset_names
+from tkamb.io.presets import PRESETS, Preset, find_preset
 from tkamb.io.scene import with_preset
 from tkamb.io.scene.case import load_case
 from tkamb.run.rerun import case_of_results, run_again
@@ -155,7 +154,7 @@ def test_another_package_can_offer_one(scene_file, monkeypatch):
     points = [EntryPoint("my-study", f"{__name__}:MyStudy", "tkamb.io.presets")]
     monkeypatch.setitem(sys.modules, __name__, SimpleNamespace(MyStudy=MyStudy))
     monkeypatch.setattr(named_classes, "entry_points", lambda group: points)
-    assert preset_names() == (SOURCE, "my-study")
+    assert PRESETS.names() == (SOURCE, "my-study")
     assert load_scene(scene_file, preset="my-study").contact.friction == 0.1
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tkamb.io.presets.registry import find_preset
+from tkamb.io.presets import find_preset
 from validation import dissertation, reproduction
 from validation.reproduction_page import facts, names_in, page
 

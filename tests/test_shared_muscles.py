@@ -95,7 +95,7 @@ def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
 def _taut_quadriceps(geometry):
     """Return the quadriceps' tension, negative where it would push."""
     from tkamb.knee.equations import KneeSystem
-    from tkamb.knee.load_state import LoadState
+    from tkamb.knee.unknowns import LoadState
 
     taut = LoadState(frozenset(), frozenset())
     return KneeSystem(geometry, FRICTION, taut).solution.values["muscle_quadriceps"]

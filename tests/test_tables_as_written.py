@@ -7,7 +7,7 @@ from pendulum_leg import changed, moving_leg, pendulum_osim, recorded_leg
 from plane_leg import plane_leg
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.io.importing.force_columns import table_forces
+from tkamb.io.importing.plates import table_forces
 from tkamb.io.opensim.kinematics import Kinematics
 from tkamb.io.opensim.motion import angle_lines, read_coordinates
 from tkamb.io.opensim.read import read_osim

@@ -30,8 +30,8 @@ Made by `{command}` on {date}, tkamb {version}. Nothing in the tables is typed: 
 numbers stand in `scripts/validation/reproduction.toml` and `dissertation_tables.toml`, ours
 in `scripts/data/dissertation.json` and `scripts/data/validation.json`."""
 SET = """\
-Why each of them: `tkamb/io/presets/sharma_2008.py`. Another study adds its own by a class and a
-row in `tkamb/io/presets/registry.py`, or from another package through the entry-point group
+Why each of them: `tkamb/io/presets.py`. Another study adds its own by a class and a
+row in `tkamb/io/presets.py`, or from another package through the entry-point group
 `tkamb.io.presets`."""
 ELEMENTS = """\
 Code and tests are paths in the repository. Where no number stands, the test is the evidence."""

@@ -5,9 +5,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tkamb.commands.scene_options import add_force
+from tkamb.commands.options import add_force
 from tkamb.errors import InputError
-from tkamb.io.defaults import CONTACT_MODEL
+from tkamb.io import CONTACT_MODEL
 from tkamb.run.guard import say
 from tkamb.units import LENGTH
 

@@ -1,13 +1,15 @@
 """Ownership of output folders: a folder is tkamb's own, and one process at a time writes to it.
 
-The file `.tkamb` marks a folder as tkamb's own. A process that writes holds a lock on it (flock),
-which the system releases when the process ends for any reason. A folder with other files is
-used only if the user asks for it, and only files that tkamb itself names are ever removed.
+The file `.tkamb` marks a folder as tkamb's own. A process that writes holds a lock on it (flock).
+The system releases the lock when the process ends for any reason. tkamb uses a folder with other
+files only if the user asks for it, and removes only files that it names itself. The files in a
+folder also show which command wrote there, so that no command overwrites or mixes another's output.
 """
 
 import fcntl
 import json
 import os
+import re
 import secrets
 import stat
 import threading
@@ -18,18 +20,92 @@ from pathlib import Path
 from typing import Any
 
 from tkamb import __version__
-from tkamb.atomic import (
+from tkamb.errors import InputError
+from tkamb.files import (
+    FILE_LIMITS,
     MARKER,
     claim_directory,
     finish_replacement,
     folder_token,
+    read_json,
+    read_text,
     replacement_pending,
 )
-from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_json, read_text
-from tkamb.io.occupants import check_occupants
 
-CHOOSE = "choose another folder with --out"
+WRITTEN = {
+    "uncertainty": ("bands.csv",),
+    "run": ("results.csv",),
+    "tradeoff": ("tradeoff.json",),
+    "stability": ("stability.json",),
+    "cohort": ("cohort.json",),
+    "wear": ("wear.json", ".wear.npz"),
+}
+"""Command -> files that only it writes; results.csv is from `uncertainty` if there is a bands.csv.
+
+The page of `compare` and the maps of `export --vtp` have other names and fit into any folder.
+"""
+BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear"}}
+"""Command -> commands whose folder it may share: their file names differ, and the page of a run
+shows its wear."""
+
+
+def occupants(folder: Path) -> dict[str, str]:
+    """Return command -> the file that says that its output, finished or under way, is there."""
+    result = {
+        command: name
+        for command, names in WRITTEN.items()
+        for name in names
+        if (folder / name).is_file()
+    }
+    for command, name in (_frames_of(folder), _rows_of(folder)):
+        if command:
+            result.setdefault(command, name)
+    if "uncertainty" in result:
+        result.pop("run", None)
+    return result
+
+
+def check_occupants(folder: Path, command: str) -> None:
+    """Raise an InputError where a folder holds another command's output than may be beside this."""
+    foreign = {
+        other: name
+        for other, name in occupants(folder).items()
+        if other != command and other not in BESIDE.get(command, ())
+    }
+    for other, name in foreign.items():
+        what = f"holds what `tkamb {other}` wrote ({name})"
+        raise InputError(what, folder, "choose another directory, or give force=True")
+
+
+def _frames_of(folder: Path) -> tuple[str, str]:
+    """Return the command whose unfinished run is kept in a folder, and its file."""
+    name = ".frames/run.json"
+    try:
+        result = read_json(folder / name)
+    except InputError:
+        return "", name
+    if not isinstance(result, dict):
+        return "", name
+    if "table of runs" in result:
+        return "cohort", name
+    return ("uncertainty" if "method of sampling" in result else "run"), name
+
+
+def _rows_of(folder: Path) -> tuple[str, str]:
+    """Return the command whose unfinished study is kept in a folder, and its file."""
+    name = "rows.jsonl"
+    if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
+        return "", name
+    try:
+        first = read_text(folder / name, FILE_LIMITS.table_bytes).partition("\n")[0]
+    except InputError:
+        return "", name
+    if not first.startswith('{"key": '):
+        return "", name
+    return ("stability" if re.search(r'"row": \{[^{}]*"kind": ', first) else "tradeoff"), name
+
+
+CHOOSE = "choose another directory"
 LONGEST_WAIT = 5.0
 """s: longest time that a reader waits for a writer that is moving finished files into place."""
 
@@ -53,7 +129,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
     Raises:
         InputError: it cannot be made or written, is not tkamb's, holds another command's output
-            (`tkamb.io.occupants`), or another process holds it; or from the block.
+            (`tkamb.io.claim`), or another process holds it; or from the block.
     """
     path = Path(path)
     new_folders = [folder for folder in (path, *path.parents) if not _exists(folder)]
@@ -184,7 +260,7 @@ def _check_ours(path: Path, force: bool) -> None:
     others = sorted(entry.name for entry in path.iterdir())
     if others:
         what = f"is not empty and not tkamb's own (it holds {others[0]!r})"
-        raise InputError(what, path, "choose another folder with --out, or give --force")
+        raise InputError(what, path, "choose another directory, or give force=True")
 
 
 def is_ours(path: Path) -> bool:
@@ -241,7 +317,7 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
     if not head or (OWN_MARK in head if magic is None else head.startswith(magic)):
         return
     what = "exists already, and tkamb did not write it"
-    raise InputError(what, path, "give another name, or --force to replace it")
+    raise InputError(what, path, "give another name, or force=True to replace it")
 
 
 def _object(path: Path) -> dict[str, Any]:

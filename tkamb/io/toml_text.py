@@ -1,17 +1,23 @@
-"""TOML from users, read within limits, so that a small text cannot take hours or gigabytes.
+"""TOML from users, read within limits, and values as TOML writes them.
 
-Python's reader takes time with the square of a dotted key's parts, memory with nesting, and
-refuses integers of thousands of digits in its own way. Each is refused before it is read.
+A small text must not take hours or gigabytes. The time of Python's reader grows with the square of
+the parts of a dotted key, its memory with nesting. It refuses integers of thousands of digits in
+its own way. tkamb refuses all three before it reads the text.
 """
 
+import json
 import re
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_text
+
+if TYPE_CHECKING:
+    from tkamb.geometry.frames import Array
 
 
 @dataclass(frozen=True)
@@ -89,3 +95,30 @@ def check_limits(text: str, where: object) -> None:
         depth = depth + 1 if match.group() in "[{" else max(depth - 1, 0)
         if depth > LIMITS.depth:
             raise InputError(f"nests values more than {LIMITS.depth} deep", where)
+
+
+def toml_text(value: str) -> str:
+    """Return a text in quotes."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def toml_numbers(values: "Array") -> str:
+    """Return numbers to three decimals."""
+    return "[" + ", ".join(f"{round(float(v), 3) + 0.0:.3f}" for v in values) + "]"
+
+
+def toml_mm(point: "Array") -> str:
+    """Return a place, m, in mm to three decimals."""
+    return toml_numbers(point * 1e3)
+
+
+def toml_key(label: str, whole: bool = False) -> str:
+    """Return a marker's label, quoted where TOML wants it; not `whole`: without its prefix."""
+    plain = label if whole else label.rpartition(":")[2]
+    return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_text(plain)
+
+
+def toml_markers(points: Mapping[str, "Array"], whole: bool = False) -> str:
+    """Return markers, by their `whole` labels or without prefix, and their places as TOML in mm."""
+    places = [f"{toml_key(label, whole)} = {toml_mm(point)}" for label, point in points.items()]
+    return f"{{ {', '.join(places)} }}"

@@ -1,1 +1,266 @@
-"""Real data for the shipped scenes: fetched on demand, never by a run."""
+"""Real data for the shipped scenes: fetched on demand by `tkamb data get`, never by a run.
+
+A data set has files, their SHA-256 and the address where they are published. Each file is written
+completely or not at all, and checked by its SHA-256. A file with the right content stays, so that
+an interrupted download continues.
+"""
+
+import json
+import shutil
+import tempfile
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path, PurePosixPath
+from urllib.parse import quote
+
+from tkamb.errors import InputError
+from tkamb.files import claim_directory, replaced_file, sha256_of
+
+NAMES = ("dm",)
+"""Data sets that `tkamb data get` knows."""
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """A file of a data set.
+
+    Args:
+        name: its path in the data set's folder.
+        sha256: of its content, hexadecimal.
+        commit: of the repository; None where it is not known where the file is published.
+        path: inside the repository; None as `commit`.
+        size: bytes, as registered; None where it is not known.
+    """
+
+    name: str
+    sha256: str
+    commit: str | None = None
+    path: str | None = None
+    size: int | None = None
+
+    def url(self, base: str) -> str | None:
+        """Return its address below that of the repository's raw files; None if unknown."""
+        if self.commit is None or self.path is None:
+            return None
+        return f"{base.rstrip('/')}/{self.commit}/{quote(self.path)}"
+
+    def places(self, folder: Path) -> list[Path]:
+        """Return where it may lie in a folder of downloads: by its name here, or as published."""
+        names = [self.name, PurePosixPath(self.name).name]
+        if self.path:
+            names += [self.path, PurePosixPath(self.path).name]
+        return [folder / name for name in dict.fromkeys(names)]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set: what it is, its licence, its address, its folder and its files."""
+
+    says: str
+    licence: str
+    repository: str
+    url: str
+    folder: Path
+    files: tuple[DataFile, ...]
+
+
+def read_dataset(name: str) -> Dataset:
+    """Return a data set of the package by its name, one of `NAMES`."""
+    text = (files("tkamb.io.datasets") / f"{name}.json").read_text(encoding="utf-8")
+    content = json.loads(text)
+    return Dataset(
+        content["says"],
+        content["licence"],
+        content["repository"],
+        content["url"],
+        Path(content["folder"]),
+        tuple(
+            DataFile(
+                file, entry["sha256"], entry.get("commit"), entry.get("path"), entry.get("bytes")
+            )
+            for file, entry in content["files"].items()
+        ),
+    )
+
+
+TIMEOUT_S = 30
+"""s: time without an answer after which the download fails."""
+LONGEST_S = 1800.0
+"""s: longest time for one file, 500 MB at 0.3 MB/s."""
+LARGEST = 1_000_000_000
+"""Bytes: largest file whose size is not registered."""
+CHUNK = 65_536
+"""Bytes that are read at a time."""
+
+
+@dataclass
+class Got:
+    """Names of the files that were kept, written, or not found."""
+
+    kept: list[str] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)
+    absent: list[str] = field(default_factory=list)
+
+
+def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
+    """Download what is missing of a data set.
+
+    Args:
+        dataset: what to get.
+        to: its folder, made if need be.
+        url: of a mirror with the same paths; default the data set's own.
+
+    Returns:
+        What was kept, what was written, and what is not published at a known address.
+
+    Raises:
+        InputError: pooch is not installed, no answer, another content than registered, or a
+            file that is there with another content. Files that were complete stay.
+    """
+    try:
+        import pooch
+    except ImportError:
+        raise InputError(
+            "needs pooch, which is not installed",
+            "tkamb data get",
+            "pip install 'tkamb[data]', or give what you downloaded by hand with --from DIR",
+        ) from None
+    pooch.get_logger().setLevel("ERROR")
+    base = url or dataset.url
+
+    def fetch(file: DataFile, beside: Path) -> Path | None:
+        address = file.url(base)
+        return _retrieved(address, file, beside) if address else None
+
+    return _get(dataset, to, fetch)
+
+
+def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
+    """Copy what is missing of a data set from a folder of downloads, or from a clone.
+
+    Args:
+        dataset: what to get.
+        to: its folder, made if need be.
+        folder: holds the files under their names here or those of the repository, with the
+            folders around them or without.
+
+    Returns:
+        What was kept, what was written, and what the folder does not hold.
+
+    Raises:
+        InputError: no such folder, none of the files in it, one of another content than
+            registered, or a file that is there with another content.
+    """
+    if not folder.is_dir():
+        raise InputError("is not a folder", folder, "give the folder of what you downloaded")
+
+    sources = {
+        file.name: _found(file, folder) for file in dataset.files
+    }  # search all files before copying any
+    if not any(sources.values()):
+        hint = f"download or clone {dataset.repository} first"
+        raise InputError("holds none of the files of this data set", folder, hint)
+    return _get(dataset, to, lambda file, beside: sources[file.name])
+
+
+def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | None]) -> Got:
+    """Write what is missing. `fetch`, given a folder to use, returns a file's content or None."""
+    missing = [file for file in dataset.files if not _is_there(file, to)]
+    got = Got(kept=[file.name for file in dataset.files if file not in missing])
+    for file in missing:
+        with tempfile.TemporaryDirectory(prefix="tkamb-data-") as beside:
+            source = fetch(file, Path(beside))
+            if source is None:
+                got.absent.append(file.name)
+                continue
+            target = to / file.name
+            claim_directory(target.parent)
+            with replaced_file(target) as temporary:
+                shutil.copyfile(source, temporary)
+                if sha256_of(temporary) != file.sha256:
+                    raise _other_content(source, file)
+        got.written.append(file.name)
+    return got
+
+
+def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
+    """Download a file into a folder, and check its content."""
+    import pooch
+    from requests.exceptions import HTTPError, RequestException
+
+    fetch = _LimitedDownload(LARGEST if file.size is None else file.size)
+    digest = f"sha256:{file.sha256}"
+    hint = "run it again: complete files are kept; or give --from DIR with files you downloaded"
+    try:
+        return Path(pooch.retrieve(address, digest, "whole", folder, downloader=fetch))
+    except HTTPError as error:
+        status = error.response.status_code if error.response is not None else "unknown"
+        raise InputError(f"cannot be downloaded (HTTP status {status})", address, hint) from None
+    except RequestException as error:
+        what = type(error).__name__  # its text is a page of nested causes
+        raise InputError(f"cannot be downloaded (no network? {what})", address, hint) from None
+    except OSError as error:
+        raise InputError(f"cannot be downloaded ({error.strerror})", address, hint) from None
+    except ValueError as error:
+        if "hash" not in str(error):
+            raise InputError(f"cannot be downloaded ({error})", address, hint) from None
+        raise _other_content(address, file) from None
+
+
+@dataclass(frozen=True)
+class _LimitedDownload:
+    """Downloads a file of at most so many bytes in at most `LONGEST_S`, for pooch."""
+
+    size: int
+
+    def __call__(self, url: str, output_file: str, pooch: object) -> None:
+        """Write what the address gives into a file.
+
+        Raises:
+            InputError: it gives more bytes than are registered, or takes too long.
+        """
+        import requests
+
+        end, received = clock.monotonic() + LONGEST_S, 0
+        with (
+            requests.get(url, stream=True, timeout=TIMEOUT_S) as answer,
+            open(output_file, "wb") as file,
+        ):
+            answer.raise_for_status()
+            for chunk in answer.iter_content(CHUNK):
+                received += len(chunk)
+                if received > self.size:
+                    what = f"gives more than the {self.size} bytes that are registered"
+                    raise InputError(what, url, "it may be another version; the file was not kept")
+                if clock.monotonic() > end:
+                    what = f"is not complete after {LONGEST_S / 60:.0f} minutes"
+                    raise InputError(what, url, "run it again: complete files are kept")
+                file.write(chunk)
+
+
+def _found(file: DataFile, folder: Path) -> Path | None:
+    """Return where a folder of downloads holds a file; None where it does not."""
+    copies = [place for place in file.places(folder) if place.is_file()]
+    for place in copies:
+        if sha256_of(place) == file.sha256:
+            return place
+    if copies:
+        raise _other_content(copies[0], file)
+    return None
+
+
+def _other_content(where: str | Path, file: DataFile) -> InputError:
+    what = f"is not {file.name} as registered: its SHA-256 is not {file.sha256[:12]}..."
+    return InputError(what, where, "it is cut short or another version; the file was not kept")
+
+
+def _is_there(file: DataFile, to: Path) -> bool:
+    target = to / file.name
+    if not target.exists() and not target.is_symlink():
+        return False
+    if sha256_of(target) == file.sha256:
+        return True
+    hint = "move it away: tkamb does not replace your files"
+    raise InputError("exists with another content than the published file", target, hint)

@@ -8,16 +8,17 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.io.importing.force_columns import TableForce, table_forces
 from tkamb.io.importing.plates import (
     Feet,
     Load,
     RecordedForce,
+    TableForce,
     common_surface,
     feet_loads,
     known_interval,
     own_plates,
     plate_forces,
+    table_forces,
     unmeasured,
 )
 from tkamb.io.importing.request import ImportRequest

@@ -43,12 +43,9 @@ class ModelChain:
     Args:
         model: the model.
         markers: names of the markers.
-        locked: coordinates that stay at their default beside those that the model locks.
     """
 
-    def __init__(
-        self, model: OpenSimModel, markers: Sequence[str], locked: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, model: OpenSimModel, markers: Sequence[str]) -> None:
         self.kinematics = Kinematics(model)
         self._at = [self.kinematics.bodies[model.markers[name].body] for name in markers]
         self._points = np.array([model.markers[name].location for name in markers])
@@ -57,7 +54,7 @@ class ModelChain:
         self.free = [
             index[name]
             for name, coordinate in model.coordinates.items()
-            if not (coordinate.locked or name in followers or name in locked)
+            if not (coordinate.locked or name in followers)
         ]
         self._couplers = [
             (index[c.dependent], index[c.independent], c.function) for c in model.couplers
@@ -225,7 +222,6 @@ def fit_model(
     model: OpenSimModel,
     recorded: Table,
     weights: Mapping[str, float] | None = None,
-    locked: Sequence[str] = (),
     laboratory_axes: str = "+x,+y,+z",
 ) -> tuple[ModelChain, ChainFit[Array]]:
     """Return a model's chain fitted to a recording, all frames at once.
@@ -234,7 +230,6 @@ def fit_model(
         model: the model.
         recorded: table of markers.
         weights: marker -> weight of its squared distance, where not 1.
-        locked: coordinates kept at their default.
         laboratory_axes: axes of the file that are the model's ground x, y and z (forward, up
             and right), as "-x,+z,+y".
 
@@ -248,7 +243,7 @@ def fit_model(
             recorded.path,
             f"the model has {', '.join(list(model.markers)[:8])}, …",
         )
-    chain = ModelChain(model, list(match), locked)
+    chain = ModelChain(model, list(match))
     scale = recorded.unit_scale(None, "length_unit")
     turn = laboratory_rotation(laboratory_axes, recorded.path)
     measured = marker_trajectories(recorded, list(match.values()), scale) @ turn.T

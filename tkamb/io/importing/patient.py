@@ -7,22 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.atomic import CHOOSE_OUT, claim_directory, write_new_text
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes
+from tkamb.files import CHOOSE_OUT, FILE_LIMITS, claim_directory, read_bytes, write_new_text
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg
-from tkamb.io.importing.links import Links, find_links
+from tkamb.io.importing.links import Links, find_links, patient_urdf
 from tkamb.io.importing.markers import recorded_labels, with_prefix
 from tkamb.io.importing.model_motion import MOTION_FILE
 from tkamb.io.importing.recorded_poses import read_poses
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import GROUND_FILE, SceneText
 from tkamb.io.importing.soft_tissue import soft_tissue, some_names
-from tkamb.io.importing.standing import with_static_markers
-from tkamb.io.importing.trial import Trial, from_coordinates, from_markers, from_poses
-from tkamb.io.importing.urdf import patient_urdf
+from tkamb.io.importing.trial import (
+    Trial,
+    from_coordinates,
+    from_markers,
+    from_poses,
+    with_static_markers,
+)
 from tkamb.io.opensim.model import OpenSimModel
 from tkamb.io.opensim.read import read_osim
 from tkamb.io.recordings.meshes import axes_rotation, load_surface

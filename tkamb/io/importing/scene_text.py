@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 from tkamb.geometry.frames import Array
-from tkamb.io.importing.links import Links
+from tkamb.io.importing.links import Links, body_link
 from tkamb.io.importing.markers import ModelSegment
 from tkamb.io.importing.model_motion import MOTION_FILE, motion_tables
-from tkamb.io.importing.recorded_poses import RecordedPoses
-from tkamb.io.importing.shank import ShankMarkers
-from tkamb.io.importing.soft_tissue import SoftTissue
-from tkamb.io.importing.toml_text import toml_end, toml_markers, toml_mm, toml_numbers, toml_text
-from tkamb.io.importing.urdf import body_link
+from tkamb.io.importing.recorded_poses import RecordedPoses, ShankMarkers
+from tkamb.io.importing.soft_tissue import End, SoftTissue
 from tkamb.io.recordings.unit_words import GivenUnits
+from tkamb.io.toml_text import toml_markers, toml_mm, toml_numbers, toml_text
 from tkamb.units import DEGREE
 
 GROUND_FILE = "ground_reaction.csv"
@@ -230,13 +228,13 @@ class SceneText:
         assert t.quadriceps is not None and t.patellar_ligament is not None
         return [
             "[quadriceps]",
-            toml_end("origin", t.quadriceps[0]),
-            toml_end("insertion", t.quadriceps[1]),
+            _end("origin", t.quadriceps[0]),
+            _end("insertion", t.quadriceps[1]),
             *self._bone(),
             "",
             "[patellar_ligament]",
-            toml_end("proximal", t.patellar_ligament[0]),
-            toml_end("distal", t.patellar_ligament[1]),
+            _end("proximal", t.patellar_ligament[0]),
+            _end("distal", t.patellar_ligament[1]),
             f"length_mm = {t.ligament_length * 1e3:.3f}",
             "",
             "[patella]",
@@ -281,7 +279,7 @@ class SceneText:
                     f"name = {toml_text(b.name)}",
                     'law = "quadratic-toe"',
                 ]
-                lines += [toml_end("proximal", b.proximal), toml_end("distal", b.distal)]
+                lines += [_end("proximal", b.proximal), _end("distal", b.distal)]
                 lines.append(f"stiffness_N_per_strain = {b.stiffness_N:g}")
                 lines.append(f"slack_length_mm = {b.slack_length_m * 1e3:.4f}")
             return lines[1:]
@@ -324,6 +322,11 @@ class SceneText:
 
 
 _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
+
+
+def _end(key: str, end: End) -> str:
+    """Return the line of a strand's end."""
+    return f"{key} = {{ link = {toml_text(end.link)}, point_mm = {toml_mm(end.point)} }}"
 
 
 def _segment(segment: ModelSegment, whole_labels: bool) -> list[str]:

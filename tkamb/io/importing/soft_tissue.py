@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.io.importing.links import Links
-from tkamb.io.importing.urdf import body_link
-from tkamb.io.opensim.lines import Ligament, Path, PathPoint
+from tkamb.io.importing.links import Links, body_link
+from tkamb.io.opensim.model import OpenSimLigament, Path, PathPoint
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
     return tuple(bundles)
 
 
-def _reason_against(ligament: Ligament, fixed: int) -> str:
+def _reason_against(ligament: OpenSimLigament, fixed: int) -> str:
     if not ligament.enabled:
         return "switched off in the model"
     if fixed != 2 or len(ligament.path.points) != 2:
@@ -197,6 +196,7 @@ def _name_muscles(links: Links, remarks: list[str]) -> None:
         )
 
 
-def some_names(names: list[str], most: int = 8) -> str:
-    """Return the first names, and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+def some_names(names: list[str]) -> str:
+    """Return the first eight names, and how many more there are."""
+    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    return ", ".join(names[:8]) + more

@@ -2,8 +2,8 @@
 
 - `tkamb.io.opensim.read`: `read_osim(path)` returns an `OpenSimModel`.
 - `tkamb.io.opensim.model`: what that holds.
-- `tkamb.io.opensim.kinematics`: `frame_poses(model, q)`; `Kinematics(model)` for many poses at
-  once, `.motion(q).points(bodies, locations)` for points with their Jacobians.
+- `tkamb.io.opensim.kinematics`: `Kinematics(model).poses(q)`, for many poses at once;
+  `.motion(q).points(bodies, locations)` for points with their Jacobians.
 - `tkamb.io.opensim.paths`: `LineSet(kinematics).at(q)` for lengths and moment arms.
-- `tkamb.io.opensim.inverse_dynamics`: the generalised forces of a motion.
+- `tkamb.io.opensim.motion`: the generalised forces of a motion.
 """

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import PPoly
+from scipy.interpolate import PPoly, make_interp_spline
 
 from tkamb.geometry.frames import Array
 
@@ -134,21 +134,11 @@ def simm_spline(x: Array, y: Array) -> Piecewise:
     """
     if len(x) == 2:
         return piecewise_linear(x, y)
-    h, n = np.diff(x), len(x)
-    secants = np.diff(y) / h
-    # Unknowns: a sixth of the third derivative's integral, c = f''/6 at the knots.
-    matrix, right = np.zeros((n, n)), np.zeros(n)
-    rows = np.arange(1, n - 1)
-    matrix[rows, rows - 1], matrix[rows, rows + 1] = h[:-1], h[1:]
-    matrix[rows, rows] = 2.0 * (h[:-1] + h[1:])
-    right[1:-1] = np.diff(secants)
-    matrix[0, :2], matrix[-1, -2:] = (-1.0, 1.0), (-1.0, 1.0)
-    if n > 3:
-        right[0] = h[0] * _third_difference(x[:4], y[:4])
-        right[-1] = h[-1] * _third_difference(x[-4:], y[-4:])
-    c = np.linalg.solve(matrix, right)
-    slopes = secants - h * (2.0 * c[:-1] + c[1:])
-    return Piecewise(PPoly(np.stack([np.diff(c) / h, 3.0 * c[:-1], slopes, y[:-1]]), x))
+    ends = (0.0, 0.0)
+    if len(x) > 3:
+        ends = (6.0 * _third_difference(x[:4], y[:4]), 6.0 * _third_difference(x[-4:], y[-4:]))
+    conditions = [(3, ends[0])], [(3, ends[1])]
+    return Piecewise(PPoly.from_spline(make_interp_spline(x, y, k=3, bc_type=conditions)))
 
 
 def _third_difference(x: Array, y: Array) -> float:

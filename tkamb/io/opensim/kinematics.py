@@ -271,16 +271,3 @@ def cross(a: Array, b: Array) -> Array:
     x, y, z = np.moveaxis(a, -1, 0)
     u, v, w = np.moveaxis(b, -1, 0)
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
-
-
-def frame_poses(model: OpenSimModel, q: Mapping[str, float] | ArrayLike) -> dict[str, Array]:
-    """Return each body's pose (..., 4, 4) in ground, ground among them.
-
-    Args:
-        model: the model.
-        q: coordinates (..., n) in the order of `model.coordinates`, or some of them by name;
-            the others stand at their defaults.
-    """
-    kinematics = Kinematics(model)
-    poses = kinematics.poses(q)
-    return {name: poses[..., k, :, :] for name, k in kinematics.bodies.items()}

@@ -15,8 +15,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.io.opensim.document import open_document
-from tkamb.io.opensim.elements import Document, Element
+from tkamb.io.opensim.document import Document, Element, open_document
 from tkamb.io.opensim.functions import Scaled
 from tkamb.io.opensim.model import (
     GROUND,

@@ -1,35 +1,38 @@
-"""A taut string past one wrap object: cylinder, sphere, ellipsoid or torus.
+"""Taut strings between two points over wrap objects: cylinder, sphere, ellipsoid, torus.
 
-Everything is in the object's frame and for many strings at once. The string touches where the
-straight line would pass through the object, or on the wrong side of it where a half is
-prescribed. A string with an end inside the object passes it as if it were not there, as in
-OpenSim. Lengths are those of the shortest string, so that dL/dq follows from the directions
-at its ends alone.
+One object at a time, in its own frame and for many strings at once. A string touches an object
+where the straight line would pass through it or, if a half is prescribed, on the wrong side of it.
+A string with an end inside the object ignores the object, as in OpenSim. Lengths are those of the
+shortest string, so that dL/dq follows from the directions at its ends alone.
 
 Around a circle of radius r, from the distance d₁ to d₂, swept angle Δ about the centre:
 
     θ = Δ - acos(r/d₁) - acos(r/d₂),   S = √(d₁² - r²) + r θ + √(d₂² - r²),   touching if θ > 0.
 
-On a cylinder the whole unrolls: L = √(S² + Δz²), z linear in S.
+A cylinder is unrolled: L = √(S² + Δz²), z linear in S.
 
-A path point of another body that moves into an ellipsoid would lose it at once: lengths then
-jump, in OpenSim by up to 14 mm. Here the ellipsoid shrinks with the point, so that the length is
-continuous: with the size k = |P/a|, and L homogeneous of degree one in P, Q and k,
+A path point of another body may move into an ellipsoid. In OpenSim the string then ignores the
+ellipsoid at once, and its length jumps by up to 14 mm. Here the ellipsoid shrinks with the point,
+so that the length is continuous. With the size k = |P/a|, and L homogeneous of degree one in P, Q
+and k,
 
     ∂L/∂k = (L + P·u_P - Q·u_Q) / k,
 
-u the string's directions at P and Q; the point is pushed out by -∂L/∂k ∂k/∂P.
+where u_P and u_Q are the string's directions at P and Q. The point is pushed out by -∂L/∂k ∂k/∂P.
+
+Several objects are passed in turn, with the touching points on the others fixed, until no touching
+point moves. Then every straight part is tangent to the objects at both its ends, and the string is
+taut.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tkamb.geometry.frames import Array
-from tkamb.io.opensim.geodesic import shortest_strings
-from tkamb.io.opensim.lines import WrapObject
-from tkamb.io.opensim.plane_strings import dot, unit
+from tkamb.geometry.frames import Array, Index, Mask, inverse
+from tkamb.io.opensim.geodesic import dot, shortest_strings, unit
+from tkamb.io.opensim.model import WrapObject
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,8 @@ class WrapSettings:
 WRAP = WrapSettings()
 
 
-Mask = NDArray[np.bool_]
-Index = NDArray[np.int64]
-
-
 @dataclass(frozen=True, eq=False)
-class Touch:
+class WrapTouch:
     """Where strings (f) touch an object.
 
     Args:
@@ -70,7 +69,7 @@ class Touch:
     push: Array
 
 
-def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> Touch:
+def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> WrapTouch:
     """Return where strings touch a wrap object, in its frame.
 
     Args:
@@ -125,7 +124,7 @@ def _around(
 
 def _cylinder(
     start: Array, end: Array, radius: float, length: float, quadrant: tuple[int, int] | None
-) -> Touch:
+) -> WrapTouch:
     """Return strings around a cylinder along z; none where they touch beyond both its ends."""
     (near, angle), (far, last) = _polar(start), _polar(end)
     if quadrant is None or quadrant[0] == 2:
@@ -145,10 +144,10 @@ def _cylinder(
     )
     off = np.minimum(np.abs(heights[0]), np.abs(heights[1])) > length / 2.0
     arc = on_circle * np.hypot(1.0, rise)
-    return Touch((turn != 0.0) & ~off, entry, leave, arc, _no_push(start))
+    return WrapTouch((turn != 0.0) & ~off, entry, leave, arc, _no_push(start))
 
 
-def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> Touch:
+def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> WrapTouch:
     """Return strings around a sphere: in the plane of both ends and its centre.
 
     A string that must pass on one half goes the long way round if that is where it leads,
@@ -172,10 +171,10 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
         radius * (np.cos(a)[:, None] * along + np.sin(a)[:, None] * across)
         for a in (ahead, ahead + turn)
     )
-    return Touch(touches, entry, leave, radius * np.abs(turn), _no_push(start))
+    return WrapTouch(touches, entry, leave, radius * np.abs(turn), _no_push(start))
 
 
-def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
+def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     """Return strings through a torus about z, pressed against the inside of its ring.
 
     The ring is taken as a cylinder along its tangent at the place that it is pressed most:
@@ -183,7 +182,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
     """
     rows = np.arange(len(start))
 
-    def at(places: Array) -> tuple[Touch, Array, Array]:
+    def at(places: Array) -> tuple[WrapTouch, Array, Array]:
         """Return touches, lengths and frames with the ring taken straight at angles (f,)."""
         inward = -np.column_stack([np.cos(places), np.sin(places), np.zeros_like(places)])
         up = np.broadcast_to([0.0, 0.0, 1.0], inward.shape)
@@ -208,12 +207,12 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
     centre = -ring * frame[rows, 0]
     entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (result.entry, result.exit))
     touches = result.touches & np.isfinite(lengths)
-    return Touch(touches, entry, leave, result.arc_m, _no_push(start))
+    return WrapTouch(touches, entry, leave, result.arc_m, _no_push(start))
 
 
 def _ellipsoid(
     start: Array, end: Array, axes: Array, quadrant: tuple[int, int] | None, moves: Mask
-) -> Touch:
+) -> WrapTouch:
     """Return strings around an ellipsoid: geodesics where the straight line would cut it."""
     p, q = start / axes, end / axes
     depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
@@ -239,4 +238,167 @@ def _ellipsoid(
             np.stack([p, q], axis=1) / (depth * (1.0 + WRAP.ellipsoid_clearance))[..., None] / axes
         )
         push[touches] = -(growth[:, None] * yields[touches])[..., None] * by_point[touches]
-    return Touch(touches, entry, leave, arc, push)
+    return WrapTouch(touches, entry, leave, arc, push)
+
+
+@dataclass(frozen=True)
+class StringSettings:
+    """The shortest string over several wrap objects, object by object."""
+
+    max_sweeps: int = 100
+    """Sweeps over all objects, after which a string without convergence is reported as failed.
+    Chosen: strings that converge need fewer."""
+    max_extrapolation: float = 10.0
+    """Largest extrapolation, as a multiple of the last step. Chosen: two sweeps do not predict
+    farther."""
+    tolerance: float = 1e-10
+    """m; a string has converged when the last sweep moves no touching point by more. Chosen: far
+    below what changes a muscle's length."""
+
+
+STRING = StringSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class WrappedStrings:
+    """Strings (f) over w objects.
+
+    Args:
+        order: (f, w) the objects each touches, from its start to its end; -1 where no more.
+        entry: (f, w, 3) m, where it meets object w.
+        exit: (f, w, 3) m, where it leaves object w.
+        arc_m: (f, w) its length on object w; NaN where no taut string was found.
+        push: (f, w, 2, 3) force of a shrinking object w on the two ends, per unit tension.
+    """
+
+    order: Index
+    entry: Array
+    exit: Array
+    arc_m: Array
+    push: Array
+
+
+def strings_over(
+    wraps: Sequence[WrapObject],
+    poses: Array,
+    start: Array,
+    end: Array,
+    allowed: Mask,
+    moves: Mask,
+) -> WrappedStrings:
+    """Return the taut strings from start to end (f, 3) over the objects that lie in the way.
+
+    Args:
+        wraps: w objects, in the order in which they are tried.
+        poses: (f, w, 4, 4) of the objects, in the frame of the points.
+        start: (f, 3) m.
+        end: (f, 3) m.
+        allowed: (f, w) whether a string may touch an object.
+        moves: (f, w, 2) whether the start and the end belong to another body than object w.
+    """
+    strings = _Strings(wraps, poses, start, end, moves)
+    if len(wraps) == 1:
+        strings.insert(0, np.flatnonzero(allowed[:, 0]))
+        return strings.found()
+    live = np.arange(len(start))
+    point, order = strings.places(), strings.order.copy()
+    value = residual = np.full_like(point, np.nan)
+    for _ in range(STRING.max_sweeps):
+        strings.sweep(live, allowed)
+        same = (strings.order == order).all(axis=1)
+        order, (last_value, last_residual) = strings.order.copy(), (value, residual)
+        value = strings.places()
+        residual = np.where(same[:, None], value - point, np.nan)
+        live = live[~(np.abs(residual[live]).max(axis=1) < STRING.tolerance)]
+        if not len(live):
+            break
+        point = value.copy()
+        point[live] += _leap(value, last_value, residual, last_residual)[live]
+        strings.place(point)
+    strings.arc[live] = np.nan
+    return strings.found()
+
+
+def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array) -> Array:
+    """Return the extrapolated step (f, 6w) from the last two sweeps (Aitken, Anderson).
+
+    Zero before there are two sweeps over the same objects, or if it is too large.
+    """
+    change = residual - last_residual
+    squared = np.maximum((change**2).sum(axis=1), 1e-300)
+    share = (residual * change).sum(axis=1) / squared
+    sound = np.abs(share) < STRING.max_extrapolation
+    leap = -np.where(sound, share, 0.0)[:, None] * (value - last_value)
+    return np.where(sound[:, None], leap, 0.0)
+
+
+class _Strings:
+    """Current state of the strings, object by object; see `strings_over` for the arguments."""
+
+    def __init__(
+        self, wraps: Sequence[WrapObject], poses: Array, start: Array, end: Array, moves: Mask
+    ) -> None:
+        self.wraps, self.poses, self.back = wraps, poses, inverse(poses)
+        self.start, self.end, self.moves = start, end, moves
+        shape = poses.shape[:2]
+        self.order = np.full(shape, -1)
+        self.entry, self.exit = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+        self.arc, self.push = np.zeros(shape), np.zeros((*shape, 2, 3))
+
+    def found(self) -> WrappedStrings:
+        """Return the strings as a result."""
+        return WrappedStrings(self.order, self.entry, self.exit, self.arc, self.push)
+
+    def places(self) -> Array:
+        """Return the touching points in one row (f, 6w) a string."""
+        return np.concatenate([self.entry, self.exit], axis=2).reshape(len(self.start), -1)
+
+    def place(self, places: Array) -> None:
+        """Set the touching points from one row (f, 6w) a string."""
+        both = places.reshape(*self.order.shape, 6)
+        self.entry, self.exit = both[..., :3].copy(), both[..., 3:].copy()
+
+    def sweep(self, rows: Index, allowed: Mask) -> None:
+        """Lay some strings again over each allowed object (f, w), one after the other."""
+        for w in range(len(self.wraps)):
+            self.remove(w, rows)
+            self.insert(w, rows[allowed[rows, w]])
+
+    def remove(self, w: int, rows: Index) -> None:
+        """Remove object w from the path of some strings."""
+        kept = np.where(self.order[rows] == w, -1, self.order[rows])
+        closed = np.argsort(kept < 0, axis=1, kind="stable")
+        self.order[rows] = np.take_along_axis(kept, closed, axis=1)
+
+    def insert(self, w: int, free: Index) -> None:
+        """Lay some strings over object w in the first of their straight parts that meets it."""
+        for gap in range(len(self.wraps)):
+            free = free[(self.order[free] >= 0).sum(axis=1) >= gap]
+            if not len(free):
+                break
+            follower = self.order[free, gap]
+            last = follower < 0
+            before = self.start[free]
+            if gap > 0:
+                before = self.exit[free, self.order[free, gap - 1]]
+            after = np.where(last[:, None], self.end[free], self.entry[free, follower])
+            is_end = np.stack([np.full(len(free), gap == 0), last], axis=1)
+            back = self.back[free, w]
+            moves = self.moves[free, w] & is_end
+            result = touch(self.wraps[w], _moved(back, before), _moved(back, after), moves)
+            self._touch(w, gap, free[result.touches], result)
+            free = free[~result.touches]
+
+    def _touch(self, w: int, gap: int, rows: Index, found: WrapTouch) -> None:
+        on, poses = found.touches, self.poses[rows, w]
+        self.entry[rows, w] = _moved(poses, found.entry[on])
+        self.exit[rows, w] = _moved(poses, found.exit[on])
+        self.arc[rows, w] = found.arc_m[on]
+        self.push[rows, w] = np.einsum("fij,fej->fei", poses[:, :3, :3], found.push[on])
+        later = self.order[rows, gap:-1]
+        self.order[rows, gap:] = np.column_stack([np.full(len(rows), w), later])
+
+
+def _moved(poses: Array, points: Array) -> Array:
+    """Return points (f, 3) moved each by its own pose (f, 4, 4)."""
+    return np.einsum("fij,fj->fi", poses[:, :3, :3], points) + poses[:, :3, 3]

@@ -82,7 +82,7 @@ def find_gait(time: Array, vertical: Array) -> Gait:
     """
     on = vertical >= GAIT.contact_force_N
     for state in (False, True):  # gaps within a stance first, then contacts that are noise
-        for first, last in _runs(on == state):
+        for first, last in uninterrupted_runs(on == state):
             inside = first > 0 and last < len(on) - 1
             if inside and time[last] - time[first] < GAIT.shortest_phase_s:
                 on[first : last + 1] = not state
@@ -91,7 +91,7 @@ def find_gait(time: Array, vertical: Array) -> Gait:
             _crossing(time, vertical, first) if first > 0 else np.nan,
             _crossing(time, vertical, last + 1) if last < len(on) - 1 else np.nan,
         )
-        for first, last in _runs(on)
+        for first, last in uninterrupted_runs(on)
     ]
     ends = float(time[0]), float(time[-1])
     return Gait(np.array(stances, float).reshape(-1, 2), ends)
@@ -104,7 +104,7 @@ def cycle_percent(time: Array, cycle: tuple[float, float]) -> Array:
     return np.where((percent >= 0.0) & (percent <= 100.0), percent, np.nan)
 
 
-def _runs(chosen: Mask) -> list[tuple[int, int]]:
+def uninterrupted_runs(chosen: Mask) -> list[tuple[int, int]]:
     """Return first and last index of each uninterrupted run of a mask (k,)."""
     steps = np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]]))
     firsts, after = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)

@@ -294,7 +294,7 @@ def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, 
         bundles = lines.ligaments(scene)
         check_collateral_sides(bundles, chain, scene.patient.side)
     if scene.generic_ligaments:
-        from tkamb.knee.generic_ligaments import generic_ligaments
+        from tkamb.knee.ligaments import generic_ligaments
 
         assert parts.femoral is not None and parts.insert is not None
         names = scene.generic_ligaments.ligaments

@@ -40,7 +40,7 @@ from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.io.toml_text import read_toml
 
 if TYPE_CHECKING:
-    from tkamb.io.presets.preset import AppliedPreset
+    from tkamb.io.presets import AppliedPreset
 
 
 class Scene(SceneTable):
@@ -171,7 +171,7 @@ def load_scene(
     Args:
         path: a TOML file; paths inside it are relative to its folder.
         overrides: dotted key ("contact.model") -> value, applied before validation.
-        preset: name of a preset (`tkamb.io.presets.registry`), applied before the overrides.
+        preset: name of a preset (`tkamb.io.presets`), applied before the overrides.
 
     Raises:
         InputError: unreadable file, unknown key, missing unit, value out of range, no such
@@ -198,7 +198,7 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
 
     Args:
         scene: as read.
-        preset: name of a preset (`tkamb.io.presets.registry`).
+        preset: name of a preset (`tkamb.io.presets`).
         overrides: dotted key -> value that replaces the preset's.
 
     Raises:
@@ -261,7 +261,7 @@ def _drop(content: dict[str, Any], table: str, key: str) -> None:
 def _apply_preset(
     content: dict[str, Any], name: str, overrides: dict[str, Any], where: object
 ) -> "AppliedPreset":
-    from tkamb.io.presets.registry import find_preset
+    from tkamb.io.presets import find_preset
 
     return find_preset(name).apply(content, overrides, where)
 
@@ -309,7 +309,9 @@ def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
     for name in tables:
         content = content.setdefault(name, {})
         if not isinstance(content, dict):
-            raise InputError(f"'{dotted}' names a key of something that is not a table", "--set")
+            raise InputError(
+                f"'{dotted}' names a key of something that is not a table", "overrides"
+            )
     content[key] = value
 
 
@@ -320,7 +322,7 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
     first = min(result, key=lambda one: rank.get(one["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
     option = next((o for o in overrides if f"{o}.".startswith(f"{key}.") or o == key), None)
-    where = path if option is None else f"--set {option}"
+    where = path if option is None else f"overrides {option}"
     more = f" ({len(result) - 1} more after this one)" if len(result) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = list(_keys_of(first["loc"][:-1]))

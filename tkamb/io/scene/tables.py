@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from tkamb.io import CONTACT_MODEL
 from tkamb.io.activities import Activity
-from tkamb.io.defaults import CONTACT_MODEL
 from tkamb.io.recordings.recording_tables import EmgTable
 from tkamb.io.recordings.scene_table import (
     DEFAULT_CLOSING,

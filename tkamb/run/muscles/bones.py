@@ -20,7 +20,7 @@ import numpy as np
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
-from tkamb.io.opensim.tension import StraightParts
+from tkamb.io.opensim.paths import StraightParts
 
 
 @dataclass(frozen=True, eq=False)

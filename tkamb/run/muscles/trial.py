@@ -21,10 +21,9 @@ import numpy as np
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
 from tkamb.io.importing.anatomy import Leg, find_leg
-from tkamb.io.opensim.inverse_dynamics import required_wrenches
 from tkamb.io.opensim.kinematics import Kinematics, Motion
 from tkamb.io.opensim.model import OpenSimModel
-from tkamb.io.opensim.motion import CoordinateMotion
+from tkamb.io.opensim.motion import CoordinateMotion, required_wrenches
 from tkamb.io.opensim.paths import LineSet, Pulls
 from tkamb.run.muscles.bones import Bones
 from tkamb.run.muscles.hill import rigid_tendon_strength

@@ -1,0 +1,277 @@
+"""Presets: the choices of a study by name, applied to any scene by `tkamb run SCENE --as NAME`.
+
+A built-in preset is one row of `BUILT_IN`. Another package offers one through the entry-point group
+`tkamb.io.presets`:
+
+    [project.entry-points."tkamb.io.presets"]
+    my-study-2026 = "my_package.my_module:MyStudy"
+
+where `MyStudy` is a subclass of `tkamb.io.presets.Preset`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+from tkamb.contact.named_classes import NamedClasses
+from tkamb.errors import InputError
+
+MODEL, OPTIONS = "contact.model", "contact.options"
+"""Options belong to the contact model that the preset names."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One key that a preset set.
+
+    Args:
+        key: dotted, as for `--set`.
+        before: value in the scene; None: not given, so that the default would hold.
+        after: value of the preset; None: the table is left out.
+    """
+
+    key: str
+    before: Any
+    after: Any
+
+
+@dataclass(frozen=True)
+class AppliedPreset:
+    """A preset as it was applied to a scene.
+
+    Args:
+        name: as given to `--as`.
+        source: of the study.
+        changes: keys whose value in the scene was different.
+        overridden: keys of the preset that `--set` or another option replaced.
+        departures: in words, remaining differences between the scene and the study.
+    """
+
+    name: str
+    source: str
+    changes: tuple[Change, ...]
+    overridden: tuple[str, ...]
+    departures: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what summary.json holds."""
+        return {
+            "name": self.name,
+            "source": self.source,
+            "changes": [vars(change) for change in self.changes],
+            "overridden": list(self.overridden),
+            "departures": list(self.departures),
+        }
+
+    def sentences(self) -> list[str]:
+        """Return what the report says about it."""
+        changed = "; ".join(
+            f"{change.key} = {_words(change.after, 'left out')} "
+            f"(scene: {_words(change.before, 'not given')})"
+            for change in self.changes
+        )
+        result = [
+            f"Run as {self.name} ({self.source}): {changed or 'no change of the scene needed'}."
+        ]
+        if self.overridden:
+            names = ", ".join(self.overridden)
+            result.append(f"Not as {self.name}, because the run's options replaced it: {names}.")
+        return result + [f"Not as {self.name}: {words}." for words in self.departures]
+
+
+def _words(value: Any, none: str) -> str:
+    if value is None:
+        return none
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {item}" for key, item in value.items()) or "none"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+class Preset:
+    """The choices of a study. Subclass it, and name the class in the registry.
+
+    Attributes:
+        name: as given to `--as`.
+        source: of the study, to cite.
+        settings: dotted key of the scene -> value; None leaves out a table.
+        needs: dotted key of a table -> why the study cannot be run without it.
+    """
+
+    name: ClassVar[str]
+    source: ClassVar[str]
+    settings: ClassVar[Mapping[str, Any]]
+    needs: ClassVar[Mapping[str, str]] = {}
+
+    def lacks(self, content: Mapping[str, Any]) -> str | None:
+        """Return in words why the study cannot use a scene, beside missing tables; None: it can.
+
+        Args:
+            content: of the scene, as its file is written.
+        """
+        del content
+        return None
+
+    def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return in words the differences between a scene and the study that remain.
+
+        Args:
+            content: of the scene, as its file is written.
+        """
+        del content
+        return ()
+
+    def apply(
+        self, content: dict[str, Any], overrides: Mapping[str, Any], where: object
+    ) -> AppliedPreset:
+        """Lay the preset over a scene's content, which is changed in place.
+
+        Args:
+            content: of the scene, as its file is written.
+            overrides: dotted key -> value that replaces the preset's afterwards.
+            where: of the scene, for messages.
+
+        Raises:
+            InputError: the scene lacks what the study needs.
+        """
+        self._check_needs(content, where)
+        other_model = overrides.get(MODEL, self.settings.get(MODEL)) != self.settings.get(MODEL)
+        changes, overridden = [], []
+        for key, value in self.settings.items():
+            if key in overrides or (key == OPTIONS and other_model):
+                overridden.append(key)
+                continue
+            before = _value_at(content, key)
+            if before != value and (before is not None or value):
+                changes.append(Change(key, before, value))
+            _put(content, key, dict(value) if isinstance(value, Mapping) else value)
+        overridden += [key for key in overrides if key.startswith(f"{OPTIONS}.")]
+        return AppliedPreset(
+            self.name, self.source, tuple(changes), tuple(overridden), self.departures(content)
+        )
+
+    def _check_needs(self, content: Mapping[str, Any], where: object) -> None:
+        hint = "add what is missing to the scene, or run it without --as"
+        lacking = self.lacks(content)
+        if lacking:
+            raise InputError(f"preset '{self.name}' needs {lacking}", where, hint)
+        missing = [key for key in self.needs if not _value_at(content, key)]
+        if missing:
+            key = missing[0]
+            more = f"; it also needs {', '.join(f'[{k}]' for k in missing[1:])}" * bool(missing[1:])
+            raise InputError(
+                f"preset '{self.name}' needs [{key}]: {self.needs[key]}{more}",
+                where,
+                hint,
+            )
+
+
+def _value_at(content: Mapping[str, Any], dotted: str) -> Any:
+    """Return the value of a dotted key, None where it is not given."""
+    value: Any = content
+    for part in dotted.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
+def _put(content: dict[str, Any], dotted: str, value: Any) -> None:
+    """Set a dotted key, or remove it for None; a table that is not there is made."""
+    *tables, last = dotted.split(".")
+    for name in tables:
+        if not isinstance(content.get(name), dict):
+            if value is None:
+                return
+            content[name] = {}
+        content = content[name]
+    if value is None:
+        content.pop(last, None)
+    else:
+        content[last] = value
+
+
+class Sharma2008(Preset):
+    """Sharma, dissertation, University of Tennessee, Knoxville (2008), chapter 4.
+
+    Each choice that a key of the scene can express, with the section that describes it.
+    """
+
+    name: ClassVar[str] = "sharma-2008"
+    source: ClassVar[str] = "Sharma, dissertation, University of Tennessee (2008), chapter 4"
+    settings: ClassVar[Mapping[str, Any]] = MappingProxyType(
+        {
+            # 4.4: "modeled to roll with slip"; slip of the lowest points of the condyles.
+            "motion.motion": "roll-slip",
+            # 4.4: the ground reaction, "obtained from a force plate, was applied at the ankle".
+            "ground_reaction.applied": "ankle",
+            # 4.4: one quadriceps and nothing else; wrapping "was taken into account".
+            "muscles": None,
+            "quadriceps.wrap": True,
+            "patellar_ligament.wrap": True,
+            # 4.5.1, 4.5.2: 26 neighbours, one stiffness E C. 5.1: cells below 1.5 mm.
+            "contact.model": "lattice-source",
+            "contact.resolution_mm": 1.5,
+            # 4.5.5: the loops; 4.5.6: total area by number of nodes in contact.
+            "contact.options": {"loops": "source", "law": "nonlinear", "pressure_rule": "source"},
+            # 4.5.2, 5.2: Halloran's curve by the fit that the source gives (E, alpha, sigma0, n).
+            "contact.material": "polyethylene",
+            "contact.friction": 0.05,
+            # 4.3: 0.5 mm, 0.5 deg; undone where penetration and angle exceed it.
+            "contact.adjust": True,
+            "contact.adjust_restore_when": "both",
+            # 4.4, 4.5.5: the body's total force loads the lattice; there is no coupling back.
+            "contact.coupling": "none",
+            "contact.released": [],
+            "contact.post": False,
+        }
+    )
+    needs: ClassVar[Mapping[str, str]] = MappingProxyType(
+        {
+            "implant.femoral": "it presses the femoral component into the insert",
+            "implant.insert": "the lattice is made from its mesh",
+            "tibia": "the shank turns about the ankle in the sagittal plane",
+            "ground_reaction": "the force plate's force acts at the ankle",
+            "quadriceps": "its tension is solved from the equations of motion",
+            "patellar_ligament": "its tension is solved from the equations of motion",
+            "patella": "quadriceps and patellar ligament meet there",
+        }
+    )
+
+    def lacks(self, content: Mapping[str, Any]) -> str | None:
+        """Return why a motion without fluoroscopy cannot be used."""
+        if content.get("motion", {}).get("interpretation") != "markers":
+            return None
+        return (
+            "the femur's recorded pose on the insert (fluoroscopy): skin markers "
+            "([motion] interpretation = 'markers') do not give it"
+        )
+
+    def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return in words the differences between a scene and the study that remain."""
+        result = []
+        kind = content["tibia"].get("kind")
+        if kind != "sagittal":
+            result.append(f"the shank moves as recorded ([tibia] kind = '{kind}'), in 3D")
+        laws = {one.get("law") for one in content.get("ligament", ())} - {"two-line"}
+        if laws:
+            result.append(f"ligaments follow the law {', '.join(sorted(map(repr, laws)))}")
+        if content.get("generic_ligaments"):
+            result.append("ligaments are a generic set scaled to the implant")
+        if not content.get("ligament") and not content.get("generic_ligaments"):
+            result.append("no ligaments are modelled")
+        return tuple(result)
+
+
+BUILT_IN = {
+    "sharma-2008": "tkamb.io.presets:Sharma2008",
+}
+
+PRESETS = NamedClasses("preset", Preset, "tkamb.io.presets", BUILT_IN)
+
+
+def find_preset(name: str) -> Preset:
+    """Return the preset of that name.
+
+    Raises:
+        InputError: no such name, a name clash, or it cannot be imported.
+    """
+    return PRESETS.find(name)()

@@ -1,1 +1,0 @@
-"""Named presets: the choices of a study, applied to any scene by `tkamb run SCENE --as NAME`."""
