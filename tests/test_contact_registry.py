@@ -26,7 +26,7 @@ from tkamb.io.scene import load_scene
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code, foreign_code
 from tkamb.run.results_folder import verify_results, write_results
 from tkamb.run.simulation import simulate
-from tkamb.show.compare.comparison import compare_folders
+from tkamb.show.comparison import compare_folders
 from tkamb.studies import tradeoff
 from tkamb.studies.cohort import run as cohort_run
 from tkamb.studies.cohort.plan import load_cohort

@@ -389,7 +389,7 @@ class Knee(AssembledKnee):
         Raises:
             InputError: no contact model, or a model that was not made by `tkamb.contact_model`.
         """
-        return import_module("tkamb.show.view.knee_on_bench").live_knee(self, q, load, folder)
+        return import_module("tkamb.show.view.live_window").live_knee(self, q, load, folder)
 
     def instant(
         self,
