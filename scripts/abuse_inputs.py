@@ -1,7 +1,7 @@
-"""Inputs that no sound program makes, from a seed: what `scripts/study_abuse` feeds to tkamb.
+"""Invalid inputs made from a seed; `scripts/study_abuse` gives them to tkamb.
 
-Each kind is a function (folder, chance) -> arguments of the command line. The folder is empty
-when it begins; what stands there when it returns is the input.
+Each kind is a function (folder, chance) -> arguments of the command line. It writes its input into
+the empty folder.
 """
 
 import json
@@ -30,7 +30,7 @@ RUN = ("--frames", "0:1")
 
 
 def arguments(folder: Path, chance: random.Random) -> list[str]:
-    """A sound command line with words changed, doubled, dropped or put in."""
+    """A valid command line with words changed, doubled, dropped or inserted."""
     commands = [
         ["run", str(MODEL / "scene.toml"), "--out", str(folder / "out"), *RUN],
         ["press", *(str(MODEL / name) for name in MESHES), "--load", "10", "--resolution", "9"],
@@ -57,7 +57,7 @@ def arguments(folder: Path, chance: random.Random) -> list[str]:
 
 
 def odd_files(folder: Path, chance: random.Random) -> list[str]:
-    """Something that is no file where a file should be."""
+    """A path that is no regular file, given where a file is expected."""
     path = folder / "odd.stl"
     kind = chance.randint(0, 6)
     if kind == 0:
@@ -135,7 +135,7 @@ def tables(folder: Path, chance: random.Random) -> list[str]:
 
 
 def urdfs(folder: Path, chance: random.Random) -> list[str]:
-    """A patient with elements lost, doubled, nested or of other numbers."""
+    """A URDF with elements dropped, doubled or nested, or with changed numbers."""
     path = copied(folder) / "patient.urdf"
     text = path.read_text(encoding="utf-8")
     for _ in range(chance.randint(1, 3)):
@@ -161,7 +161,7 @@ def urdfs(folder: Path, chance: random.Random) -> list[str]:
 
 
 def meshes(folder: Path, chance: random.Random) -> list[str]:
-    """A mesh cut short, of changed bytes, or of another kind than its name says."""
+    """A mesh that is truncated, has changed bytes, or is of another format than its suffix."""
     copied(folder)
     name = chance.choice(MESHES)
     path = folder / name
@@ -185,7 +185,7 @@ def meshes(folder: Path, chance: random.Random) -> list[str]:
 
 
 def folders(folder: Path, chance: random.Random) -> list[str]:
-    """A folder of results in which files were changed, lost, swapped or put in."""
+    """A folder of results with files changed, dropped, swapped or added."""
     out = folder / "out"
     shutil.copytree(os.environ["TKAMB_ABUSE_RESULTS"], out)
     names = ["results.csv", "summary.json", "contact.h5", ".tkamb", ".tkamb-commit", ".frames"]
@@ -219,7 +219,7 @@ def folders(folder: Path, chance: random.Random) -> list[str]:
 
 
 def forged(folder: Path, chance: random.Random) -> list[str]:
-    """A folder of results from somebody else, of right hashes and wrong content."""
+    """A forged folder of results, with right hashes and wrong content."""
     results = Path(os.environ["TKAMB_ABUSE_RESULTS"])
     out = str(forge(folder, results, chance))
     made = str(folder / "made")
@@ -239,7 +239,7 @@ def forged(folder: Path, chance: random.Random) -> list[str]:
 
 
 def toml(folder: Path, chance: random.Random) -> list[str]:
-    """A scene, material, springs or --set text that is small to write and large to read."""
+    """A scene, material, springs file or --set text that is short but expensive to read."""
     count = chance.choice([100, 5_000, 200_000, 2_000_000])
     key = chance.choice(["a", "contact.options.x", "motion", "material.table"])
     text = chance.choice(
@@ -277,12 +277,12 @@ def toml(folder: Path, chance: random.Random) -> list[str]:
 
 
 def options(folder: Path, chance: random.Random) -> list[str]:
-    """A sound command line with one or two of its command's options given an odd value.
+    """A valid command line with odd values for one or two of its options.
 
-    The folder `precious` is somebody else's: what lies there must stay as it is.
+    The folder `precious` holds another program's files, which must not change.
     """
     from tkamb.cli import _parser
-    from tkamb.commands.option_rules import leaf_parsers
+    from tkamb.commands.options import leaf_parsers
 
     results, scene = os.environ["TKAMB_ABUSE_RESULTS"], str(MODEL / "scene.toml")
     precious = folder / PRECIOUS
@@ -380,7 +380,7 @@ def opensim_leg() -> tempfile.TemporaryDirectory:
 
 
 def reworded(content: bytes, chance: random.Random) -> bytes:
-    """Return a text whose lines, or words between angle brackets and blanks, are changed."""
+    """Return a text with changed lines, or with changed words between brackets and blanks."""
     lines = content.decode("utf-8", "replace").splitlines() or [""]
     for _ in range(chance.randint(1, 4)):
         number, how = chance.randrange(len(lines)), chance.randint(0, 5)
@@ -426,13 +426,13 @@ def copied(folder: Path) -> Path:
 
 
 def run(folder: Path) -> list[str]:
-    """Return a run of the folder's scene, its body alone being the quickest."""
+    """Return the arguments of a run of the folder's scene without contact, which is quick."""
     out = str(folder / "out")
     return ["run", str(folder / "scene.toml"), "--out", out, *RUN, "--contact", "hertz"]
 
 
 def spoilt(content: bytes, chance: random.Random) -> bytes:
-    """Return bytes cut short, flipped, doubled or put in."""
+    """Return the bytes truncated, or with some flipped, doubled or inserted."""
     spoilt = bytearray(content)
     for _ in range(chance.choice([1, 1, 5, 50])):
         if not spoilt:

@@ -2,8 +2,8 @@
 """Measure the lattice: time, memory, and how approach, force, area and peak settle.
 
 Each row runs in its own process with one thread, so that its peak memory can be measured;
-OMP_NUM_THREADS and TKAMB_THREADS change the number of threads. The approach since first touch
-is computed when it is read: `approach_s` is the time of that.
+OMP_NUM_THREADS and TKAMB_THREADS change the number of threads. `approach_s` is the time that it
+takes to compute the approach since first touch, which a press does only when asked.
 
     scripts/bench_lattice.py --cases two-condyles dm30 jw --data FOLDER --resolutions 2 1.5 1
     scripts/bench_lattice.py --cases shipped --contacts lattice --resolutions 1 0.75 0.5

@@ -1,4 +1,4 @@
-"""A pytest plugin: which functions of the package each test calls, and how long it takes.
+"""A pytest plugin that records the functions of the package that each test calls, and its time.
 
     python -m pytest -p called_functions --called out/called.jsonl tests/test_x.py
 

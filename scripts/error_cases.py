@@ -1,9 +1,9 @@
 """Pairs of bodies on which the contact models' errors are measured, by situation.
 
-There are three situations with different errors of a map: contact in the interior of a smooth
-surface, on a flank (its normal far from the vertical) and at an edge (the outline of the insert, a
-rim with a fillet, a femoral part with an edge). Every second pair of each situation is held out:
-it tests the errors that the other half states and does not enter them.
+Errors of a pressure map differ between three situations: contact in the interior of a smooth
+surface, on a flank (its normal is far from the vertical) and at an edge (the outline of the insert,
+a rim with a fillet, a femoral component with an edge). In each situation every second pair is held
+out. The stated errors come from the other pairs, and the held-out pairs test them.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,8 @@ class ErrorCaseSettings:
     """The cases from which known errors are measured."""
 
     insert_mm: float = 16.0
-    """mm; edge of the inserts. Chosen: small enough for fine cells, wide enough that contact ends
-    inside."""
+    """mm; edge length of the inserts. Chosen: small enough for fine cells, and wide enough that the
+    contact does not reach the outline."""
     vertex_spacing_mm: float = 0.25
     """mm; distance between the vertices of the surfaces. Chosen: facets then change no pressure
     noticeably."""
@@ -43,14 +43,14 @@ class ErrorCase:
     """A pair of bodies, the place of their contact, and the load.
 
     Args:
-        name: of the case.
-        situation: where the contact lies.
-        held_out: whether it tests the stated errors; if not, it is used to compute them.
-        femoral: height (m) of the femoral component's underside over its lowest point.
-        insert: height (m) of the insert's top.
-        load: N.
-        shift_mm: x and z of the femoral component.
-        width_mm: of the femoral component.
+        name: name of the case.
+        situation: where the contact lies: interior, flank or edge.
+        held_out: whether the case tests the stated errors; otherwise they are computed from it.
+        femoral: function of x and z (m): height (m) of the femoral underside over its lowest point.
+        insert: function of x and z (m): height (m) of the insert's top.
+        load: contact force, N.
+        shift_mm: x and z of the femoral component, mm.
+        width_mm: edge length of the femoral component, mm.
     """
 
     name: str
@@ -160,7 +160,7 @@ def _level(thickness_mm: float) -> Height:
 
 
 def _ball(radius_x_mm: float, radius_z_mm: float) -> Height:
-    """Return an ellipsoid with these radii along x and z at its lowest point."""
+    """Return the height of an ellipsoid, given its radii along x and z at the lowest point."""
     a, b = radius_x_mm * MILLIMETRE, radius_z_mm * MILLIMETRE
 
     def height(x: Array, z: Array) -> Array:
@@ -171,7 +171,7 @@ def _ball(radius_x_mm: float, radius_z_mm: float) -> Height:
 
 
 def _dish(thickness_mm: float, radius_x_mm: float, radius_z_mm: float) -> Height:
-    """Return a dish of these radii; a negative one is a ridge."""
+    """Return the height of a dish, given its radii; a negative radius makes a ridge."""
     a, b = radius_x_mm * MILLIMETRE, radius_z_mm * MILLIMETRE
     return lambda x, z: thickness_mm * MILLIMETRE + x**2 / (2 * a) + z**2 / (2 * b)
 

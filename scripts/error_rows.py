@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from error_cases import ErrorCase, error_cases
-from tkamb.contact.narrow import TOO_NARROW
+from tkamb.contact.flags import TOO_NARROW
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import InputError
 from tkamb.studies.quantities import Quantities, errors, quantities
@@ -22,7 +22,7 @@ class ErrorReferenceSettings:
     """The reference of the known errors."""
 
     resolution_mm: float = 0.5
-    """mm; resolution of the reference. Chosen: half of the finest that is compared with it."""
+    """mm; resolution of the reference. Chosen: half of the finest compared resolution."""
 
 
 ERROR_REFERENCE = ErrorReferenceSettings()
@@ -53,15 +53,16 @@ class ErrorRow:
 
     Args:
         case: name of the pair.
-        situation: where its contact lies.
-        held_out: whether it tests the stated errors; if not, it is used to compute them.
-        material: of the insert.
-        contact: name of the model.
-        resolution_mm: of its map.
-        status: how the press ended; "too narrow" where the contact is flagged so: no error is
-        stated for such contacts.
-        errors: relative, approach, mean and peak pressure and area; empty without an answer.
-        uncertainty: of the reference, relative.
+        situation: where the contact lies: interior, flank or edge.
+        held_out: whether the case tests the stated errors; otherwise they are computed from it.
+        material: name of the insert's material.
+        contact: name of the contact model.
+        resolution_mm: resolution of the pressure map, mm.
+        status: status of the press, or "too narrow" after that flag; such contacts have
+            no stated error.
+        errors: relative errors of approach, mean and peak pressure and area; empty if the press
+            failed.
+        uncertainty: relative uncertainties of the reference.
     """
 
     case: str
@@ -96,7 +97,7 @@ def solve(case: ErrorCase, material: str, contact: str, resolution_mm: float) ->
 
 
 def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
-    """Return the errors of all settings that were solved and whose references were.
+    """Return the errors of all settings that were solved together with their references.
 
     Args:
         solved: `solved_key` -> what `solve` returned.

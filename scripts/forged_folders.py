@@ -1,4 +1,4 @@
-"""Forged folders of results, made from a seed: their hashes are right, their content is wrong."""
+"""Forged folders of results, made from a seed, with right hashes and wrong content."""
 
 import hashlib
 import json

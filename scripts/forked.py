@@ -1,6 +1,6 @@
-"""Commands in forked processes: what tkamb imports is there already, so that a study takes minutes.
+"""Commands in forked processes, which have tkamb's imports already, so that a study takes minutes.
 
-A child is a process like any other: it can be killed, interrupted, and limited.
+A child can be killed, interrupted and limited as any other process.
 """
 
 import importlib
@@ -21,7 +21,7 @@ NEEDED = (
     "tkamb.run.maps",
     "tkamb.contact.lattice.model",
     "tkamb.contact.foundation",
-    "tkamb.knee.equilibrium.released",
+    "tkamb.knee.released",
     "tkamb.show.report",
     "tkamb.show.view.show",
     "tkamb.studies.uncertainty.run",
@@ -32,7 +32,7 @@ NEEDED = (
     "pyarrow.parquet",
     "tqdm",
 )
-"""Modules that are imported once; one that is not there under this name costs time alone."""
+"""Modules that are imported once, before the first fork."""
 
 
 def import_all(report: bool = True) -> None:
@@ -53,7 +53,7 @@ def import_all(report: bool = True) -> None:
 
 
 def prepare_once() -> None:
-    """Have runs of equal scenes share what prepares their frames, guesses not; forked ones too."""
+    """Make runs of equal scenes share prepared knees and contact models, but no initial guesses."""
     from tkamb.run import simulation
     from tkamb.run.frames import FrameSolver
 
@@ -70,12 +70,12 @@ def prepare_once() -> None:
 
 
 class Forked:
-    """A command line in a process of its own.
+    """A command line in a separate process.
 
     Args:
-        arguments: of `tkamb`.
-        folder: where the process works.
-        prepare: called in the child first; sets limits.
+        arguments: arguments of `tkamb`.
+        folder: working directory of the process.
+        prepare: function that the child calls first, for example to set limits.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Forked:
                 os._exit(120)
 
     def status(self) -> int | None:
-        """Return the exit status; that of a signal is negative; None while it runs."""
+        """Return the exit status; negative after a signal, None while the process runs."""
         if self._status is None:
             ended, status = os.waitpid(self.pid, os.WNOHANG)
             if ended:
@@ -114,7 +114,7 @@ class Forked:
         return self._status
 
     def wait(self, longest: float) -> int | None:
-        """Wait for the end, s at most; return `status`."""
+        """Wait for the end, at most `longest` seconds; return `status`."""
         end = time.monotonic() + longest
         while self.status() is None and time.monotonic() < end:
             time.sleep(0.01)

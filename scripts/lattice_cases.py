@@ -1,4 +1,4 @@
-"""Bodies and poses that the lattice's measurements share, in metres, insert frame."""
+"""Bodies and poses for the measurements of the lattice, in metres in the insert frame."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The page of `tkamb live` in a headless browser, for the scripts that measure and picture it."""
+"""The page of `tkamb live` in a headless browser, for measurements and pictures."""
 
 import tempfile
 import time

@@ -15,10 +15,10 @@ import time
 import numpy as np
 import scipy.sparse.linalg as linalg
 
+from tkamb.contact.lattice.calibrated import CalibratedNetwork
+from tkamb.contact.lattice.linear.compliance import SINGLE
 from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.linear.response import SINGLE
 from tkamb.contact.lattice.meshing.cells import CORNERS
-from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 
 

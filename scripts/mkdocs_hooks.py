@@ -22,7 +22,7 @@ API = (
     "contact.registry.contact_model", "contact.model", "contact.result.ContactResult",
     "contact.pair", "testing", "errors",
 )  # fmt: skip
-"""What others program against."""
+"""Public names, documented on the page of the API."""
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 
@@ -37,23 +37,23 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Lead the links of a page of docs/ that leave it to the pages made here."""
+    """Change the links of a page in docs/ so that they lead to pages of the site."""
     source = ROOT / "docs" / page.file.src_uri
     return _led(markdown, source.parent, page.file.src_uri) if source.is_file() else markdown
 
 
 def _page(page: str, source: str) -> str:
-    """Return the text of a file with its links led to pages."""
+    """Return the text of a file with links to pages of the site."""
     return _led((ROOT / source).read_text(encoding="utf-8"), (ROOT / source).parent, page)
 
 
 def _led(text: str, folder: Path, page: str) -> str:
-    """Return a text with its links led to pages; those to other files become plain names.
+    """Return a text with links to pages of the site; links to other files become plain names.
 
     Args:
-        text: Markdown.
-        folder: to which its links are relative.
-        page: what it becomes.
+        text: Markdown text.
+        folder: folder to which the links in the text are relative.
+        page: name of the page that is made from the text.
     """
     made = {(ROOT / file).resolve(): name for name, file in COPIED.items()}
     made[ROOT / "docs" / "gallery"] = "gallery.md"
@@ -81,7 +81,7 @@ def _api() -> str:
 
 
 def _gallery() -> str:
-    """Return the gallery's page: of each example its picture, first words and code."""
+    """Return the gallery's page with the picture, the first words and the code of each example."""
     parts = ["# Gallery\n\nEach example runs in the tests and is held to the number it asserts.\n"]
     for path in sorted((ROOT / "docs" / "gallery").glob("*.py")):
         _, words, code = path.read_text(encoding="utf-8").split('"""', 2)

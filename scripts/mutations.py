@@ -1,7 +1,6 @@
-"""One-line faults in Python source: what may be changed, and the changed text.
+"""One-line faults in Python source: the places that can be changed, and the changed text.
 
-A fault is drawn by a seed from all that the source allows, so that the same seed gives the same
-faults as long as the source is the same.
+A seed draws from all possible faults; the same seed and source give the same faults.
 """
 
 import ast
@@ -32,12 +31,12 @@ class Fault:
 
     @property
     def change(self) -> str:
-        """Return where it is and what it changes, wherever in the function."""
+        """Return the function and the change, without the line."""
         return f"{self.file}:{self.function}:{self.kind}:{self.before}->{self.after}"
 
     @property
     def name(self) -> str:
-        """Return a name that stays while the line does."""
+        """Return a name that stays the same as long as the line does."""
         return f"{self.change} in {self.text}"
 
     def applied(self, text: str) -> str:
@@ -73,7 +72,7 @@ class _Finder(ast.NodeVisitor):
         self._inside.pop()
 
     def visit_Raise(self, node):
-        """A message is no physics."""
+        """Skip messages: they hold no physics."""
 
     visit_JoinedStr = visit_Assert = visit_Raise
 
@@ -136,7 +135,7 @@ class _Finder(ast.NodeVisitor):
 
 
 def all_faults(root: Path, folders: tuple[str, ...]) -> list[Fault]:
-    """Return every fault that the modules in some folders may allow, in order."""
+    """Return every possible fault of the modules in some folders, in order."""
     found = []
     for folder in folders:
         for path in sorted((root / folder).rglob("*.py")):
@@ -148,9 +147,9 @@ def all_faults(root: Path, folders: tuple[str, ...]) -> list[Fault]:
 
 
 def drawn(root: Path, faults: list[Fault], count: int, seed: int) -> list[Fault]:
-    """Return some of the faults: kinds in turn, at most one a line, all of them Python.
+    """Return some of the faults: kinds in turn, at most one per line, all with valid syntax.
 
-    Their order hangs on what they change alone, so that a change elsewhere draws few others.
+    Their order depends only on their own source, so that a change elsewhere changes few of them.
     """
     heaps = {kind: [f for f in faults if f.kind == kind] for kind in KINDS}
     for heap in heaps.values():

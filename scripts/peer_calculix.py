@@ -4,10 +4,10 @@
     scripts/peer_calculix.py --out out/peer_calculix --resume
     scripts/peer_calculix.py --page
 
-The first line presses every case with every model, each in a process of its own, and writes
-peer_calculix.json, .md and .png; finished rows are kept, and --resume goes on from them. With
---page the JSON is kept in scripts/data/ as well, and docs/development/peer_calculix.md and its
-picture are made from it; alone, --page makes them from scripts/data/peer_calculix.json as it is.
+The first command presses every case with every model, each in a separate process, and writes
+peer_calculix.json, .md and .png. With --resume it skips the rows that are finished. With --page it
+also copies the JSON to scripts/data/ and makes docs/development/peer_calculix.md and its picture
+from it. The second command makes them from scripts/data/peer_calculix.json and measures nothing.
 """
 
 import argparse
@@ -24,11 +24,11 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from lattice_cases import two_condyles  # noqa: E402
-from tkamb.atomic import claim_directory, write_text  # noqa: E402
 from tkamb.contact.materials import material  # noqa: E402
 from tkamb.contact.pair import ContactPair  # noqa: E402
 from tkamb.contact.registry import contact_model  # noqa: E402
-from tkamb.memory import peak_rss  # noqa: E402
+from tkamb.files import claim_directory, write_text  # noqa: E402
+from tkamb.geometry.memory import peak_rss  # noqa: E402
 from tkamb.studies.calculix import find_program  # noqa: E402
 from tkamb.studies.cases import StudyCase  # noqa: E402
 from tkamb.studies.kept_rows import KeptRows, row_key  # noqa: E402
@@ -42,14 +42,14 @@ LAWS = ("linear", "nonlinear")
 LOADS_N = (1000.0, 2500.0)
 VARUS_DEG = (0.0, 0.3)
 LEAST_PRESSURE = 0.1e6
-"""Pa: a node with less does not count to the area."""
+"""Pa; nodes with a smaller pressure do not count towards the area."""
 WARM_PRESSES = 5
 LIMITS = {
     ("lattice", "linear"): {"approach": 2.0, "force": 2.0, "peak": 4.0, "area": 5.0},
     ("fe", "linear"): {"approach": 1.5, "peak": 2.0},
     ("lattice", "nonlinear"): {"approach": 5.0},
 }
-"""Per cent off `PEER`: what was asked for."""
+"""Largest difference from `PEER` that was specified, in per cent."""
 DOCS, DATA = ROOT / "docs", ROOT / "scripts" / "data"
 
 
@@ -91,10 +91,10 @@ def took_row(job, nodes, prepare, cold, warm, memory):
 
 
 def found(result):
-    """Return what is compared of a result, by one definition for every model.
+    """Return the quantities of a result to compare, defined alike for every model.
 
-    The effective area (sum F)²/sum(F p) is that of an even pressure with the same force and
-    the same work: no node that hardly touches decides it.
+    The effective area is (sum F)²/sum(F p). A uniform pressure on this area has the same force and
+    the same sum(F p). Nodes with a very small pressure hardly change it.
     """
     size = np.linalg.norm(result.nodal_force, axis=1)
     return {
@@ -114,7 +114,7 @@ def same_case(row):
 
 
 def differences(row, peer):
-    """Return how far a row is off the peer's, in per cent; force: the condyle that is further."""
+    """Return the differences of a row from the peer's, in per cent; of both condyles the larger."""
     forces = [row[side] / peer[side] - 1 for side in ("medial_N", "lateral_N")]
     apart = {
         "approach": row["approach_mm"] / peer["approach_mm"] - 1,
@@ -127,7 +127,7 @@ def differences(row, peer):
 
 
 def block(rows):
-    """Return the page's tables: every case, what was asked for, time and memory."""
+    """Return the page's tables: every case, the specified differences, time and memory."""
     peers = {same_case(row): row for row in rows if row["model"] == PEER}
     lines = [
         "| law | N | varus ° | model | approach mm | off % | medial / lateral N | off % "
@@ -177,7 +177,7 @@ def costs(rows):
 
 
 def picture(rows):
-    """Return the figure: every model's distance from the peer, case by case."""
+    """Return the figure: the difference of every model from the peer in each case."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -214,7 +214,7 @@ def picture(rows):
 
 
 def measured_rows(options):
-    """Return the rows of all jobs, kept ones first come."""
+    """Return the rows of all jobs; finished rows come first."""
     find_program()
     kept = KeptRows(claim_directory(options.out), options.resume)
     rows = []
@@ -233,7 +233,7 @@ def measured_rows(options):
 
 
 def apart(job):
-    """Measure in a process of its own, with one thread."""
+    """Measure in a separate process with one thread."""
     import os
 
     command = [sys.executable, __file__, "--one", json.dumps(job)]

@@ -29,8 +29,8 @@ HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
 def block(rows: Sequence[Row]) -> list[str]:
     """Return the lines between the markers: table, comparison with finite elements, advice.
 
-    One line per setting, over all cases on which it was measured: medians of the times over
-    the pairs of bodies, largest errors.
+    The table has a line per setting, with the median time over the pairs of bodies and the largest
+    errors over all measured cases.
     """
     bodies = len({bodies_of(row.job.case) for row in rows})
     cases = len({row.job.case for row in rows})
@@ -64,7 +64,7 @@ SHORT = (
 
 
 def short_block(rows: Sequence[Row]) -> list[str]:
-    """Return the README's few lines: time of a position, and the largest errors, of `SHORT`."""
+    """Return the README's table of time per position and largest errors, for `SHORT`."""
     settings = _settings(rows)
     lines = [
         "| contact, 1 mm | ms a position | condyle force % | peak pressure % | area % |",
@@ -82,11 +82,10 @@ def short_block(rows: Sequence[Row]) -> list[str]:
 def known_errors_json(rows: Sequence[Row], cases: Sequence[ErrorRow] = ()) -> str:
     """Return the text of `tkamb/run/known_errors.json`, setting by setting.
 
-    Settings that failed on a case of the study, or that belong to another program, are left out:
-    nothing is known of them that would hold for every run.
+    Settings of another program are left out, and those that failed on a case of the study.
 
     Args:
-        rows: of the trade-off study; its material is polyethylene.
+        rows: rows of the trade-off study, whose material is polyethylene.
         cases: errors on the pairs of bodies of `error_cases`.
     """
     found: dict[tuple[str, float, str], list[dict[str, float]]] = {}
@@ -104,7 +103,7 @@ def known_errors_json(rows: Sequence[Row], cases: Sequence[ErrorRow] = ()) -> st
 def _known_error(
     key: tuple[str, float, str], errors: Sequence[Mapping[str, float]], cases: Sequence[ErrorRow]
 ) -> dict[str, Any]:
-    """Return what is stated of one setting (model, mm, material), as JSON."""
+    """Return the stated errors of one setting (model, mm, material) as JSON."""
     names = [name for name in KnownError.__dataclass_fields__ if name in KEYS]
     worst: dict[str, float | None] = {
         name: max((row[name] for row in errors if name in row), default=None) for name in names
@@ -129,7 +128,7 @@ def _known_error(
 
 
 def _settings(rows: Sequence[Row]) -> dict[Setting, list[Row]]:
-    """Return the rows of each setting: a model's variants beside it, coarse ones first."""
+    """Return the rows of each setting, a model's variants together, coarse resolutions first."""
     found: dict[Setting, list[Row]] = {}
     for row in rows:
         found.setdefault(setting_of(row), []).append(row)
@@ -162,7 +161,7 @@ def _percent(errors: Sequence[float]) -> str:
 
 
 def body_block(rows: Sequence[BodyRow]) -> list[str]:
-    """Return the table of the body's trade."""
+    """Return the table of speed and accuracy of the inverse dynamics."""
     heads = " | ".join(f"{head} %" for head in BODY_HEADS.values())
     lines = [
         f"| knee bend | ms per frame | before the frames s | {heads} |",
@@ -182,9 +181,9 @@ def with_block(text: str, lines: Sequence[str], name: str = "tradeoff") -> str:
     """Return a page's text with the lines between its markers.
 
     Args:
-        text: of the page.
-        lines: of the block.
-        name: of the markers, `<!-- name:begin -->` and `<!-- name:end -->`.
+        text: text of the page.
+        lines: lines of the block.
+        name: the name in the markers `<!-- name:begin -->` and `<!-- name:end -->`.
 
     Raises:
         InputError: the page does not hold both markers, in order and once.
@@ -198,10 +197,10 @@ def with_block(text: str, lines: Sequence[str], name: str = "tradeoff") -> str:
 
 
 def moved(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]]) -> list[int]:
-    """Return which points changed between on and off the front though no tie explains it.
+    """Return the points that moved onto or off the front without a tie.
 
-    A tie explains it when the two points of every pair that decides lie within the noise of each
-    other in one of the two measurements.
+    A point on the front that another point almost dominates is a tie: both lie within the noise of
+    each other in one of the two measurements.
 
     Args:
         first: (seconds, error) of each point.

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.geometry.sections import sagittal_section
+from tkamb.geometry.polygons import sagittal_section
 from tkamb.geometry.surface import Surface
 from tkamb.units import DEGREE, MILLIMETRE
 

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from tkamb.contact.lattice import model as lattice_model
-from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
-from tkamb.contact.lattice.solids.solid import chunks
+from tkamb.contact.lattice.calibrated import CalibratedNetwork
+from tkamb.contact.lattice.solid import chunks
 
 
 def internal_force(solid, field):

@@ -6,10 +6,9 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import KNEE_COORDINATES
-from tkamb.knee.equilibrium.released import released_indices
-from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
-from tkamb.knee.joint_equilibrium import JointEquilibrium, unit_keeper
 from tkamb.knee.ligaments import BundleArrays
+from tkamb.knee.released import released_indices
+from tkamb.knee.released_forces import SCALE, JointEquilibrium, ReleasedForces, unit_keeper
 
 BALL, HALF, HEIGHT = 25e-3, 20e-3, 10e-3
 """Radius of the spheres, half their distance, thickness of the insert under them, m."""

@@ -1,6 +1,6 @@
 """Folders of results without a report, which takes longer to draw than all the rest."""
 
-from tkamb.atomic import replaced_together
+from tkamb.files import replaced_together
 from tkamb.io.claim import claimed_directory
 from tkamb.run.maps import write_maps
 from tkamb.run.results_folder import put_numbers

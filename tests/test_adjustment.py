@@ -18,7 +18,7 @@ from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings, RestoreRul
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.knee.equilibrium.adjusted_press import press_adjusted
+from tkamb.knee.adjustment import press_adjusted
 
 RADIUS, HALF = 0.02, 0.022
 HEIGHT = 1.5e-4

@@ -9,14 +9,14 @@ import pytest
 from joints import HALF, flat_joint
 from scenes import write_scene
 from tkamb import simulate
-from tkamb.contact.narrow import TOO_NARROW
-from tkamb.contact.probe import Probe
+from tkamb.contact.flags import TOO_NARROW
+from tkamb.contact.model import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactResult
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.knee.equilibrium.split_sensitivity import split_sensitivity, split_tangent
+from tkamb.knee.adjustment import split_sensitivity, split_tangent
 from tkamb.run.agreement import contradictions
 from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.show.axis import horizontal_axis

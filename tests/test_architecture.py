@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "tkamb"
 
 ORDER = ("geometry", "contact", "knee", "io", "run", "studies", "show", "commands")
 """From the lowest folder to the highest: each imports from those before it, and from itself."""
-SERVES_ALL = {"atomic", "code_identity", "errors", "files", "memory", "units"}
+SERVES_ALL = {"errors", "files", "units"}
 """Modules beside the folders, without knees: numbers, files, memory, messages."""
 ON_TOP = {"__init__", "__main__", "cli", "moved", "testing"}
 """Modules that may import all."""
@@ -37,7 +37,8 @@ def imported(path):
 def part_of(name):
     """Return the folder, or the module beside the folders, that a dotted name belongs to."""
     parts = name.split(".")
-    return parts[1] if len(parts) > 1 and parts[1] != "__version__" else ""
+    public = {"__version__", "code_identity"}  # of the package itself, beside no folder
+    return parts[1] if len(parts) > 1 and parts[1] not in public else ""
 
 
 @pytest.mark.parametrize("folder", ORDER)

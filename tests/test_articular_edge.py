@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.contact.articular_edge import EDGE, ArticularEdge
+from tkamb.contact.flags import EDGE, ArticularEdge
 from tkamb.contact.foundation import LinearFoundation
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair

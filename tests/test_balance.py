@@ -21,11 +21,11 @@ from joints import (
     settle,
 )
 from tkamb.contact.foundation import LinearFoundation
-from tkamb.contact.probe import Probe
+from tkamb.contact.model import Probe
 from tkamb.contact.registry import contact_model
 from tkamb.geometry.frames import knee_axes, knee_pose, knee_twist
-from tkamb.knee.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
+from tkamb.knee.balance import BalanceStatus, Trial, find_balance
+from tkamb.knee.released_forces import SCALE, ReleasedForces
 
 LOAD = 1000.0
 TOUCH = HEIGHT + BALL - 0.05e-3

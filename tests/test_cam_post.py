@@ -23,8 +23,8 @@ from tkamb.geometry.post import divide_insert
 from tkamb.geometry.surface import Surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.knee.joint_equilibrium import external_wrench
 from tkamb.knee.load import total_wrench, wrench_of
+from tkamb.knee.released_forces import external_wrench
 from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.run.tabulate import frame_row
 from tkamb.studies.designs.design import CAM_MESH, INSERT_MESH, load_design

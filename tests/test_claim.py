@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tkamb import atomic
-from tkamb.atomic import JOURNAL, MARKER, folder_token, replaced_file, replaced_together
+from tkamb import files
 from tkamb.errors import InputError
+from tkamb.files import JOURNAL, MARKER, folder_token, replaced_file, replaced_together
 from tkamb.io.claim import claimed_directory, settle
 
 ROOT = Path(__file__).parents[1]
@@ -63,7 +63,7 @@ def test_a_thread_may_claim_again_what_it_holds(tmp_path):
 
 def test_a_foreign_folder_is_refused_without_force(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
-    refused = pytest.raises(InputError, match=r"not tkamb's own .*thesis.tex.*--force")
+    refused = pytest.raises(InputError, match=r"not tkamb's own .*thesis.tex.*force=True")
     with refused, claimed_directory(tmp_path):
         pass
     assert names(tmp_path) == {"thesis.tex"}
@@ -185,7 +185,7 @@ def test_a_kill_between_the_renames_is_mended_by_the_next(tmp_path, monkeypatch)
             replace(source, target)
 
         with monkeypatch.context() as patch:
-            patch.setattr(atomic.os, "replace", dying)
+            patch.setattr(files.os, "replace", dying)
             with pytest.raises(SystemExit) if renames < 3 else pytest.MonkeyPatch.context():
                 write_two(folder, "new")
         settle(folder)
@@ -220,10 +220,10 @@ def test_a_long_name_can_be_written(tmp_path):
         temporary.write_text("x")
     assert path.read_text() == "x"
     with pytest.raises(InputError, match="cannot be written"):
-        atomic.write_text(tmp_path / ("n" * 256), "x")
+        files.write_text(tmp_path / ("n" * 256), "x")
     assert names(tmp_path) == {path.name}
 
 
 def test_names_that_are_not_utf8_can_be_written_down(tmp_path):
-    atomic.write_text(tmp_path / "a.json", json.dumps({"f": "\udcff"}, ensure_ascii=False))
+    files.write_text(tmp_path / "a.json", json.dumps({"f": "\udcff"}, ensure_ascii=False))
     assert json.loads((tmp_path / "a.json").read_text()) == {"f": "\udcff"}

@@ -18,12 +18,12 @@ from interrupted_runs import broken_off, held_elsewhere
 from synthetic_run import make_run
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.geometry.memory import give_back
 from tkamb.io.claim import claimed_directory, settle
-from tkamb.memory import give_back
 from tkamb.run.simulation import simulate
 from tkamb.run.workers import PoolOptions
 from tkamb.show.cohort_report import _split_into_plots, cohort_html, draw_groups
-from tkamb.show.design_figure import design_bars, draw_designs, run_error
+from tkamb.show.study_figures import design_bars, draw_designs, run_error
 from tkamb.studies.cohort.folder import frame_table, write_cohort
 from tkamb.studies.cohort.outcome import Outcome, chosen_map
 from tkamb.studies.cohort.plan import CohortTable, load_cohort

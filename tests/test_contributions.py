@@ -7,7 +7,7 @@ import pytest
 
 from knees import UP, bent_knee
 from shared_trials import two_flexors
-from tkamb.knee.contributions import (
+from tkamb.knee.crossing import (
     EXTENSORS,
     EXTERNAL,
     LIGAMENTS,

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tkamb.cli import main
-from tkamb.commands import datasets as command
+from tkamb.commands import import_model as command
 from tkamb.io.datasets import DataFile, Dataset, read_dataset
 
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "dm"

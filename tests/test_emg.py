@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from recordings import write_c3d
 from shared_trials import STRENGTHS, two_flexors
 from tkamb.errors import InputError
-from tkamb.io.recordings.emg import Envelopes, envelope, load_envelopes
+from tkamb.io.recordings.measured import Envelopes, envelope, load_envelopes
 from tkamb.io.scene.measured import EmgTable
 from tkamb.io.scene.si import in_si
 from tkamb.run.muscles.sharing import SHARING, EmgGuide

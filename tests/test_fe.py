@@ -6,7 +6,7 @@ import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block
 from lattice_bodies import condyles, dished_insert, pair
-from tkamb.contact.lattice.solids.bbar import BbarHexahedra
+from tkamb.contact.lattice.bbar import BbarHexahedra
 from tkamb.contact.materials import Material, material
 from tkamb.contact.registry import contact_model
 from tkamb.geometry.frames import knee_pose

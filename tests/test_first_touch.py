@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.geometry.bounds import HeightBound
+from tkamb.geometry.closest import HeightBound
 from tkamb.geometry.first_touch import FirstTouch
 from tkamb.geometry.frames import knee_pose, pose, transform
 from tkamb.geometry.surface import Surface

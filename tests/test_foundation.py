@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.contact import neighbourhood
+from tkamb.contact import samples as contact_samples
 from tkamb.contact.foundation import (
     OVER_THE_EDGE,
     ElasticFoundation,
@@ -299,12 +299,12 @@ def test_a_guess_spares_the_bed_and_changes_nothing(aside, monkeypatch):
         looked.append(len(samples.points))
         return gaps_and_facets(samples, *arguments)
 
-    monkeypatch.setattr(neighbourhood, "gaps_and_facets", counted)
+    monkeypatch.setattr(contact_samples, "gaps_and_facets", counted)
     found = model.press(state, 1500.0, lowered(0), before)
     assert found.status is ContactStatus.OK
     assert found.residual <= PRESS.load_tolerance
     np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
-    nearer_than = neighbourhood.FARTHEST / neighbourhood.OBLIQUE
+    nearer_than = contact_samples.FARTHEST / contact_samples.OBLIQUE
     assert (looked[0] < len(state.points)) == (aside < nearer_than)
 
 
@@ -326,7 +326,7 @@ def test_columns_that_the_neighbourhood_left_out_are_found_by_the_whole_bed(monk
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))
     before = model.press(state, 1500.0, lowered(0, x=-12e-3))
-    monkeypatch.setattr(neighbourhood, "OBLIQUE", 0.0)
+    monkeypatch.setattr(contact_samples, "OBLIQUE", 0.0)
     found = model.press(state, 1500.0, lowered(0), before)
     np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
 

@@ -9,7 +9,7 @@ from pendulum_leg import recorded_leg
 from synthetic_run import make_run
 from tkamb import load_scene, simulate
 from tkamb.cli import main
-from tkamb.io.recordings.gait import cycle_percent, find_gait
+from tkamb.io.recordings.gait_cycle import cycle_percent, find_gait
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.panels import panels
 from tkamb.show.plots import Sheet

@@ -5,8 +5,7 @@ import pytest
 from scipy.integrate import quad
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
-from tkamb.contact.ellipse import contact_ellipse
-from tkamb.contact.hertz import Hertz, condyle_geometry
+from tkamb.contact.hertz import Hertz, condyle_geometry, contact_ellipse
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus

@@ -8,13 +8,13 @@ import trimesh
 
 from random_inserts import joined_surfaces, voxel_surface
 from tkamb.contact.lattice.meshing.cells import cell_volumes
-from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.lattice.meshing.quality import whole_lattice
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
-from tkamb.geometry.inner_walls import find_inner_wall
+from tkamb.geometry.repair import find_inner_wall
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.meshes import load_surface
 

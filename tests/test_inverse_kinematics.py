@@ -6,8 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates, knee_pose, pose, transform
-from tkamb.io.recordings.inverse_kinematics import fit_chain
-from tkamb.io.recordings.leg_chain import FLEXION, LegChain, LegState, Segment
+from tkamb.io.recordings.inverse_kinematics import FLEXION, LegChain, LegState, Segment, fit_chain
 from tkamb.io.recordings.markers import fit_rigid, fit_seen
 
 FRAMES = 7

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from lattice_blocks import block
+from tkamb.contact.lattice.bbar import BbarHexahedra
+from tkamb.contact.lattice.calibrated import CalibratedNetwork
 from tkamb.contact.lattice.linear import cache
+from tkamb.contact.lattice.linear.compliance import SINGLE
 from tkamb.contact.lattice.linear.operator import fixed_unknowns, operator_error, prepare_operator
-from tkamb.contact.lattice.linear.response import SINGLE
-from tkamb.contact.lattice.solids.bbar import BbarHexahedra
-from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 
 EDGES = np.full(3, 1e-3)

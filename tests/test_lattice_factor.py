@@ -7,9 +7,9 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block
+from tkamb.contact.lattice.calibrated import CalibratedNetwork
+from tkamb.contact.lattice.linear.compliance import unknowns_of
 from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.linear.response import unknowns_of
-from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 
 MM = 1e-3

@@ -25,7 +25,7 @@ from tkamb.contact.lattice.meshing.cells import (
     join_springs,
     scaled_jacobians,
 )
-from tkamb.contact.lattice.meshing.columns import _without_narrow_gaps, interval_ends
+from tkamb.contact.lattice.meshing.columns import Levels, _without_narrow_gaps, interval_ends
 from tkamb.contact.lattice.meshing.contact_map import contact_squares
 from tkamb.contact.lattice.meshing.grid import (
     BOTTOM,
@@ -35,9 +35,8 @@ from tkamb.contact.lattice.meshing.grid import (
     build_grid,
     grid_spacing,
 )
-from tkamb.contact.lattice.meshing.levels import Levels
-from tkamb.contact.lattice.meshing.notches import NOTCH
 from tkamb.contact.lattice.meshing.quality import measure_quality
+from tkamb.contact.lattice.meshing.walls import NOTCH
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose

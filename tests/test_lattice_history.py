@@ -12,8 +12,7 @@ from tkamb.contact.area import area_above
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
-from tkamb.contact.result import medial_points
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.result import WarmStart, medial_points
 from tkamb.geometry.frames import knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case

@@ -5,10 +5,10 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block
-from tkamb.contact.lattice.solids.bbar import BbarHexahedra
-from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
-from tkamb.contact.lattice.solids.curve import ShearCurve
-from tkamb.contact.lattice.source.springs import SourceNetwork
+from tkamb.contact.lattice.bbar import BbarHexahedra
+from tkamb.contact.lattice.calibrated import CalibratedNetwork
+from tkamb.contact.lattice.solid import ShearCurve
+from tkamb.contact.lattice.source_springs import SourceNetwork
 from tkamb.contact.materials import material, tabulated_material
 
 MM = 1e-3

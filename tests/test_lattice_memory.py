@@ -9,15 +9,15 @@ import scipy.sparse as sparse
 
 from lattice_blocks import block
 from lattice_bodies import box_insert, pair, sphere_cap
-from tkamb import memory
-from tkamb.contact.lattice.linear import memory_need, operator
+from tkamb.contact.lattice.calibrated import CalibratedNetwork
+from tkamb.contact.lattice.linear import operator
+from tkamb.contact.lattice.linear.compliance import SINGLE
 from tkamb.contact.lattice.linear.multifrontal import Dissection
 from tkamb.contact.lattice.linear.operator import fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.linear.response import SINGLE
-from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
+from tkamb.geometry import memory
 
 LINEAR = material("polyethylene-linear")
 
@@ -35,7 +35,7 @@ def test_the_count_bounds_what_is_taken(counts, monkeypatch):
     prepare_operator(stiffness, index, held, top, SINGLE)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < memory_need.MEMORY_NEED.safety_factor * needs[0] < 3 * peak
+    assert peak < operator.MEMORY_NEED.safety_factor * needs[0] < 3 * peak
 
 
 def test_a_single_front_takes_its_matrix_in_8_bytes_and_in_4():
@@ -43,8 +43,8 @@ def test_a_single_front_takes_its_matrix_in_8_bytes_and_in_4():
     nodes = np.arange(30)
     joined = sparse.csr_matrix(np.ones((30, 30)))
     tree = Dissection([nodes], [-1])
-    found = memory_need.factor_memory(tree, joined, np.zeros(30, bool), 4)
-    assert found == memory_need.MEMORY_NEED.entry_bytes * 90**2 + (8 + 4) * 90**2
+    found = operator.factor_memory(tree, joined, np.zeros(30, bool), 4)
+    assert found == operator.MEMORY_NEED.entry_bytes * 90**2 + (8 + 4) * 90**2
 
 
 def test_the_updates_of_two_fronts_wait_for_the_third():
@@ -53,18 +53,18 @@ def test_the_updates_of_two_fronts_wait_for_the_third():
     joined = np.ones((30, 30))
     joined[:10, 10:20] = joined[10:20, :10] = 0.0
     tree = Dissection([first, second, between], [2, 2, -1])
-    found = memory_need.factor_memory(tree, sparse.csr_matrix(joined), np.zeros(30, bool), 4)
+    found = operator.factor_memory(tree, sparse.csr_matrix(joined), np.zeros(30, bool), 4)
     own, update = 60 * 30, 30 * 30
     last = 4 * (2 * own + 30**2) + 8 * (2 * update + 30**2)
     at_second = 4 * 2 * own + 8 * (update + own + update)
     assert at_second > last
-    assert found == memory_need.MEMORY_NEED.entry_bytes * 9 * joined.sum() + at_second
+    assert found == operator.MEMORY_NEED.entry_bytes * 9 * joined.sum() + at_second
 
 
 @pytest.mark.parametrize("left", [2e8, 6e7, 1.5e7])
 def test_what_does_not_fit_is_refused_with_what_does(monkeypatch, left):
     bodies = pair(sphere_cap(22e-3), box_insert(0.04, 0.01, 0.06), LINEAR)
-    monkeypatch.setattr(memory_need, "available_memory", lambda: left)
+    monkeypatch.setattr(operator, "available_memory", lambda: left)
     with pytest.raises(InputError, match=r"GB are left; take .* mm or coarser") as refused:
         contact_model("lattice-linear", 0.5 if left > 1e8 else 1.0, cache=False).prepare(bodies)
     fits = float(re.search(r"take ([\d.]+) mm", str(refused.value))[1])
@@ -73,7 +73,7 @@ def test_what_does_not_fit_is_refused_with_what_does(monkeypatch, left):
 
 def test_no_size_helps_when_nothing_is_left(monkeypatch):
     bodies = pair(sphere_cap(22e-3), box_insert(0.02, 0.01, 0.02), LINEAR)
-    monkeypatch.setattr(memory_need, "available_memory", lambda: 1e3)
+    monkeypatch.setattr(operator, "available_memory", lambda: 1e3)
     with pytest.raises(InputError, match="free some memory"):
         contact_model("lattice-linear", 2.0, cache=False).prepare(bodies)
 

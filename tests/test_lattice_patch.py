@@ -5,18 +5,18 @@ import pytest
 import scipy.sparse.linalg as linalg
 
 from lattice_blocks import block, uniform_strain
-from tkamb.contact.lattice.meshing.cells import PAIRS, gauss_gradients, mean_gradient
-from tkamb.contact.lattice.solids.bbar import BbarHexahedra
-from tkamb.contact.lattice.solids.calibrated import (
+from tkamb.contact.lattice.bbar import BbarHexahedra
+from tkamb.contact.lattice.calibrated import (
     CalibratedNetwork,
     body_diagonal_stiffness,
     box_corners,
+    deviatoric_matrices,
     spring_families,
     spring_matrix,
 )
-from tkamb.contact.lattice.solids.cell_loops import deviatoric_matrices
-from tkamb.contact.lattice.solids.solid import DEVIATORIC, strain_matrix
-from tkamb.contact.lattice.source.springs import SourceNetwork, source_factor
+from tkamb.contact.lattice.meshing.cells import PAIRS, gauss_gradients, mean_gradient
+from tkamb.contact.lattice.solid import DEVIATORIC, strain_matrix
+from tkamb.contact.lattice.source_springs import SourceNetwork, source_factor
 from tkamb.contact.materials import Material
 
 MM = 1e-3

@@ -7,9 +7,8 @@ import pytest
 
 from lattice_bodies import condyles, dished_insert, pair
 from tkamb.contact.lattice.initial_guess import LatticeStart, initial_guess, lattice_start
-from tkamb.contact.lattice.linear import compliance, response
-from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component
-from tkamb.contact.lattice.linear.response import unknowns_of
+from tkamb.contact.lattice.linear import compliance
+from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component, unknowns_of
 from tkamb.contact.lattice.nonlinear_balance import elements_that_count
 from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.settings import LatticeSolverSettings
@@ -177,7 +176,7 @@ def test_the_compliance_grows_node_by_node(state, monkeypatch):
     whole = by_component(half.among(unknowns_of(nodes)).compliance())
     monkeypatch.setattr(compliance, "COMPLIANCE", compliance.ComplianceSettings(spare_nodes=2))
     for few in (0, 100):
-        monkeypatch.setattr(response, "RESPONSE", response.ResponseSettings(few_columns=few))
+        monkeypatch.setattr(compliance, "RESPONSE", compliance.ResponseSettings(few_columns=few))
         cache = ComplianceCache(half)
         for some in ([20], [5, 8], [2], [8, 21, 30], [3, 5]):
             cache.among(np.array(some))

@@ -16,9 +16,8 @@ from random_inserts import (
     voxel_surface,
 )
 from tkamb.contact.lattice.meshing.cells import cell_volumes
-from tkamb.contact.lattice.meshing.grid import build_grid
-from tkamb.contact.lattice.meshing.pieces import missing_part, outer_skin
-from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.lattice.meshing.grid import build_grid, missing_part, outer_skin
+from tkamb.contact.lattice.meshing.quality import whole_lattice
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model

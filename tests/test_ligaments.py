@@ -13,11 +13,12 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.io.scene.lines import ligament
 from tkamb.io.scene.tables import LigamentTable
-from tkamb.knee.generic_ligaments import condylar_axis, generic_ligaments
 from tkamb.knee.ligaments import (
     LIGAMENT,
     Ligament,
     build_ligaments,
+    condylar_axis,
+    generic_ligaments,
     ligament_loads,
     quadratic_toe_force,
     strain_table,

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from tkamb.commands.scene_options import _setting
+from tkamb.commands.options import _setting
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
 from tkamb.files import HASH_LIMIT, sha256_of

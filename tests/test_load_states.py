@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from knees import HALF, UP, bent_knee
 from tkamb.knee.equations import solve_knee
 from tkamb.knee.load import PointForces
-from tkamb.knee.load_state import LoadState, wrong_signs
-from tkamb.knee.unknowns import Solution
+from tkamb.knee.unknowns import LoadState, Solution, wrong_signs
 
 FRICTION = 0.05
 CARRIED = (

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from synthetic_run import make_run
 from tkamb.errors import InputError
-from tkamb.io.recordings.measured_force import load_measured_force
+from tkamb.io.recordings.measured import load_measured_force
 from tkamb.io.scene.measured import MeasuredTable
 from tkamb.io.scene.si import in_si
 from tkamb.run.recorded import compare_measured, comparison_words, measured_column

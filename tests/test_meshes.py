@@ -13,9 +13,8 @@ from shapes import joined, plate, sphere, two_dishes
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry import topology
-from tkamb.geometry.normals import corner_angles, corner_normals
 from tkamb.geometry.repair import repair
-from tkamb.geometry.surface import Surface
+from tkamb.geometry.surface import Surface, corner_angles, corner_normals
 from tkamb.geometry.topology import boundary_loops
 from tkamb.io.recordings.mesh_check import check_mesh
 from tkamb.io.recordings.meshes import (

@@ -8,7 +8,7 @@ import tkamb
 from scenes import MODEL
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.knee.generic_ligaments import BUNDLES
+from tkamb.knee.ligaments import BUNDLES
 from tkamb.show.methods import methods
 
 

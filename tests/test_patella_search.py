@@ -173,18 +173,24 @@ def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
         np.testing.assert_array_equal(recorded.joints(k)[0], case.motion.patella[k])
 
 
-def test_thigh_and_patella_move_as_recorded_and_filtered():
-    """The scene's own chain, asked without tkamb.Knee: same place, same inertial forces."""
+def test_the_patella_stays_at_its_equilibrium_and_its_rates_are_filtered():
+    """The filter moves no place: the button touches, the ligament has its length.
+
+    The scene's own chain, asked without tkamb.Knee, has the same places and inertial forces.
+    """
     case = load_case(load_scene(MODEL / "scene.toml", FEW | {"motion.cutoff_Hz": 1.0}))
     mechanics, motion, tibia = mechanics_of(case), case.motion, case.tibia
+    solved = np.array([state.coordinates for state in mechanics.extensor.states])
+    filtered, velocity, acceleration = case.rates(motion.time, solved)
+    assert np.abs(filtered - solved).max() > 1e-5  # m, rad
     for k in (3, 8):
         knee = np.stack([motion.coordinates[k], motion.velocity[k], motion.acceleration[k]])
         patella = mechanics.extensor.joints(k)
-        found = mechanics.extensor.states[k].coordinates
-        assert np.abs(patella[0] - found).max() > 1e-5  # m, rad: the filter moves it
+        np.testing.assert_array_equal(patella, [solved[k], velocity[k], acceleration[k]])
         joints = np.hstack([knee, patella])
         shank = (tibia.pose[k], tibia.velocity[k], tibia.acceleration[k])
-        recorded, state = case.chain.at(ChainMotion(*shank, joints)), mechanics.geometry(k).state
+        recorded, geometry = case.chain.at(ChainMotion(*shank, joints)), mechanics.geometry(k)
+        state = geometry.state
         for link in ("femur", "patella"):
             np.testing.assert_allclose(state.pose(link), recorded.pose(link), rtol=0, atol=1e-9)
         forces = [
@@ -193,6 +199,10 @@ def test_thigh_and_patella_move_as_recorded_and_filtered():
         ]
         np.testing.assert_allclose(*forces, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(mechanics.instant(k).coordinates, motion.coordinates[k])
+        _, ligament = mechanics.extensor.lines.paths(state)
+        assert ligament.length == pytest.approx(case.patellar_ligament.length, abs=1e-7)
+        touch = mechanics.extensor.lines.given(mechanics.poses[k], patella[0])
+        assert abs(touch.gap) < 1e-7
 
 
 def test_the_moments_of_three_lines_on_the_patella_add_up_to_nothing(plain):

@@ -9,8 +9,7 @@ import pytest
 from knees import INERTIA, leg_urdf, random_motion
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose
-from tkamb.io.recordings.patient import load_urdf
-from tkamb.io.recordings.segments import segment_inertia
+from tkamb.io.recordings.patient import load_urdf, segment_inertia
 from tkamb.io.scene.si import in_si
 from tkamb.io.scene.tables import PatientTable
 from tkamb.knee.chain import Chain, ChainMotion

@@ -15,10 +15,9 @@ from tkamb.geometry.frames import MIRROR
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.crossing import CrossingLines, MuscleShare
-from tkamb.knee.equilibrium.relaxation import Relaxation
-from tkamb.knee.equilibrium.released_forces import SCALE, ReleasedForces
-from tkamb.knee.joint_equilibrium import external_wrench
 from tkamb.knee.load import total_wrench
+from tkamb.knee.relaxation import Relaxation
+from tkamb.knee.released_forces import SCALE, ReleasedForces, external_wrench
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import contact_side, mechanics_of
 from tkamb.run.simulation import simulate

@@ -13,8 +13,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from headless import Page
 from synthetic_run import MASS_KG, make_run
-from tkamb.contact.articular_edge import AT_EDGE
-from tkamb.contact.narrow import TOO_NARROW
+from tkamb.contact.flags import AT_EDGE, TOO_NARROW
 from tkamb.errors import InputError
 from tkamb.run import metrics
 from tkamb.run.metrics import map_rows
@@ -25,8 +24,8 @@ from tkamb.show.panels import Line, Panel, panels
 from tkamb.show.plots import WIDTH, Sheet
 from tkamb.show.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.show.report import THIRD, report_html, write_report
+from tkamb.show.sections import flag_rows, motion_table, reasons
 from tkamb.show.style import BLACK, PRESSURE_MAP, svg_text
-from tkamb.show.tables import flag_rows, motion_table, reasons
 
 VOID = {"meta", "br", "input", "img", "link", "hr"}
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from synthetic_run import make_run
-from tkamb.atomic import claim_directory
 from tkamb.errors import InputError
+from tkamb.files import claim_directory
 from tkamb.run.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 from tkamb.run.maps import ContactMaps, MapWriter, read_maps, write_maps
 from tkamb.run.results import Results, csv_text, read_csv

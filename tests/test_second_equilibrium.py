@@ -9,10 +9,10 @@ import pytest
 
 import tkamb
 from tkamb.cli import main
-from tkamb.knee.equilibrium import balance, released
-from tkamb.knee.equilibrium.balance import BalanceStatus
-from tkamb.knee.equilibrium.released import RELEASED_KNEE, KneeEquilibrium
-from tkamb.knee.equilibrium.starts import INITIAL_POSE, InitialPoses
+from tkamb.knee import balance, released
+from tkamb.knee.balance import BalanceStatus
+from tkamb.knee.released import RELEASED_KNEE, KneeEquilibrium
+from tkamb.knee.starts import INITIAL_POSE, InitialPoses
 
 MODEL = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw"

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tkamb.contact.probe import condyle_wrenches
+from tkamb.contact.model import condyle_wrenches
 from tkamb.geometry.frames import knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
+from tkamb.knee.balance import BalanceStatus
 from tkamb.knee.equations import unsolved
-from tkamb.knee.equilibrium.balance import BalanceStatus
-from tkamb.knee.equilibrium.released_forces import SCALE
-from tkamb.knee.joint_equilibrium import external_wrench
 from tkamb.knee.load import total_wrench
+from tkamb.knee.released_forces import SCALE, external_wrench
 from tkamb.run.frames import FrameSolver
 from tkamb.run.read_scene import contact_side, mechanics_of
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tkamb.geometry.normals import sharp_edges
-from tkamb.geometry.surface import Surface
+from tkamb.geometry.surface import Surface, sharp_edges
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:

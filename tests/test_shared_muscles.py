@@ -95,7 +95,7 @@ def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
 def _taut_quadriceps(geometry):
     """Return the quadriceps' tension, negative where it would push."""
     from tkamb.knee.equations import KneeSystem
-    from tkamb.knee.load_state import LoadState
+    from tkamb.knee.unknowns import LoadState
 
     taut = LoadState(frozenset(), frozenset())
     return KneeSystem(geometry, FRICTION, taut).solution.values["muscle_quadriceps"]
@@ -161,7 +161,7 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
     own = (
         "tkamb.run.muscles",
         "tkamb.io.opensim",
-        "tkamb.io.recordings.emg",
+        "tkamb.io.recordings.measured",
         "tkamb.io.recordings.measured",
         "tkamb.run.recorded",
     )

@@ -7,14 +7,14 @@ import pytest
 import scipy.sparse.linalg as sparse_linalg
 
 from lattice_bodies import above, box_insert, pair, sphere_cap
+from tkamb.contact.lattice import source_lattice as loops
 from tkamb.contact.lattice.linear import operator
-from tkamb.contact.lattice.source import model as loops
-from tkamb.contact.lattice.source.held import (
+from tkamb.contact.lattice.source_lattice import (
     CandidateResponse,
     ConjugateGradientSettings,
     HeldNodes,
+    LoopSettings,
 )
-from tkamb.contact.lattice.source.model import LoopSettings
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus

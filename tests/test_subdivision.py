@@ -11,9 +11,8 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
-from tkamb.geometry.curved import CurvedSurface
+from tkamb.geometry.curved import CurvedSurface, coarsened
 from tkamb.geometry.frames import knee_pose
-from tkamb.geometry.subdivision import coarsened
 from tkamb.geometry.surface import Surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case

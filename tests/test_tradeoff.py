@@ -13,9 +13,9 @@ from scenes import write_scene
 from tkamb.cli import main
 from tkamb.contact.registry import BUILT_IN, contact_model
 from tkamb.errors import InputError
+from tkamb.geometry.memory import peak_rss
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.memory import peak_rss
 from tkamb.studies import tradeoff
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, copied_scene, study_case, thin_out
@@ -184,7 +184,7 @@ def test_a_measure_in_a_process_of_its_own():
 def test_peak_memory_is_the_process_s_own():
     """A parent that holds 400 MB starts a process that takes a tenth of it."""
     held = np.ones(50_000_000)
-    asked = "from tkamb.memory import peak_rss; print(peak_rss())"
+    asked = "from tkamb.geometry.memory import peak_rss; print(peak_rss())"
     told = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
     assert float(told.stdout) < 0.5 * held.nbytes / 1e6 < peak_rss()
 

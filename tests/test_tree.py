@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from shapes import plate, sphere
-from tkamb.geometry import first_touch, nearest, rays, tree
+from tkamb.geometry import first_touch, nearest, rays
 from tkamb.geometry.first_touch import MOST_CORNERS, FirstTouch
 from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
@@ -123,7 +123,7 @@ def test_what_is_asked_in_other_arrays_is_not_compiled_anew():
 def test_sorted_triangles_are_parted_as_they_come(monkeypatch):
     """Some twice, to fill the leaves: the first ones after the last made it quadratic."""
     orders = []
-    monkeypatch.setattr(tree, "_halve", lambda centres, order, leaves: orders.append(order))
+    monkeypatch.setattr(nearest, "_halve", lambda centres, order, leaves: orders.append(order))
     for count in (5, 63, 100):
         assert np.array_equal(np.unique(ribbon(count).tree.faces), np.arange(count))
     assert len(orders) == 3 and all((np.diff(order) >= 0).all() for order in orders)

@@ -8,7 +8,7 @@ import trimesh
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
-from tkamb.geometry.sections import convex_outline, sagittal_outline, sagittal_section
+from tkamb.geometry.polygons import convex_outline, sagittal_outline, sagittal_section
 from tkamb.geometry.surface import Surface
 from tkamb.knee.load import LinkPoint, total_wrench
 from tkamb.knee.muscles import Line, Wrap

@@ -8,11 +8,11 @@ import pytest
 from joints import BALL, HEIGHT, LINEAR, flat_joint
 from tkamb.contact.foundation import LinearFoundation
 from tkamb.geometry.frames import knee_pose
-from tkamb.knee.equilibrium import released
-from tkamb.knee.equilibrium.balance import BalanceStatus, Trial, find_balance
-from tkamb.knee.equilibrium.released import RELEASED_KNEE, ReleasedKnee, ahead
-from tkamb.knee.equilibrium.released_forces import SCALE
-from tkamb.knee.equilibrium.starts import INITIAL_POSE, carried_on
+from tkamb.knee import released
+from tkamb.knee.balance import BalanceStatus, Trial, find_balance
+from tkamb.knee.released import RELEASED_KNEE, ReleasedKnee, ahead
+from tkamb.knee.released_forces import SCALE
+from tkamb.knee.starts import INITIAL_POSE, carried_on
 
 CELL = 1e-3
 

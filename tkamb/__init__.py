@@ -8,7 +8,10 @@
 Each name is imported when it is first used.
 """
 
+import hashlib
+from functools import lru_cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.moved import accept_old_names
@@ -75,6 +78,24 @@ _HOMES = {
 __version__ = "0.2.0"
 
 accept_old_names()
+
+
+@lru_cache(maxsize=4)
+def code_identity(part: str = "") -> str:
+    """Return the SHA-256 of the source of a subpackage, by default of the whole package.
+
+    Code that only shows results or reads arguments is left out, because it changes no number.
+
+    Args:
+        part: path of the subpackage below the package, like "contact/lattice".
+    """
+    digest, package = hashlib.sha256(), Path(__file__).parent
+    for path in sorted((package / part).rglob("*.py")):
+        name = path.relative_to(package)
+        shows = name.parts[0] in ("show", "commands") or name.stem == "cli"
+        if not shows and not name.stem.endswith("_report"):
+            digest.update(name.as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def __getattr__(name: str) -> Any:

@@ -12,19 +12,14 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb import __version__
 from tkamb.commands.check import add_check
-from tkamb.commands.cohort import add_cohort
-from tkamb.commands.compare import add_compare
-from tkamb.commands.datasets import add_data
-from tkamb.commands.export import add_export
 from tkamb.commands.help_examples import add_examples
-from tkamb.commands.import_model import add_import
-from tkamb.commands.live import add_live
+from tkamb.commands.import_model import add_data, add_import
 from tkamb.commands.mesh import add_contact, add_mesh, add_no_cache, add_press, without_cache
-from tkamb.commands.option_rules import check_options
-from tkamb.commands.scene_options import add_preset, add_scene_options, overrides_of
-from tkamb.commands.studies import add_stability, add_tradeoff
+from tkamb.commands.options import add_preset, add_scene_options, check_options, overrides_of
+from tkamb.commands.results import add_compare, add_export, add_folder_commands
+from tkamb.commands.studies import add_cohort, add_stability, add_tradeoff
 from tkamb.commands.uncertainty import add_uncertainty
-from tkamb.commands.view import add_view
+from tkamb.commands.view import add_live, add_view
 from tkamb.commands.wear import add_wear
 from tkamb.geometry.threads import threads
 from tkamb.io.starter import add_new
@@ -85,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     add_new(commands)
     add_check(commands)
     _add_run(commands)
-    _add_folder_commands(commands)
+    add_folder_commands(commands)
     add_compare(commands)
     add_press(commands)
     add_contact(commands)
@@ -118,21 +113,6 @@ def _add_run(commands: Any) -> None:
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
-
-
-def _add_folder_commands(commands: Any) -> None:
-    verify = commands.add_parser("verify", help="check that a folder of results is unchanged")
-    verify.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
-    verify.set_defaults(command=_verify)
-    report = commands.add_parser("report", help="write report.html of a folder of results again")
-    report.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
-    report.set_defaults(command=_report)
-    methods = commands.add_parser(
-        "methods",
-        help="the Methods paragraph of a paper, from a folder of results",
-    )
-    methods.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
-    methods.set_defaults(command=_methods)
 
 
 def _add_scene(commands: Any) -> None:
@@ -204,37 +184,6 @@ def _scene_of(options: argparse.Namespace) -> "Scene":
 
 def _default_directory(scene: Path) -> Path:
     return Path("out") / scene.resolve().parent.name
-
-
-def _verify(options: argparse.Namespace) -> int:
-    from tkamb.run.results_folder import verify_results
-
-    verdict = verify_results(options.folder)
-    for line in verdict.differs:
-        say(f"{options.folder}: {line}")
-    for line in verdict.lines()[len(verdict.differs) :]:
-        print(f"{options.folder}: {line}")
-    return 1 if verdict.differs else 0
-
-
-def _report(options: argparse.Namespace) -> int:
-    from tkamb.io.claim import claimed_directory
-    from tkamb.run.results_folder import REPORT_NAME, read_results
-    from tkamb.show.report import write_report
-
-    results = read_results(options.folder)  # before a folder is made or marked
-    with claimed_directory(options.folder) as folder:
-        write_report(results, folder / REPORT_NAME)
-    print(f"report: {options.folder / REPORT_NAME}")
-    return 0
-
-
-def _methods(options: argparse.Namespace) -> int:
-    from tkamb.run.results_folder import read_results
-    from tkamb.show.methods import methods
-
-    print(methods(read_results(options.folder).summary).text())
-    return 0
 
 
 def _scene(options: argparse.Namespace) -> int:

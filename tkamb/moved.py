@@ -14,7 +14,7 @@ from types import ModuleType
 
 FOLDERS = {
     "tkamb.body": "tkamb.knee",
-    "tkamb.equilibrium": "tkamb.knee.equilibrium",
+    "tkamb.equilibrium": "tkamb.knee",
     "tkamb.scene": "tkamb.io.scene",
     "tkamb.inputs": "tkamb.io.recordings",
     "tkamb.importing": "tkamb.io.importing",
@@ -24,8 +24,8 @@ FOLDERS = {
     "tkamb.cohort": "tkamb.studies.cohort",
     "tkamb.wear": "tkamb.studies.wear",
     "tkamb.designs": "tkamb.studies.designs",
-    "tkamb.check": "tkamb.show.check",
-    "tkamb.compare": "tkamb.show.compare",
+    "tkamb.check": "tkamb.show",
+    "tkamb.compare": "tkamb.show",
     "tkamb.view": "tkamb.show.view",
     "tkamb.datasets": "tkamb.io.datasets",
     "tkamb.starter": "tkamb.io.starter",
@@ -35,6 +35,8 @@ FOLDERS = {
 }
 """Folder of release 0.1 -> where its modules are."""
 MODULES = {
+    "tkamb.atomic": "tkamb.files",
+    "tkamb.memory": "tkamb.geometry.memory",
     "tkamb.simulation": "tkamb.run.simulation",
     "tkamb.results": "tkamb.run.results",
     "tkamb.results_folder": "tkamb.run.results_folder",
@@ -44,7 +46,17 @@ MODULES = {
     "tkamb.muscles.emg": "tkamb.run.muscles.sharing",
     "tkamb.output.comparison": "tkamb.run.recorded",
     "tkamb.wear.picture": "tkamb.studies.wear.report",
-    "tkamb.compare.pairing": "tkamb.show.compare.comparison",
+    "tkamb.compare.pairing": "tkamb.show.comparison",
+    "tkamb.compare.figures": "tkamb.show.comparison_page",
+    "tkamb.compare.page": "tkamb.show.comparison_page",
+    "tkamb.check.inventory": "tkamb.show.scene_check",
+    "tkamb.output.reading": "tkamb.show.sections",
+    "tkamb.output.tables": "tkamb.show.sections",
+    "tkamb.view.film": "tkamb.show.view.page",
+    "tkamb.view.colours": "tkamb.show.view.drawing",
+    "tkamb.view.arrows": "tkamb.show.view.lines",
+    "tkamb.view.strands": "tkamb.show.view.lines",
+    "tkamb.view.shading": "tkamb.show.view.payload",
     "tkamb.designs.touch": "tkamb.studies.designs.design",
     "tkamb.guard": "tkamb.run.guard",
     "tkamb.known_errors": "tkamb.run.known_errors",
@@ -79,11 +91,14 @@ MODULES = {
     "tkamb.named_classes": "tkamb.contact.named_classes",
     "tkamb.cohort.report": "tkamb.show.cohort_report",
     "tkamb.studies.tradeoff_report": "tkamb.show.tradeoff_report",
-    "tkamb.scene_options": "tkamb.commands.scene_options",
-    "tkamb.export_command": "tkamb.commands.export",
+    "tkamb.scene_options": "tkamb.commands.options",
+    "tkamb.export_command": "tkamb.commands.results",
     "tkamb.mesh_command": "tkamb.commands.mesh",
     "tkamb.importing.command": "tkamb.commands.import_model",
     "tkamb.studies.command": "tkamb.commands.studies",
+    "tkamb.cohort.command": "tkamb.commands.studies",
+    "tkamb.compare.command": "tkamb.commands.results",
+    "tkamb.datasets.command": "tkamb.commands.import_model",
 }
 """Module of release 0.1 -> its new name."""
 

@@ -16,7 +16,7 @@ from deep_knee_bend import button
 from deep_knee_bend import dimensions as d
 from deep_knee_bend.implant import FEMORAL
 from tkamb.geometry.frames import inverse, knee_pose, transform
-from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.polygons import sagittal_outline
 from tkamb.geometry.surface import Surface
 from tkamb.knee.wrapping import taut_path
 from tkamb.studies.designs.sagittal import normal as normal_at

@@ -13,8 +13,8 @@ import numpy as np
 
 from tkamb.contact import materials
 from tkamb.contact.lattice.meshing.cells import CORNERS, DIRECTIONS, join_springs
-from tkamb.contact.lattice.source.model import SourceLattice
-from tkamb.contact.lattice.source.springs import source_factor
+from tkamb.contact.lattice.source_lattice import SourceLattice
+from tkamb.contact.lattice.source_springs import source_factor
 from tkamb.contact.materials import RambergOsgood
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case

@@ -2,7 +2,7 @@
 
 import argparse
 
-from tkamb.commands.option_rules import leaf_parsers
+from tkamb.commands.options import leaf_parsers
 
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "new": (

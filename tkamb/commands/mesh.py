@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tkamb.commands.scene_options import add_force
+from tkamb.commands.options import add_force
 from tkamb.errors import InputError
 from tkamb.io import CONTACT_MODEL
 from tkamb.run.guard import say

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.commands.scene_options import add_scene_options, overrides_of
+from tkamb.commands.options import add_scene_options, overrides_of
 from tkamb.run.guard import say
 
 if TYPE_CHECKING:

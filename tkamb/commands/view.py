@@ -1,4 +1,4 @@
-"""`tkamb view`: arguments in, exit status out."""
+"""`tkamb view` and `tkamb live`: windows on a run and on a knee."""
 
 import argparse
 import os
@@ -77,7 +77,7 @@ def _view(options: argparse.Namespace) -> int:
         print(f"picture: {options.png}")
     films = [path for path in (options.gif, options.mp4) if path]
     for path in films:
-        from tkamb.show.view.film import write_film
+        from tkamb.show.view.page import write_film
 
         write_film(show, path, lambda frames: tqdm(frames, "filming", unit="frame", disable=None))
         print(f"film: {path}")
@@ -113,7 +113,7 @@ def _check(options: argparse.Namespace) -> None:
         check_output_file(path, options.force)
     for kind in ("gif", "mp4"):
         if path := getattr(options, kind):
-            from tkamb.show.view.film import check_film
+            from tkamb.show.view.page import check_film
 
             check_film(path, f"--{kind}")
     if options.png:
@@ -130,3 +130,40 @@ def check_port(port: int) -> None:
     """
     if not 0 <= port <= HIGHEST_PORT:
         raise InputError(f"no port {port}", "--port", f"give 0 (any) to {HIGHEST_PORT}")
+
+
+def add_live(commands: Any) -> None:
+    """Add `live` to the command line."""
+    live = commands.add_parser(
+        "live",
+        help="turn and press a knee by hand; contact is computed as sliders move",
+    )
+    live.add_argument(
+        "path",
+        type=Path,
+        metavar="SCENE|RESULTS",
+        help="scene.toml or a folder that `tkamb run` wrote",
+    )
+    live.add_argument("--frame", type=int, default=0, metavar="K", help="recorded frame at first")
+    live.add_argument("--contact", metavar="NAME", help="contact model, instead of the scene's")
+    live.add_argument("--out", type=Path, metavar="DIR", help="for kept scenes; default: out/live")
+    live.add_argument("--port", type=int, default=0, help="of the window; default: any free")
+    live.set_defaults(command=_live)
+
+
+def _live(options: argparse.Namespace) -> int:
+    from tkamb.show.view.live_window import open_live
+    from tkamb.show.view.show import open_window
+
+    check_port(options.port)
+    say(f"reading {options.path}")
+    window = open_live(
+        options.path, frame=options.frame, contact=options.contact, folder=options.out
+    )
+    say("preparing contact")
+    server = window.server(options.port)
+    say(f"live: {server.url} (this machine only; Ctrl-C ends it)")
+    if not open_window(server.url):
+        say("no window can be opened here: open that address in a browser")
+    server.serve()
+    return 0

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.commands.scene_options import add_set
+from tkamb.commands.options import add_set
 from tkamb.errors import InputError
 from tkamb.run.guard import say
 

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.materials import Material
-from tkamb.contact.model import ContactModel
+from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact, condyle_wrenches
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.probe import CondyleWrench, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, rotate, transform
@@ -242,7 +241,7 @@ class CamPost:
 
 
 class PostProbe:
-    """Cam and post at neighbouring poses; see `tkamb.contact.probe.Probe`."""
+    """Cam and post at neighbouring poses; see `tkamb.contact.model.Probe`."""
 
     def __init__(self, cam_post: CamPost, rotated_model: Any) -> None:
         self._cam_post, self._turned = cam_post, rotated_model

@@ -5,21 +5,20 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from tkamb.contact.flags import narrow_flags
 from tkamb.contact.materials import Material
-from tkamb.contact.model import ContactModel
-from tkamb.contact.narrow import narrow_flags
-from tkamb.contact.neighbourhood import NEAR, Neighbourhood
+from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pressing import PRESS, press_by_search
-from tkamb.contact.probe import CondyleWrench, ProbedContact
-from tkamb.contact.result import ContactResult, ContactStatus, medial_points
+from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart, medial_points
 from tkamb.contact.samples import (
     DEEPEST,
+    NEAR,
+    Neighbourhood,
     SampledContact,
     SurfaceSamples,
     gaps_along_normals,
     gaps_and_facets,
 )
-from tkamb.contact.warm_start import Guess, WarmStart
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse, rotate, transform
 
@@ -243,7 +242,7 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
 
 
 class FoundationProbe:
-    """Forces and tangent stiffness of the near columns; see `tkamb.contact.probe.Probe`.
+    """Forces and tangent stiffness of the near columns; see `tkamb.contact.model.Probe`.
 
     A femoral displacement u at the point that a column meets, with femoral normal m there,
     changes the gap along the insert's normal n by (m . u)/(m . n). With p'(d) the slope of the

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from tkamb.contact.articular_edge import ArticularEdge
+from tkamb.contact.flags import ArticularEdge
 from tkamb.contact.materials import Material
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch

@@ -11,8 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.warm_start import Guess, WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array

@@ -39,7 +39,7 @@ BUILT_IN = {
     "foundation-linear": "tkamb.contact.foundation:LinearFoundation",
     "lattice": "tkamb.contact.lattice.model:CalibratedLattice",
     "lattice-linear": "tkamb.contact.lattice.model:LinearLattice",
-    "lattice-source": "tkamb.contact.lattice.source.model:SourceLattice",
+    "lattice-source": "tkamb.contact.lattice.source_lattice:SourceLattice",
     "fe": "tkamb.contact.lattice.model:FiniteElements",
 }
 

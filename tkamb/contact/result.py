@@ -1,4 +1,9 @@
-"""What a contact model finds at one pose: pressure map, wrench, and what each condyle carries."""
+"""The result of a contact model at one pose, and the warm start of its next evaluation.
+
+A `ContactResult` holds the pressure map, the wrench and the loads of each condyle. A caller that
+presses many times takes `ContactModel.press_from`: it returns the result and a `WarmStart`, which
+the caller passes to the next press. A result may be passed instead, but saves less time.
+"""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tkamb.contact.articular_edge import edge_of_insert_flags
+from tkamb.contact.flags import edge_of_insert_flags
 from tkamb.contact.pair import ContactPair, ContactSurface, PreparedContact
 from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
@@ -327,3 +332,39 @@ def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
                 f"{side} peak above {limit / MEGAPASCAL:.0f} MPa: polyethylene's law is "
                 "not known there; check whether the contact lies on the lip or at an edge"
             )
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """An earlier contact, as far as a next one of the same prepared state may begin with it.
+
+    It may save time, and changes no answer beyond the model's tolerance.
+
+    Args:
+        pair: the two bodies.
+        pose: (4, 4) pose_femoral_in_insert.
+        points: (n, 3) m, the map's.
+        pressure: (n,) Pa; NaN where the contact failed.
+        gap: (n,) m.
+    """
+
+    pair: ContactPair
+    pose: Array
+    points: Array
+    pressure: Array
+    gap: Array
+
+    @classmethod
+    def after(cls, result: ContactResult) -> "WarmStart":
+        """Return the start that an answer by itself gives."""
+        return WarmStart(result.pair, result.pose, result.points, result.pressure, result.gap)
+
+    @cached_property
+    def approach(self) -> float:
+        """m, travel along -y since first touch; NaN where the contact failed."""
+        failed = bool(np.isnan(self.pressure).any())
+        return float("nan") if failed else self.pair.approach(self.pose)
+
+
+Guess = ContactResult | WarmStart
+"""What a press may begin with: both have `pose`, `points`, `pressure`, `gap` and `approach`."""

@@ -18,7 +18,7 @@ better than any other point, so the centre stays where it was recorded. About th
 points, 25 mm below, 0.4 deg shift the component sideways by 0.2 mm, and in dishes little
 wider than the condyles the contact by 1.3 mm: enough to change the total force by 0.02 BW.
 
-`tkamb.knee.equilibrium.adjusted_press` compares the adjustment with the deformation, and may
+`tkamb.knee.adjustment` compares the adjustment with the deformation, and may
 restore the recorded rotation.
 """
 

@@ -1,14 +1,185 @@
-"""The smooth surface that a triangulation stands for: a curved patch over every triangle."""
+"""The smooth surface that a triangulation approximates: a curved patch over every triangle.
+
+Some meshes are flat subdivisions: each edge of a coarser mesh was halved without a change of
+shape. The new vertices have the normals of two triangles at most, so that only the coarser
+triangles show the curvature. `coarsened` finds those coarser triangles.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
-from tkamb.geometry.subdivision import Coarsened, coarsened
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import Ragged, edge_use
+
+
+@dataclass(frozen=True)
+class SubdivisionSettings:
+    """When coarse triangles of a surface are divided."""
+
+    halving_tolerance: float = 1e-6
+    """1: largest distance of a halved edge's middle from its line, as a share of the surface's
+    size. Chosen: files round coordinates by less."""
+    most_levels: int = 8
+    """Times that a triangle may be divided. Chosen: a triangle is then divided into 65,536."""
+    most_parts: int = 100
+    """Parts of a surface beyond which it is left as it is. Chosen: no implant has as many."""
+
+
+SUBDIVISION = SubdivisionSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Coarsened:
+    """A surface and its triangles' places on a finer one.
+
+    Args:
+        surface: the coarser triangles.
+        parent: (k,) the one that each finer triangle is part of.
+        corners: (k, 3, 3) barycentric coordinates there of each finer triangle's corners.
+    """
+
+    surface: Surface
+    parent: Index
+    corners: Array
+
+
+def coarsened(surface: Surface) -> Coarsened | None:
+    """Return the surface of which this one is a flat subdivision, as often as it was done.
+
+    Parts of a surface are looked at one by one; a part is undone as a whole or not at all.
+    None where nothing is to be undone.
+    """
+    coarse: Coarsened | None = None
+    for _ in range(SUBDIVISION.most_levels):
+        step = _coarsened_once(surface if coarse is None else coarse.surface)
+        if step is None:
+            break
+        if coarse is None:
+            coarse = step
+        else:
+            corners = coarse.corners @ step.corners[coarse.parent]
+            coarse = Coarsened(step.surface, step.parent[coarse.parent], corners)
+    return coarse
+
+
+def _coarsened_once(surface: Surface) -> Coarsened | None:
+    faces = surface.faces
+    across = _across(faces)
+    count, part = _parts(across)
+    if count > SUBDIVISION.most_parts:
+        return None
+    search = _Search(surface, across)
+    middles = [search.middles_of(np.flatnonzero(part == number)) for number in range(count)]
+    middle = np.concatenate(middles) if middles else np.zeros(0, np.int64)
+    if not middle.size:
+        return None
+    own = np.arange(len(middle))
+    parent = np.full(len(faces), -1)
+    parent[middle] = own
+    parent[across[middle]] = own[:, None]
+    rest = np.flatnonzero(parent < 0)
+    parent[rest] = len(middle) + np.arange(len(rest))
+    tips = np.concatenate([search.tips(middle), faces[rest]])
+    halves = np.concatenate([faces[middle], np.full((len(rest), 3), -1)])
+    at_tip = faces[:, :, None] == tips[parent][:, None]
+    at_half = faces[:, :, None] == halves[parent][:, None]
+    corners = at_tip + 0.5 * (at_half.any(axis=2, keepdims=True) & ~at_half)
+    return Coarsened(Surface(surface.vertices, tips, surface.name), parent, corners)
+
+
+class _Search:
+    """Searches the middle triangles of triangles that were cut into four.
+
+    A middle triangle's corners are the middles of the edges between the tips of its three
+    neighbours. From one of them the next are found across the neighbours' tips.
+    """
+
+    def __init__(self, surface: Surface, across: Index) -> None:
+        self._faces, self._points, self._across = surface.faces, surface.vertices, across
+        self._near = SUBDIVISION.halving_tolerance * float(
+            np.linalg.norm(np.ptp(surface.bounds, axis=0))
+        )
+        self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
+
+    def tips(self, middle: Index) -> Index:
+        """Return the vertices (m, 3) of the neighbours across from each corner's edge."""
+        others, own = self._faces[self._across[middle]], self._faces[middle]
+        shared = (others[:, :, :, None] == own[:, None, None]).any(axis=3)
+        return np.take_along_axis(others, np.argmin(shared, axis=2)[..., None], axis=2)[..., 0]
+
+    def middles_of(self, part: Index) -> Index:
+        """Return the middle triangles of a part (faces that hang together); none: not cut."""
+        first = part[0]
+        starts = [[first], *([face] for face in self._across[first])]
+        if len(part) % 4 == 0:
+            for start in starts:
+                centres = self._spread(np.array(start))
+                if centres is not None and 4 * len(centres) == len(part):
+                    return centres
+        return np.zeros(0, np.int64)
+
+    def _spread(self, start: Index) -> Index | None:
+        """Return all middle triangles that follow from one; None if they contradict each other."""
+        kind = np.zeros(len(self._faces), np.int8)  # 1: middle, 2: at a tip
+        even = np.zeros(len(self._points), bool)
+        new, layers = start, []
+        while new.size:
+            if not self._are_middles(new) or (kind[new] == 2).any():
+                return None
+            kind[new] = 1
+            layers.append(new)
+            if (kind[self._across[new]] == 1).any():
+                return None
+            kind[self._across[new]] = 2
+            tips = np.unique(self.tips(new))
+            tips = tips[~even[tips]]
+            even[tips] = True
+            new = self._beyond(tips)
+            new = new[kind[new] != 1] if (new >= 0).all() else np.array([-1])
+        every = np.concatenate(layers)
+        return None if even[self._faces[every]].any() else every
+
+    def _are_middles(self, faces: Index) -> bool:
+        """Say whether the corners of faces halve the edges between their neighbours' tips."""
+        if (faces < 0).any() or (self._across[faces] < 0).any():
+            return False
+        a, b, c = np.moveaxis(self._points[self.tips(faces)], 1, 0)
+        halves = 0.5 * np.stack([b + c, c + a, a + b], axis=1)
+        return bool(np.abs(halves - self._points[self._faces[faces]]).max() <= self._near)
+
+    def _beyond(self, tips: Index) -> Index:
+        """Return the faces across from each tip of all the faces around it."""
+        return np.unique(self._across.ravel()[self._corners.of(tips)[1]])
+
+
+def _across(faces: Index) -> Index:
+    """Return the face (k, 3) across the edge opposite each corner; -1: none, or several."""
+    edge, count = edge_use(faces)
+    order = np.argsort(edge, kind="stable")
+    first = np.cumsum(count) - count
+    pair = np.full((len(count), 2), -1)
+    two = count == 2
+    pair[two] = order[first[two][:, None] + [0, 1]] // 3
+    edges = pair[edge].reshape(-1, 3, 2)
+    own = np.arange(len(faces))[:, None]
+    other = np.where(edges[..., 0] == own, edges[..., 1], edges[..., 0])
+    return np.roll(other, -1, axis=1)
+
+
+def _parts(across: Index) -> tuple[int, Index]:
+    """Return the number of parts that are connected across edges, and each face's part (k,)."""
+    face, corner = np.nonzero(across >= 0)
+    ones = np.ones(len(face), np.int8)
+    graph = coo_array((ones, (face, across[face, corner])), shape=(len(across),) * 2)
+    count, part = connected_components(graph.tocsr(), directed=False)
+    return int(count), part.astype(np.int64)
+
 
 SMALLEST_COSINE = 0.1
 """Smallest cosine between normal and direction by which a shift is divided: 84 deg."""

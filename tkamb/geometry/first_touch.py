@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.condyles import condyle_faces
 from tkamb.geometry.frames import Array
+from tkamb.geometry.nearest import TriangleTree
 from tkamb.geometry.surface import Surface
-from tkamb.geometry.tree import TriangleTree
 
 STEEP = 1e-9
 """1: a triangle whose area in plan view is a smaller share of its area is a wall. Its edges count

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask, pose
-from tkamb.geometry.inner_walls import facing_material
+from tkamb.geometry.repair import facing_material
 from tkamb.geometry.surface import Surface
 
 

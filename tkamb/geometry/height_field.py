@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
-from tkamb.geometry.ragged import counted
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import counted
 from tkamb.geometry.winding import PlanGrid
 
 

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import connected_components
 
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.nearest import TriangleTree, rows
 from tkamb.geometry.threads import in_halves
-from tkamb.geometry.tree import TriangleTree, rows
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface

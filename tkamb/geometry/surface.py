@@ -1,4 +1,4 @@
-"""A triangulated surface in SI units and one named frame."""
+"""A triangulated surface in SI units and one named frame, and the normals of its smooth shape."""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -6,18 +6,32 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.geometry.frames import Array, Index, transform
-from tkamb.geometry.normals import SHARP_EDGE, corner_angles, corner_normals, interpolated
-from tkamb.geometry.ragged import Ragged
-from tkamb.geometry.topology import same_places
+from tkamb.geometry.frames import Array, Index, Mask, transform
+from tkamb.geometry.topology import Ragged, edge_use, same_places
 
 if TYPE_CHECKING:
     import trimesh
 
-    from tkamb.geometry.nearest import NearestPoints
+    from tkamb.geometry.nearest import NearestPoints, TriangleTree
     from tkamb.geometry.rays import RayCaster
-    from tkamb.geometry.tree import TriangleTree
     from tkamb.geometry.winding import WindingNumber
+
+SHARP_EDGE = float(np.deg2rad(40.0))
+"""rad: neighbouring triangles that turn by more than this meet in a sharp edge."""
+NO_CREASE = float(np.pi)
+"""rad: all triangles at a vertex count, however they turn."""
+
+
+@dataclass(frozen=True)
+class NormalSettings:
+    """Normals of a mesh."""
+
+    cosine_rounding: float = 1e-9
+    """1: difference of two cosines that is rounding. Chosen: above rounding."""
+
+
+NORMAL = NormalSettings()
+
 
 SMOOTH_WITHIN = np.radians(30.0)
 """rad; triangles that meet at a larger angle belong to different smooth surfaces."""
@@ -131,6 +145,15 @@ class Surface:
         return corner_normals(self, SHARP_EDGE, corner_angles(self))
 
     @cached_property
+    def vertex_normals(self) -> Array:
+        """Unit normals (k, 3, 3) of the vertices, weighted by the areas of their triangles."""
+        return corner_normals(self, NO_CREASE, self.areas[:, None] * np.ones(3))
+
+    def vertex_normals_at(self, faces: Index, weights: Array) -> Array:
+        """Return `vertex_normals` interpolated by barycentric weights (n, 3) on faces (n,)."""
+        return _mean_normals(weights, self.vertex_normals[faces])
+
+    @cached_property
     def _smooth_corner_normals(self) -> Array:
         return corner_normals(self, SMOOTH_WITHIN, corner_angles(self))
 
@@ -141,12 +164,13 @@ class Surface:
         beyond a crease of 30 deg. A box keeps its face normals, a faceted sphere gets radial
         ones to second order.
         """
-        return interpolated(self, self._smooth_corner_normals, points, faces)
+        weights = self.barycentric(points, faces)
+        return _mean_normals(weights, self._smooth_corner_normals[faces])
 
     @cached_property
     def tree(self) -> "TriangleTree":
         """Boxes over its triangles, in its own frame."""
-        from tkamb.geometry.tree import TriangleTree  # numba, which not all need
+        from tkamb.geometry.nearest import TriangleTree  # numba, which not all need
 
         return TriangleTree(self)
 
@@ -156,7 +180,7 @@ class Surface:
 
         Triangles that face down or sideways are topmost only at an edge of one that faces up.
         """
-        from tkamb.geometry.tree import TriangleTree
+        from tkamb.geometry.nearest import TriangleTree
 
         upward = np.flatnonzero(self.face_normals[:, 1] > 0.0)
         return TriangleTree(self, upward) if len(upward) else self.tree
@@ -198,3 +222,67 @@ class Surface:
     def __getstate__(self) -> dict[str, Any]:
         """Leave out derived objects: they are far larger, and are made again where needed."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
+    """Return unit normals (k, 3, 3), one per triangle and corner.
+
+    Each is the weighted mean of the normals of those triangles at the vertex that turn by at
+    most `crease` from the triangle itself, so that a rim does not tilt the normals of the
+    surface beside it. A triangle without area has zero normals.
+
+    Args:
+        surface: vertices at the same place count as one.
+        crease: rad; `NO_CREASE`: the same normal for all corners at a vertex.
+        weights: (k, 3) of each triangle at its corners: `corner_angles`, or its area.
+    """
+    normals, vertex = np.repeat(surface.face_normals, 3, axis=0), surface.corner_vertices.ravel()
+    weighted = weights.reshape(-1, 1) * normals
+    mean = _sums(vertex, weighted)
+    total = mean[vertex]
+    if crease < NO_CREASE:
+        # Normals within half the crease angle of their mean are within the crease angle of each
+        # other, so they need no comparison in pairs.
+        lean = np.einsum("cj,cj->c", normals, _unit(mean)[vertex])
+        rough = np.zeros(len(mean), bool)
+        rough[vertex[~(lean > np.cos(crease / 2) + NORMAL.cosine_rounding)]] = True
+        corners = np.flatnonzero(rough[vertex])
+        corner_of_pair, neighbour = surface.corners_at_vertices.of(vertex[corners])
+        turn = np.einsum("pj,pj->p", normals[corners[corner_of_pair]], normals[neighbour])
+        counts = (turn >= np.cos(crease))[:, None]
+        total[corners] = _sums(
+            corner_of_pair, np.where(counts, weighted[neighbour], 0.0), len(corners)
+        )
+    return _unit(total).reshape(-1, 3, 3)
+
+
+def corner_angles(surface: Surface) -> Array:
+    """Return the angles (k, 3), rad, of the triangles."""
+    corners = surface.triangles
+    ahead = np.roll(corners, -1, axis=1) - corners
+    behind = np.roll(corners, 1, axis=1) - corners
+    sine = np.linalg.norm(np.cross(ahead, behind), axis=2)
+    return np.arctan2(sine, np.einsum("ijk,ijk->ij", ahead, behind))
+
+
+def _mean_normals(weights: Array, normals: Array) -> Array:
+    """Return the unit means (n, 3) of three normals (n, 3, 3), by barycentric weights (n, 3)."""
+    return _unit(np.einsum("ij,ijk->ik", weights, normals))
+
+
+def sharp_edges(surface: Surface, sharp: float = SHARP_EDGE) -> Mask:
+    """Return (k, 3): whether the edge opposite each corner is sharp, open or shared by many."""
+    edge, count = edge_use(surface.faces)
+    cosine = 0.5 * (_sums(edge, np.repeat(surface.face_normals, 3, axis=0)) ** 2).sum(axis=1) - 1
+    flags = (count != 2) | (cosine < np.cos(sharp))
+    return np.roll(flags[edge].reshape(-1, 3), -1, axis=1)
+
+
+def _sums(index: Index, rows: Array, count: int = 0) -> Array:
+    """Return the sums (count or more, n) of the rows (m, n) with each index (m,)."""
+    return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
+
+
+def _unit(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)

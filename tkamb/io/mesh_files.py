@@ -7,12 +7,11 @@ from typing import Any
 
 import trimesh
 
-from tkamb.atomic import replaced_file
 from tkamb.contact.lattice.meshing.grid import Lattice
-from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality
-from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality, whole_lattice
 from tkamb.contact.registry import MAP_GRID
 from tkamb.errors import InputError
+from tkamb.files import replaced_file
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.topology import separate_bodies
 from tkamb.io.recordings.mesh_check import mended_mesh

@@ -13,10 +13,10 @@ from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, ind
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.atomic import replaced_file
 from tkamb.contact.lattice.meshing.cells import scaled_jacobians
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.errors import InputError
+from tkamb.files import replaced_file
 from tkamb.geometry.frames import Array
 
 if TYPE_CHECKING:

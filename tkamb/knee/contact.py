@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tkamb.contact.model import ContactModel
+from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.probe import CondyleWrench, ProbedContact
-from tkamb.contact.result import ContactStatus
-from tkamb.contact.warm_start import Guess
+from tkamb.contact.result import ContactStatus, Guess
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, cross, pose
 from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
@@ -80,7 +78,7 @@ class KneeContact:
         return KneeContact(self.model, self.pair.of_material(stiffer), friction)
 
     def probe(self, start: Guess | None = None) -> Any:
-        """Return a new probe (`tkamb.contact.probe.Probe`), which a caller keeps as warm start."""
+        """Return a new probe (`tkamb.contact.model.Probe`), which a caller keeps as warm start."""
         return self.model.probe(self.state, start)
 
     def precise_probe(self, start: Guess | None = None) -> Any:

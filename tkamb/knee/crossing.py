@@ -1,21 +1,51 @@
-"""Muscles across the knee whose forces are known: all but those that end on the patella.
+"""Muscles across the knee, other than the extensor group, in the equations of one frame.
 
 A taut line crosses from the shank at p to the thigh, or the pelvis above it, at q. With force F it
 pulls the shank at p along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank are
 one body, so that a line which ends on the foot pulls that body where it leaves the foot. A pull
 from the pelvis acts on the femur here, and the loads across the hip balance it with all other
 loads on the thigh. Both ends are fixed to their links and follow the knee.
+
+The equations are linear in all loads while contact points and lines are fixed. Two things follow.
+
+1. The tension of the extensor group is Q = Q_0 + sum_i g_i F_i + h r, with Q_0 its value without
+   the other muscles, F_i their forces, and r a moment on the tibia about the insert's z. Solved
+   for r this is the knee's row of a static optimisation (`flexion_row`),
+
+       -Q_0/h = -(1/h) Q + sum_i (g_i/h) F_i + r,
+
+   with contact, ligaments, patella and friction in it: -1/h is the arm of the extensor group,
+   -Q_0/h the moment that all muscles together supply. With released coordinates, contact points
+   and the medial-lateral split depend on the muscles. The row then comes from the tension of the
+   patellar ligament, which is linear in the muscle forces by the tangent of contact and ligaments
+   (`ReleasedForces.tension_per_wrench`). A condyle that lifts off changes that row smoothly.
+
+2. The normal forces are the sum of what each load causes by itself (`condyle_contributions`),
+
+       N_side = N_side(weight, inertia and ground) + N_side(ligaments) + sum_i N_side(muscle i),
+
+   and N_side(post) where a cam on the insert's post is modelled. Each term is computed with all
+   other muscles and, except in their own term, the ligaments at zero force. A muscle alone leaves
+   a flexion moment at the knee. A moment about the insert's z balances it, beside the residuals
+   that balance the AP and ML force and the axial moment in every frame. The sum of these moments
+   over all terms is the knee's reserve. The extensor group is one muscle here.
+
+References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
+Sasaki & Neptune, J Biomech 43:2780 (2010), doi:10.1016/j.jbiomech.2010.06.011.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.knee import unknowns
+from tkamb.knee.equations import KneeGeometry, KneeSystem, SolvedLoads
 from tkamb.knee.load import PointForces, wrench_of
+from tkamb.knee.unknowns import LoadState
 
 if TYPE_CHECKING:
     from tkamb.knee.chain import ChainState
@@ -131,3 +161,144 @@ class MuscleShare:
     def _knee_reserve(self) -> Array:
         """(3,) N·m on the tibia, about the insert's z as the residual moment of flexion is."""
         return self.reserve[self.flexion] * unknowns.AXES["ml"]
+
+
+@dataclass(frozen=True, eq=False)
+class FlexionRow:
+    """The knee's row of the muscles' sharing.
+
+    Args:
+        moment: N·m on the tibia about the insert's z, which muscles and reserve supply together.
+        extensor_arm: m, of the extensor group.
+        arms: (c,) m, of the crossing muscles.
+    """
+
+    moment: float
+    extensor_arm: float
+    arms: Array
+
+
+def flexion_row(
+    geometry: KneeGeometry, lines: CrossingLines, friction: float, lifted: frozenset[str]
+) -> FlexionRow:
+    """Return the row at one frame, the extensor mechanism taut.
+
+    Args:
+        geometry: the frame, with an extensor mechanism; the forces of other muscles in it do
+            not enter.
+        lines: of the muscles that cross the knee.
+        friction: Coulomb coefficient of the femorotibial contact.
+        lifted: sides that carry nothing.
+
+    Raises:
+        ComputationError: the patella has no place there, or the equations are singular.
+    """
+    if geometry.extensor is None:
+        raise ComputationError("; ".join(geometry.problems) or "no patella", "muscles")
+    alone = replace(geometry, share=None)
+    system = KneeSystem(alone, friction, LoadState(lifted, frozenset()))
+    if not system.solution.regular:
+        raise ComputationError("singular equations", "muscles")
+    moment = unknowns.moment_pair("tibia", "femur", unknowns.AXES["ml"])
+    groups = [*lines.unit_loads(geometry.state), moment]
+    name = unknowns.muscle_load(geometry.extensor.muscles[0])
+    change = system.response(geometry.state.generalised(groups))[system.names.index(name)]
+    gains, slope = change[:-1], float(change[-1])
+    return _solved_for_reserve(system.solution.values[name], gains, slope)
+
+
+def yielding_flexion_row(
+    geometry: KneeGeometry, lines: CrossingLines, base: float, per_wrench: Array
+) -> FlexionRow:
+    """Return the row at one frame whose released coordinates yield to the muscles.
+
+    The patella's equilibrium relates the extensor group's tension to the ligament's: Q = a T + b.
+
+    Args:
+        geometry: the frame, with an extensor mechanism; its contact is not used.
+        lines: of the muscles that cross the knee.
+        base: N, tension of the patellar ligament without the other muscles.
+        per_wrench: (6,) N per N and per N·m, what a wrench on the insert, about its origin,
+            adds to it.
+
+    Raises:
+        ComputationError: the equations of the patella are singular.
+    """
+    state = geometry.state
+    ratio, free = _tension_by_ligament(geometry)
+    gains = ratio * lines.unit_wrenches(state.pose("tibia"), state.pose("femur")) @ per_wrench
+    slope = ratio * float(per_wrench[3:] @ unknowns.AXES["ml"])
+    return _solved_for_reserve(ratio * base + free, gains, slope)
+
+
+def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
+    """Return a and b (N) of the extensor group's tension Q = a T + b, T the ligament's.
+
+    They follow from the patella's own three equations, which contain no other load of the leg.
+    """
+    extensor, state = geometry.extensor, geometry.state
+    assert extensor is not None
+    femur_ml = state.pose("femur")[:3, 2]
+    pressed = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
+    unknown_forces = [geometry.muscles[0], *pressed]
+    loads = [
+        *(unknown.loads for unknown in unknown_forces),
+        extensor.patellar_ligament,
+        geometry.ligaments,
+    ]
+    columns = state.generalised(loads)[state.chain.patella_columns()]
+    matrix, ligament, constants = columns[:, :3], columns[:, 3], columns[:, 4]
+    names = [unknown.name for unknown in unknown_forces]
+    alone = unknowns.solve(names, matrix, state.inertial[state.chain.patella_columns()] - constants)
+    if not alone.regular:
+        raise ComputationError("singular equations", "muscles")
+    return -float(np.linalg.solve(matrix, ligament)[0]), alone.values[names[0]]
+
+
+def _solved_for_reserve(alone: float, gains: Array, slope: float) -> FlexionRow:
+    """Return the row of Q = alone + gains F + slope r."""
+    return FlexionRow(-alone / slope, -1.0 / slope, np.asarray(gains / slope))
+
+
+EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
+"""Names beside the muscles': weight, inertia and ground; all bundles; a cam on the post, if it is
+modelled; the extensor group."""
+
+
+def condyle_contributions(
+    geometry: KneeGeometry, loads: SolvedLoads, friction: float
+) -> dict[str, dict[str, float]]:
+    """Return side -> load -> what it adds to the side's normal force, N; the sum is that force.
+
+    Args:
+        geometry: a frame with contact, extensor mechanism and the other muscles' share.
+        loads: its solution; a side that is lifted has no contributions.
+        friction: Coulomb coefficient of the femorotibial contact.
+    """
+    share, extensor = geometry.share, geometry.extensor
+    if share is None or extensor is None or loads.problems:
+        return {}
+    slack = frozenset(extensor.muscles) if loads.slack else frozenset[str]()
+    bare = replace(geometry, share=None, ligaments=(), post=())
+    system = KneeSystem(bare, friction, LoadState(loads.lifted, slack))
+    lines = share.lines.unit_loads(geometry.state)
+    moment = unknowns.moment_pair("tibia", "femur", unknowns.AXES["ml"])
+    constants = {LIGAMENTS: geometry.ligaments} | ({POST: geometry.post} if geometry.post else {})
+    unit = system.response(geometry.state.generalised([*constants.values(), *lines, moment]))
+    outside = np.array([system.solution.values[name] for name in system.names])
+    force = share.force[share.crossing]
+    pulls = np.concatenate([np.ones(len(constants)), force])
+    caused = np.column_stack([outside, unit[:, :-1] * pulls])
+    pulled = np.zeros(len(outside))
+    if not slack:
+        # The extensor group is a known load here; a flexion moment is the unknown in its place.
+        row = system.names.index(unknowns.muscle_load(extensor.muscles[0]))
+        per_newton = unit[:, -1] / unit[row, -1]
+        caused = caused - np.outer(per_newton, caused[row])
+        pulled = per_newton * extensor.tension(loads.values)
+    names = [EXTERNAL, *constants, *(share.muscles[i] for i in share.crossing), EXTENSORS]
+    caused = np.column_stack([caused, pulled])
+    return {
+        side: dict(zip(names, caused[system.names.index(f"{side}_normal")].tolist(), strict=True))
+        for side in system.carrying
+    }

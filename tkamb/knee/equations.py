@@ -11,6 +11,7 @@ and three residuals. A smaller model has fewer unknowns:
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,10 +19,19 @@ from tkamb.geometry.frames import Array, cross
 from tkamb.knee import unknowns
 from tkamb.knee.chain import ChainState
 from tkamb.knee.contact_points import CondylePoint
-from tkamb.knee.crossing import MuscleShare
 from tkamb.knee.load import PointForces
-from tkamb.knee.load_state import LoadState, contradictions, load_states, wrong_signs
-from tkamb.knee.unknowns import Unknown, muscle_load, solve
+from tkamb.knee.unknowns import (
+    LoadState,
+    Unknown,
+    contradictions,
+    load_states,
+    muscle_load,
+    solve,
+    wrong_signs,
+)
+
+if TYPE_CHECKING:
+    from tkamb.knee.crossing import MuscleShare
 
 
 @dataclass(frozen=True)
@@ -90,13 +100,13 @@ class KneeGeometry:
     muscles: tuple[Unknown, ...] = ()
     coordinates: Array = field(default_factory=lambda: np.full(6, np.nan))
     tensions: dict[str, float] = field(default_factory=dict)
-    share: MuscleShare | None = None
+    share: "MuscleShare | None" = None
     post: tuple[PointForces, ...] = ()
     problems: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class KneeLoads:
+class SolvedLoads:
     """Loads from the equations of one frame; NaN where they are singular.
 
     Args:
@@ -125,11 +135,11 @@ class KneeLoads:
     problems: tuple[str, ...]
 
 
-def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
+def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     """Return all loads of one frame: those of the load state without a wrong sign.
 
     If several states have no wrong sign, the one that leaves out fewest loads is taken, and
-    `ambiguous` is true. If none has, the frame has no number. See `tkamb.knee.load_state`.
+    `ambiguous` is true. If none has, the frame has no number. See `tkamb.knee.unknowns`.
 
     Args:
         geometry: the frame.
@@ -159,7 +169,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> KneeLoads:
     return replace(admissible[0].loads(), ambiguous=len(admissible) > 1)
 
 
-def solved_unknowns(geometry: KneeGeometry, loads: KneeLoads, friction: float) -> list[Unknown]:
+def solved_unknowns(geometry: KneeGeometry, loads: SolvedLoads, friction: float) -> list[Unknown]:
     """Return the unknown loads of one frame in the load state that was found.
 
     Args:
@@ -172,15 +182,15 @@ def solved_unknowns(geometry: KneeGeometry, loads: KneeLoads, friction: float) -
     return KneeSystem(geometry, friction, LoadState(loads.lifted, slack)).unknowns
 
 
-def unsolved(problems: Iterable[str]) -> KneeLoads:
+def unsolved(problems: Iterable[str]) -> SolvedLoads:
     """Return a frame without a number, and why."""
     nan = np.nan
     state = (frozenset[str](), False, False)
-    return KneeLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
+    return SolvedLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
 
 
 def dome_sensitivity(
-    geometry: KneeGeometry, loads: KneeLoads, friction: float
+    geometry: KneeGeometry, loads: SolvedLoads, friction: float
 ) -> tuple[float, float] | None:
     """Return the change of muscle and patellofemoral force as the button sits higher, N/m.
 
@@ -261,11 +271,11 @@ class KneeSystem:
         """Sides that carry load."""
         return [side for side in self.geometry.condyles if side not in self.lifted]
 
-    def loads(self) -> KneeLoads:
+    def loads(self) -> SolvedLoads:
         """Return the loads of this set."""
         values = self.solution.values
         flexion, adduction = self.external_moments()
-        return KneeLoads(
+        return SolvedLoads(
             values | dict.fromkeys(self._zero_loads(), 0.0),
             self.contact_force(values),
             flexion,

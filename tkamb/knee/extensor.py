@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_coordinates, transform
-from tkamb.geometry.sections import sagittal_outline
+from tkamb.geometry.polygons import sagittal_outline
 from tkamb.geometry.surface import Surface
 from tkamb.knee.chain import Chain
 from tkamb.knee.equations import Extensor
@@ -320,9 +320,12 @@ class ExtensorFrames:
         return solve_patella(mechanism, pose, last.coordinates, last.slopes)
 
     def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
-        """Return the solved coordinates with their rates (f, 3, 3); NaN where it is lost.
+        """Return the solved coordinates with their rates (f, 3, 3); NaN where the patella is lost.
 
-        Lost frames between found ones are bridged for the rates of their neighbours (shape-
+        The coordinates are those of equilibrium. The filter is for rates and accelerations alone:
+        at a filtered place the button would not touch and the moments would not balance.
+
+        Lost frames between solved ones are bridged for the rates of their neighbours (shape-
         preserving cubic): a patella of 0.1 kg turns an acceleration that is wrong by 1 m/s²
         into 0.1 N.
         """
@@ -339,8 +342,10 @@ class ExtensorFrames:
             )
         part = slice(solved_frames[0], solved_frames[-1] + 1)
         bridged = PchipInterpolator(time[solved_frames], places[solved_frames])(time[part])
+        _, velocity, acceleration = rates(time[part], bridged)
         result = np.full((len(places), 3, 3), np.nan)
-        result[part] = np.stack(rates(time[part], bridged), axis=1)
+        result[part, 1], result[part, 2] = velocity, acceleration
+        result[:, 0] = places
         result[np.isnan(places).any(axis=1)] = np.nan
         return result
 

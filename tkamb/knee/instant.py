@@ -15,11 +15,11 @@ from tkamb.geometry.frames import SIDES, Array, cross, knee_pose, knee_twist
 from tkamb.knee.canonical import canonical_state
 from tkamb.knee.chain import Chain, ChainMotion
 from tkamb.knee.contact_points import CondylePoint, ContactPoints, contact_points
-from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
 from tkamb.knee.load import PointForces
 
 if TYPE_CHECKING:
-    from tkamb.contact.probe import CondyleWrench
+    from tkamb.contact.model import CondyleWrench
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.knee.chain import ChainState
     from tkamb.knee.crossing import MuscleShare
@@ -64,7 +64,7 @@ class SharingMuscles(Protocol):
     def tension(self, share: "MuscleShare") -> float:
         """Return what the extensor group pulls with, N."""
 
-    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, KneeLoads]:
+    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
         """Return the geometry with the muscles' forces in it, and all loads."""
 
 
@@ -112,7 +112,6 @@ class Instant:
         two_condyles: whether there are two.
         ground: what acts on the shank from outside; None: nothing.
         muscles: those of the leg that share the load; None: the quadriceps alone acts.
-        finds_patella: whether the place of the patella is not part of q.
     """
 
     chain: Chain
@@ -126,7 +125,6 @@ class Instant:
     two_condyles: bool
     ground: PointForces | None = None
     muscles: SharingMuscles | None = None
-    finds_patella: bool = False
 
     @property
     def sides(self) -> set[str]:
@@ -145,12 +143,10 @@ class Instant:
 
         Args:
             coordinates: (6,) m and rad; None: those of q.
-            patella: where the patella is; None: as it is found there. At the coordinates of q its
-                body stays where q places it: a place found frame by frame may be filtered in q.
+            patella: where the patella is; None: as it is found there.
         """
         place = self.coordinates if coordinates is None else coordinates
         motion = self.motion
-        as_in_q = coordinates is None and patella is None and not self.finds_patella
         problems: tuple[str, ...] = ()
         if self.extensor is not None and patella is None:
             try:
@@ -159,7 +155,7 @@ class Instant:
                 problems = (str(error),)
         joints = motion.joints.copy()
         joints[0, :6] = place
-        if patella is not None and patella.status.found and not as_in_q:
+        if patella is not None and patella.status.found:
             joints[0, 6:] = patella.coordinates
         state = canonical_state(
             self.chain, replace(motion, joints=joints), self.shank, self.thigh, self.on_patella
@@ -191,7 +187,7 @@ class Instant:
         """Return where the undeformed condyles meet the insert at a pose (4, 4), with its rates."""
         return contact_points(query, pose, lambda point: self.sliding(self.coordinates, point))
 
-    def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, KneeLoads]:
+    def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
         """Return a geometry with the muscles' shares in it, and its loads.
 
         Args:

@@ -7,11 +7,10 @@ SI units; NumPy arrays and Pinocchio types in and out. No file is read, nothing 
 call changes the next: what may save time is a `KneeData` that the caller makes and hands over.
 """
 
-import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -20,63 +19,20 @@ from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
     Array,
-    inverse,
     knee_pose,
-    mirrored_pose,
-    sagittal_pose,
 )
-from tkamb.knee.anatomy import find_anatomy
-from tkamb.knee.assembly import (
-    bundle_on_chain,
-    crossing_and_others,
-    extensor_lines,
-    placed_insert,
-    prepared_contact,
-    surfaces_of,
-)
-from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, mirrored_spatial, se3, summed
+from tkamb.knee.assembled import PATELLAR_LIGAMENT, AssembledKnee, KneeData
+from tkamb.knee.canonical import KneePlace, mirrored_spatial, summed
 from tkamb.knee.contact_points import NO_CONTACT
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.instant import Instant, PatellaAt, PatellaFinder, SharingMuscles
 from tkamb.knee.load import PointForces
 from tkamb.knee.loads import KneeLoads, knee_loads
-from tkamb.knee.muscles import Muscle
-from tkamb.knee.parts import Extensor, Implant
-from tkamb.knee.tension import checked_tensions, tension_lines
 
 if TYPE_CHECKING:
-    from tkamb.contact.model import ContactModel
-    from tkamb.contact.probe import ProbedContact
-    from tkamb.contact.result import ContactResult
-    from tkamb.contact.warm_start import Guess, WarmStart
-    from tkamb.geometry.closest import ClosestPointQuery
-    from tkamb.knee.contact import KneeContact
-    from tkamb.knee.equilibrium.released import KneeEquilibrium
-    from tkamb.knee.extensor import ExtensorLines
-    from tkamb.knee.ligaments import Ligament
-    from tkamb.knee.patella import PatellaState
-
-PATELLAR_LIGAMENT = "patellar_ligament"
-"""Its name among the tensions."""
-
-
-@dataclass(eq=False)
-class KneeData:
-    """What a caller hands from one call to the next to save time; made by `Knee.create_data`.
-
-    It changes how long a call takes, and no answer beyond the solver's tolerance.
-
-    Args:
-        data: Pinocchio's, of the user's model.
-        probe: of the contact model, which remembers the last contact; None without one.
-        patella: where the patella was found last.
-        seen: the last pose, as bytes, and the contact there.
-    """
-
-    data: Any
-    probe: Any = None
-    patella: "PatellaState | None" = None
-    seen: "tuple[bytes, ProbedContact] | None" = None
+    from tkamb.contact.model import ProbedContact
+    from tkamb.contact.result import ContactResult, Guess, WarmStart
+    from tkamb.knee.released import KneeEquilibrium
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +60,7 @@ class Equilibrium:
     search: "KneeEquilibrium"
 
 
-class Knee:
+class Knee(AssembledKnee):
     """A total knee replacement on a user's Pinocchio model.
 
     The knee lies between the frames "femur" and "tibia" of the model, whatever joints are between
@@ -137,107 +93,6 @@ class Knee:
     Raises:
         InputError: what is given does not fit together, in one line.
     """
-
-    def __init__(
-        self,
-        model: pin.Model,
-        side: Literal["right", "left"] = "right",
-        *,
-        implant: Implant | None = None,
-        ligaments: "Iterable[Ligament]" = (),
-        extensor: Extensor | None = None,
-        contact: "ContactModel | KneeContact | str | None" = None,
-        friction: float = 0.0,
-        muscles: Iterable[Muscle] = (),
-        frames: Mapping[str, str] | None = None,
-        joints: Sequence[str] = (),
-        cache: bool = False,
-    ) -> None:
-        if side not in ("right", "left"):
-            raise InputError(f"side {side!r}", "Knee", "give 'right' or 'left'")
-        if not 0.0 <= friction <= 1.0:
-            raise InputError(f"friction {friction}", "Knee", "give 0 to 1")
-        self.model, self.side, self.friction = model, side, float(friction)
-        self.implant, left = implant or Implant(), side == "left"
-        self.anatomy = find_anatomy(
-            model, frames or {}, joints, extensor.plane if extensor else None
-        )
-        given = surfaces_of(self.implant, left, contact is not None, extensor is not None)
-        insert, placed = placed_insert(self.anatomy, self.implant, given.insert, left)
-        self._surfaces = replace(given, insert=placed)
-        component = self.anatomy.femoral
-        self.chain = CanonicalChain(self.anatomy, left, extensor is not None, component, insert)
-        self.bridge = Bridge(self.anatomy, left, self.chain, component, insert)
-        self._lines = tension_lines(muscles, self.anatomy)
-        self._take(ligaments)
-        self.extensor = extensor
-        self.extensor_lines: ExtensorLines | None = None
-        if extensor is not None:
-            self.extensor_lines = extensor_lines(self.bridge, extensor, self._surfaces)
-        self.contact: KneeContact | None = None
-        if contact is not None:
-            given_contact = prepared_contact(contact, self.implant, self._surfaces, cache)
-            self.contact = given_contact.changed(self.friction)
-
-    def _take(self, bundles: "Iterable[Ligament]") -> None:
-        self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in bundles)
-        self._crossing, self._others = crossing_and_others(self.chain, self.ligaments)
-
-    def with_ligaments(self, ligaments: "Iterable[Ligament]") -> "Knee":
-        """Return the same knee with other ligaments, which shares all else."""
-        other = copy.copy(self)
-        other._take(ligaments)
-        return other
-
-    def with_contact(self, model: "ContactModel") -> "Knee":
-        """Return the same knee with another contact model, prepared when it is first needed."""
-        from tkamb.knee.contact import KneeContact
-
-        other = copy.copy(self)
-        other.contact = KneeContact(model, self._need_contact().pair, self.friction)
-        return other
-
-    @property
-    def femoral(self) -> Any:
-        """The femoral component in its own frame, a right knee's; None: not given."""
-        return self._surfaces.femoral
-
-    @property
-    def insert(self) -> Any:
-        """The insert in the insert frame, a right knee's; None: not given."""
-        return self._surfaces.insert
-
-    @property
-    def button(self) -> Any:
-        """The patellar button in the patella's frame, a right knee's; None: not given."""
-        return self._surfaces.button
-
-    def create_data(self) -> KneeData:
-        """Return an object that a caller hands from call to call to save time."""
-        probe = None if self.contact is None else self.contact.probe()
-        return KneeData(self.model.createData(), probe)
-
-    def pose(self, q: Array) -> pin.SE3:
-        """Return the pose of the femoral component in the insert frame."""
-        place = self._kinematics(self.create_data_for_kinematics(), q)
-        return se3(mirrored_pose(place.pose) if self.left else place.pose)
-
-    def coordinates(self, q: Array) -> Array:
-        """Return the knee coordinates (6,) in the order of `KNEE_COORDINATES`, m and rad.
-
-        After Grood and Suntay; those of a left knee are those of its mirror image, whose clinical
-        signs are the same (`tkamb.geometry.frames`).
-        """
-        return self._kinematics(self.create_data_for_kinematics(), q).coordinates
-
-    @property
-    def left(self) -> bool:
-        """Whether it is a left knee."""
-        return self.side == "left"
-
-    def create_data_for_kinematics(self) -> KneeData:
-        """Return data without a contact."""
-        return KneeData(self.model.createData())
 
     def external_forces(
         self,
@@ -348,16 +203,6 @@ class Knee:
         contact = self._contact_at(data, place)
         return self._mirrored_matrix(self.contact.damping(contact, self.bridge.twist(data.data)))
 
-    def relative_jacobian(self, q: Array, data: KneeData | None = None) -> Array:
-        """Return J (6, nv): J v is the femoral component's twist against the insert.
-
-        Of its point at the insert's origin, insert frame. So the generalised force of a wrench w
-        on the insert (and -w on the femur) is -J^T w, and that of the knee's stiffness K in
-        `pin.computeABADerivatives` is -J^T K J.
-        """
-        data = self.create_data_for_kinematics() if data is None else data
-        return self.bridge.relative_jacobian(data.data, self._check(q, "q", self.model.nq))
-
     def inverse_dynamics(
         self,
         q: Array,
@@ -395,7 +240,7 @@ class Knee:
         instant = self.instant(q, v, a, external, tensions, data)
         geometry, points = instant.geometry(), NO_CONTACT
         if contact is not None:
-            from tkamb.contact.probe import condyle_wrenches
+            from tkamb.contact.model import condyle_wrenches
 
             wrenches = condyle_wrenches(contact, self._need_contact().pair.split)
             geometry = instant.touching(geometry, instant.coordinates, wrenches, {})
@@ -482,7 +327,7 @@ class Knee:
                 few degrees of freedom to reach the pose.
             ComputationError: the femur does not lie over the insert.
         """
-        from tkamb.knee.equilibrium.released import ReleasedKnee
+        from tkamb.knee.released import ReleasedKnee
 
         contact, allowed = self._need_contact(), [n for n in KNEE_COORDINATES if n != "flexion"]
         for name in released:
@@ -542,51 +387,7 @@ class Knee:
         Raises:
             InputError: no contact model, or one without a name (`tkamb.contact_model`).
         """
-        return import_module("tkamb.show.view.knee_on_bench").live_knee(self, q, load, folder)
-
-    def at(self, q: Array, data: KneeData) -> KneePlace:
-        """Return where the knee is at q, and bring the placements in `data` up to date."""
-        return self._kinematics(data, q)
-
-    def link_poses(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
-        """Return link -> pose (4, 4) in the insert frame, of a right knee.
-
-        Args:
-            q: (nq,), which places a patella of the model.
-            femur: (4, 4) of the femoral component in the insert frame.
-            data: from `create_data`.
-
-        Returns:
-            The poses, and whether the patella is among them; not where it is found nowhere.
-        """
-        place, patella = replace(self._kinematics(data, q), pose=femur), None
-        if self.extensor is not None:
-            try:
-                patella = self._find_patella(place, data)
-            except ComputationError:
-                patella = None
-        return self._link_poses(place, patella), patella is not None
-
-    def extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
-        """Return quadriceps and patellar ligament as they run (n, 3) m, insert frame.
-
-        Empty without an extensor mechanism, or where the patella is found nowhere.
-        """
-        if self.extensor_lines is None or "patella" not in poses:
-            return {}
-        muscle, ligament = self.extensor_lines.paths_at(poses)
-        return {self.extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
-
-    @property
-    def query(self) -> "ClosestPointQuery":
-        """Closest points of femoral component and insert, made when first asked for."""
-        return self._need_contact().pair.closest_points
-
-    def nearest_points(self, coordinates: Array) -> dict[str, Array]:
-        """Return side -> (3,) m, where each undeformed condyle is nearest to the insert."""
-        gaps = self.query.at(knee_pose(coordinates))
-        centres = {"medial": gaps.medial.centre}
-        return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
+        return import_module("tkamb.show.view.live_window").live_knee(self, q, load, folder)
 
     def instant(
         self,
@@ -646,23 +447,7 @@ class Knee:
             self.contact is not None and self.contact.pair.split is not None,
             None if external is None else bridge.on_shank(pin_data, external),
             muscles,
-            self._finds_patella,
         )
-
-    def _check(self, values: Array, name: str, size: int) -> Array:
-        array = np.asarray(values, float)
-        if array.shape != (size,):
-            raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
-        return array
-
-    def _kinematics(self, data: KneeData, q: Array, v: Array | None = None) -> KneePlace:
-        q = self._check(q, "q", self.model.nq)
-        if v is None:
-            pin.forwardKinematics(self.model, data.data, q)
-        else:
-            v = self._check(v, "v", self.model.nv)
-            pin.forwardKinematics(self.model, data.data, q, v)
-        return self.bridge.place(data.data)
 
     def _contact_at(self, data: KneeData, place: KneePlace) -> "ProbedContact":
         """Return the contact at a place; the last one is remembered in the caller's data."""
@@ -671,68 +456,6 @@ class Knee:
             assert self.contact is not None
             data.seen = key, self.contact.at(data.probe, place.pose)
         return data.seen[1]
-
-    def _need_contact(self) -> "KneeContact":
-        if self.contact is None:
-            raise InputError("has no contact model", "Knee", "give contact= and implant=")
-        return self.contact
-
-    @property
-    def _finds_patella(self) -> bool:
-        """Whether the place of the patella is found, and not that of q."""
-        return self.anatomy.patella is None
-
-    @property
-    def _extensor_names(self) -> tuple[str, ...]:
-        return (self.extensor.quadriceps.name, PATELLAR_LIGAMENT) if self.extensor else ()
-
-    def _pulls(self, tensions: Mapping[str, float]) -> bool:
-        return self.extensor is not None and tensions.get(self._extensor_names[0], 0.0) != 0
-
-    def _tensions(self, tensions: Mapping[str, float] | float | None) -> dict[str, float]:
-        return checked_tensions(tensions, self._extensor_names, self._lines)
-
-    def _find_patella(self, place: KneePlace, data: KneeData) -> "PatellaState":
-        lines = self.extensor_lines
-        assert lines is not None
-        if self._finds_patella:
-            data.patella = solution = lines.solved(place.pose, data.patella)
-        else:
-            assert place.patella is not None
-            solution = lines.given(place.pose, place.patella)
-        if not solution.status.found:
-            raise ComputationError(f"patella lost: {solution.status.value}", "extensor")
-        return solution
-
-    def _link_poses(self, place: KneePlace, patella: "PatellaState | None") -> dict[str, Array]:
-        """Return link -> pose (4, 4) in the insert frame."""
-        poses = {
-            "femur": place.pose,
-            "tibia": inverse(self.chain.insert_in_tibia),
-            "insert": np.eye(4),
-        }
-        if patella is not None:
-            joint = self.chain.patella_joint_in_femur
-            poses["patella"] = place.pose @ joint @ sagittal_pose(patella.coordinates)
-        return poses
-
-    def _with_lines(self, data: KneeData, tensions: Mapping[str, float], forces: Any) -> Any:
-        """Return forces on the joints with the pulls of the muscles' lines added.
-
-        Args:
-            data: with joint placements up to date.
-            tensions: muscle -> N.
-            forces: one per joint; None: none.
-        """
-        pulls = [name for name in self._lines if tensions.get(name, 0.0)]
-        if not pulls:
-            return forces
-        given = [pin.Force.Zero()] * self.model.njoints if forces is None else forces
-        total = [pin.Force(force) for force in given]
-        for name in pulls:
-            for joint, force in self._lines[name].forces(data.data, tensions[name]):
-                total[joint] += force
-        return pin.StdVec_Force(total)
 
     def _ligament_stiffness(self, place: KneePlace) -> Array:
         """Return the derivative (6, 6) of the wrench of the bundles between femur and tibia."""
@@ -754,7 +477,7 @@ class Knee:
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
         """Return the knee at rest, from first touch at the other coordinates of q."""
-        from tkamb.knee.equilibrium.starts import InitialPoses
+        from tkamb.knee.starts import InitialPoses
 
         pair = self._need_contact().pair
         if not np.isfinite(pair.first_touch_height(knee_pose(instant.coordinates))):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, cross
 
 
@@ -19,6 +20,10 @@ class LinkPoint:
 
     link: str
     position: Array
+
+
+Point = LinkPoint | tuple[str, Sequence[float]]
+"""A point on a frame of the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,3 +76,26 @@ def total_wrench(loads: Sequence[PointForces], point: Array) -> Array:
     total = wrenches(loads).sum(axis=0)
     total[3:] -= cross(point, total[:3])
     return total
+
+
+def link_point(point: Point) -> LinkPoint:
+    """Return a point on a frame, whichever way it was given.
+
+    Raises:
+        InputError: not a frame's name and three finite numbers.
+    """
+    link: object = None
+    position: object = ()
+    if isinstance(point, LinkPoint):
+        link, position = point.link, point.position
+    elif isinstance(point, tuple | list) and len(point) == 2:
+        link, position = point
+    try:
+        place = np.asarray(position, float)
+    except (TypeError, ValueError):
+        place = np.empty(0)
+    if not isinstance(link, str) or place.shape != (3,) or not np.isfinite(place).all():
+        raise InputError(
+            f"{point!r} is no point on a frame", "Knee", "give (frame name, (x, y, z)) in metres"
+        )
+    return LinkPoint(link, place)

@@ -7,8 +7,7 @@ import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.knee.canonical import Bridge
-from tkamb.knee.equations import KneeGeometry, solved_unknowns
-from tkamb.knee.equations import KneeLoads as SolvedLoads
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solved_unknowns
 from tkamb.knee.load import PointForces, scaled
 from tkamb.knee.unknowns import MUSCLE, muscle_load
 

@@ -1,21 +1,23 @@
-"""Muscles, tendons and the paths they take, as data: points on links, what they wrap, strength.
+"""Muscles, tendons and their paths: points on links, what they wrap, strength, given tensions.
 
 A line of action is a massless string through points of the links, perhaps around the outline
 of one of them. A unit tension on it, with the reactions of what it passes, is one column of the
 equations of motion. Its moment arm about any coordinate q of the chain is then -dL/dq.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pinocchio as pin
 
-from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array, transform
-from tkamb.geometry.sections import sagittal_outline
-from tkamb.knee.load import LinkPoint, PointForces
+from tkamb.errors import ComputationError, InputError, names_near
+from tkamb.geometry.frames import Array, cross, transform
+from tkamb.geometry.polygons import sagittal_outline
+from tkamb.knee.anatomy import Anatomy, Place
+from tkamb.knee.load import LinkPoint, PointForces, link_point
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -242,3 +244,88 @@ def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
                 f"[[muscle]] {muscle.name}",
                 "give one muscle from the femur to the patella; [muscles] takes the others",
             )
+
+
+@dataclass(frozen=True, eq=False)
+class TensionLine:
+    """A line of given tension, straight from point to point.
+
+    Args:
+        places: the frames that its points are fixed to.
+        positions: (3,) m each, of the points in these frames.
+    """
+
+    places: tuple[Place, ...]
+    positions: tuple[Array, ...]
+
+    def forces(self, data: Any, tension: float) -> list[tuple[int, pin.Force]]:
+        """Return joints, and the forces on them in their own frames.
+
+        Args:
+            data: Pinocchio's, with joint placements up to date.
+            tension: N.
+        """
+        placements = [data.oMi[place.joint] for place in self.places]
+        points = [
+            placement.act(place.placement.act(position))
+            for placement, place, position in zip(
+                placements, self.places, self.positions, strict=True
+            )
+        ]
+        steps = np.diff(np.array(points), axis=0)
+        along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+        pulls = tension * np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
+        return [
+            (place.joint, placement.actInv(pin.Force(pull, cross(point, pull))))
+            for placement, place, point, pull in zip(
+                placements, self.places, points, pulls, strict=True
+            )
+        ]
+
+
+def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, TensionLine]:
+    """Return muscle -> its line.
+
+    Raises:
+        InputError: fewer than two points, a wrap, or no such frame.
+    """
+    lines = {}
+    for muscle in muscles:
+        points = [link_point(point) for point in muscle.points]
+        if len(points) < 2 or muscle.wrap is not None:
+            raise InputError(
+                "is no straight line over two points or more",
+                f"muscle {muscle.name}",
+                "give its points; a quadriceps that wraps belongs to extensor=",
+            )
+        places = tuple(anatomy.frame(point.link) for point in points)
+        lines[muscle.name] = TensionLine(places, tuple(point.position for point in points))
+    return lines
+
+
+def checked_tensions(
+    tensions: Mapping[str, float] | float | None, extensor: tuple[str, ...], lines: Iterable[str]
+) -> dict[str, float]:
+    """Return muscle -> N.
+
+    Args:
+        tensions: as given; a number alone is the quadriceps'.
+        extensor: names of the extensor mechanism's lines, the quadriceps first.
+        lines: names of the other muscles.
+
+    Raises:
+        InputError: an unknown muscle, or a tension that is negative or not finite.
+    """
+    if tensions is None:
+        return {}
+    if not isinstance(tensions, Mapping):
+        if not extensor:
+            raise InputError("has no quadriceps", "tensions", "give extensor=, or names")
+        tensions = {extensor[0]: tensions}
+    names = (*extensor, *lines)
+    for name, tension in tensions.items():
+        if name not in names:
+            raise InputError(f"no muscle '{name}'", "tensions", names_near(name, list(names)))
+        if not (np.isfinite(tension) and tension >= 0.0):
+            raise InputError(f"tension {tension} N", f"muscle {name}", "a muscle only pulls")
+    return {name: float(tension) for name, tension in tensions.items()}

@@ -34,8 +34,7 @@ from numpy.typing import NDArray
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index, pose, transform
-from tkamb.geometry.normals import sharp_edges
-from tkamb.geometry.surface import Surface
+from tkamb.geometry.surface import Surface, sharp_edges
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ class PatellofemoralContact:
     ) -> None:
         self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
         self._nearest = femoral.nearest
-        normals = femoral.corner_normals, self._nearest.corner_normals
+        normals = femoral.corner_normals, femoral.vertex_normals
         self._facets = femoral.triangles, *normals, sharp_edges(femoral)
         self._samples = _joint_side(patellar)
         self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)

@@ -15,7 +15,7 @@ from tkamb.units import DEGREE
 
 if TYPE_CHECKING:
     from tkamb.io.scene.case import Case
-    from tkamb.knee.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.frame_contact import FrameContact
     from tkamb.run.mechanics import FrameLoads
 
 

@@ -6,7 +6,7 @@
 - `coupling = "points"`: each condyle's resultant then takes the place of point and normal in
   the equations, and this is repeated until load and centres of pressure no longer change.
 - `released = [...]`: these coordinates find their own equilibrium under contact, ligaments
-  and muscle line (`tkamb.knee.equilibrium.released`); the equations then use the resultants found.
+  and muscle line (`tkamb.knee.released`); the equations then use the resultants found.
 """
 
 import time as clock
@@ -16,26 +16,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.contact.model import condyle_wrenches
 from tkamb.contact.pressing import within_insert
-from tkamb.contact.probe import condyle_wrenches
-from tkamb.contact.result import ContactResult, ContactStatus, medial_points
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, WarmStart, medial_points
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.geometry.threads import both
+from tkamb.knee.adjustment import press_adjusted, split_sensitivity, split_tangent
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import solve_knee, unsolved
-from tkamb.knee.equilibrium.adjusted_press import press_adjusted
-from tkamb.knee.equilibrium.frame_contact import FrameContact
-from tkamb.knee.equilibrium.post_side import post_contact
-from tkamb.knee.equilibrium.split_sensitivity import split_sensitivity, split_tangent
+from tkamb.knee.frame_contact import FrameContact, post_contact
 from tkamb.knee.instant import Instant
 from tkamb.run.mechanics import FrameLoads, Mechanics
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
-    from tkamb.knee.equilibrium.released import KneeEquilibrium
+    from tkamb.knee.released import KneeEquilibrium
 
 NAN = float("nan")
 
@@ -95,8 +92,8 @@ class ContactSide:
         self._probe = self.model.probe(self.state)
         self.released = None
         if released:
-            from tkamb.knee.equilibrium.released import ReleasedKnee
-            from tkamb.knee.equilibrium.starts import InitialPoses
+            from tkamb.knee.released import ReleasedKnee
+            from tkamb.knee.starts import InitialPoses
 
             probe = self._probe if post is None else post.probe_with(self._probe)
             self.released = ReleasedKnee(probe, released)

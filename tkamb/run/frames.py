@@ -18,7 +18,7 @@ from tkamb.run.tabulate import frame_row
 from tkamb.run.workers import WorkerPool
 
 if TYPE_CHECKING:
-    from tkamb.knee.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.frame_contact import FrameContact
     from tkamb.knee.slip import CondyleSlip
     from tkamb.run.contact_side import ContactSide
 

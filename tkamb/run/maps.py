@@ -17,9 +17,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tkamb.atomic import replaced_file
 from tkamb.errors import InputError, not_installed
-from tkamb.files import check_file
+from tkamb.files import check_file, replaced_file
 from tkamb.geometry.frames import Array
 from tkamb.io.hdf5_file import NotingFile, check_written
 from tkamb.run.maps_check import check_maps_file, check_values

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.memory import available_memory
+from tkamb.geometry.memory import available_memory
 
 WRITTEN = "run it again, or ask whoever sent it for a folder that `tkamb run` wrote"
 FILTERS = frozenset({h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE})

@@ -76,8 +76,7 @@ def doubt_of_peak(results: "Results", side: str, frame: int) -> str:
 
     A run's status has the flags of each frame.
     """
-    from tkamb.contact.articular_edge import AT_EDGE
-    from tkamb.contact.narrow import TOO_NARROW
+    from tkamb.contact.flags import AT_EDGE, TOO_NARROW
 
     doubts = {
         AT_EDGE: AT_EDGE,

@@ -25,6 +25,7 @@ from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import MIRROR, Array, Index, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
+from tkamb.geometry.memory import peak_rss
 from tkamb.io import CONTACT_MODEL
 from tkamb.io.given_material import (
     material_as_json,
@@ -32,8 +33,7 @@ from tkamb.io.given_material import (
     named_material,
 )
 from tkamb.io.recordings.meshes import axes_rotation, load_surface, mirrored
-from tkamb.knee.equilibrium.adjusted_press import press_adjusted
-from tkamb.memory import peak_rss
+from tkamb.knee.adjustment import press_adjusted
 from tkamb.run.known_errors import KnownError, as_json, known_error, known_error_words, left_out
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
@@ -324,7 +324,7 @@ def _adjustment_settings(
         )
     if not adjust:
         if restore_when is not None:
-            raise InputError("needs the femoral adjustment", "restore_when", "give --adjust too")
+            raise InputError("needs the femoral adjustment", "restore_when", "give adjust=True too")
         return None
     return (
         AdjustmentSettings()

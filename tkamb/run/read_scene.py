@@ -139,7 +139,7 @@ def contact_side(
         sensitivity: see `ContactSide`.
         post: cam and post, if they are prepared already.
     """
-    from tkamb.knee.equilibrium.post_side import cam_on_post
+    from tkamb.knee.frame_contact import cam_on_post
     from tkamb.run.contact_side import ContactSide
 
     table, contact = case.scene.contact, mechanics.knee.contact

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.probe import ProbedContact
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.model import ProbedContact
+from tkamb.contact.result import WarmStart
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.knee.equilibrium.balance import Balance, BalanceStatus
-from tkamb.knee.equilibrium.frame_contact import FrameContact
-from tkamb.knee.equilibrium.released import KneeEquilibrium
+from tkamb.knee.balance import Balance, BalanceStatus
+from tkamb.knee.frame_contact import FrameContact
+from tkamb.knee.released import KneeEquilibrium
 from tkamb.run.contact_side import ContactSide
 from tkamb.run.shards import CONTACT_PLACES
 

@@ -13,7 +13,7 @@ from tkamb.run.columns import ACTIVATION, ENVELOPE, family_column
 from tkamb.run.status import FAILED
 
 if TYPE_CHECKING:
-    from tkamb.io.recordings.emg import Envelopes
+    from tkamb.io.recordings.measured import Envelopes
 
 
 PREDICTED = {

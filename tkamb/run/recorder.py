@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.atomic import replaced_together
+from tkamb.files import replaced_together
 from tkamb.geometry.frames import Array
 from tkamb.run.results_folder import MAPS_NAME, REPORT_NAME, SUMMARY_NAME, put_numbers, read_results
 from tkamb.run.shards import CONTACT_PLACES, Row, Shard, Shards, check_same_run

@@ -11,11 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb import __version__
-from tkamb.atomic import Replacement, replaced_together, write_synced
-from tkamb.code_identity import code_identity
+from tkamb import __version__, code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, MEGABYTE, read_json, sha256_of
+from tkamb.files import (
+    FILE_LIMITS,
+    MEGABYTE,
+    Replacement,
+    read_json,
+    replaced_together,
+    sha256_of,
+    write_synced,
+)
 from tkamb.io.claim import claimed_directory, settle
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.results import Results, csv_text, read_bands, read_csv

@@ -12,7 +12,7 @@ from tkamb.run.mechanics import FrameLoads
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.knee.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.frame_contact import FrameContact
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from tkamb import __version__
-from tkamb.code_identity import code_identity
+from tkamb import __version__, code_identity
 from tkamb.files import named_files, sha256_of
-from tkamb.io.recordings.gait import GAIT, cycle_percent
+from tkamb.io.recordings.gait_cycle import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene, scene_files
 from tkamb.io.scene.tables import ContactTable, MusclesTable

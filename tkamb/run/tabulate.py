@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
-from tkamb.io.recordings.gait import cycle_percent
+from tkamb.io.recordings.gait_cycle import cycle_percent
 from tkamb.io.scene.case import Case
-from tkamb.knee.contributions import condyle_contributions
+from tkamb.knee.crossing import condyle_contributions
 from tkamb.knee.equations import dome_sensitivity
 from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
 from tkamb.run.columns import (
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.marker_motion import MarkerKinematics
     from tkamb.knee.contact_points import CondylePoint
     from tkamb.knee.crossing import MuscleShare
-    from tkamb.knee.equilibrium.frame_contact import FrameContact
+    from tkamb.knee.frame_contact import FrameContact
     from tkamb.knee.slip import CondyleSlip
 
 NAN = float("nan")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array, Mask
-from tkamb.geometry.ragged import counted
+from tkamb.geometry.topology import counted
 from tkamb.units import MILLIMETRE
 
 

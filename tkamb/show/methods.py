@@ -275,7 +275,7 @@ def _ligaments(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterato
 
 
 def _generic_words(chosen: Sequence[str]) -> Iterator[str]:
-    from tkamb.knee.generic_ligaments import BUNDLES
+    from tkamb.knee.ligaments import BUNDLES
 
     for name, bundle in BUNDLES.items():
         if name.split("_")[0] in chosen:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.atomic import write_text
 from tkamb.errors import InputError
+from tkamb.files import write_text
 from tkamb.geometry.frames import Array
 from tkamb.run.columns import KINDS
 from tkamb.run.metrics import failed, flagged

@@ -15,7 +15,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
-from tkamb.memory import peak_rss
+from tkamb.geometry.memory import peak_rss
 from tkamb.studies.measures import ONE_THREAD
 
 PROGRAM = "ccx"

@@ -11,10 +11,9 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from tkamb.atomic import write_text
-from tkamb.code_identity import code_identity
+from tkamb import code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes, write_text
 
 FILE_NAME = "rows.jsonl"
 

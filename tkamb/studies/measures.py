@@ -19,11 +19,10 @@ from typing import Any
 
 from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_class, contact_model
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.warm_start import WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, WarmStart
 from tkamb.errors import TkambError
 from tkamb.geometry import threads
-from tkamb.memory import peak_rss
+from tkamb.geometry.memory import peak_rss
 from tkamb.run.known_errors import setting_label
 from tkamb.studies.cases import StudyCase, study_case
 from tkamb.studies.quantities import Quantities, quantities, raster_map

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.atomic import write_text
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import ComputationError, InputError
+from tkamb.files import write_text
 from tkamb.geometry.frames import Array
 from tkamb.studies.cases import Sphere, StudyCase
 from tkamb.studies.elastic_layer import sphere_on_layer

@@ -22,8 +22,7 @@ from typing import Any
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
-from tkamb.contact.result import ContactResult, ContactStatus
-from tkamb.contact.warm_start import Guess
+from tkamb.contact.result import ContactResult, ContactStatus, Guess
 from tkamb.errors import ComputationError, TkambError
 from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form

@@ -7,7 +7,7 @@ import numpy as np
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, ContactResponse
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState, Region, TangentPlanes
 from tkamb.contact.lattice.settings import LATTICE_SOLVER
-from tkamb.contact.warm_start import Guess, WarmStart
+from tkamb.contact.result import Guess, WarmStart
 from tkamb.geometry.frames import Array, Index, Mask
 
 

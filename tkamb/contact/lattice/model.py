@@ -6,7 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from tkamb.contact.lattice.flags import unseen_flags
+from tkamb.contact.lattice.bbar import BbarHexahedra
+from tkamb.contact.lattice.calibrated import CalibratedNetwork
 from tkamb.contact.lattice.initial_guess import (
     InitialGuess,
     LatticeStart,
@@ -15,14 +16,17 @@ from tkamb.contact.lattice.initial_guess import (
     lattice_start,
 )
 from tkamb.contact.lattice.linear.cache import cached_operator
-from tkamb.contact.lattice.linear.compliance import ComplianceCache
-from tkamb.contact.lattice.linear.memory_need import TooLittleMemoryError, check_assembly_memory
-from tkamb.contact.lattice.linear.operator import ElasticOperator, fixed_unknowns, prepare_operator
-from tkamb.contact.lattice.linear.response import SINGLE
+from tkamb.contact.lattice.linear.compliance import SINGLE, ComplianceCache
+from tkamb.contact.lattice.linear.operator import (
+    ElasticOperator,
+    TooLittleMemoryError,
+    check_assembly_memory,
+    fixed_unknowns,
+    prepare_operator,
+)
 from tkamb.contact.lattice.meshing.contact_map import contact_map
 from tkamb.contact.lattice.meshing.grid import Lattice
-from tkamb.contact.lattice.meshing.whole import whole_lattice
-from tkamb.contact.lattice.newton import solve_by_newton
+from tkamb.contact.lattice.meshing.quality import whole_lattice
 from tkamb.contact.lattice.probe import LatticeProbe
 from tkamb.contact.lattice.problem import (
     ContactProblem,
@@ -32,19 +36,15 @@ from tkamb.contact.lattice.problem import (
     TangentPlanes,
     undeformed,
 )
-from tkamb.contact.lattice.report import PressureRule, result_of
+from tkamb.contact.lattice.report import PressureRule, result_of, unseen_flags
 from tkamb.contact.lattice.settings import LATTICE_SOLVER, LatticeSolverSettings
-from tkamb.contact.lattice.solids.bbar import BbarHexahedra
-from tkamb.contact.lattice.solids.calibrated import CalibratedNetwork
-from tkamb.contact.lattice.solids.solid import Solid
-from tkamb.contact.lattice.solver import Solution, solve
+from tkamb.contact.lattice.solid import Solid
+from tkamb.contact.lattice.solver import Solution, solve, solve_by_newton
 from tkamb.contact.materials import LinearElastic, Material
-from tkamb.contact.model import ContactModel
+from tkamb.contact.model import ContactModel, Probe
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import check_load, within_insert
-from tkamb.contact.probe import Probe
-from tkamb.contact.result import ContactResult
-from tkamb.contact.warm_start import Guess, WarmStart
+from tkamb.contact.result import ContactResult, Guess, WarmStart
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE

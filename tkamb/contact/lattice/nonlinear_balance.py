@@ -22,7 +22,7 @@ import numpy as np
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.problem import ContactProblem, Region
 from tkamb.contact.lattice.settings import LatticeSolverSettings
-from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.contact.lattice.solid import Solid
 from tkamb.geometry.frames import Array, Mask
 
 NEAR = 0.05

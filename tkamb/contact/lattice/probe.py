@@ -18,10 +18,9 @@ import numpy as np
 
 from tkamb.contact.lattice.initial_guess import lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
+from tkamb.contact.model import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.pressing import Presses
-from tkamb.contact.probe import Probe, ProbedContact, condyle_wrenches
-from tkamb.contact.result import ContactResult, medial_points
-from tkamb.contact.warm_start import Guess, WarmStart
+from tkamb.contact.result import ContactResult, Guess, WarmStart, medial_points
 from tkamb.geometry.frames import Array, Index
 
 TURN_STEP = 5e-5
@@ -46,7 +45,7 @@ class FindsForces(Presses, Protocol):
 
 
 class LatticeProbe(Probe):
-    """`evaluate` with the stiffness of what it found; see `tkamb.contact.probe.Probe`.
+    """`evaluate` with the stiffness of what it found; see `tkamb.contact.model.Probe`.
 
     Args:
         model: of the lattice family, nodes pressed along the femoral normal.

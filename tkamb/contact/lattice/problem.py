@@ -11,7 +11,7 @@ from tkamb.contact.lattice.linear.multifrontal import Shares
 from tkamb.contact.lattice.linear.operator import ElasticOperator
 from tkamb.contact.lattice.meshing.contact_map import ContactMap
 from tkamb.contact.lattice.meshing.grid import Lattice
-from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.contact.lattice.solid import Solid
 from tkamb.contact.pair import PreparedContact
 from tkamb.geometry.curved import CurvedSurface
 from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform

@@ -1,17 +1,172 @@
-"""From a solution of the lattice to the contract's result: pressures, sums, flags."""
+"""From a solution of the lattice to the contract's result: pressures, sums, flags.
 
-from dataclasses import replace
+Flags name strains, edges and contacts that the lattice does not resolve. At a rounded edge that is
+narrower than the cells the pressure is that of a punch: it rises with every refinement
+(docs/lattice.md, "Convergence on real implants"). If a contact is too narrow for the cells, the
+peak is an average over an area larger than the contact.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tkamb.contact.area import covered_areas
-from tkamb.contact.lattice.flags import strain_flags, unresolved_flags, unsettled_flag
-from tkamb.contact.lattice.problem import LEAST_NORMAL_Y, LatticeState, tangent_planes
+from tkamb.contact.flags import narrow_flags
+from tkamb.contact.lattice.problem import (
+    LEAST_NORMAL_Y,
+    LatticeState,
+    SurfaceFromBelow,
+    tangent_planes,
+)
 from tkamb.contact.lattice.solver import Solution
-from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.pressing import PRESS
+from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.units import DEGREE, MILLIMETRE
+
+
+@dataclass(frozen=True)
+class LatticeFlagSettings:
+    """When a result of the lattice gets a flag."""
+
+    edge_distance_cells: float = 2.0
+    """Cells: distance from the peak at which the femoral normal is looked at. Chosen: a peak at an
+    edge lies one or two cells inside it."""
+    least_edge_distance: float = 2.0 * MILLIMETRE
+    """m: smallest distance from the peak at which the femoral normal is looked at. Chosen: an edge
+    of 6 mm radius counts as an edge with fine cells too."""
+    sharp_edge_angle: float = 20.0 * DEGREE
+    """rad: turn of the femoral normal over that distance from which a peak is flagged. Chosen: the
+    turn of a radius of 6 cells."""
+    strain_flag: float = -0.4
+    """1: principal strain below which a result is flagged. The material law has no barrier at
+    -1, and measured curves end before -0.4."""
+    max_unseen_height: float = 0.2e-3
+    """m: height of the femoral surface between nodes that may stay unseen. Chosen: a node of a 3 mm
+    cell misses the bottom of a ball of 15 mm radius by 0.15 mm."""
+    collapse_strain: float = -1.0
+    """1: principal strain at which a cell is compressed to nothing; the result is out of range. By
+    definition of the strain."""
+
+
+LATTICE_FLAG = LatticeFlagSettings()
+
+
+AROUND = np.array([(x, 0.0, z) for x in (-1, 0, 1) for z in (-1, 0, 1)], float)
+
+
+def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, ...]:
+    """Return the flags of peaks that the cells do not resolve."""
+    medial = medial_points(result.points, result.pose, state.pair.split)
+    sides = {"medial": medial, "lateral": ~medial}
+    pressures = {side: np.where(own, result.pressure, 0.0) for side, own in sides.items()}
+    peaks = {
+        side: result.points[np.argmax(pressure)]
+        for side, pressure in pressures.items()
+        if pressure.max(initial=0.0) > 0.0
+    }
+    femoral, spacing = state.problem.femoral, state.lattice.spacing
+    return (
+        *narrow_flags(state.surface.triangles, result.pressure > 0, sides),
+        *edge_flags(femoral, result.pose, spacing, peaks),
+    )
+
+
+def edge_flags(
+    femoral: SurfaceFromBelow,
+    pose: Array,
+    spacing: Array,
+    peaks: Mapping[str, Array],
+) -> tuple[str, ...]:
+    """Return a flag for each peak that lies at an edge of the femoral component.
+
+    There the femoral normal turns by more than `LATTICE_FLAG.sharp_edge_angle`. The normal under
+    the peak is compared with normals along x, z and both diagonals. Their distance from the peak is
+    `LATTICE_FLAG.edge_distance_cells`, and at least `LATTICE_FLAG.least_edge_distance`. Each
+    direction ends where the femoral surface ends.
+
+    Args:
+        femoral: the femoral component seen from below.
+        pose: (4, 4) pose_femoral_in_insert.
+        spacing: (3,) m, edges of a cell.
+        peaks: side -> (3,) m, where its pressure is highest, insert frame.
+    """
+    reach = np.maximum(LATTICE_FLAG.edge_distance_cells * spacing, LATTICE_FLAG.least_edge_distance)
+    # Eight directions at equal distance; the diagonals are shortened to it.
+    around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None] * reach
+    sites = (np.array(list(peaks.values())).reshape(-1, 1, 3) + around).reshape(-1, 3)
+    normals = femoral.over(sites, pose)[1].reshape(len(peaks), len(AROUND), 3)
+    sharp = zip(peaks, map(_sharpness, normals), strict=True)
+    return tuple(
+        f"the {side} peak pressure lies at an edge of the femoral component, which {how} "
+        f"within {reach.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
+        for side, how in sharp
+        if how
+    )
+
+
+def _sharpness(normals: NDArray[np.float64]) -> str:
+    """Return in words how sharply the surface turns around the middle point, if it does."""
+    if not np.isfinite(normals).all():
+        return "ends"
+    # The middle row is the place of the peak itself.
+    cosine = normals @ normals[len(AROUND) // 2]
+    turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
+    return f"turns by {turn / DEGREE:.0f} deg" if turn > LATTICE_FLAG.sharp_edge_angle else ""
+
+
+def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ...], bool]:
+    """Return the flags and whether the insert is compressed to nothing."""
+    if solution.field is not None:
+        solid = state.problem.solid
+        least = solid.least_principal_strain(solution.field)
+        kind = "principal strain"
+    else:
+        # A linear solver keeps no field of displacements: the mean strain of a column stands for
+        # it.
+        sunk = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]
+        least, kind = float(sunk.min(initial=0.0)), "mean strain of a column"
+    if least <= LATTICE_FLAG.collapse_strain:
+        return (f"{kind} {least:.2f}: the insert is compressed to nothing",), True
+    return (
+        (f"{kind} {least:.2f} is below {LATTICE_FLAG.strain_flag}",)
+        if least < LATTICE_FLAG.strain_flag
+        else ()
+    ), False
+
+
+def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
+    """Yield a flag where the meshes overlap much before any node is touched.
+
+    Args:
+        state: prepared contact.
+        result: of a press.
+        depth: m, how far the femoral component went below the first contact node.
+    """
+    unseen = result.approach - depth
+    if unseen > max(
+        LATTICE_FLAG.max_unseen_height, PRESS.flagged_thickness_share * result.approach
+    ):
+        yield (
+            f"the meshes first touch {unseen / MILLIMETRE:.2g} mm before any node does (cells of "
+            f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from first "
+            "touch: check the meshes for a spike or a ridge"
+        )
+
+
+def unsettled_flag(solution: Solution) -> str:
+    """Return in words how large the residual of a solution is that has not converged."""
+    percent = 100 * solution.residual.reported
+    return (
+        f"the solver has not converged: after {solution.passes} passes the residual is "
+        f"{percent:.2g} % of the force or of the distance to the femoral surface; "
+        "check whether the femoral mesh is rough"
+    )
+
 
 PressureRule = Literal["tributary", "source"]
 

@@ -28,8 +28,9 @@ iteration, and these are reported:
 The last pass (`max_passes`, or a residual force above `DIVERGED`) stops it in any case. It counts
 as converged with a gap of up to force_tolerance. The work of the residual estimates the relative
 error of the approach: for an error du = e u, r = e K_T u. The load and lambda >= 0 hold to rounding
-in every pass. When no pass gets there, Newton's method with a refactorised tangent goes on
-(`newton.py`).
+in every pass. When no pass gets there, full Newton iteration goes on (`solve_by_newton`). It is the
+reference, too: every step refactorises the tangent stiffness and solves the contact on its own
+compliance, so that it shares nothing with the accelerated iteration but the contact conditions.
 """
 
 from dataclasses import dataclass, replace
@@ -39,11 +40,20 @@ import numpy as np
 from tkamb.contact.lattice.active_set import ContactForces, solve_contact
 from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.linear.compliance import ContactResponse
-from tkamb.contact.lattice.nonlinear_balance import LinearBalance, NonlinearBalance, Residual
+from tkamb.contact.lattice.linear.operator import prepare_operator
+from tkamb.contact.lattice.nonlinear_balance import (
+    LinearBalance,
+    NonlinearBalance,
+    Residual,
+    forces_of,
+)
 from tkamb.contact.lattice.problem import ContactProblem, Region, TangentPlanes, tangent_planes
 from tkamb.contact.lattice.settings import LatticeSolverSettings
+from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, Index, Mask
 
+MOST_STEPS = 30
+"""Steps of full Newton iteration after which it stops."""
 DIVERGED = 10.0
 """Relative residual force at which the iteration is given up."""
 STAGNATION_RATIO = 0.7
@@ -210,3 +220,69 @@ class SlidingNodes:
         miss = np.where(forces.active, np.abs(gap), np.maximum(-gap, 0))
         size = float(np.abs(moved[forces.active]).max())
         return float(np.nan_to_num(miss, nan=0.0).max()) / max(size, 1e-300)
+
+
+def solve_by_newton(
+    problem: ContactProblem,
+    pose: Array,
+    load: float | None,
+    guess: InitialGuess,
+    settings: LatticeSolverSettings,
+    field: Array | None = None,
+) -> Solution:
+    """Return the contact at a pose under a load (N), or at approach 0 when load is None.
+
+    Args:
+        problem: solid, boundary and femoral component.
+        pose: (4, 4) pose_femoral_in_insert.
+        load: N along -y, or None.
+        guess: candidates and first active set; its compliance is not used.
+        settings: tolerances; the number of passes is not used.
+        field: (n, 3) m, where to start; at rest by default.
+
+    Raises:
+        ComputationError: the tangent is not positive definite, or numbers overflow.
+    """
+    solid, nodes = problem.solid, problem.contact_nodes[guess.candidates]
+    points = problem.surface_points[guess.candidates]
+    u = np.zeros_like(solid.nodes) if field is None else field
+    active, step, before, free = guess.active, 1.0, np.inf, ~problem.held.reshape(-1, 3)
+    sliding = SlidingNodes(problem, points, u[nodes], pose, guess.planes)
+    for steps in range(1, MOST_STEPS + 1):
+        planes, last = sliding.planes, steps == MOST_STEPS
+        u_full, forces = _step(problem, nodes, points, u, planes, load, active)
+        u, active = u + step * (u_full - u), forces.active
+        gap, force = sliding.follow(u[nodes], forces), forces.force[:, None] * planes.normals
+        internal, shares, softening = forces_of(solid, u)
+        outside = -internal
+        outside[nodes] += force
+        residual = replace(Residual.of(free * outside, u, force, u[nodes], softening), gap=gap)
+        if not np.isfinite(residual.force):
+            raise ComputationError("Newton's iteration left the range of numbers")
+        within = residual.within(settings, last)
+        if within or last:
+            break
+        step, before = 0.5 if residual.force > 2 * before else 1.0, residual.force
+    forces = replace(forces, converged=within and forces.converged)
+    h = free * solid.scatter.sum(shares)
+    return Solution(guess.candidates, forces, planes, u[nodes], u, h, steps, residual)
+
+
+def _step(
+    problem: ContactProblem,
+    nodes: Index,
+    points: Array,
+    u: Array,
+    planes: TangentPlanes,
+    load: float | None,
+    active: Mask,
+) -> tuple[Array, ContactForces]:
+    """Return the displacement (n, 3) and contact forces of one linearised step."""
+    solid = problem.solid
+    operator = prepare_operator(solid.tangent(u), problem.index, problem.held, nodes)
+    relaxed = u - operator.solve(solid.internal_force(u))
+    response = ContactResponse.of(operator.half)
+    forces, _ = solve_pass(response, relaxed[nodes], points, planes, load, active)
+    pushed = np.zeros_like(u)
+    pushed[nodes] = forces.force[:, None] * planes.normals
+    return relaxed + operator.solve(pushed), forces

@@ -15,9 +15,8 @@ from importlib.resources import files
 from pathlib import Path, PurePosixPath
 from urllib.parse import quote
 
-from tkamb.atomic import claim_directory, replaced_file
 from tkamb.errors import InputError
-from tkamb.files import sha256_of
+from tkamb.files import claim_directory, replaced_file, sha256_of
 
 NAMES = ("dm",)
 """Data sets that `tkamb data get` knows."""

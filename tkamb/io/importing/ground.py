@@ -24,11 +24,11 @@ from tkamb.io.importing.plates import (
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import GroundFile
 from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.force_plates import PLATE_LOAD, around_load, unloaded_level
 from tkamb.io.recordings.ground_reaction import (
     recorded_wrench,
     summed_reaction,
 )
-from tkamb.io.recordings.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.io.recordings.recordings import ForceRecording
 from tkamb.io.recordings.tables import Table, read_table
 

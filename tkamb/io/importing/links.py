@@ -19,7 +19,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, knee_coordinates, pose, transform
 from tkamb.io.importing.anatomy import Leg
 from tkamb.io.recordings.meshes import axes_rotation
-from tkamb.io.recordings.segments import RigidInertia, combined
+from tkamb.io.recordings.patient import RigidInertia, combined
 from tkamb.io.recordings.urdf_check import KNEE_JOINTS, PATELLA_JOINTS
 from tkamb.units import DEGREE
 

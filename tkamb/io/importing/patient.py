@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.atomic import CHOOSE_OUT, claim_directory, write_new_text
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes
+from tkamb.files import CHOOSE_OUT, FILE_LIMITS, claim_directory, read_bytes, write_new_text
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg

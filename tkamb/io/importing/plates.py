@@ -17,10 +17,10 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.recordings.c3d import Recording
-from tkamb.io.recordings.gait import uninterrupted_runs
+from tkamb.io.recordings.force_plates import around_load, unloaded_level
+from tkamb.io.recordings.gait_cycle import uninterrupted_runs
 from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import marker_trajectories
-from tkamb.io.recordings.plate_loads import around_load, unloaded_level
 from tkamb.io.recordings.tables import Table
 
 _KINDS = {"v": "force", "f": "force", "p": "point", "m": "moment", "t": "moment"}

@@ -6,7 +6,7 @@ import numpy as np
 
 from tkamb.geometry.frames import Array
 from tkamb.io.importing.links import Links, body_link
-from tkamb.io.opensim.model import Ligament, Path, PathPoint
+from tkamb.io.opensim.model import OpenSimLigament, Path, PathPoint
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
     return tuple(bundles)
 
 
-def _reason_against(ligament: Ligament, fixed: int) -> str:
+def _reason_against(ligament: OpenSimLigament, fixed: int) -> str:
     if not ligament.enabled:
         return "switched off in the model"
     if fixed != 2 or len(ligament.path.points) != 2:

@@ -31,7 +31,7 @@ from tkamb.io.importing.recorded_poses import RecordedPoses, ShankMarkers, shank
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import GroundFile, MarkerFile, SceneText
 from tkamb.io.recordings.c3d import read_c3d
-from tkamb.io.recordings.leg_chain import LegChain
+from tkamb.io.recordings.inverse_kinematics import LegChain
 from tkamb.io.recordings.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.io.recordings.markers import matched_labels, plain_label
 from tkamb.io.recordings.tables import Table, read_table, with_unit

@@ -21,9 +21,9 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates
-from tkamb.io.recordings.gait import Gait, find_gait
+from tkamb.io.recordings.force_plates import PLATE_LOAD, around_load, unloaded_level
+from tkamb.io.recordings.gait_cycle import Gait, find_gait
 from tkamb.io.recordings.laboratory import check_roles, laboratory_rotation
-from tkamb.io.recordings.plate_loads import PLATE_LOAD, around_load, unloaded_level
 from tkamb.io.recordings.recordings import ForceRecording, Side
 from tkamb.io.recordings.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.io.recordings.tables import Table, read_table

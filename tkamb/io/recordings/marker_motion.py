@@ -25,9 +25,15 @@ from tkamb.geometry.frames import (
     transform,
 )
 from tkamb.io.recordings.filtering import Cutoff, differentiate_poses
-from tkamb.io.recordings.inverse_kinematics import ChainFit, fit_chain
+from tkamb.io.recordings.inverse_kinematics import (
+    FLEXION,
+    ChainFit,
+    LegChain,
+    LegState,
+    Segment,
+    fit_chain,
+)
 from tkamb.io.recordings.laboratory import laboratory_rotation
-from tkamb.io.recordings.leg_chain import FLEXION, LegChain, LegState, Segment
 from tkamb.io.recordings.markers import MARKER_FIT, fit_seen, marker_trajectories
 from tkamb.io.recordings.recordings import MarkerSet, MotionRecording, Side
 from tkamb.io.recordings.tables import Table, read_table

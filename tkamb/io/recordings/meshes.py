@@ -11,13 +11,11 @@ from tkamb.errors import InputError
 from tkamb.files import FILE_LIMITS, check_file
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import MIRROR, Array
-from tkamb.geometry.inner_walls import InnerWall, find_inner_wall, touching_groups
 from tkamb.geometry.polygons import triangulated
-from tkamb.geometry.repair import Repair, repair
+from tkamb.geometry.repair import InnerWall, Repair, find_inner_wall, repair, touching_groups
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import Body, BoundaryLoop, connected_parts, separate_bodies
-from tkamb.io.recordings.polygon_files import read_obj, read_ply
-from tkamb.io.recordings.stl import read_binary_stl
+from tkamb.io.recordings.polygon_files import read_binary_stl, read_obj, read_ply
 from tkamb.io.recordings.vtp import read_vtp
 from tkamb.units import LENGTH, MILLIMETRE
 

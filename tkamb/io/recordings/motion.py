@@ -23,8 +23,8 @@ from tkamb.geometry.frames import (
     knee_pose,
     mirrored_pose,
 )
-from tkamb.io.recordings.cycle import Cycle
 from tkamb.io.recordings.filtering import differentiate_coordinates
+from tkamb.io.recordings.gait_cycle import Cycle
 from tkamb.io.recordings.laboratory import angle_scale, check_roles, poses_of_columns
 from tkamb.io.recordings.recordings import MotionRecording, Side
 from tkamb.io.recordings.samples import (

@@ -21,9 +21,8 @@ from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
-    from tkamb.io.recordings.emg import Envelopes
     from tkamb.io.recordings.ground_reaction import GroundReaction
-    from tkamb.io.recordings.measured_force import MeasuredForce
+    from tkamb.io.recordings.measured import Envelopes, MeasuredForce
     from tkamb.io.recordings.recordings import MotionRecording
     from tkamb.io.recordings.tibia import BodyMotion
     from tkamb.knee.ligaments import Ligament
@@ -275,7 +274,7 @@ def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
 def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
     if scene.measured is None:
         return None
-    from tkamb.io.recordings.measured_force import load_measured_force
+    from tkamb.io.recordings.measured import load_measured_force
 
     return load_measured_force(in_si(scene.measured), motion.time)
 
@@ -283,7 +282,7 @@ def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
 def _emg(scene: Scene, motion: KneeMotion) -> "Envelopes | None":
     if scene.muscles is None or scene.muscles.emg is None:
         return None
-    from tkamb.io.recordings.emg import load_envelopes
+    from tkamb.io.recordings.measured import load_envelopes
 
     return load_envelopes(in_si(scene.muscles.emg), motion.time)
 
@@ -298,7 +297,7 @@ def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, 
         bundles = lines.ligaments(scene)
         check_collateral_sides(bundles, chain, scene.patient.side)
     if scene.generic_ligaments:
-        from tkamb.knee.generic_ligaments import generic_ligaments
+        from tkamb.knee.ligaments import generic_ligaments
 
         assert parts.femoral is not None and parts.insert is not None
         names = scene.generic_ligaments.ligaments

@@ -2,7 +2,7 @@
 
 Lengths are shares of body height (Drillis and Contini 1966, as in Winter 2009, figure 4.1): ankle
 0.039, shank 0.246, thigh 0.245. Masses and inertias are those of de Leva (1996),
-`tkamb.io.recordings.segments`. The implant keeps its size. Joint centres, attachments on bone, the
+`tkamb.io.recordings.patient`. The implant keeps its size. Joint centres, attachments on bone, the
 ground reaction and its point scale; attachments near the knee move with it. A left leg is the
 mirror image: positions along z, the force to the right and the meshes.
 
@@ -23,7 +23,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
-from tkamb.io.recordings.segments import RigidInertia, Sex, combined, segment_inertia
+from tkamb.io.recordings.patient import RigidInertia, Sex, combined, segment_inertia
 
 MESHES = ("femoral_component", "insert", "patellar_button")
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
 from tkamb.contact.lattice.meshing.grid import Lattice
-from tkamb.contact.lattice.meshing.whole import whole_lattice
+from tkamb.contact.lattice.meshing.quality import whole_lattice
 from tkamb.contact.lattice.problem import SurfaceFromBelow
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model

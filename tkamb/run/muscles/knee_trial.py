@@ -2,7 +2,7 @@
 
 The leg's other rows (hip, ankle, subtalar) are those of the OpenSim model. The knee's comes from
 the equations of the knee itself, frame by frame: the moment, the arm of the extensor group and
-the arms of the muscles that cross the knee (`tkamb.knee.extensor_response`).
+the arms of the muscles that cross the knee (`tkamb.knee.crossing`).
 """
 
 from collections.abc import Mapping

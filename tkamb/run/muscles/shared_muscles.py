@@ -1,7 +1,7 @@
 """The muscles of a scene with [muscles]: shared frame by frame, in agreement with the knee.
 
 Hip, ankle and subtalar rows of the static optimisation are the OpenSim model's, made once for all
-frames. The flexion row is the knee's own (`tkamb.knee.extensor_response`), so that the tension of
+frames. The flexion row is the knee's own (`tkamb.knee.crossing`), so that the tension of
 the extensor group which the optimisation finds is the one that the knee's equations give back.
 """
 
@@ -14,9 +14,14 @@ from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.si import in_si
 from tkamb.io.scene.tables import MusclesTable
-from tkamb.knee.crossing import CrossingLines, MuscleShare
-from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
-from tkamb.knee.extensor_response import FlexionRow, flexion_row, yielding_flexion_row
+from tkamb.knee.crossing import (
+    CrossingLines,
+    FlexionRow,
+    MuscleShare,
+    flexion_row,
+    yielding_flexion_row,
+)
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
 from tkamb.run.muscles.knee_trial import KneeTrial
 from tkamb.run.muscles.recording import LegRecording, group_names, load_knee_trial
 from tkamb.run.muscles.sharing import EmgGuide, Sharing
@@ -131,7 +136,7 @@ class FrameMuscles:
         """Return the tension of the extensor group, N."""
         return float(share.force[self.trial.extensor].sum())
 
-    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, KneeLoads]:
+    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
         """Return the geometry with the muscles' forces in it, and all loads.
 
         Contact points and lines stay, so the sharing is exact at once; again where a condyle

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.io.recordings.segments import DE_LEVA
+from tkamb.io.recordings.patient import DE_LEVA
 from tkamb.io.scene.case import Case
 from tkamb.run.plausibility.question import Question
 from tkamb.units import DEGREE, MILLIMETRE

@@ -53,7 +53,7 @@ class CaseResults:
         if contact is None or (contact.coupling == "none" and not contact.released):
             rows = map_rows(self.results)
             return [self._geometry(k, rows.get(row)) for row, k in enumerate(progress(self.frames))]
-        from tkamb.knee.equilibrium.frame_contact import FrameContact
+        from tkamb.knee.frame_contact import FrameContact
 
         side, result = contact_side(self.case, self.mechanics), list[KneeGeometry]()
         touched: list[FrameContact] = []
@@ -194,7 +194,7 @@ def check_frame(sources: Sequence[Source], frame: int) -> None:
 
 def no_frame(frame: int, most: int) -> InputError:
     """Return the error for a frame that is beyond the longest run's `most` frames."""
-    return InputError(f"there is no frame {frame}", "--frame", f"give one of 0 to {most - 1}")
+    return InputError(f"there is no frame {frame}", "frame", f"give one of 0 to {most - 1}")
 
 
 def match_frames(case: Case, results: Results) -> CaseResults:

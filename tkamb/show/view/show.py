@@ -10,8 +10,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tkamb.atomic import replaced_file, write_text
 from tkamb.errors import InputError
+from tkamb.files import replaced_file, write_text
 from tkamb.show.view import CAMERAS
 from tkamb.show.view.draw import draw
 from tkamb.show.view.drawing import Drawing
@@ -101,7 +101,7 @@ class Show:
         if not -most <= frame < most:
             raise no_frame(frame, most)
         if camera not in CAMERAS:
-            raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
+            raise InputError(f"no view '{camera}'", "camera", f"there are: {', '.join(CAMERAS)}")
         return frame % most, camera
 
     def server(self, port: int = 0) -> "ViewServer":

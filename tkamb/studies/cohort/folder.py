@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.atomic import replaced_together, write_rows, write_synced
 from tkamb.errors import not_installed
-from tkamb.files import sha256_of
+from tkamb.files import replaced_together, sha256_of, write_rows, write_synced
 from tkamb.run.columns import ordered_names
 from tkamb.run.pages import page
 from tkamb.studies.cohort.outcome import Outcome

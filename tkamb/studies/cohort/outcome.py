@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
-from tkamb.memory import give_back
+from tkamb.geometry.memory import give_back
 from tkamb.run.columns import KINDS
 from tkamb.run.metrics import lateral_axis_name, map_rows
 from tkamb.run.results import Results

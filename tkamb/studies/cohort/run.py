@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tkamb import __version__
-from tkamb.code_identity import code_identity
+from tkamb import __version__, code_identity
 from tkamb.errors import InputError
 from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.run.guard import interrupt_as_such
@@ -110,7 +109,7 @@ def run_cohort(
                     shards.put(number, outcome.shard())
                     outcomes[number] = outcome
         except KeyboardInterrupt:
-            words = f"{len(outcomes)} of {len(numbers)} runs are kept; go on with --resume"
+            words = f"{len(outcomes)} of {len(numbers)} runs are kept; go on with resume=True"
             raise KeyboardInterrupt(words) from None
         outcomes = {number: outcomes[number] for number in numbers}
         if part is None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
-from tkamb.atomic import write_rows
+from tkamb.files import write_rows
 from tkamb.io.hdf5_file import new_hdf5
 from tkamb.run.results_folder import (
     BANDS_NAME,

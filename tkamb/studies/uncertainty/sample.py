@@ -15,7 +15,7 @@ from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.knee.equilibrium.frame_contact import FrameContact
+from tkamb.knee.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
 from tkamb.run.mechanics import Mechanics
 from tkamb.run.read_scene import SharedState, contact_side, mechanics_of

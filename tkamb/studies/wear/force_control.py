@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.model import ContactModel
-from tkamb.contact.result import ContactStatus
-from tkamb.contact.warm_start import Guess
+from tkamb.contact.result import ContactStatus, Guess
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_axes, knee_coordinates, knee_pose
-from tkamb.knee.equilibrium.balance import BalanceStatus
-from tkamb.knee.equilibrium.released_forces import FreeForces
+from tkamb.knee.balance import BalanceStatus
+from tkamb.knee.released_forces import FreeForces
 from tkamb.studies.wear.springs import Springs
 from tkamb.units import DEGREE, MILLIMETRE
 

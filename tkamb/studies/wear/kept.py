@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tkamb.atomic import replaced_file
-from tkamb.code_identity import code_identity
+from tkamb import code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes
+from tkamb.files import FILE_LIMITS, read_bytes, replaced_file
 from tkamb.run.plug_ins import foreign_code
 from tkamb.run.shards import UNREADABLE
 from tkamb.studies.wear.setup import WearSetup
@@ -74,7 +73,7 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
         raise _damaged(path, str(error) or type(error).__name__) from None
     if str(content.pop("identity", "")) != identity:
         what = "is of another simulation: bodies, motion, law, numbers or code differ"
-        raise InputError(what, path, "leave --resume out, or choose another folder with --out")
+        raise InputError(what, path, "leave out resume=True, or choose another directory")
     try:
         rows = json.loads(str(content.pop("rows")))
         values = {name: one.item() if one.ndim == 0 else one for name, one in content.items()}

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
-from tkamb.atomic import replaced_together, write_rows, write_synced
-from tkamb.code_identity import code_identity
+from tkamb import code_identity
+from tkamb.files import replaced_together, write_rows, write_synced
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
 from tkamb.io.vtk import write_triangles

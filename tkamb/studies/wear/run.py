@@ -124,7 +124,7 @@ class WearRun:
             if kept is None:
                 raise
             done = f"{kept.cycles:.6g} cycles are kept"
-            raise KeyboardInterrupt(f"{done}; go on with --resume") from None
+            raise KeyboardInterrupt(f"{done}; go on with resume=True") from None
 
 
 @dataclass(eq=False)

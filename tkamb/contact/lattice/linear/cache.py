@@ -36,11 +36,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from tkamb.code_identity import code_identity
+from tkamb import code_identity
+from tkamb.contact.lattice.linear.compliance import HalfResponse
 from tkamb.contact.lattice.linear.multifrontal import CholeskyFactor
 from tkamb.contact.lattice.linear.operator import ElasticOperator, operator_error
-from tkamb.contact.lattice.linear.response import HalfResponse
-from tkamb.contact.lattice.solids.solid import Solid
+from tkamb.contact.lattice.solid import Solid
 from tkamb.errors import InputError
 from tkamb.files import open_regular
 from tkamb.geometry.compiled import compiled

@@ -1,0 +1,287 @@
+"""Options: what commands on a scene share, and which options mean nothing beside which others.
+
+An option that would be ignored is refused, because the user expects an effect. `RULES` has the
+rules by command; `tests/test_option_rules.py` checks that it has every option of every command.
+"""
+
+import argparse
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+from tkamb.io.toml_text import check_key, check_limits
+
+
+def add_scene_options(command: Any) -> None:
+    """Add scene, --contact, --resolution, --out, --frames and --set to a command."""
+    command.add_argument("scene", type=Path, help="scene.toml")
+    command.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
+    command.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
+    command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
+    command.add_argument("--frames", type=_frames, metavar="A:B:STEP", help="frames, as in Python")
+    add_set(command)
+
+
+def add_set(command: Any) -> None:
+    """Add --set to a command."""
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        type=_setting,
+        metavar="TABLE.KEY=VALUE",
+        help="override a key of the scene; a list in brackets and quotes: "
+        "--set 'contact.released=[\"adduction\"]'",
+    )
+
+
+def add_preset(command: Any) -> None:
+    """Add --as to a command."""
+    command.add_argument(
+        "--as",
+        dest="preset",
+        metavar="NAME",
+        help="apply a study's own choices to the scene: sharma-2008; --set still overrides them",
+    )
+
+
+def add_force(command: argparse.ArgumentParser) -> None:
+    """Add --force to a command that writes one file."""
+    command.add_argument(
+        "--force", action="store_true", help="--out may replace a file that tkamb did not write"
+    )
+
+
+def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return dotted key -> value of what `add_scene_options` was given."""
+    overrides = dict(options.set)
+    if options.contact:
+        overrides["contact.model"] = options.contact
+    if options.resolution is not None:
+        overrides["contact.resolution_mm"] = options.resolution
+    return overrides
+
+
+def _frames(text: str) -> slice:
+    from tkamb.run.frame_choice import frames_slice
+
+    try:
+        return frames_slice(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise argparse.ArgumentTypeError(f"'{text}' is not TABLE.KEY=VALUE")
+    if "\n" in text.strip():
+        raise argparse.ArgumentTypeError("is more than one line; give --set for each key")
+    try:
+        check_key(key, f"'{key[:40]}'")
+        check_limits(value, f"'{key.strip()}'")
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    try:
+        return key.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
+
+
+@dataclass(frozen=True)
+class Rule:
+    """When an option means something.
+
+    Args:
+        option: its name on the command line.
+        needs: options of which at least one must be there; none: no such need.
+        excludes: options beside which it means nothing.
+        because: reason, after "does not go with --x" or "needs --x".
+        unless: value of the excluded option with which the option is allowed.
+    """
+
+    option: str
+    needs: tuple[str, ...] = ()
+    excludes: tuple[str, ...] = ()
+    because: str = ""
+    unless: str | None = None
+
+
+MESHES = ("--femoral", "--insert")
+POSE_OPTIONS = (
+    *("--pose-columns", "--pose-sequence", "--pose-units", "--pose-signs-turned"),
+    *("--stride", "--stance"),
+)
+POSED = "the poses are the knee's motion"
+MODELS_OWN = "the file holds the model's coordinates, not markers"
+NO_OUTPUT = "nothing is written"
+ONE_BY_ONE = "it varies one input at a time"
+WORKERS_OF_CLUSTER = Rule(
+    "--workers", excludes=("--dask",), because="a cluster has its own", unless="local"
+)
+
+RULES: dict[str, tuple[Rule, ...]] = {
+    "import": (
+        Rule("--grf-force", needs=("--grf",)),
+        Rule("--static", excludes=("--motion",), because=MODELS_OWN),
+        Rule("--static", excludes=("--poses",), because=POSED),
+        Rule("--femoral-frame", needs=("--femoral",)),
+        Rule("--insert-frame", needs=("--insert",)),
+        Rule("--patella-frame", needs=("--patella",)),
+        Rule("--patella", needs=MESHES),
+        Rule("--femur-bone", needs=("--patella",), because="the quadriceps wraps it"),
+        Rule("--mesh-unit", needs=MESHES),
+        Rule("--mesh-axes", needs=MESHES),
+        Rule("--contact", needs=MESHES, because="contact is between the two"),
+        *(Rule(option, needs=("--poses",)) for option in POSE_OPTIONS),
+        Rule("--poses", excludes=("--motion",), because=MODELS_OWN),
+        Rule("--stride", excludes=("--cycle",), because="either says where 0 and 100 % lie"),
+        Rule("--muscles", needs=("--patella",), because="the quadriceps pulls on it"),
+        Rule("--stride", excludes=("--interval",), because="either chooses the part"),
+        Rule("--plates", needs=("--c3d",), because="other files hold no plates"),
+        Rule("--laboratory-axes", excludes=("--motion",), because="the model's ground is meant"),
+        Rule("--without", excludes=("--motion",), because=MODELS_OWN),
+        Rule("--method", excludes=("--motion",), because=MODELS_OWN),
+        Rule("--method", excludes=("--poses",), because=POSED),
+        Rule("--marker-prefix", excludes=("--motion",), because=MODELS_OWN),
+        Rule("--length-unit", excludes=("--motion",), because=MODELS_OWN),
+        *(
+            Rule(option, needs=("--c3d",), because="tables are in N and N·m")
+            for option in ("--force-unit", "--moment-unit")
+        ),
+        *(
+            Rule(option, excludes=("--grf",), because="tables are in N and N·m")
+            for option in ("--force-unit", "--moment-unit")
+        ),
+    ),
+    "uncertainty": (
+        *(
+            Rule(o, excludes=("--screen",), because=NO_OUTPUT)
+            for o in ("--out", "--resume", "--force")
+        ),
+        *(
+            Rule(o, excludes=("--screen",), because=ONE_BY_ONE)
+            for o in ("--samples", "--method", "--indices")
+        ),
+        WORKERS_OF_CLUSTER,
+    ),
+    "cohort": (WORKERS_OF_CLUSTER,),
+    "wear": (
+        Rule("--springs", needs=("--simulator",)),
+        Rule("--period", needs=("--simulator",), because="a scene has its own clock"),
+    ),
+    "view": (
+        Rule(
+            "--port",
+            excludes=("--html", "--png", "--gif", "--mp4"),
+            because="a window alone has a port",
+        ),
+        Rule("--force", needs=("--html", "--png", "--gif", "--mp4"), because=NO_OUTPUT),
+    ),
+    "export": (
+        Rule("--out", needs=("--vtp", "--deck"), because="--sto names its own file"),
+        Rule("--frame", needs=("--deck",)),
+        Rule("--resolution", needs=("--deck",)),
+        Rule("--force", excludes=("--sto",), because="it replaces nothing"),
+    ),
+    "tradeoff": (Rule("SCENE", excludes=("--quick",), because="it measures two cases of its own"),),
+    "press": (
+        Rule("--force", needs=("--out",), because=NO_OUTPUT),
+        Rule("--restore-when", needs=("--adjust",)),
+    ),
+    "check": (Rule("--force", needs=("--out",), because=NO_OUTPUT),),
+    "mesh lattice": (Rule("--force", needs=("--out",), because=NO_OUTPUT),),
+}
+
+
+def check_options(
+    parser: argparse.ArgumentParser, arguments: Sequence[str], options: argparse.Namespace
+) -> None:
+    """Raise if an option is given that its companions make meaningless.
+
+    Args:
+        parser: of the whole command line.
+        arguments: that it has accepted.
+        options: what it made of them.
+
+    Raises:
+        InputError: names the option, and what it needs or excludes.
+    """
+    command, leaf, rest = command_of(parser, arguments)
+    given = _given(leaf, rest)
+    for rule in RULES.get(command, ()):
+        if rule.option not in given:
+            continue
+        why = f": {rule.because}" if rule.because else ""
+        if rule.needs and not given & {*rule.needs}:
+            raise InputError(
+                f"needs {' or '.join(rule.needs)}{why}",
+                rule.option,
+                f"leave it out, or give {rule.needs[0]}",
+            )
+        for other in rule.excludes:
+            value = getattr(options, other.lstrip("-").replace("-", "_"), None)
+            if other in given and (rule.unless is None or value != rule.unless):
+                raise InputError(f"does not go with {other}{why}", rule.option, "leave one out")
+
+
+def command_of(
+    parser: argparse.ArgumentParser, arguments: Sequence[str]
+) -> tuple[str, argparse.ArgumentParser, Sequence[str]]:
+    """Return the command's name, its own parser, and the arguments after its name."""
+    names, rest = [], list(arguments)
+    while verbs := _verbs(parser):
+        at = next((k for k, word in enumerate(rest) if word in verbs), None)
+        if at is None:
+            break
+        names.append(rest[at])
+        parser, rest = verbs[rest[at]], rest[at + 1 :]
+    return " ".join(names), parser, rest
+
+
+def leaf_parsers(
+    parser: argparse.ArgumentParser, name: str = ""
+) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """Yield every command with its own parser."""
+    verbs = _verbs(parser)
+    if not verbs:
+        yield name, parser
+    for verb, inner in verbs.items():
+        yield from leaf_parsers(inner, f"{name} {verb}".strip())
+
+
+def _verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return dict(action.choices)
+    return {}
+
+
+def _given(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str]:
+    """Return the long names of the options that arguments hold, shortened ones too.
+
+    A positional argument that may be left out goes by its metavar.
+    """
+    names = {
+        name: next(o for o in action.option_strings if o.startswith("--"))
+        for action in parser._actions
+        for name in action.option_strings
+        if any(o.startswith("--") for o in action.option_strings)
+    }
+    given = set()
+    for word in arguments:
+        if word == "--":
+            break
+        option = word.partition("=")[0]
+        full = [name for name in names if name.startswith(option)] if option[:2] == "--" else []
+        match = option if option in names else full[0] if len(full) == 1 else None
+        if match is not None:
+            given.add(names[match])
+    result, _ = parser.parse_known_args(list(arguments))
+    for action in parser._actions:
+        if action.nargs == "?" and not action.option_strings and getattr(result, action.dest):
+            given.add(str(action.metavar))
+    return given

@@ -1,0 +1,178 @@
+"""`tkamb verify`, `report`, `methods`, `compare` and `export`: commands on folders of results."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from tkamb.errors import InputError
+from tkamb.run.guard import say
+
+PAGE_NAME = "compare.html"
+
+
+def add_compare(commands: Any) -> None:
+    """Add `compare` to the command line."""
+    compare = commands.add_parser("compare", help="two or more folders of results, side by side")
+    compare.add_argument(
+        "folders", type=Path, nargs="+", metavar="DIR", help="that `tkamb run` wrote; two or more"
+    )
+    compare.add_argument(
+        "--axis",
+        choices=("flexion", "cycle", "time"),
+        help="common axis; default: the one that all of them ask for",
+    )
+    compare.add_argument(
+        "--frame",
+        type=int,
+        metavar="K",
+        help="of the first run: maps there; default: largest force",
+    )
+    compare.add_argument(
+        "--out", type=Path, metavar="DIR", help=f"folder of {PAGE_NAME}; default out/compare"
+    )
+    compare.add_argument("--force", action="store_true", help="write into a folder not tkamb's")
+    compare.add_argument("--json", action="store_true", help="print the differences as JSON")
+    compare.set_defaults(command=_compare)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from tkamb.files import write_text
+    from tkamb.io.claim import claimed_directory
+    from tkamb.show.comparison import compare_folders
+    from tkamb.show.comparison_page import comparison_html, table_lines
+
+    result = compare_folders(options.folders, options.axis)
+    html = comparison_html(result, options.frame)
+    place = options.out or Path("out") / "compare"
+    with claimed_directory(place, options.force) as folder:
+        write_text(folder / PAGE_NAME, html)
+    lines = [*table_lines(result), f"page: {folder / PAGE_NAME}"]
+    text = json.dumps(result.as_dict(), indent=2) if options.json else "\n".join(lines)
+    print(text)
+    return 0
+
+
+def add_export(commands: Any) -> None:
+    """Add the command `export` to the parser's commands."""
+    export = commands.add_parser("export", help="results for other programs")
+    export.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    kind = export.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--sto", type=Path, metavar="F.sto", help="all columns, for OpenSim")
+    kind.add_argument(
+        "--vtp", action="store_true", help="pressure maps over time, for ParaView; needs --out"
+    )
+    kind.add_argument(
+        "--deck", choices=("ccx", "feb"), help="one frame's contact, for CalculiX or FEBio 4"
+    )
+    export.add_argument(
+        "--out", type=Path, metavar="DIR2", help="folder of --vtp; file of --deck (.inp, .feb)"
+    )
+    export.add_argument("--frame", type=int, metavar="K", help="of --deck: row of results.csv")
+    export.add_argument(
+        "--resolution", type=float, metavar="MM", help="of --deck: edge of its hexahedra"
+    )
+    export.add_argument("--force", action="store_true", help="--out may be a folder not tkamb's")
+    export.set_defaults(command=_export)
+
+
+def _export(options: argparse.Namespace) -> int:
+    if (options.vtp or options.deck) and not options.out:
+        hint = "--vtp --out DIR2, or --deck ccx --frame K --out F.inp"
+        raise InputError("needs --out", "--vtp" if options.vtp else "--deck", hint)
+    if options.deck and options.frame is None:
+        raise InputError("needs --frame", "--deck", "--deck ccx --frame K")
+    if options.deck:
+        return _export_deck(options)
+    return _export_maps(options) if options.vtp else _export_storage(options)
+
+
+def _export_deck(options: argparse.Namespace) -> int:
+    from tkamb.contact.registry import MAP_GRID
+    from tkamb.files import write_text
+    from tkamb.io.claim import check_output_file
+    from tkamb.run.decks.frame import SUFFIX, frame_press
+
+    if options.out.suffix.lower() != SUFFIX[options.deck]:
+        raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")
+    if options.resolution is not None and not 0 < options.resolution <= MAP_GRID.coarsest_mm:
+        hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
+        raise InputError(f"resolution {options.resolution} mm", "--resolution", hint)
+    check_output_file(options.out, options.force)
+    result = frame_press(options.folder, options.frame, options.resolution)
+    write_text(options.out, result.deck(options.deck))
+    print("\n".join([f"{options.out}: {result.comments()[0]}", *result.comments()[2:]]))
+    return 0
+
+
+def _export_storage(options: argparse.Namespace) -> int:
+    from tkamb.run.results_folder import read_results
+    from tkamb.show.storage import write_results_storage
+
+    results = read_results(options.folder)
+    print(f"{options.sto}: {write_results_storage(results, options.sto)}")
+    return 0
+
+
+def _export_maps(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import claimed_directory
+    from tkamb.io.vtk import write_map_series
+    from tkamb.run.results_folder import read_results
+
+    results = read_results(options.folder)
+    if results.maps is None:
+        raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
+    with claimed_directory(options.out, options.force) as folder:
+        names = write_map_series(results.maps, folder)
+    more = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
+    more += "; without the post's pressure" if "post_force_N" in results.columns else ""
+    frames = f"{len(names) - 1} of {len(results)} frames"
+    print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{more}")
+    return 0
+
+
+def add_folder_commands(commands: Any) -> None:
+    """Add `verify`, `report` and `methods` to the command line."""
+    verify = commands.add_parser("verify", help="check that a folder of results is unchanged")
+    verify.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    verify.set_defaults(command=_verify)
+    report = commands.add_parser("report", help="write report.html of a folder of results again")
+    report.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    report.set_defaults(command=_report)
+    methods = commands.add_parser(
+        "methods",
+        help="the Methods paragraph of a paper, from a folder of results",
+    )
+    methods.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    methods.set_defaults(command=_methods)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from tkamb.run.results_folder import verify_results
+
+    verdict = verify_results(options.folder)
+    for line in verdict.differs:
+        say(f"{options.folder}: {line}")
+    for line in verdict.lines()[len(verdict.differs) :]:
+        print(f"{options.folder}: {line}")
+    return 1 if verdict.differs else 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import claimed_directory
+    from tkamb.run.results_folder import REPORT_NAME, read_results
+    from tkamb.show.report import write_report
+
+    results = read_results(options.folder)  # before a folder is made or marked
+    with claimed_directory(options.folder) as folder:
+        write_report(results, folder / REPORT_NAME)
+    print(f"report: {options.folder / REPORT_NAME}")
+    return 0
+
+
+def _methods(options: argparse.Namespace) -> int:
+    from tkamb.run.results_folder import read_results
+    from tkamb.show.methods import methods
+
+    print(methods(read_results(options.folder).summary).text())
+    return 0

@@ -1,0 +1,194 @@
+"""Flags of a contact whose peak pressure is not reliable: too narrow, or at the insert's edge.
+
+A map knows the pressure at its points only. If contact is a few points wide, the highest pressure
+lies between them, and the sum over the points is not the integral over the contact.
+
+A real edge is rounded more finely than any map resolves, and it wears and chips. The flag says
+where the peak lies, so that a reader does not rely on its value.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.geometry.surface import Surface
+from tkamb.units import DEGREE, MILLIMETRE
+
+TOO_NARROW = "contact is too narrow"
+"""Words of the flag, after "the <side> "."""
+
+
+@dataclass(frozen=True)
+class NarrowContactSettings:
+    """When a contact is too narrow for the map's points."""
+
+    least_inner_points: int = 5
+    """Points with contact all around, from which a peak is right within 8 %, wherever the
+    contact lies among the points. That is a sphere's contact with about 17 points, or three
+    rows of points under a cylinder. With no such point a lattice's peak is 5 to 96 % too
+    low (docs/lattice.md)."""
+
+
+NARROW_CONTACT = NarrowContactSettings()
+
+
+def narrow_flags(
+    triangles: Index,
+    touched: Mask,
+    sides: Mapping[str, Mask],
+    points: str = "cells",
+) -> Iterator[str]:
+    """Yield a flag for each condyle with fewer than `NARROW_CONTACT.least_inner_points`.
+
+    An inner point has contact all around.
+
+    Args:
+        triangles: (k, 3) of the contact surface.
+        touched: (n,) which of its points are in contact.
+        sides: side -> (n,) which points are under it.
+        points: what a user makes finer, in a word.
+    """
+    within = surrounded(triangles, touched)
+    for side, own in sides.items():
+        if (
+            touched[own].any()
+            and np.count_nonzero(within & own) < NARROW_CONTACT.least_inner_points
+        ):
+            yield (
+                f"the {side} {TOO_NARROW} for the {points}: its peak pressure cannot be "
+                f"relied on and is mostly too low; take finer {points}"
+            )
+
+
+def surrounded(triangles: Index, touched: Mask) -> Mask:
+    """Return which points (n,) have contact all around: at every corner of their triangles."""
+    a, b, c = touched[triangles.T]
+    edge = triangles[(a | b | c) & ~(a & b & c)]
+    within = touched.copy()
+    within[edge] = False
+    return within
+
+
+AT_EDGE = "contact reaches the edge of the insert's articular surface"
+"""Words of the flag, after "the <side> "."""
+DOWN = np.array([0.0, -1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class EdgeSettings:
+    """When contact is at the edge of an insert."""
+
+    spacing: float = 0.5 * MILLIMETRE
+    """m: spacing of the vertical rays that find the edge. Chosen: the distance from the edge is
+    known to half of it."""
+    steepest: float = 50.0 * DEGREE
+    """rad from the horizontal: a steeper surface beside the outline belongs to the rim. Chosen: it
+    is 50 deg, steeper than any part of a dish that carries."""
+    rim: float = 4.0 * MILLIMETRE
+    """m: largest width of the rim. Chosen: a steep surface farther inside is a flank of the
+    eminence or of a post."""
+    reach: float = 2.5 * MILLIMETRE
+    """m: contact that is nearer to the edge is flagged. Chosen: the radius of a usual insert's
+    rounded rim (1 to 2 mm) plus half the spacing of a map."""
+    share: float = 0.05
+    """1: share of the peak pressure from which a point counts as loaded. Chosen: a smaller pressure
+    does no harm."""
+
+
+EDGE = EdgeSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class ArticularEdge:
+    """Distance from the edge of the articular surface, seen from above.
+
+    Args:
+        origin: (2,) m, x and z of the first cell.
+        away: (a, b) m, distance of each cell's centre from the nearest cell beyond the edge.
+    """
+
+    origin: Array
+    away: Array
+    spacing: float
+
+    @classmethod
+    def of(cls, insert: Surface, settings: EdgeSettings = EDGE) -> "ArticularEdge":
+        """Return the edge of an insert: where it ends, or turns down to its walls.
+
+        Args:
+            insert: in the insert frame.
+            settings: when contact is at the edge.
+        """
+        from scipy.ndimage import distance_transform_edt  # a report needs the words alone
+
+        low, high = insert.bounds[:, [0, 2]]
+        # Two rows of margin on each side, so that the outside is one connected region.
+        count = np.ceil((high - low) / settings.spacing).astype(int) + 4
+        origin = low - 1.5 * settings.spacing
+        x, z = (origin[d] + settings.spacing * np.arange(count[d]) for d in (0, 1))
+        grid = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
+        height = insert.bounds[1, 1] + MILLIMETRE
+        rays = np.insert(grid, 1, height, axis=1)
+        distance, face = insert.rays.first(rays, DOWN)
+        covered = np.isfinite(distance).reshape(count)
+        upright = insert.face_normals[face][:, 1].reshape(count)
+        inside = distance_transform_edt(covered, settings.spacing)
+        steep = covered & (upright < np.cos(settings.steepest)) & (inside <= settings.rim)
+        # Steep ground counts as rim only where it is connected to the outside; a post's flank is
+        # not.
+        beyond = _joined_to_outside(~covered | steep, ~covered)
+        return cls(origin, distance_transform_edt(~beyond, settings.spacing), settings.spacing)
+
+    def distance(self, points: Array) -> Array:
+        """Return the distance (n,) of points (n, 3) from the edge in x and z, m; 0 beyond it."""
+        cell = np.round((points[:, [0, 2]] - self.origin) / self.spacing).astype(int)
+        cell = np.clip(cell, 0, np.array(self.away.shape) - 1)
+        # The distance is measured between ray places; the edge lies half a spacing nearer on
+        # average.
+        return np.asarray(np.maximum(self.away[tuple(cell.T)] - self.spacing / 2, 0.0), float)
+
+
+def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
+    """Return the connected parts of a mask (a, b) that hold a cell outside the insert."""
+    from scipy.ndimage import label  # a report needs the words alone
+
+    part, _ = label(flat, structure=np.ones((3, 3)))
+    touching = np.unique(part[outside])
+    return np.asarray(flat & np.isin(part, touching), bool)
+
+
+def edge_of_insert_flags(
+    edge: ArticularEdge,
+    points: Array,
+    pressure: Array,
+    sides: Mapping[str, Mask],
+    settings: EdgeSettings = EDGE,
+) -> Iterator[str]:
+    """Yield a flag for each condyle whose contact reaches the edge of the articular surface.
+
+    Args:
+        edge: of the insert.
+        points: (n, 3) m, of the map.
+        pressure: (n,) Pa.
+        sides: side -> (n,) which points are under it.
+        settings: when contact is at the edge.
+    """
+    for side, own in sides.items():
+        own_pressure = np.where(own, pressure, 0.0)
+        highest = float(own_pressure.max(initial=0.0))
+        if highest <= 0.0:
+            continue
+        # A faint pressure at the rim does not make an edge contact.
+        loaded = np.flatnonzero(own_pressure > settings.share * highest)
+        away = edge.distance(points[loaded])
+        if away.min() > settings.reach:
+            continue
+        peak = float(away[np.argmax(own_pressure[loaded])])
+        where = (
+            "its peak pressure lies there"
+            if peak <= settings.reach
+            else f"its peak pressure lies {peak / MILLIMETRE:.1f} mm from it"
+        )
+        yield (f"the {side} {AT_EDGE} (within {settings.reach / MILLIMETRE:g} mm); {where}")

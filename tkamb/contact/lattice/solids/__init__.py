@@ -1,1 +1,0 @@
-"""Cells with a material: stiffness, nonlinear residual, tangent."""

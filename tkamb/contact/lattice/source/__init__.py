@@ -1,1 +1,0 @@
-"""The lattice of Sharma (2008), kept for comparison."""

@@ -1,0 +1,204 @@
+"""The gait cycle: from foot strikes of a force plate, or recorded over its per cent.
+
+A foot is on the ground while the vertical ground reaction is at least `contact_force_N`. The
+time at which the force crosses this threshold is interpolated linearly between two samples.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array, Mask
+
+
+@dataclass(frozen=True)
+class GaitSettings:
+    """When a foot counts as on the ground."""
+
+    contact_force_N: float = 20.0
+    """N, vertical: Zeni et al., Gait & Posture 27:710 (2008); above a plate's noise, reached within
+    some milliseconds of the strike."""
+    shortest_phase_s: float = 0.1
+    """s: a shorter contact or gap is noise. Chosen: stance and swing of walking last 0.6 and 0.4
+    s."""
+
+
+GAIT = GaitSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Gait:
+    """What a foot's force plates show of gait.
+
+    Args:
+        stances: (n, 2) s, foot strike and toe-off of each stance; NaN where the recording begins or
+            ends within the stance, or has no force there.
+        recorded: s, first and last sample.
+    """
+
+    stances: Array
+    recorded: tuple[float, float]
+
+    @property
+    def foot_strikes(self) -> list[float]:
+        """Return the times (s) of the strikes that were recorded."""
+        return [float(time) for time in self.stances[:, 0] if np.isfinite(time)]
+
+    @property
+    def toe_offs(self) -> list[float]:
+        """Return the times (s) of the toe-offs that were recorded."""
+        return [float(time) for time in self.stances[:, 1] if np.isfinite(time)]
+
+    def spans(self) -> list[tuple[float, float]]:
+        """Return the stances (s), cut at the ends of the recording."""
+        start, end = self.recorded
+        return [
+            (float(np.nan_to_num(on, nan=start)), float(np.nan_to_num(off, nan=end)))
+            for on, off in self.stances
+        ]
+
+    def cycle(self, start: float, end: float) -> tuple[float, float] | None:
+        """Return the cycle (s) between two strikes that holds most of start to end, s.
+
+        None where no two strikes follow each other.
+        """
+        strikes = self.foot_strikes
+        cycles = list(pairwise(strikes))
+        overlaps = [min(b, end) - max(a, start) for a, b in cycles]
+        if not overlaps or max(overlaps) <= 0.0:
+            return None
+        return cycles[int(np.argmax(overlaps))]
+
+
+def find_gait(time: Array, vertical: Array) -> Gait:
+    """Return the stances of a foot.
+
+    Args:
+        time: (k,) s, rising.
+        vertical: (k,) N, upward ground reaction of the foot, unfiltered.
+    """
+    on = vertical >= GAIT.contact_force_N
+    for state in (False, True):  # gaps within a stance first, then contacts that are noise
+        for first, last in uninterrupted_runs(on == state):
+            inside = first > 0 and last < len(on) - 1
+            if inside and time[last] - time[first] < GAIT.shortest_phase_s:
+                on[first : last + 1] = not state
+    stances = [
+        (
+            _crossing(time, vertical, first) if first > 0 else np.nan,
+            _crossing(time, vertical, last + 1) if last < len(on) - 1 else np.nan,
+        )
+        for first, last in uninterrupted_runs(on)
+    ]
+    ends = float(time[0]), float(time[-1])
+    return Gait(np.array(stances, float).reshape(-1, 2), ends)
+
+
+def cycle_percent(time: Array, cycle: tuple[float, float]) -> Array:
+    """Return per cent of a cycle (...,) at times (...,) s; NaN outside it."""
+    start, end = cycle
+    percent = 100.0 * (time - start) / (end - start)
+    return np.where((percent >= 0.0) & (percent <= 100.0), percent, np.nan)
+
+
+def uninterrupted_runs(chosen: Mask) -> list[tuple[int, int]]:
+    """Return first and last index of each uninterrupted run of a mask (k,)."""
+    steps = np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]]))
+    firsts, after = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+    return [(int(a), int(b) - 1) for a, b in zip(firsts, after, strict=True)]
+
+
+def _crossing(time: Array, vertical: Array, after: int) -> float:
+    """Return when the force crosses the threshold between a sample and the one before."""
+    low, high = vertical[after - 1], vertical[after]
+    share = (GAIT.contact_force_N - low) / (high - low) if high != low else 1.0
+    share = float(np.clip(share, 0.0, 1.0))
+    return float(time[after - 1] + share * (time[after] - time[after - 1]))
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """A cycle recorded over its per cent, laid on an interval of time.
+
+    Args:
+        start: s.
+        period: s.
+        offset_percent: per cent of the cycle at `start`.
+        closed: 0 and 100 % were recorded and agree.
+    """
+
+    start: float
+    period: float
+    offset_percent: float
+    closed: bool
+
+    @staticmethod
+    def of(
+        percent: Array,
+        knee: Array,
+        interval: tuple[float, float],
+        offset_percent: float,
+        path: Path,
+    ) -> "Cycle":
+        """Return the scene's cycle.
+
+        It is closed if 100 % was recorded too and no coordinate differs there from 0 % by
+        more than its largest step between neighbouring samples.
+
+        Args:
+            percent: (n,) the recorded per cents.
+            knee: (n, 6) knee coordinates there.
+            interval: s, on which the cycle lies.
+            offset_percent: per cent of the cycle at the interval's start.
+            path: of the file, for messages.
+
+        Raises:
+            InputError: not per cent, not an interval, or an offset into an open cycle.
+        """
+        start, end = interval
+        if not start < end:
+            raise InputError("[motion] cycle_s does not rise", path)
+        if percent[0] < -1e-9 or percent[-1] > 100 + 1e-9 or percent[-1] - percent[0] < 2:
+            raise InputError(
+                f"time runs from {percent[0]:g} to {percent[-1]:g}, which is not per cent",
+                path,
+                "drop cycle_s, or give per cent of the cycle",
+            )
+        whole = percent[-1] - percent[0] > 100 - 1e-9
+        steps = np.abs(np.diff(knee, axis=0)).max(axis=0)
+        closed = bool(whole and np.all(np.abs(knee[-1] - knee[0]) <= steps))
+        if offset_percent and not closed:
+            raise InputError(
+                "is not a closed cycle, so it has no frame before or after its ends",
+                path,
+                "set cycle_offset_percent to 0",
+            )
+        return Cycle(start, end - start, offset_percent, closed)
+
+    def seconds(self, percent: Array) -> Array:
+        """Return the times of per cents, not wrapped into the interval."""
+        return self.start + (percent - self.offset_percent) / 100.0 * self.period
+
+    def percent(self, time: Array) -> Array:
+        """Return per cent of the cycle, rising from the offset."""
+        return self.offset_percent + (time - self.start) / self.period * 100.0
+
+    def frames(self, sampled: Array, count: int | None) -> Array:
+        """Return the times of the frames: evenly `count`, or those recorded."""
+        if not self.closed:
+            return np.linspace(sampled[0], sampled[-1], count) if count else sampled
+        if count:
+            return np.linspace(self.start, self.start + self.period, count)
+        if not self.offset_percent:
+            return sampled
+        turn = np.mod(sampled[:-1] - self.start, self.period)
+        return self.start + np.append(np.unique(np.round(turn, 12)), self.period)
+
+    def wrapped(self, at: Array, sampled: Array) -> Array:
+        """Return times inside the recorded cycle, whole periods away from `at`."""
+        if not self.closed or not self.offset_percent:
+            return np.clip(at, sampled[0], sampled[-1])
+        return np.clip(sampled[0] + np.mod(at - sampled[0], self.period), sampled[0], sampled[-1])

@@ -1,0 +1,246 @@
+"""Measurements beside the motion: forces of an instrumented implant, envelopes of surface EMG.
+
+An envelope is the signal high-passed, rectified, low-passed and divided by a normalising value.
+Both filters are Butterworth filters of second order that run forwards and backwards. They shift no
+phase and halve the amplitude at the cut-off. With the sampling interval h the low-pass multiplies
+each frequency f by
+
+    1 / (1 + r⁴),  r = tan(pi f h) / tan(pi f_c h),
+
+and the high-pass by r⁴ / (1 + r⁴). The signal is mirrored at its ends, so that the envelope there
+is a mean as elsewhere. Values of the envelope below zero are set to zero.
+
+Reference: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., 2009, ch. 10.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.io.recordings.recordings import EmgRecording, ForceMeasurement
+from tkamb.io.recordings.samples import check_overlap
+from tkamb.io.recordings.tables import Table, read_table
+
+FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
+"""Newton per unit of force; lbf: 0.45359237 kg x 9.80665 m/s²."""
+
+
+@dataclass(frozen=True)
+class ForceSampleSettings:
+    """Interpolation between the samples of a measured force."""
+
+    max_gap: float = 2.5
+    """Multiple of the median step: a wider gap is not interpolated. Chosen: one lost sample is."""
+
+
+FORCE_SAMPLES = ForceSampleSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredForce:
+    """Axial forces on the insert, compression positive.
+
+    Args:
+        path: the file.
+        time: (n,) s, on the clock of the motion.
+        force: total, medial, lateral, as far as known -> (n,) N; gaps are NaN.
+    """
+
+    path: Path
+    time: Array
+    force: dict[str, Array]
+
+    def at(self, time: Array) -> dict[str, Array]:
+        """Return the forces (f,) N at some times, linear between neighbouring samples.
+
+        NaN outside the measurement, beside a gap, and between samples that are too far apart.
+
+        Args:
+            time: (f,) s.
+        """
+        step = np.diff(self.time)
+        right = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
+        inside = (time >= self.time[0]) & (time <= self.time[-1])
+        inside &= step[right - 1] <= FORCE_SAMPLES.max_gap * np.median(step)
+        return {
+            name: np.where(inside, np.interp(time, self.time, values), np.nan)
+            for name, values in self.force.items()
+        }
+
+
+def load_measured_force(source: ForceMeasurement, time: Array) -> MeasuredForce:
+    """Read what was measured.
+
+    Args:
+        source: file, columns, unit, clock.
+        time: (f,) s, of the motion; the two must overlap.
+
+    Raises:
+        InputError: no such file or column, or nothing measured during the motion.
+    """
+    table = read_table(source.file, source.format)
+    name = source.columns.get("time", "time")
+    assert isinstance(name, str)
+    clock = table.time(name) + source.offset
+    if len(clock) < 2:
+        raise InputError("holds fewer than two samples", source.file)
+    force = {
+        role: _sum(table, column) * FORCE[source.unit]
+        for role, column in source.columns.items()
+        if role != "time"
+    }
+    check_overlap(source.file, clock, time, "[measured]")
+    return MeasuredForce(source.file, clock, _with_third(force))
+
+
+def _sum(table: Table, column: str | dict[str, float]) -> Array:
+    factors = {column: 1.0} if isinstance(column, str) else column
+    return np.sum([factor * table.column(name) for name, factor in factors.items()], axis=0)
+
+
+def _with_third(force: dict[str, Array]) -> dict[str, Array]:
+    """Return total, medial and lateral where two of them are known: total = medial + lateral."""
+    if set(force) == {"medial", "lateral"}:
+        return {"total": force["medial"] + force["lateral"], **force}
+    for side, other in (("medial", "lateral"), ("lateral", "medial")):
+        if set(force) == {"total", side}:
+            return {**force, other: force["total"] - force[side]}
+    return force
+
+
+@dataclass(frozen=True)
+class EmgSettings:
+    """How a recorded EMG becomes an envelope."""
+
+    filter_order: int = 2
+    """Order of either Butterworth filter in each direction. Chosen: forward and backward make the
+    usual fourth order."""
+    flat_share: float = 1e-9
+    """Share of the largest value. Chosen: a signal that departs less from its mean holds round-off
+    only."""
+    step_tolerance: float = 0.01
+    """Share of the median time step by which steps between samples may differ from it. Chosen: the
+    jitter of a clock is smaller."""
+
+
+EMG = EmgSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Envelopes:
+    """Normalised envelopes on the motion's clock.
+
+    Args:
+        path: the file.
+        time: (n,) s.
+        values: channel -> (n,), 1 at the normalising value.
+        channel_of: muscle -> channel.
+        normalised_by: channel -> the normalising value, in the file's unit.
+    """
+
+    path: Path
+    time: Array
+    values: dict[str, Array]
+    channel_of: dict[str, str]
+    normalised_by: dict[str, float]
+
+    def at(self, muscle: str, time: Array) -> Array:
+        """Return a muscle's envelope (f,) at times (f,) s; NaN outside the recording."""
+        values = self.values[self.channel_of[muscle]]
+        return np.interp(time, self.time, values, left=np.nan, right=np.nan)
+
+
+def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
+    """Read EMG and return its envelopes.
+
+    Args:
+        source: file, channels, filters.
+        motion: (f,) s, times of the motion; the two must overlap.
+
+    Raises:
+        InputError: no such file or channel, nothing measured during the motion, a gap, uneven
+            samples, a cut-off that they do not carry, too short a recording, a channel without
+            signal.
+    """
+    time, signals = _signals(source)
+    step = np.diff(time)
+    if len(step) < 2 or np.abs(step - np.median(step)).max() > EMG.step_tolerance * np.median(step):
+        raise InputError("has EMG that is not sampled evenly", source.file, "resample it")
+    check_overlap(source.file, time + source.offset, motion, "[muscles.emg]")
+    rate = len(step) / (time[-1] - time[0])
+    values, normalised_by = {}, {}
+    for channel, signal in signals.items():
+        try:
+            result = envelope(signal, rate, source.cutoff, source.high_pass)
+        except InputError as error:
+            raise InputError(
+                error.what, f"{source.file}: channel '{channel}'", error.hint
+            ) from None
+        by = result.max() if source.normalised_by == "recording" else source.normalised_by[channel]
+        normalised_by[channel] = float(by)
+        if not result.max() > EMG.flat_share * np.abs(signal).max():
+            raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
+        values[channel] = result / normalised_by[channel]
+    muscles = {muscle: channel for channel, own in source.channels.items() for muscle in own}
+    return Envelopes(source.file, time + source.offset, values, muscles, normalised_by)
+
+
+def envelope(
+    signal: Array, rate_Hz: float, cutoff_Hz: float, high_pass_Hz: float | Literal["none"]
+) -> Array:
+    """Return the envelope (n,) of an EMG signal, in its unit.
+
+    The envelope of A sin(2π f t) is its mean 2A/π, for f between the two cut-offs and far from
+    both.
+
+    Args:
+        signal: (n,) evenly sampled.
+        rate_Hz: of the samples.
+        cutoff_Hz: of the low-pass after rectifying.
+        high_pass_Hz: of the high-pass before; "none" only subtracts the mean.
+
+    Raises:
+        InputError: a gap, a cut-off at or above half the rate, or a signal shorter than a
+            period of a cut-off.
+    """
+    if not np.isfinite(signal).all():
+        raise InputError("has a gap or a value that is not finite", "EMG", "fill or cut the gap")
+    for cutoff in (cutoff_Hz, high_pass_Hz):
+        if cutoff == "none":
+            continue
+        if not 0 < cutoff < 0.5 * rate_Hz:
+            raise InputError(f"cut-off {cutoff:g} Hz is not below half of {rate_Hz:g} Hz", "EMG")
+        if len(signal) * cutoff < rate_Hz:
+            raise InputError(f"is shorter than a period of the cut-off {cutoff:g} Hz", "EMG")
+    centred = signal - signal.mean()
+    if high_pass_Hz != "none":
+        centred -= _low_passed(centred, high_pass_Hz / rate_Hz)
+    return np.maximum(_low_passed(np.abs(centred), cutoff_Hz / rate_Hz), 0.0)
+
+
+def _low_passed(signal: Array, cutoff: float) -> Array:
+    """Return a signal (n,) low-passed at a cut-off, periods per sample.
+
+    By its spectrum: scipy.signal, which filters sample by sample, takes 0.3 s to import.
+    """
+    mirrored = np.concatenate([signal, signal[-2:0:-1]])
+    ratio = np.tan(np.pi * np.fft.rfftfreq(len(mirrored))) / np.tan(np.pi * cutoff)
+    spectrum = np.fft.rfft(mirrored) / (1.0 + ratio ** (2 * EMG.filter_order))
+    return np.fft.irfft(spectrum, len(mirrored))[: len(signal)]
+
+
+def _signals(source: EmgRecording) -> tuple[Array, dict[str, Array]]:
+    """Return times (n,) s on the file's clock and channel -> (n,)."""
+    if source.file.suffix.lower() != ".c3d":
+        table = read_table(source.file)
+        time = table.time(source.time)
+        return time, {name: table.complete_column(name) for name in source.channels}
+    from tkamb.io.recordings.c3d import read_c3d
+
+    recording = read_c3d(source.file)
+    signals = {name: recording.channel(name) for name in source.channels}
+    return recording.analog_time, signals

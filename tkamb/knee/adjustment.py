@@ -1,0 +1,271 @@
+"""The femoral adjustment and the medial-lateral split: pressing, checking, effect and sensitivity.
+
+The recorded femur is adjusted to touch with both condyles, because the split depends on a rotation
+smaller than the error of fluoroscopy. After the press the adjustment is compared with the
+deformation. Sharma (2008), section 4.3, figure 4-8: "If the final femoral penetration and coronal
+angle is more than the adjustments made, the original orientation of the femur is restored and the
+analysis is reconducted." The rule has two readings, `AdjustmentSettings.restore_when`:
+
+- "both" (the wording, and the default): restored if the penetration exceeds the translation
+  and the coronal angle of the penetrations exceeds the turn.
+- "either": restored if one of them does. Penetration then decides almost alone: a femur recorded
+  at the right height is hardly moved, so that nearly every load restores it, and the split jumps
+  where the recorded height changes by a tenth of a millimetre.
+
+Where a change of the recorded pose by `AdjustmentSettings.input_change` may change that decision,
+the result has a flag.
+
+The adjustment should leave the total force unchanged (Sharma 2008, 5.2.2: less than 0.001 BW).
+`adjustment_effect` solves the same equations with the recorded contact points; a run flags a frame
+whose total changes.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tkamb.contact.model import ContactModel
+from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart
+from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, touches
+from tkamb.geometry.closest import ClosestPointQuery
+from tkamb.geometry.frames import KNEE_COORDINATES, knee_axes, knee_coordinates, knee_pose
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.equations import SolvedLoads
+from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.contact.model import Probe
+
+
+@dataclass(frozen=True)
+class SplitSensitivitySettings:
+    """How the medial share of the force changes with adduction."""
+
+    adduction_step: float = 0.02 * DEGREE
+    """rad: step of the finite difference. Chosen: small against the 0.2 to 0.5 deg that unload a
+    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to 0.1 deg
+    agree within 5 to 15 %."""
+
+
+SPLIT_SENSITIVITY = SplitSensitivitySettings()
+
+
+ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "si"))
+
+
+def split_sensitivity(
+    probe: "Probe",
+    result: ContactResult,
+    start: WarmStart | None = None,
+) -> float:
+    """Return the change of the medial force with the adduction at a constant load, N/rad.
+
+    Zero where one condyle carries everything: the value then holds until the other condyle touches.
+    NaN where the press with more adduction fails.
+
+    Args:
+        probe: of the contact model.
+        result: a contact; its load is the force along -y.
+        start: that came with it.
+    """
+    load = -float(result.wrench_on_insert[1])
+    place = knee_coordinates(result.pose)
+    place[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
+    begin = WarmStart.after(result) if start is None else start
+    rotated, _ = probe.pressed(load, knee_pose(place), begin)
+    if rotated.status is not ContactStatus.OK:
+        return float("nan")
+    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step
+
+
+def split_tangent(probe: "Probe", result: ContactResult) -> float:
+    """Return what `split_sensitivity` does, from the tangent of a model that knows it.
+
+    With the tangents t of the wrenches F on the insert, at a constant superior-inferior load
+    the femur follows an adduction da by dy = -(sum t_y,a / sum t_y,y) da, and the medial force
+    changes by n . (t_a da + t_y dy).
+
+    Args:
+        probe: of the contact model, exact.
+        result: a contact.
+    """
+    place = knee_coordinates(result.pose)
+    condyles = probe.seen(result).condyles
+    if len(condyles) < 2:
+        return 0.0
+    twists = knee_axes(place)[[ADDUCTION, SUPERIOR]].T
+    changes = {
+        side: condyle.stiffness[:3] @ twists
+        for side, condyle in condyles.items()
+        if condyle.stiffness is not None
+    }
+    total = sum(change[1] for change in changes.values())
+    follow = np.array([1.0, -total[0] / total[1]])
+    return float(-condyles["medial"].normal @ changes["medial"] @ follow)
+
+
+def _medial(result: ContactResult) -> float:
+    return result.medial.force if result.medial else 0.0
+
+
+@dataclass(frozen=True)
+class AdjustmentEffectSettings:
+    """What an adjustment of the pose changes."""
+
+    jump_distance: float = 5.0 * MILLIMETRE
+    """m: a contact point that moves farther than this has jumped to or from the eminence or lip.
+    Chosen: on one dish a contact point moves by less from frame to frame."""
+
+
+ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
+
+
+@dataclass(frozen=True)
+class AdjustmentEffect:
+    """The adjusted frame against the recorded one.
+
+    Args:
+        force: N, change of the total contact force; NaN where one of the frames has no solution.
+        share: change of medial / (medial + lateral) by coronal equilibrium.
+        cause: in words, the largest change of the contact.
+    """
+
+    force: float
+    share: float
+    cause: str
+
+
+def adjustment_effect(
+    adjusted: SolvedLoads,
+    recorded: SolvedLoads,
+    points_adjusted: Mapping[str, CondylePoint],
+    points_recorded: Mapping[str, CondylePoint],
+) -> AdjustmentEffect:
+    """Return what changes from the recorded to the adjusted contact points.
+
+    Args:
+        adjusted: loads with the contact points of the adjusted pose.
+        recorded: loads with those of the recorded pose; all else is the same.
+        points_adjusted: side -> contact point.
+        points_recorded: side -> contact point.
+    """
+    total, before = (float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded))
+    share = _share(adjusted, points_adjusted) - _share(recorded, points_recorded)
+    with_adjustment, without = (
+        _name_carriers(loads, points)
+        for loads, points in ((adjusted, points_adjusted), (recorded, points_recorded))
+    )
+    if with_adjustment != without:
+        cause = f"with it {with_adjustment}, without it {without}"
+    else:
+        cause = _largest_move(points_adjusted, points_recorded)
+    return AdjustmentEffect(total - before, share, cause)
+
+
+def _share(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> float:
+    normal = {side: loads.values.get(f"{side}_normal", 0.0) for side in points}
+    total = sum(normal.values())
+    return normal["medial"] / total if total > 0 else float("nan")
+
+
+def _name_carriers(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> str:
+    sides = [side for side in points if side not in loads.lifted]
+    return "both condyles carry" if len(sides) > 1 else f"the {sides[0]} condyle alone carries"
+
+
+def _largest_move(now: Mapping[str, CondylePoint], before: Mapping[str, CondylePoint]) -> str:
+    """Return which contact point moved most."""
+    distances = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
+    side = max(distances, key=lambda name: distances[name])
+    word = "jumps" if distances[side] > ADJUSTMENT_EFFECT.jump_distance else "moves"
+    return f"the {side} contact point {word} by {distances[side] / MILLIMETRE:.1f} mm"
+
+
+def press_adjusted(
+    model: ContactModel,
+    state: Any,
+    load: float,
+    adjustment: Adjustment,
+    query: ClosestPointQuery,
+    start: Guess | None = None,
+) -> tuple[ContactResult, Adjustment, WarmStart]:
+    """Press the adjusted femur in, check the adjustment, and undo its rotation if required.
+
+    Args:
+        model: any contact model.
+        state: what its `prepare` returned.
+        load: N, superior-inferior.
+        adjustment: of the recorded pose, by `tkamb.geometry.adjustment.adjust`.
+        query: closest points of the same pair.
+        start: an earlier result or warm start, to save time.
+
+    Returns:
+        The contact, whose flags hold those of the adjustment, the adjustment as it was checked,
+        and the start of the next press.
+
+    Raises:
+        ComputationError: the femoral component does not lie over the insert.
+    """
+    result, start = model.press_from(state, load, adjustment.pose, start)
+    final = adjustment.coronal_angle == 0.0 or adjustment.restored
+    if result.status is not ContactStatus.OK or final:
+        adjustment = replace(adjustment, penetration=float(result.approach))
+        return _flagged(result, adjustment), adjustment, start
+    checked, restore, doubts = _check(query, adjustment, result)
+    if restore:
+        # At the recorded rotation the limit of the turn has no effect.
+        pose, translation, flags = moved_to_touch(query, checked.recorded, checked.settings)
+        checked = replace(checked, pose=pose, translation=translation, restored=True, flags=flags)
+        result, start = model.press_from(state, load, pose, start)
+    checked = replace(checked, flags=(*checked.flags, *doubts))
+    return _flagged(result, checked), checked, start
+
+
+def _flagged(result: ContactResult, adjustment: Adjustment) -> ContactResult:
+    """Return the contact with the adjustment's flags after its own."""
+    if not adjustment.flags:
+        return result
+    return replace(result, flags=(*result.flags, *adjustment.flags))
+
+
+def _check(
+    query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult
+) -> tuple[Adjustment, bool, tuple[str, ...]]:
+    """Return the checked adjustment, whether to undo it, and a flag where that is in doubt."""
+    settings, distance = adjustment.settings, adjustment.intercondylar_distance
+    medial, lateral = touches(query, result.pose)
+    penetration, angle = -min(medial, lateral), (medial - lateral) / distance
+    deeper = penetration - abs(adjustment.translation)
+    angle_excess = (abs(angle) - abs(adjustment.coronal_angle)) * distance
+    margin = settings.input_change
+    # Where the final angle is about as large as the turn and both are below what a mesh resolves,
+    # restoring the rotation changes nothing.
+    tilted = abs(angle) * distance > settings.level_difference
+    outcomes = {
+        _restored(settings.restore_when, *exceeded)
+        for exceeded in product(
+            _either_side(deeper, margin), _either_side(angle_excess, margin * tilted)
+        )
+    }
+    doubts: tuple[str, ...] = ()
+    if len(outcomes) > 1:
+        doubts = (
+            f"femoral adjustment: a change of the recorded pose by {margin / MILLIMETRE:g} mm "
+            f"decides "
+            "whether the recorded rotation is restored; the medial-lateral split depends on it",
+        )
+    restore = _restored(settings.restore_when, deeper > 0, angle_excess > 0)
+    checked = replace(adjustment, penetration=penetration, final_angle=angle)
+    return checked, restore, doubts
+
+
+def _either_side(excess: float, margin: float) -> set[bool]:
+    """Return what `excess > 0` may be where the excess is known to within a margin, both m."""
+    return {excess - margin > 0, excess > 0, excess + margin > 0}
+
+
+def _restored(rule: RestoreRule, deeper: bool, rotated: bool) -> bool:
+    return (deeper and rotated) if rule == "both" else (deeper or rotated)

@@ -1,1 +1,0 @@
-"""Released knee coordinates: the pose at which contact, ligaments and muscles balance."""

@@ -1,0 +1,136 @@
+"""The contact of one frame as a run records it: both condyles, and cam and post."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tkamb.contact.area import area_above
+from tkamb.contact.result import ContactResult, WarmStart
+from tkamb.geometry.adjustment import Adjustment
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.contact.cam_post import CamPost, PostContact
+    from tkamb.contact.materials import Material
+    from tkamb.contact.model import ContactModel
+    from tkamb.contact.pair import ContactPair
+    from tkamb.geometry.frames import Array
+    from tkamb.geometry.surface import Surface
+    from tkamb.knee.released import KneeEquilibrium
+
+
+@dataclass(frozen=True)
+class PostSideSettings:
+    """On which side of the post the cam is."""
+
+    pose_error: float = 0.5 * MILLIMETRE
+    """m: error of a position from fluoroscopy; a deeper overlap of cam and post becomes a question
+    to the user. Chosen: above its usual error."""
+
+
+POST_SIDE = PostSideSettings()
+
+
+def cam_on_post(
+    model: "ContactModel",
+    pair: "ContactPair",
+    post: "Surface",
+    material: "Material",
+    ready: "CamPost | None" = None,
+) -> "CamPost":
+    """Return cam and post, prepared.
+
+    Args:
+        model: the contact model.
+        pair: femoral component and insert.
+        post: of the insert, insert frame.
+        material: of the insert.
+        ready: the same prepared already, perhaps of another material.
+
+    Raises:
+        InputError: see `CamPost`.
+    """
+    if ready is not None:
+        return ready if ready.material == material else ready.of_material(material)
+    from tkamb.contact.cam_post import CamPost
+
+    return CamPost(model, pair.femoral, post, pair.split, material)
+
+
+def post_contact(
+    cam_post: "CamPost | None", pose: "Array", released: Sequence[str]
+) -> "PostContact | None":
+    """Return cam and post at a pose (4, 4), with a question if a recorded AP makes them overlap.
+
+    None where they are not modelled.
+    """
+    if cam_post is None:
+        return None
+    post = cam_post.at(pose)
+    if "ap" in released or post.problem or not post.gap < -POST_SIDE.pose_error:
+        return post
+    question = (
+        f"cam and post overlap by {-post.gap / MILLIMETRE:.1f} mm as recorded, which makes "
+        f"{np.linalg.norm(post.force):.0f} N: release ap"
+    )
+    return replace(post, flags=(*post.flags, question))
+
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameContact:
+    """The contact side of one frame.
+
+    Args:
+        result: the contact, None where it could not be computed.
+        medial: (n,) which map points lie under the medial condyle.
+        adjustment: the femoral adjustment, checked and perhaps restored; None if not asked for.
+        seconds: computing time.
+        problem: why there is no result, or empty.
+        flags: plain words that a reader must know.
+        iterations: iterations between body and contact until convergence; 0 if not coupled.
+        load_change: N, change of the load in the last iteration.
+        point_change: m, change of the centres of pressure in the last iteration.
+        equilibrium: the search for the released coordinates, if there are any.
+        sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
+            adduction is released, or there is one condyle.
+        start: where a contact of the next frame may begin; None where there is no result.
+        triangles: (k, 3) of the map.
+        post: cam and post, where the scene asks for their contact.
+    """
+
+    result: ContactResult | None
+    medial: NDArray[np.bool_]
+    adjustment: Adjustment | None
+    seconds: float
+    problem: str
+    flags: tuple[str, ...]
+    iterations: int = 0
+    load_change: float = NAN
+    point_change: float = NAN
+    equilibrium: "KneeEquilibrium | None" = None
+    sensitivity: float = NAN
+    start: WarmStart | None = None
+    triangles: NDArray[np.int64] | None = None
+    post: "PostContact | None" = None
+
+    def area_above(self, side: str, pressure: float) -> float:
+        """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
+
+        The pressure is taken as linear between the map's points, see
+        `tkamb.contact.area.area_above`.
+        """
+        if self.result is None or self.triangles is None:
+            return NAN
+        condyle = self.result.medial if side == "medial" else self.result.lateral
+        if condyle is None:
+            return NAN
+        own = self.medial if side == "medial" else ~self.medial
+        own_pressure = np.where(own, self.result.pressure, 0.0)
+        above = area_above(self.result.points, self.triangles, own_pressure, pressure)
+        return min(above / condyle.area, 1.0)

@@ -1,0 +1,114 @@
+"""Relaxation of the muscle forces that a search for equilibrium holds constant.
+
+The muscle sharing depends on the knee's equilibrium, and the equilibrium on the sharing. Under a
+light load the knee is compliant, and computing both in turn would oscillate. The forces f are
+therefore changed only by a part omega of the difference to the required ones, f',
+
+    f <- f + omega (f' - f),   omega <- -omega d . (d' - d) / |d' - d|²,
+
+with d and d' the last two differences f' - f: Aitken's secant for a vector. At the end f = f'.
+
+The compliance of the knee to the muscles decides the muscles' arms, and depends itself on the
+equilibrium. In the first passes the measured compliance is used. Later it is changed only by half
+of the difference to the measured one, then by a quarter, so that it converges where the contact's
+stiffness changes fast with the pose. If it still does not converge (a condyle is about to lift and
+the pose jumps), it is kept constant. `doubt` is the difference that remains.
+
+References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
+Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.geometry.frames import Array
+from tkamb.knee.released_forces import RELEASED_FORCE
+
+if TYPE_CHECKING:
+    from tkamb.knee.crossing import MuscleShare
+
+
+@dataclass(frozen=True)
+class MuscleIterationSettings:
+    """The iteration between muscle forces and knee equilibrium."""
+
+    muscle_force_tolerance: float = 1.0
+    """N: largest difference, over the muscles, of the force that is needed from the force that is
+    applied, at which the iteration has converged. Chosen: it is a thousandth of a usual muscle
+    force."""
+
+
+MUSCLE_ITERATION = MuscleIterationSettings()
+
+LEAST, MOST = 0.05, 1.0
+"""The limits of omega."""
+
+
+STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
+"""Up to this number of passes, the compliance is changed by this share of the difference."""
+TURNS = np.array(
+    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
+)
+"""Makes answers to forces and to moments comparable."""
+
+
+class Relaxation:
+    """The muscles' forces over the passes of one search.
+
+    Attributes:
+        settled: whether the required forces agree with the applied ones, so that they are applied.
+        doubt: relative difference of the measured compliance from the one that is used; 0: none.
+    """
+
+    def __init__(self) -> None:
+        self._held: MuscleShare | None = None
+        self._last: Array | None = None
+        self._part, self.settled = MOST, True
+        self._yields: Array | None = None
+        self._passes, self.doubt = 0, 0.0
+
+    def yielding(self, measured: Array | None) -> Array | None:
+        """Return the compliance of the knee that is used in the next pass.
+
+        Args:
+            measured: compliance at the last equilibrium, see `ReleasedForces.tension_per_wrench`.
+        """
+        self._passes, self.doubt = self._passes + 1, 0.0
+        last, self._yields = self._yields, measured
+        step = next((part for until, part in STEPS if self._passes <= until), 0.0)
+        if last is None or measured is None or step == 1.0:
+            return measured
+        relaxed = last + step * (measured - last)
+        away, size = (float(np.linalg.norm(part * TURNS)) for part in (measured - relaxed, relaxed))
+        if away > 0.0:
+            self.doubt = away / size if size > 0.0 else np.inf
+        self._yields = relaxed
+        return relaxed
+
+    def mixed(self, required: "MuscleShare") -> "MuscleShare":
+        """Return the forces of the next pass.
+
+        Args:
+            required: the sharing at the equilibrium under the forces of the last pass.
+        """
+        applied, self._held, self.settled = self._held, required, False
+        if applied is None:
+            return required
+        away = required.force - applied.force
+        if self._last is not None:
+            change = away - self._last
+            part = -self._part * float(self._last @ change) / max(float(change @ change), 1e-12)
+            self._part = float(np.clip(part, LEAST, MOST))
+        self._last = away
+        self.settled = bool(np.abs(away).max() < MUSCLE_ITERATION.muscle_force_tolerance)
+        if not self.settled:
+            self._held = replace(
+                required,
+                activation=applied.activation
+                + self._part * (required.activation - applied.activation),
+                force=applied.force + self._part * away,
+                reserve=applied.reserve + self._part * (required.reserve - applied.reserve),
+            )
+        return self._held

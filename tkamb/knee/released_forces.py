@@ -1,0 +1,449 @@
+"""Generalised forces on the released knee coordinates, of a leg or of a simulator.
+
+Across the knee, femur and shank exchange one wrench. It balances ground reaction, weight and
+inertia of the shank. It does not depend on the knee coordinates, because the shank moves as
+recorded. Contact, ligaments, muscles and the patellar ligament must add up to it:
+
+    R(q, y) = w_external + w_ligaments(q) + w_muscles(q) + w_contact(q) + B y = 0   (on the insert)
+
+The columns B are the loads that may keep the prescribed coordinates in place: the patellar
+ligament's line (flexion), and the residuals of the equations of motion for the others. The
+extensor muscle and the patellofemoral force are internal to the femur's side. A released
+coordinate i is driven by the generalised force
+
+    r_i = -J_i(q) . R(q, y),   y such that the prescribed coordinates have none,
+
+J of `knee_axes`: zero at equilibrium, and along +q_i where the femur wants to go.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
+from tkamb.knee import unknowns
+from tkamb.knee.balance import Balance, Trial, find_balance
+from tkamb.knee.contact_points import CondylePoint
+from tkamb.knee.crossing import MuscleShare
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.load import wrench_of
+
+if TYPE_CHECKING:
+    from tkamb.contact.model import Probe, ProbedContact
+    from tkamb.knee.ligaments import BundleArrays, Ligament
+
+
+@dataclass(frozen=True, eq=False)
+class PatellarLine:
+    """The patellar ligament where it leaves the patella: a straight line to an anchor.
+
+    Args:
+        end: (3,) m, on the patella, carried by the femur, femur frame.
+        anchor: (3,) m, the next point on the shank, tuberosity or front lip, insert frame.
+    """
+
+    end: Array
+    anchor: Array
+
+    def wrench(self, poses: Array) -> Array:
+        """Return the wrench (..., 6) of a unit tension on the insert at poses (..., 4, 4)."""
+        line = transform(poses, self.end) - self.anchor
+        return wrench_of(self.anchor, line / np.linalg.norm(line, axis=-1, keepdims=True))
+
+
+@dataclass(frozen=True, eq=False)
+class JointEquilibrium:
+    """The equations of equilibrium of the released knee coordinates at one frame.
+
+    Args:
+        external: (6,) w_external on the insert, force and moment about its origin.
+        ligaments: the bundles.
+        line: the patellar ligament, which balances flexion; None: a moment balances it.
+        keeping: (6, m) the other columns of B, of unit magnitude.
+        released: indices of the n released coordinates.
+        share: the muscles across the knee beside the quadriceps, if modelled.
+        tibia: (4, 4) pose of the tibia link in the insert frame.
+    """
+
+    external: Array
+    ligaments: "BundleArrays"
+    line: PatellarLine | None
+    keeping: Array
+    released: tuple[int, ...]
+    share: MuscleShare | None = None
+    tibia: Array = field(default_factory=lambda: np.eye(4))
+
+    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+        """Return r (..., n): generalised forces on the released coordinates.
+
+        Args:
+            coordinates: (..., 6) knee coordinates.
+            contact: (6,) w_contact on the insert.
+        """
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
+        reactions = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
+        remainder = wrench + np.einsum("...ij,...j->...i", columns, reactions)
+        return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], remainder)
+
+    def kept(self, coordinates: Array, contact: Array) -> Array:
+        """Return y (6 - n,): the loads that keep the prescribed coordinates, flexion last."""
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
+        return _magnitudes(axes[..., self._prescribed, :], columns, wrench)
+
+    def contact_gain(self, coordinates: Array) -> Array:
+        """Return d r / d w_contact (n, 6) at coordinates (6,)."""
+        axes, columns = knee_axes(coordinates), self.columns(coordinates)
+        rows = axes[self._prescribed]
+        # Projection that takes the reactions of the prescribed coordinates out of a contact wrench.
+        through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
+        return np.asarray(-axes[list(self.released)] @ through)
+
+    def kept_and_left(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
+        """Return what `kept` does, and the residual wrench R (6,) on the insert."""
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
+        reactions = _magnitudes(axes[self._prescribed], columns, wrench)
+        return reactions, wrench + columns @ reactions
+
+    def whole(self, coordinates: Array, contact: Array) -> Array:
+        """Return generalised forces (m, 6) on all coordinates, with y of the last of m places.
+
+        Args:
+            coordinates: (m, 6) knee coordinates.
+            contact: (6,) w_contact on the insert.
+        """
+        axes, columns, wrench = self._sum_loads(coordinates, contact)
+        reactions = _magnitudes(axes[-1, self._prescribed], columns[-1], wrench[-1])
+        return -np.einsum("mij,mj->mi", axes, wrench + columns @ reactions)
+
+    def columns(self, coordinates: Array) -> Array:
+        """Return B (6, 6 - n) at coordinates (6,)."""
+        return self._columns(knee_pose(coordinates))
+
+    @property
+    def _prescribed(self) -> list[int]:
+        return [i for i in range(6) if i not in self.released]
+
+    def _sum_loads(self, coordinates: Array, contact: Array) -> tuple[Array, Array, Array]:
+        """Return axes (..., 6, 6), columns B (..., 6, 6 - n) and wrench (..., 6)."""
+        poses = knee_pose(coordinates)
+        wrench = self.external + contact + self.ligaments.wrench(poses)
+        if self.share is not None:
+            wrench = wrench + self.share.wrench(self.tibia, poses)
+        return knee_axes(coordinates), self._columns(poses), wrench
+
+    def _columns(self, poses: Array) -> Array:
+        """Return B (..., 6, 6 - n) at poses (..., 4, 4)."""
+        line = None if self.line is None else self.line.wrench(poses)[..., None]
+        if line is not None and not self.keeping.size:
+            return line
+        columns = np.broadcast_to(self.keeping, (*poses.shape[:-2], *self.keeping.shape))
+        return columns if line is None else np.concatenate([columns, line], axis=-1)
+
+
+def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
+    """Return y with rows (columns y + wrench) = 0."""
+    # Prescribed coordinates are held: their reactions make the generalised forces on them vanish.
+    right = np.einsum("...ij,...j->...i", rows, wrench)
+    return np.asarray(-np.linalg.solve(rows @ columns, right[..., None])[..., 0])
+
+
+def joint_equilibrium(
+    geometry: KneeGeometry,
+    ligaments: "Sequence[Ligament]",
+    coordinates: Array,
+    released: tuple[int, ...],
+    middle: Array,
+    slack: bool,
+    external: Array,
+) -> JointEquilibrium:
+    """Return the equations of equilibrium of the knee at one frame.
+
+    Args:
+        geometry: the frame; its condyles and ligament loads are not used.
+        ligaments: the bundles.
+        coordinates: (6,) knee coordinates of the geometry.
+        released: indices of the released coordinates; flexion is never among them.
+        middle: (3,) m, where the residual forces act, insert frame.
+        slack: the extensor mechanism carries nothing.
+        external: (6,) see `external_wrench`.
+    """
+    line = None if slack or geometry.extensor is None else patellar_line(geometry, coordinates)
+    columns = [
+        unit_keeper(name, middle)
+        for i, name in enumerate(KNEE_COORDINATES)
+        if i not in released and not (name == "flexion" and line)
+    ]
+    return JointEquilibrium(
+        external,
+        crossing_bundles(geometry, ligaments, coordinates),
+        line,
+        np.array(columns).reshape(-1, 6).T,
+        released,
+        geometry.share,
+        geometry.state.pose("tibia"),
+    )
+
+
+def unit_keeper(name: str, middle: Array) -> Array:
+    """Return the wrench (6,) on the insert of the residual that keeps one knee coordinate.
+
+    As in the equations of motion: forces along the insert's axes at `middle`, moments about
+    its x (adduction), y (axial rotation) and z (flexion).
+    """
+    axis = unknowns.AXES[
+        {"adduction": "ap", "axial_rotation": "si", "flexion": "ml"}.get(name, name)
+    ]
+    if name in unknowns.AXES:
+        return wrench_of(middle, axis)
+    return np.concatenate([np.zeros(3), axis])
+
+
+def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
+    """Return the patellar ligament's first straight stretch at coordinates (6,)."""
+    extensor, chain = geometry.extensor, geometry.state.chain
+    assert extensor is not None
+    shank = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
+    free = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
+    end, along = free[0].points[0], free[0].forces[0]
+    # The ligament may wrap the insert, so that its anchor is the first point on the shank along it.
+    away = min(float((load.points[0] - end) @ along) for load in shank)
+    return PatellarLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
+
+
+def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
+    """Return the wrench (6,) on the insert that ground, weight and inertia exert on the shank.
+
+    The same wherever the knee is in that frame.
+    """
+    state = geometry.state
+    hip = unknowns.hip(state.point("hip", np.zeros(3)))
+    ground = [geometry.ground] if geometry.ground else []
+    columns = state.generalised([*(unknown.loads for unknown in hip), ground])
+    # As in `KneeSystem`: what hip and knee supply together, less the ground reaction.
+    without = state.inertial - columns[:, -1]
+    # The first six equations hold no internal loads of the knee, so that they give the hip's alone.
+    at_hip = np.linalg.solve(columns[:6, :6], without[:6])
+    knee = (without - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
+    # Generalised forces are axes times wrench; solved for the wrench on the tibia.
+    return np.asarray(np.linalg.solve(knee_axes(coordinates), knee))
+
+
+def crossing_bundles(
+    geometry: KneeGeometry, ligaments: "Sequence[Ligament]", coordinates: Array
+) -> "BundleArrays":
+    """Return the bundles that cross the knee, their ends in the femur and insert frames.
+
+    An end on the patella is taken as fixed to the femur.
+    """
+    from tkamb.knee.ligaments import BundleArrays
+
+    state, chain = geometry.state, geometry.state.chain
+    to_femur = inverse(knee_pose(coordinates))
+    crossing, femur, shank = [], [], []
+    for bundle in ligaments:
+        ends = {
+            chain.on_shank(end.link): transform(state.pose(end.link), end.position)
+            for end in (bundle.proximal, bundle.distal)
+        }
+        if len(ends) == 2:
+            crossing.append(bundle)
+            femur.append(transform(to_femur, ends[False]))
+            shank.append(ends[True])
+    return BundleArrays.of(crossing, np.array(femur), np.array(shank))
+
+
+@dataclass(frozen=True)
+class ReleasedForceSettings:
+    """The forces on released coordinates."""
+
+    lever_arm: float = 0.025
+    """m: arm that makes rotations comparable to translations. Chosen: half the usual distance of
+    the condyles."""
+    difference_step: float = 1e-7
+    """m: step of the finite differences of joint axes and ligaments. Chosen: far above rounding,
+    far below a curvature's radius."""
+
+
+RELEASED_FORCE = ReleasedForceSettings()
+
+SCALE = np.array(
+    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
+)
+
+Sliding = Callable[[Array, Array], Array]
+
+
+def _no_sliding(place: Array, point: Array) -> Array:
+    return np.zeros(3)
+
+
+class Joint(Protocol):
+    """Loads on the free coordinates beside the contact, of a leg or of a simulator."""
+
+    @property
+    def released(self) -> tuple[int, ...]:
+        """Indices of the n free coordinates."""
+
+    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+        """Return the generalised forces (..., n) at coordinates (..., 6) and a contact (6,)."""
+
+    def contact_gain(self, coordinates: Array) -> Array:
+        """Return their derivative by the contact's wrench on the insert, (n, 6)."""
+
+
+J = TypeVar("J", bound=Joint)
+
+
+class FreeForces(Generic[J]):
+    """Generalised forces on the free coordinates of a joint at trial places.
+
+    Args:
+        joint: loads beside the contact.
+        probe: of the contact model.
+        place: (6,) knee coordinates; those not free stay.
+        friction: Coulomb coefficient.
+        sliding: from coordinates (6,) and point (3,) to the femur's velocity there (3,), m/s.
+        touch: the contact at that place, where it is known already.
+
+    Attributes:
+        seen: scaled coordinates as bytes -> contact there.
+    """
+
+    def __init__(
+        self,
+        joint: J,
+        probe: "Probe",
+        place: Array,
+        friction: float = 0.0,
+        sliding: Sliding = _no_sliding,
+        touch: "ProbedContact | None" = None,
+    ) -> None:
+        self._joint, self._probe, self._place = joint, probe, np.array(place, float)
+        self._friction, self._sliding = friction, sliding
+        self._rows = list(joint.released)
+        self._scale = SCALE[self._rows]
+        self._start = self._place[self._rows] * self._scale
+        self.seen: dict[bytes, ProbedContact] = {}
+        if touch is not None:
+            self.seen[self._start.tobytes()] = touch
+
+    def balance(
+        self, stiffness: Array | None = None, residual_share: float = 0.0, reach: float = np.inf
+    ) -> Balance:
+        """Return the equilibrium of the free coordinates, with the given place as initial guess.
+
+        Args:
+            stiffness: (n, n) N/m of a search near by.
+            residual_share: see `find_balance`.
+            reach: m, see `find_balance`.
+        """
+        return find_balance(self.trial, self._start, stiffness, residual_share, reach)
+
+    def contact(self, balance: Balance) -> "ProbedContact":
+        """Return the contact of a balance."""
+        return self.seen[balance.coordinates.tobytes()]
+
+    def trial(self, x: Array) -> Trial:
+        """Return scaled forces and stiffness at scaled coordinates (n,), m."""
+        place, key = self._with(x), x.tobytes()
+        contact = self.seen.get(key)
+        if contact is None:
+            contact = self.seen[key] = self._probe.at(knee_pose(place))
+        if not contact.known:
+            return Trial(np.full(len(x), np.nan))
+        wrench, stiffness = self._with_friction(place, contact)
+        force_noise = contact.accuracy * float(np.linalg.norm(wrench[:3]))
+        if stiffness is None:
+            force = self._joint.imbalance(place, wrench) / self._scale
+            return Trial(force, force_noise=force_noise)
+        steps = np.zeros((len(x) + 1, 6))
+        steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
+        forces = self._joint.imbalance(place + steps, wrench) / self._scale
+        change = (forces[:-1] - forces[-1]).T / RELEASED_FORCE.difference_step
+        twists = knee_axes(place)[self._rows] / self._scale[:, None]
+        gain = self._joint.contact_gain(place) / self._scale[:, None]
+        tangent = -(change + gain @ stiffness @ twists.T)
+        return Trial(forces[-1], tangent, contact.exact, force_noise)
+
+    def left(self) -> float:
+        """Return the largest scaled force, N, at the place where the search would begin."""
+        return float(np.abs(self.trial(self._start).force).max())
+
+    def at(self, balance: Balance) -> Array:
+        """Return the knee coordinates (6,) of a balance."""
+        return self._with(balance.coordinates)
+
+    def _with(self, x: Array) -> Array:
+        place = self._place.copy()
+        place[self._rows] = x / self._scale
+        return place
+
+    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+        """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
+        wrench, stiffness = np.zeros(6), np.zeros((6, 6))
+        for condyle in contact.loads:
+            sliding = self._sliding(place, condyle.point)
+            touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
+            drag = touch.normal - touch.direction(self._friction)
+            rubbing = wrench_of(touch.point, drag)
+            wrench += condyle.wrench + condyle.force * rubbing
+            if condyle.stiffness is not None:
+                pressed = -touch.normal @ condyle.stiffness[:3]
+                stiffness += condyle.stiffness + np.outer(rubbing, pressed)
+        return wrench, stiffness if contact.tangent else None
+
+
+class ReleasedForces(FreeForces[JointEquilibrium]):
+    """Generalised forces on the released coordinates of a leg, its patella fixed to the femur."""
+
+    def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
+        """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.
+
+        The released coordinates move by dq to the new equilibrium. With K = -df/dq of the
+        generalised forces f = -J w of contact, ligaments and muscles,
+
+            -J dw - K dq - J B dy = 0
+
+        gives dq and the change dy of the loads that keep the other coordinates; the tension of the
+        patellar ligament is one of them. None where the contact model does not know its tangent.
+
+        Args:
+            contact: at the place where the search begins, in equilibrium.
+        """
+        place = self._place
+        wrench, stiffness = self._with_friction(place, contact)
+        if stiffness is None:
+            return None
+        steps = np.zeros((len(self._rows) + 1, 6))
+        steps[np.arange(len(self._rows)), self._rows] = RELEASED_FORCE.difference_step / self._scale
+        forces = self._joint.whole(place + steps, wrench)
+        axes = knee_axes(place)
+        twists = axes[self._rows] / self._scale[:, None]
+        change = (
+            forces[:-1] - forces[-1]
+        ).T / RELEASED_FORCE.difference_step - axes @ stiffness @ twists.T
+        matrix = np.hstack([-change, axes @ self._joint.columns(place)])
+        return np.asarray(-np.linalg.solve(matrix, axes)[-1])
+
+    def tension_at_rest(self, contact: "ProbedContact", per_wrench: Array) -> float:
+        """Return the tension (N) of the patellar ligament at the equilibrium near by.
+
+        A residual wrench at the place counts as a further wrench to which the knee yields.
+
+        Args:
+            contact: at the place where the search begins.
+            per_wrench: (6,), see `tension_per_wrench`.
+        """
+        wrench, _ = self._with_friction(self._place, contact)
+        reactions, remainder = self._joint.kept_and_left(self._place, wrench)
+        return float(reactions[-1] + per_wrench @ remainder)
+
+    def pushes(self, balance: Balance) -> bool:
+        """Return whether the patellar ligament, where it is taut, would have to push."""
+        if self._joint.line is None:
+            return False
+        place = self.at(balance)
+        wrench, _ = self._with_friction(place, self.contact(balance))
+        return bool(self._joint.kept(place, wrench)[-1] < 0)

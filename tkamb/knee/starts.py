@@ -1,0 +1,187 @@
+"""Initial guesses of the released coordinates, and the equilibrium that is found from them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.contact.pair import ContactPair
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
+from tkamb.knee.balance import BalanceStatus
+from tkamb.knee.instant import Instant
+from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
+from tkamb.knee.released_forces import SCALE
+from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.contact.cam_post import CamPost
+
+ASTRAY = (
+    BalanceStatus.OUT_OF_RANGE,
+    BalanceStatus.NOT_CONVERGED,
+    BalanceStatus.RUNS_AWAY,  # may also happen from a bad initial guess
+)
+"""Failures of a search after which another initial guess is tried."""
+
+
+@dataclass(frozen=True)
+class InitialPoseSettings:
+    """Initial guesses of the released coordinates."""
+
+    max_extrapolation: float = 2e-3
+    """m: an initial guess is extrapolated at most this far from the last frame. Chosen: a guess
+    that is far off costs more than it gains."""
+    first_penetration: float = 5e-5
+    """m: penetration of the initial guess of a first frame. Chosen: a loaded contact of
+    polyethylene is deeper, a loose one is found from it too."""
+    max_continuation: float = 1e-3
+    """m (rotations times the lever arm): a search that ends farther from its initial guess has
+    not merely followed the last frame; other initial guesses then say whether there is a second
+    equilibrium. Chosen: frame by frame the shipped knee moves by 0.5 mm at most."""
+    other_shift: float = 5e-3
+    """m: anterior and posterior of the recorded pose, where a frame without earlier ones is
+    searched from again. Chosen: about a third of a dish."""
+    same_place: float = 0.5e-3
+    """m (rotations times the lever arm): equilibria farther apart are two. Chosen: well above what
+    the tolerances leave open."""
+
+
+INITIAL_POSE = InitialPoseSettings()
+
+AP = KNEE_COORDINATES.index("ap")
+
+
+class InitialPoses:
+    """The initial guesses of a search, the likeliest first.
+
+    Args:
+        knee: it searches from an initial guess.
+        pair: femoral component and insert.
+        post: cam and post, if they are modelled.
+    """
+
+    def __init__(self, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None") -> None:
+        self._knee, self._pair, self._post = knee, pair, post
+
+    def rest(
+        self, instant: Instant, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
+    ) -> KneeEquilibrium:
+        """Return the equilibrium from the first initial guess that converges.
+
+        Where it lies farther than `INITIAL_POSE.max_continuation` from that start, the search is
+        repeated from the starts that are left; one that ends elsewhere is described in `second`.
+
+        Args:
+            instant: the knee.
+            previous: the last three frames that were found.
+            points: side -> where a condyle that carries nothing is nearest to the insert.
+
+        Raises:
+            ComputationError: no start lies over the insert, or no muscle forces carry the frame.
+        """
+        knee, failure = None, "the femoral component does not lie over the insert"
+        recorded = instant.coordinates
+        starts = self._starts(recorded, [knee.coordinates for knee in previous])
+        for place in starts:
+            if not np.isfinite(place).all():
+                continue
+            try:
+                knee = self._knee.find(instant, place, points, previous[-1] if previous else None)
+            except ComputationError as error:
+                failure = error.what
+                continue
+            if knee.balance.status not in ASTRAY and not (knee.problem and instant.muscles):
+                break
+        if knee is None:
+            raise ComputationError(failure)
+        if knee.problem or _apart(place, knee.coordinates) <= INITIAL_POSE.max_continuation:
+            return knee
+        others = list(starts) or self._beside(instant)
+        return replace(knee, second=self._second(instant, knee, others, points))
+
+    def _beside(self, instant: Instant) -> list[Array]:
+        """Return the recorded pose moved forwards and backwards, just touching."""
+        places = [instant.coordinates.copy(), instant.coordinates.copy()]
+        for place, sign in zip(places, (1.0, -1.0), strict=True):
+            place[AP] += sign * INITIAL_POSE.other_shift * (AP in self._knee.released)
+        return [self.on_the_insert(place) for place in places]
+
+    def _second(
+        self,
+        instant: Instant,
+        knee: KneeEquilibrium,
+        starts: list[Array],
+        points: dict[str, Array],
+    ) -> str:
+        """Return in words another equilibrium to which other starts lead; empty: there is none."""
+        for place in starts:
+            if not np.isfinite(place).all():
+                continue
+            try:
+                other = self._knee.find(instant, place, points)
+            except ComputationError:
+                continue
+            apart = _apart(other.coordinates, knee.coordinates)
+            if other.problem or apart <= INITIAL_POSE.same_place:
+                continue
+            moved = np.abs(other.coordinates - knee.coordinates)
+            forces = [np.linalg.norm(one.contact.wrench[:3]) for one in (knee, other)]
+            return (
+                f"a second equilibrium: from another initial guess the search ends "
+                f"{moved[:3].max() / MILLIMETRE:.1f} mm and {moved[3:].max() / DEGREE:.1f} deg "
+                f"away, with {forces[1]:.0f} N instead of {forces[0]:.0f} N of contact force"
+            )
+        return ""
+
+    def _starts(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
+        """Yield initial guesses: extrapolated from the last frames, the last frame, as recorded.
+
+        The first keeps its height; the others are moved to first touch.
+        """
+        rows = list(self._knee.released)
+        for number, place in enumerate([carried_on(previous), previous[-1]] if previous else []):
+            start = recorded.copy()
+            start[rows] = place[rows]
+            yield start if number == 0 else self.on_the_insert(start)
+        yield self.on_the_insert(recorded)
+
+    def on_the_insert(self, place: Array) -> Array:
+        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch.
+
+        Where AP is released and a cam overlaps the post, AP makes them just touch, too.
+        """
+        touching = self._on_the_dishes(place)
+        if self._post is None or AP not in self._knee.released:
+            return touching
+        gap = self._post.clearance(knee_pose(touching))
+        if not gap < 0:
+            return touching
+        return self._on_the_dishes(
+            np.array([place[0] + gap + INITIAL_POSE.first_penetration, *place[1:]])
+        )
+
+    def _on_the_dishes(self, place: Array) -> Array:
+        height = self._pair.first_touch_height(knee_pose(place))
+        return np.array([place[0], height - INITIAL_POSE.first_penetration, *place[2:]])
+
+
+def _apart(first: Array, second: Array) -> float:
+    """Return the largest distance (m) between coordinates (6,), rotations times the lever arm."""
+    return float(np.abs((second - first) * SCALE).max())
+
+
+def carried_on(previous: list[Array]) -> Array:
+    """Return the coordinates (6,) after those of up to three frames.
+
+    The last step is repeated, scaled by how well the step before predicted it, and limited to
+    `INITIAL_POSE.max_extrapolation`, because a lightly loaded knee moves irregularly.
+    """
+    if len(previous) < 3:
+        return previous[-1]
+    before, step = ((b - a) * SCALE for a, b in pairwise(previous))
+    part = float(before @ step) / max(float(before @ before), 1e-18)
+    longest = INITIAL_POSE.max_extrapolation / max(float(np.linalg.norm(step)), 1e-9)
+    return previous[-1] + min(max(part, 0.0), 1.0, longest) * (previous[-1] - previous[-2])

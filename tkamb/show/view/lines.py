@@ -1,0 +1,389 @@
+"""Lines and arrows of a drawing: ligaments, tendons, muscles, centres of pressure and forces.
+
+The size of a force comes from results.csv, its line of action from the geometry of the frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, Mask, transform
+from tkamb.geometry.surface import Surface
+from tkamb.knee.chain import ChainState
+from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.wrapping import TautPath
+from tkamb.run.mechanics import Mechanics
+from tkamb.run.metrics import failed, stretches
+from tkamb.show.style import SIDE_COLOURS
+from tkamb.show.view.drawing import (
+    SLACK,
+    TENDON,
+    WRAPPED,
+    Colours,
+    Marker,
+    Strand,
+    activation_colours,
+    rgb,
+    strain_colours,
+)
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from tkamb.knee.load import PointForces
+from tkamb.show.style import BLACK, FORCE_COLOURS
+from tkamb.show.view.drawing import Arrow
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+
+NOTHING = np.full(3, np.nan)
+
+
+@dataclass(frozen=True)
+class ArrowSettings:
+    """Arrows of the viewer."""
+
+    contact_point_radius: float = 0.6 * MILLIMETRE
+    """m; radius of the sphere at a centre of pressure. Chosen: it is seen and hides little."""
+
+
+ARROW = ArrowSettings()
+
+
+def force_arrows(
+    results: "Results", geometries: Sequence[KneeGeometry], friction: float
+) -> tuple[Arrow, ...]:
+    """Return the forces on the leg that are modelled.
+
+    The condyles' arrows are the forces on the insert with their friction: their sum is the
+    contact force of results.csv.
+
+    Args:
+        results: of the same frames.
+        geometries: the frames.
+        friction: Coulomb coefficient of the femorotibial contact.
+    """
+    columns = {
+        "ground reaction": _vector(results, "ground_reaction_{}_N"),
+        "hip": _vector(results, "hip_force_{}_N"),
+    }
+    result = [
+        _arrow(
+            "ground reaction",
+            geometries,
+            centre_of_pressure,
+            columns["ground reaction"],
+            "on the foot",
+        ),
+        _arrow("hip", geometries, _hip, columns["hip"], "on the femur, at the hip"),
+        *_extensor(results, geometries),
+        *_condyles(results, geometries, friction),
+    ]
+    return tuple(arrow for arrow in result if np.isfinite(arrow.forces).any())
+
+
+def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
+    """Return a ball at each condyle's contact point and at the patella's."""
+    result = {
+        f"{side} contact point": [_condyle_point(one, side) for one in geometries]
+        for side in ("medial", "lateral")
+    }
+    patella = "patellofemoral contact point"
+    result[patella] = [
+        one.extensor.contact_point if one.extensor else NOTHING for one in geometries
+    ]
+    return tuple(
+        Marker(
+            name,
+            "patella" if name == patella else "contact points",
+            BLACK,
+            np.stack(points),
+            ARROW.contact_point_radius,
+        )
+        for name, points in result.items()
+        if np.isfinite(points).any()
+    )
+
+
+def _arrow(
+    name: str,
+    geometries: Sequence[KneeGeometry],
+    point: Callable[[KneeGeometry], Array],
+    forces: Array,
+    meaning: str,
+) -> Arrow:
+    points = np.stack([point(one) for one in geometries])
+    return Arrow(name, FORCE_COLOURS[name], points, forces, name == "hip", meaning)
+
+
+def centre_of_pressure(geometry: KneeGeometry) -> Array:
+    """Return where the ground reaction acts (3,) m; NaN without one."""
+    return geometry.ground.points[0] if geometry.ground else NOTHING
+
+
+def _hip(geometry: KneeGeometry) -> Array:
+    return geometry.state.point("hip", np.zeros(3))
+
+
+def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Arrow]:
+    """Return the forces of the tendons, and the force of the femur on the patella."""
+    arrows = []
+    for name, column, meaning in (
+        ("quadriceps", "quadriceps_N", "on the patella"),
+        ("patellar ligament", "patellar_ligament_N", "on the tibia"),
+    ):
+        ends = [_distal_end(one, name) for one in geometries]
+        points = np.stack([point for point, _ in ends])
+        forces = results[column][:, None] * np.stack([pull for _, pull in ends])
+        arrows.append(Arrow(name, FORCE_COLOURS[name], points, forces, False, meaning))
+    normal, across, points = (
+        np.stack(rows) for rows in zip(*map(_patella, geometries), strict=True)
+    )
+    forces = (
+        results["patellofemoral_N"][:, None] * normal
+        + results["patellofemoral_tangential_N"][:, None] * across
+    )
+    name = "patellofemoral"
+    arrows.append(Arrow(name, FORCE_COLOURS[name], points, -forces, True, "on the femur"))
+    return arrows
+
+
+def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
+    """Return where a tendon ends and the pull (3,) of one newton there."""
+    if geometry.extensor is None:
+        return NOTHING, NOTHING
+    (muscle,) = geometry.muscles
+    loads = muscle.loads if name == "quadriceps" else geometry.extensor.patellar_ligament
+    end: PointForces = loads[1]
+    return end.points[0], end.forces[0]
+
+
+def _patella(geometry: KneeGeometry) -> tuple[Array, Array, Array]:
+    """Return the patellofemoral normal, tangent and contact point."""
+    extensor = geometry.extensor
+    if extensor is None:
+        return NOTHING, NOTHING, NOTHING
+    tangent = np.cross(geometry.state.pose("femur")[:3, 2], extensor.contact_normal)
+    return extensor.contact_normal, tangent, extensor.contact_point
+
+
+def _condyles(
+    results: "Results", geometries: Sequence[KneeGeometry], friction: float
+) -> list[Arrow]:
+    if not any(one.condyles for one in geometries):
+        forces = np.stack(
+            [
+                results["force_ap_N"],
+                -results["force_si_N"],
+                results["force_ml_N"],
+            ],
+            axis=1,
+        )
+        points = np.stack([one.state.pose("femur")[:3, 3] for one in geometries])
+        return [Arrow("knee", FORCE_COLOURS["knee"], points, forces, True, "on the tibia")]
+    arrows = []
+    for side in ("medial", "lateral"):
+        points = np.stack([_condyle_point(one, side) for one in geometries])
+        ways = np.stack(
+            [
+                one.condyles[side].direction(friction) if side in one.condyles else NOTHING
+                for one in geometries
+            ]
+        )
+        forces = -results[f"{side}_force_equilibrium_N"][:, None] * ways
+        name = f"{side} condyle"
+        arrows.append(Arrow(name, FORCE_COLOURS[name], points, forces, True, "on the insert"))
+    return arrows
+
+
+def _condyle_point(geometry: KneeGeometry, side: str) -> Array:
+    return geometry.condyles[side].point if side in geometry.condyles else NOTHING
+
+
+def _vector(results: "Results", pattern: str) -> Array:
+    return np.stack([results[pattern.format(axis)] for axis in ("ap", "si", "ml")], axis=1)
+
+
+BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
+"""m, radii; bundles are thinner where a ligament has many."""
+
+
+@dataclass(frozen=True)
+class ViewStrandSettings:
+    """How muscles and ligaments are drawn."""
+
+    muscle_radius: float = 2.0 * MILLIMETRE
+    """m; radius of a muscle's tube. Chosen: it is seen well in the view."""
+    slack_force: float = 1.0
+    """N: a tendon or muscle with a smaller force is drawn grey. Chosen: far below forces that
+    matter."""
+    least_activation: float = 0.1
+    """1: smallest upper end of the colour scale of activations. Chosen: small activations then look
+    small."""
+    many_bundles: int = 20
+    """Ligament bundles from which on they are drawn thinner. Chosen: thick ones would cover each
+    other."""
+
+
+VIEW_STRAND = ViewStrandSettings()
+
+
+def ligament_strands(
+    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
+) -> tuple[tuple[Strand, ...], float]:
+    """Return the bundles coloured by strain, and the upper limit of the colour scale.
+
+    A frame that failed has no numbers: its bundles are grey, and no scale ends at them.
+    """
+    bundles = mechanics.ligaments
+    if not bundles:
+        return (), 0.0
+    links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
+    poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
+    failures = failed(results)
+    strains = [np.where(failures, np.nan, one.strain(one.length(poses))) for one in bundles]
+    limit = float(np.nanmax(strains, initial=0.01))
+    radius = BUNDLE * (0.5 if len(bundles) > VIEW_STRAND.many_bundles else 1.0)
+    strands = []
+    for bundle, strain in zip(bundles, strains, strict=True):
+        points = np.stack(bundle.ends(poses), axis=1)
+        colours = np.repeat(strain_colours(strain, limit)[:, None], 2, axis=1)
+        strands.append(Strand(bundle.name, "ligaments", points, colours, radius))
+    return tuple(strands), limit
+
+
+def extensor_strands(
+    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
+) -> tuple[Strand, ...]:
+    """Return muscle and patellar ligament, the part that lies on the bone in another colour.
+
+    In frames where one carries less than a newton it is grey.
+    """
+    extensor = mechanics.extensor
+    if extensor is None:
+        return ()
+    paths: list[tuple[TautPath | None, ...]] = []
+    for state in states:
+        try:
+            paths.append(extensor.lines.paths(state))
+        except ComputationError:
+            paths.append((None, None))
+    muscle, ligament = (list(result) for result in zip(*paths, strict=True))
+    name = extensor.lines.muscle.name.replace("_", " ")
+    slack = [
+        results[f"{one}_N"] < VIEW_STRAND.slack_force for one in ("quadriceps", "patellar_ligament")
+    ]
+    return (
+        _tendon(name, muscle, slack[0]),
+        _tendon("patellar ligament", ligament, slack[1]),
+    )
+
+
+def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ...], float]:
+    """Return the muscles across the knee coloured by activation, and the scale's upper limit.
+
+    From where a line leaves the shank or foot to where it reaches thigh or pelvis; those that
+    carry less than a newton are grey, and frames without a solution have none.
+    """
+    shares = [one.share if one.share and one.share.status == "ok" else None for one in geometries]
+    first = next((share for share in shares if share), None)
+    if first is None:
+        return (), 0.0
+    count = len(first.crossing)
+    ends = np.full((len(shares), count, 2, 3), np.nan)
+    activation, force = np.zeros((2, len(shares), count))
+    for k, (one, share) in enumerate(zip(geometries, shares, strict=True)):
+        if share is not None:
+            ends[k, :, 0] = transform(one.state.pose("tibia"), share.lines.shank)
+            ends[k, :, 1] = transform(one.state.pose("femur"), share.lines.thigh)
+            activation[k], force[k] = share.activation[share.crossing], share.force[share.crossing]
+    limit = max(float(activation.max()), VIEW_STRAND.least_activation)
+    colours = activation_colours(np.where(force < VIEW_STRAND.slack_force, 0.0, activation), limit)
+    strands = tuple(
+        Strand(
+            first.muscles[muscle],
+            "muscles",
+            ends[:, i],
+            np.repeat(colours[:, i, None], 2, axis=1),
+            VIEW_STRAND.muscle_radius,
+        )
+        for i, muscle in enumerate(first.crossing)
+    )
+    return strands, limit
+
+
+def _tendon(name: str, paths: list[TautPath | None], slack: Mask) -> Strand:
+    """Return the strand of a taut path (f), grey where it is slack (f,).
+
+    Its corners are doubled where the colour changes.
+    """
+    lines = [_colour_path(path) for path in paths]
+    most = max(len(points) for points, _ in lines)
+    points = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), mode="edge") for p, _ in lines])
+    colours = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for _, c in lines])
+    colours[slack] = rgb(SLACK)
+    return Strand(name, "extensor lines", points, colours, TENDON_RADIUS)
+
+
+def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
+    """Return points and colours: free, on the bone, free."""
+    free, wrapped = rgb(TENDON), rgb(WRAPPED)
+    if path is None or not np.isfinite(path.points).all():
+        return np.full((2, 3), np.nan), np.stack([free, free])
+    corners = path.points[1:-1]
+    if len(corners) < 2:
+        return path.points, np.repeat(free[None], len(path.points), axis=0)
+    points = np.concatenate([path.points[:2], corners, path.points[-2:]])
+    colours = np.repeat(wrapped[None], len(points), axis=0)
+    colours[[0, 1, -2, -1]] = free
+    return points, colours
+
+
+def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
+    """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
+    rays, top = insert.rays, float(insert.bounds[1, 1]) + MILLIMETRE
+    result = {}
+    for side in SIDE_COLOURS:
+        x, z = (results[f"{side}_cop_{axis}_mm"] * MILLIMETRE for axis in ("ap", "ml"))
+        points = np.column_stack([x, np.full(len(x), top), z])
+        finite = np.isfinite(points).all(axis=1)
+        points[~finite] = np.nan
+        down, _ = rays.first(points[finite], np.array([0.0, -1.0, 0.0]))
+        points[finite, 1] -= np.where(np.isfinite(down), down, np.nan)
+        result[side] = points
+    return result
+
+
+def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:
+    """Return the path of each centre of pressure, broken where it is missing or jumps."""
+    strands = []
+    for side, points in centres.items():
+        for number, stretch in enumerate(stretches(points)):
+            part = points[stretch] + np.array([0.0, 2.0 * PATH, 0.0])
+            colours = np.repeat(rgb(SIDE_COLOURS[side])[None], len(part), axis=0)
+            name = f"{side} path {number}"
+            strands.append(Strand(name, "load paths", part[None], colours[None], PATH))
+    return tuple(strands)
+
+
+def centre_markers(centres: dict[str, Array]) -> tuple[Marker, ...]:
+    """Return a ball at each centre of pressure."""
+    return tuple(
+        Marker(
+            f"{side} centre of pressure",
+            "load paths",
+            SIDE_COLOURS[side],
+            points,
+            0.9 * MILLIMETRE,
+        )
+        for side, points in centres.items()
+    )
