@@ -12,8 +12,8 @@ from test_uncertainty import SCENE, bodies_alone, knee
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, knee_pose, transform
+from tkamb.io.recordings.recording_tables import MarkersTable
 from tkamb.io.scene.case import load_case
-from tkamb.io.scene.recording_tables import MarkersTable
 from tkamb.io.scene.uncertainty import CorrelationTable
 from tkamb.knee.load import PointForces
 from tkamb.run.muscles.shared_muscles import SharedMuscles

@@ -141,7 +141,7 @@ def test_interrupted_samples_go_on_to_the_same_band(tmp_path):
 
 @pytest.mark.parametrize("samples", [-1, 5, 10**6])
 def test_too_few_or_too_many_samples_are_refused(samples):
-    with pytest.raises(InputError, match="--samples"):
+    with pytest.raises(InputError, match="samples"):
         check_samples(samples)
 
 

@@ -11,18 +11,19 @@ import pytest
 import shapes
 from headless import Page, chromium
 from synthetic_run import make_run
+from tkamb.contact.lattice.meshing.grid import OTHER
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR
 from tkamb.io.recordings.vtp import read_vtp, read_vtp_values
 from tkamb.io.vtk import write_triangles
 from tkamb.run.results_folder import read_results
 from tkamb.show.report import report_html
-from tkamb.show.view.colours import INSERT, rgb, wear_colours, wear_scale
+from tkamb.show.sections import wear_section
+from tkamb.show.view.drawing import INSERT, rgb, wear_colours, wear_scale
 from tkamb.show.view.payload import pack
 from tkamb.show.view.run import open_run
 from tkamb.show.view.show import Show
 from tkamb.show.view.solids import worn_insert
-from tkamb.show.wear import OTHER, wear_section
 from viewed import shipped_run
 
 PIXEL = bytes.fromhex(

@@ -476,7 +476,7 @@ def claim_directory(path: str | Path) -> Path:
             probe.write(b"tkamb")
     except (OSError, ValueError) as error:
         raise InputError(
-            f"output folder cannot be written ({_reason(error)})", path, "choose another with --out"
+            f"output folder cannot be written ({_reason(error)})", path, "choose another directory"
         ) from None
     return path
 

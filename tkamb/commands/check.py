@@ -11,7 +11,7 @@ from tkamb.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tkamb.show.check.scene_check import SceneCheck
+    from tkamb.show.scene_check import SceneCheck
 
 PICTURES = (".png", ".html")
 POLICY = (
@@ -37,7 +37,7 @@ def add_check(commands: Any) -> None:
 def _check(options: argparse.Namespace) -> int:
     from tkamb.io.claim import check_output_file
     from tkamb.run.stages import Stages
-    from tkamb.show.check.scene_check import check_scene
+    from tkamb.show.scene_check import check_scene
 
     if options.out and options.out.suffix.lower() not in PICTURES:
         hint = f"name it like check{PICTURES[0]}"
@@ -56,7 +56,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _write_picture(check: "SceneCheck", path: Path) -> None:
     from tkamb.files import replaced_file, write_text
-    from tkamb.show.check.leg_picture import draw_leg
+    from tkamb.show.leg_picture import draw_leg
 
     figure = draw_leg(check.case, check.mechanics)
     if path.suffix.lower() == ".html":
@@ -73,7 +73,7 @@ def check_html(check: "SceneCheck", figure: "Figure") -> str:
 
     style = asset("tkamb.show", "report.css")
     return render(
-        "tkamb.show.check",
+        "tkamb.show",
         "check.html",
         policy=POLICY.format(style=policy_sources(style)),
         style=style,

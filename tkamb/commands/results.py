@@ -39,8 +39,8 @@ def add_compare(commands: Any) -> None:
 def _compare(options: argparse.Namespace) -> int:
     from tkamb.files import write_text
     from tkamb.io.claim import claimed_directory
-    from tkamb.show.compare.comparison import compare_folders
-    from tkamb.show.compare.page import comparison_html, table_lines
+    from tkamb.show.comparison import compare_folders
+    from tkamb.show.comparison_page import comparison_html, table_lines
 
     result = compare_folders(options.folders, options.axis)
     html = comparison_html(result, options.frame)

@@ -204,7 +204,7 @@ def _stability(options: argparse.Namespace) -> int:
 
 def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.run.workers import PoolOptions
-    from tkamb.show.stability_picture import picture
+    from tkamb.show.study_figures import picture
     from tkamb.studies import stability as study
     from tkamb.studies.kept_rows import KeptRows
     from tkamb.studies.stability import table

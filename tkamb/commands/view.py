@@ -77,7 +77,7 @@ def _view(options: argparse.Namespace) -> int:
         print(f"picture: {options.png}")
     films = [path for path in (options.gif, options.mp4) if path]
     for path in films:
-        from tkamb.show.view.film import write_film
+        from tkamb.show.view.page import write_film
 
         write_film(show, path, lambda frames: tqdm(frames, "filming", unit="frame", disable=None))
         print(f"film: {path}")
@@ -113,7 +113,7 @@ def _check(options: argparse.Namespace) -> None:
         check_output_file(path, options.force)
     for kind in ("gif", "mp4"):
         if path := getattr(options, kind):
-            from tkamb.show.view.film import check_film
+            from tkamb.show.view.page import check_film
 
             check_film(path, f"--{kind}")
     if options.png:

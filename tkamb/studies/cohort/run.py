@@ -245,7 +245,7 @@ def run_cohort(
                     shards.put(number, outcome.shard())
                     outcomes[number] = outcome
         except KeyboardInterrupt:
-            words = f"{len(outcomes)} of {len(numbers)} runs are kept; go on with --resume"
+            words = f"{len(outcomes)} of {len(numbers)} runs are kept; go on with resume=True"
             raise KeyboardInterrupt(words) from None
         outcomes = {number: outcomes[number] for number in numbers}
         if part is None:

@@ -208,7 +208,7 @@ def estimate_uncertainty(
     if not STATISTICS_LIMITS.min_samples <= samples <= MOST_SAMPLES:
         raise InputError(
             f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
-            "--samples",
+            "samples",
         )
     if directory is None and resume:
         raise InputError("there is no folder to go on in", "resume", "give a directory")
@@ -292,7 +292,7 @@ class _Job:
         except KeyboardInterrupt:
             if shards is None or not samples:
                 raise
-            words = f"{len(samples)} of {count} samples are kept; go on with --resume"
+            words = f"{len(samples)} of {count} samples are kept; go on with resume=True"
             raise KeyboardInterrupt(words) from None
         return self._found(names, [samples[n] for n in range(count)])
 

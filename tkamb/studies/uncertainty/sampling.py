@@ -149,7 +149,7 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
         InputError: unknown method, or no samples.
     """
     if count < 1:
-        raise InputError(f"{count} is no number of samples", "--samples", "give at least 1")
+        raise InputError(f"{count} is no number of samples", "samples", "give at least 1")
     if method == "sobol":
         # random_base2 draws whole powers of two, for which the sequence is balanced
         uniform = qmc.Sobol(dimensions, seed=seed).random_base2((count - 1).bit_length())
@@ -164,7 +164,7 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
         )
     else:
         raise InputError(
-            f"unknown method '{method}'", "--method", names_near(method, get_args(Method))
+            f"unknown method '{method}'", "method", names_near(method, get_args(Method))
         )
     return ndtri(np.clip(uniform[:count], SMALLEST_TAIL, 1.0 - SMALLEST_TAIL))
 

@@ -299,7 +299,7 @@ class Sampling:
         except KeyboardInterrupt:
             if shards is None or not done:
                 raise
-            what = f"{len(done)} of {count} samples are kept; go on with --resume"
+            what = f"{len(done)} of {count} samples are kept; go on with resume=True"
             raise KeyboardInterrupt(what) from None
         return _bands(self.inputs, [done[n] for n in range(count)], rows, simulation[1])
 

@@ -93,7 +93,7 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
         raise _damaged(path, str(error) or type(error).__name__) from None
     if str(content.pop("identity", "")) != identity:
         what = "is of another simulation: bodies, motion, law, numbers or code differ"
-        raise InputError(what, path, "leave --resume out, or choose another folder with --out")
+        raise InputError(what, path, "leave out resume=True, or choose another directory")
     try:
         rows = json.loads(str(content.pop("rows")))
         values = {name: one.item() if one.ndim == 0 else one for name, one in content.items()}
@@ -208,7 +208,7 @@ class WearRun:
             if kept is None:
                 raise
             done = f"{kept.cycles:.6g} cycles are kept"
-            raise KeyboardInterrupt(f"{done}; go on with --resume") from None
+            raise KeyboardInterrupt(f"{done}; go on with resume=True") from None
 
 
 @dataclass(eq=False)
