@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.io.recordings.motion import KneeMotion
-from tkamb.io.recordings.recording_tables import GroundReactionTable
-from tkamb.io.recordings.recording_tables import MotionTable
-from tkamb.io.recordings.recording_tables import TibiaTable
+from tkamb.io.recordings.recording_tables import GroundReactionTable, MotionTable, TibiaTable
 from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.case import Case
 from tkamb.knee.load import LinkPoint

@@ -16,9 +16,7 @@ from tkamb.contact.registry import contact_names
 from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, Index, knee_pose
 from tkamb.io.recordings.patient import load_urdf
-from tkamb.io.scene.case import Case
-from tkamb.io.scene.case import with_insert
-from tkamb.io.scene.si import in_si
+from tkamb.io.scene.case import Case, with_insert
 from tkamb.knee.chain import Chain
 from tkamb.knee.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
