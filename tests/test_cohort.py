@@ -23,14 +23,7 @@ from tkamb.io.claim import claimed_directory, settle
 from tkamb.run.simulation import simulate
 from tkamb.run.workers import PoolOptions
 from tkamb.show.cohort_report import _split_into_plots, cohort_html, draw_groups
-from tkamb.show.study_figures import design_bars
-from tkamb.show.study_figures import draw_designs
-from tkamb.show.study_figures import run_error
-from tkamb.studies.cohort.folder import frame_table
-from tkamb.studies.cohort.folder import write_cohort
-from tkamb.show.design_figure import design_bars
-from tkamb.show.design_figure import draw_designs
-from tkamb.show.design_figure import run_error
+from tkamb.show.study_figures import design_bars, draw_designs, run_error
 from tkamb.studies.cohort.outcome import Outcome, chosen_map
 from tkamb.studies.cohort.plan import CohortTable, load_cohort
 from tkamb.studies.cohort.run import frame_table, run_cohort, write_cohort

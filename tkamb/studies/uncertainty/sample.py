@@ -27,9 +27,9 @@ from tkamb.geometry.frames import (
     knee_pose,
 )
 from tkamb.io.recordings.markers import fit_seen
+from tkamb.io.recordings.recording_tables import MarkerSegmentTable
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.io.scene.recording_tables import MarkerSegmentTable
 from tkamb.knee.frame_contact import FrameContact
 from tkamb.knee.ligaments import Ligament
 from tkamb.knee.load import LinkPoint
