@@ -19,12 +19,20 @@ from tkamb.knee.load import PointForces
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import mechanics_of
 from tkamb.studies.uncertainty.bands import influences
-from tkamb.studies.uncertainty.correlation import correlation_root
 from tkamb.studies.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
 from tkamb.studies.uncertainty.run import estimate_uncertainty
-from tkamb.studies.uncertainty.sample import Sampler
-from tkamb.studies.uncertainty.sampling import Point, normal_samples, one_at_a_time
-from tkamb.studies.uncertainty.varied_case import displaced_by_markers, varied_case, varied_muscles
+from tkamb.studies.uncertainty.sample import (
+    Sampler,
+    displaced_by_markers,
+    varied_case,
+    varied_muscles,
+)
+from tkamb.studies.uncertainty.sampling import (
+    Point,
+    correlation_root,
+    normal_samples,
+    one_at_a_time,
+)
 
 NAMES = ["a", "b", "c"]
 
