@@ -29,7 +29,7 @@ from tkamb.io.recordings.ground_reaction import (
     recorded_wrench,
     summed_reaction,
 )
-from tkamb.io.recordings.recordings import ForceRecording
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.io.recordings.tables import Table, read_table
 
 
@@ -210,17 +210,13 @@ def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError
 def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
     """Return a force of a table as a recorded force in the laboratory."""
     columns = {"time": "time", **force.columns}
-    source = ForceRecording(
-        table.path,
-        "none",
-        None,
-        (),
-        columns,
-        "m",
-        axes,
-        "on the foot",
-        IMPORTED_FORCE.hold_below,
-        0.0,
+    source = GroundReactionTable(
+        file=table.path,
+        columns=columns,
+        length_unit="m",
+        laboratory_axes=axes,
+        cutoff_Hz="none",
+        unloaded_N=IMPORTED_FORCE.hold_below,
     )
     time, wrench, level = recorded_wrench(source)
     on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)

@@ -449,7 +449,7 @@ def _motion_notes(request: ImportRequest, trial: Trial) -> list[str]:
             "phase is "
             "mapped to one of their strides: an assumption."
         )
-    if centres := [centre.name.replace("_", " ") for centre in trial.shank.centres]:
+    if centres := [name.replace("_", " ") for name in trial.shank.centres]:
         notes.append(
             f"The shank shows {len(trial.shank.points)} markers. They are completed by "
             f"{' and '.join(centres)} from the markers of its neighbours, so its lean is less "

@@ -19,9 +19,7 @@ from tkamb.io.importing.links import Links
 from tkamb.io.importing.markers import ModelSegment
 from tkamb.io.recordings.meshes import axes_rotation
 from tkamb.io.recordings.motion import KneeMotion, load_motion
-from tkamb.io.recordings.recordings import JointCentre
-from tkamb.io.scene.recording_tables import MotionTable
-from tkamb.io.scene.si import in_si
+from tkamb.io.recordings.recording_tables import MotionTable
 from tkamb.io.toml_text import toml_markers, toml_mm, toml_text
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -34,25 +32,23 @@ class ShankMarkers:
         path: the recording.
         axes: axes of the file that point forward, up and right.
         points: label of a marker -> its place (3,) m in the tibia link.
-        centres: joint centres that are used as further markers.
+        centres: name of a joint centre that is used as a further marker -> the lines of its table
+            [[tibia.joint_centre]].
         remarks: lines on the joint centres, for the report.
     """
 
     path: Path
     axes: str
     points: dict[str, Array]
-    centres: tuple[JointCentre, ...]
+    centres: dict[str, list[str]]
     remarks: tuple[str, ...]
 
     def lines(self, path: str) -> list[str]:
         """Return the scene's table [tibia]; `path` is the recording's path as TOML."""
         lines = ["[tibia]", 'kind = "markers"', f"file = {path}"]
         lines += [f'laboratory_axes = "{self.axes}"', f"markers_mm = {toml_markers(self.points)}"]
-        for centre in self.centres:
-            lines += ["", "[[tibia.joint_centre]]", f"name = {toml_text(centre.name)}"]
-            lines.append(f"markers_mm = {toml_markers(centre.markers)}")
-            lines.append(f"centre_mm = {toml_mm(centre.centre)}")
-            lines.append(f"tibia_mm = {toml_mm(centre.tibia)}")
+        for centre in self.centres.values():
+            lines += ["", *centre]
         return lines
 
 
@@ -80,7 +76,7 @@ def shank_markers(
         InputError: there are fewer than three points.
     """
     points = segments["shank"].points
-    centres: list[JointCentre] = []
+    centres: dict[str, list[str]] = {}
     text: list[str] = []
     if len(points) < 3:
         centres, text = _carried(links, segments, femur)
@@ -91,17 +87,20 @@ def shank_markers(
             recording,
             "three markers of the foot give the ankle's centre, three of the thigh the knee's",
         )
-    return ShankMarkers(recording, axes, points, tuple(centres), tuple(text))
+    return ShankMarkers(recording, axes, points, centres, tuple(text))
 
 
 def _carried(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
-) -> tuple[list[JointCentre], list[str]]:
+) -> tuple[dict[str, list[str]], list[str]]:
     """Return the joint centres that move with markers of foot and thigh, and remarks on them."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
-    centres, text = [], []
+    centres: dict[str, list[str]] = {}
+    text = []
     if len(foot.points) >= 3 and foot.centre is not None:
-        centres.append(JointCentre("ankle_centre", foot.points, foot.centre, np.zeros(3)))
+        centres["ankle_centre"] = _centre_lines(
+            "ankle_centre", foot.points, foot.centre, np.zeros(3)
+        )
         text.append(f"shank: the foot's {len(foot.points)} markers give its ankle centre")
     if len(thigh.points) >= 3:
         own = {name: transform(links.femur, point) for name, point in thigh.points.items()}
@@ -109,12 +108,32 @@ def _carried(
         places = transform(femur, centre)
         mean = places.mean(axis=0)
         apart = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
-        centres.append(JointCentre("knee_centre", own, centre, mean))
+        centres["knee_centre"] = _centre_lines("knee_centre", own, centre, mean)
         text.append(
             f"shank: the thigh's {len(own)} markers give its knee centre, at the mean of "
             f"{len(places)} recorded poses ({apart:.1f} mm rms about it)"
         )
     return centres, text
+
+
+def _centre_lines(
+    name: str, markers: Mapping[str, Array], centre: Array, tibia: Array
+) -> list[str]:
+    """Return the lines of a table [[tibia.joint_centre]].
+
+    Args:
+        name: name of the joint centre.
+        markers: label of a marker of the neighbouring segment -> its place (3,) m in that frame.
+        centre: (3,) m, the joint centre in the same frame.
+        tibia: (3,) m, the joint centre in the tibia link.
+    """
+    return [
+        "[[tibia.joint_centre]]",
+        f"name = {toml_text(name)}",
+        f"markers_mm = {toml_markers(markers)}",
+        f"centre_mm = {toml_mm(centre)}",
+        f"tibia_mm = {toml_mm(tibia)}",
+    ]
 
 
 ROLES = tuple(f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3))
@@ -236,14 +255,14 @@ def read_poses(
 
 def _motion_table(
     recording: PoseRecording, cutoff_Hz: float, interval: tuple[float, float] | None
-) -> Any:
+) -> MotionTable:
     keys = recording.keys() | {
         "file": recording.file,
         "cutoff_Hz": cutoff_Hz,
         "interval_s": interval,
     }
     keys["columns"] = dict(zip(ROLES, recording.columns, strict=True))
-    return in_si(MotionTable.model_validate(keys))
+    return MotionTable.model_validate(keys)
 
 
 def _in_stance(recording: PoseRecording, motion: KneeMotion) -> Array:

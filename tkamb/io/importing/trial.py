@@ -34,10 +34,9 @@ from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.inverse_kinematics import LegChain
 from tkamb.io.recordings.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.io.recordings.markers import matched_labels, plain_label
+from tkamb.io.recordings.recording_tables import MarkersTable
 from tkamb.io.recordings.tables import Table, read_table, with_unit
 from tkamb.io.scene import Scene
-from tkamb.io.scene.recording_tables import MarkersTable
-from tkamb.io.scene.si import in_si
 
 
 def with_static_markers(
@@ -110,7 +109,7 @@ def calibrated_markers(
         )
         for own in table.segment
     ]
-    markers = in_si(table.model_copy(update={"segment": tuple(points)}))
+    markers = table.model_copy(update={"segment": tuple(points)})
     segments, measured = leg_segments(markers, recorded, None, side)
     chain = LegChain(segments, pose_insert_in_tibia, markers.knee == "free")
     neutral = neutral_coordinates(markers, side)
