@@ -9,8 +9,8 @@ from tkamb.io.opensim.model import (
     Coordinate,
     Joint,
     JointAxis,
-    Muscle,
     OpenSimModel,
+    OpenSimMuscle,
     Path,
     PathPoint,
 )
@@ -28,7 +28,9 @@ def hinge(name: str, parent: str, child: str, coordinate: str | None, place) -> 
     return Joint(name, kind, parent, child, pose(np.eye(3), place), np.eye(4), axes, ())
 
 
-def muscle(name: str, *points: tuple[str, list[float]], force: float = 1000.0, **numbers) -> Muscle:
+def muscle(
+    name: str, *points: tuple[str, list[float]], force: float = 1000.0, **numbers
+) -> OpenSimMuscle:
     """Return a straight muscle through points of bodies."""
     path = Path(
         tuple(PathPoint(f"{name}{k}", b, np.array(p)) for k, (b, p) in enumerate(points)), ()
@@ -39,10 +41,10 @@ def muscle(name: str, *points: tuple[str, list[float]], force: float = 1000.0, *
         "pennation_rad": 0.0,
         "max_contraction_velocity": 10.0,
     }
-    return Muscle(name, "Thelen2003Muscle", path, force, **(values | numbers), enabled=True)
+    return OpenSimMuscle(name, "Thelen2003Muscle", path, force, **(values | numbers), enabled=True)
 
 
-def plane_leg(*muscles: Muscle) -> OpenSimModel:
+def plane_leg(*muscles: OpenSimMuscle) -> OpenSimModel:
     """Return the leg: hip at the pelvis's origin 1 m up, knee and ankle below it when straight."""
     inertia = 0.01 * np.eye(3)
     places = {"pelvis": 0.0, "femur_r": -0.2, "tibia_r": -0.2, "foot_r": 0.0}

@@ -14,7 +14,7 @@ from tkamb.io.scene.case import load_case
 from tkamb.knee.chain import Chain
 from tkamb.run.read_scene import mechanics_of
 from tkamb.run.tabulate import WHY_IT_FAILED
-from tkamb.show.tables import strain_table
+from tkamb.show.sections import strain_table
 
 FEW = {"motion.frames": 26}
 FRAMES = slice(10, 91, 40)

@@ -13,9 +13,8 @@ from tkamb.cli import main
 from tkamb.commands.check import check_html
 from tkamb.io.starter import lay_out
 from tkamb.run.muscles import static_optimisation
-from tkamb.show.check.inventory import _listed
-from tkamb.show.check.leg_picture import draw_leg, leg_frame, shown_frames
-from tkamb.show.check.scene_check import _missing, check_scene
+from tkamb.show.leg_picture import draw_leg, leg_frame, shown_frames
+from tkamb.show.scene_check import _listed, _missing, check_scene
 
 
 @pytest.fixture(scope="module")

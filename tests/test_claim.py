@@ -63,7 +63,7 @@ def test_a_thread_may_claim_again_what_it_holds(tmp_path):
 
 def test_a_foreign_folder_is_refused_without_force(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
-    refused = pytest.raises(InputError, match=r"not tkamb's own .*thesis.tex.*--force")
+    refused = pytest.raises(InputError, match=r"not tkamb's own .*thesis.tex.*force=True")
     with refused, claimed_directory(tmp_path):
         pass
     assert names(tmp_path) == {"thesis.tex"}

@@ -12,9 +12,9 @@ from tkamb.cli import main
 from tkamb.contact.flags import AT_EDGE
 from tkamb.run.metrics import peak_pressure
 from tkamb.run.results import Results
-from tkamb.show.compare import page
-from tkamb.show.compare.comparison import compare_folders
-from tkamb.show.compare.figures import shown_frame
+from tkamb.show import comparison_page as page
+from tkamb.show.comparison import compare_folders
+from tkamb.show.comparison_page import shown_frame
 
 
 def written(folder, results, **summary):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from scenes import write_scene
+from tkamb.cli import main
 from tkamb.contact import named_classes
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.registry import (
@@ -25,7 +26,7 @@ from tkamb.io.scene import load_scene
 from tkamb.run.plug_ins import CONTACT_CODE, contact_code, foreign_code
 from tkamb.run.results_folder import verify_results, write_results
 from tkamb.run.simulation import simulate
-from tkamb.show.compare.comparison import compare_folders
+from tkamb.show.comparison import compare_folders
 from tkamb.studies import tradeoff
 from tkamb.studies.cohort import run as cohort_run
 from tkamb.studies.cohort.plan import load_cohort
@@ -208,6 +209,22 @@ def test_the_code_of_another_package_is_part_of_a_runs_identity(tmp_path, monkey
         simulate(scene, frames=slice(0, 1), directory=folders[0], resume=True)
     for name in [n for n in sys.modules if n.startswith("tkamb_winkler")]:
         del sys.modules[name]
+
+
+def test_an_error_of_a_plug_in_names_the_plug_in(plugin, tmp_path, monkeypatch, capsys):
+    run = ["run", str(write_scene(tmp_path / "scene")), "--contact", "winkler", "--resolution", "3"]
+    run += ["--frames", "0:1", "--out", str(tmp_path / "out")]
+    model = contact_class("winkler")
+    code = "def evaluate(self, *pose):\n    return np.linalg.inv(np.zeros((2, 2)))\n"
+    bad = {}
+    exec(code, vars(sys.modules[model.__module__]), bad)  # the plug-in's own, fails within NumPy
+    monkeypatch.setattr(model, "evaluate", bad["evaluate"])
+    monkeypatch.chdir(tmp_path)
+    assert main(run) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "contact model 'winkler' (tkamb_winkler, " in line
+    assert "raised LinAlgError: Singular matrix; details are in " in line
+    assert "not foreseen" not in line
 
 
 def test_code_of_tkamb_is_not_foreign(plugin):

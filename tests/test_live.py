@@ -19,9 +19,8 @@ from tkamb.cli import main
 from tkamb.errors import InputError, TkambError
 from tkamb.io.scene.case import load_case
 from tkamb.show.view.bench import BenchRequest, Placement
-from tkamb.show.view.knee_on_bench import bench_of_knee
 from tkamb.show.view.live import LiveKnee
-from tkamb.show.view.live_window import LiveWindow
+from tkamb.show.view.live_window import LiveWindow, bench_of_knee
 from tkamb.show.view.show import serve_in_background
 from tkamb.studies.designs.design import DESIGN_FILE, FEMORAL_MESH, INSERT_MESH, load_design
 from tkamb.studies.designs.solids import write_stl

@@ -24,8 +24,8 @@ from tkamb.show.panels import Line, Panel, panels
 from tkamb.show.plots import WIDTH, Sheet
 from tkamb.show.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.show.report import THIRD, report_html, write_report
+from tkamb.show.sections import flag_rows, motion_table, reasons
 from tkamb.show.style import BLACK, PRESSURE_MAP, svg_text
-from tkamb.show.tables import flag_rows, motion_table, reasons
 
 VOID = {"meta", "br", "input", "img", "link", "hr"}
 

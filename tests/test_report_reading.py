@@ -19,7 +19,7 @@ from tkamb.show.pages import asset
 from tkamb.show.panels import panels
 from tkamb.show.plots import Sheet
 from tkamb.show.pressure_maps import PRESSURE_PICTURE, TopView, draw_pressure
-from tkamb.show.reading import conclusions
+from tkamb.show.sections import conclusions
 from tkamb.show.style import new_figure
 
 

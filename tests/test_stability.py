@@ -15,7 +15,7 @@ import pytest
 from tkamb.cli import main
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
-from tkamb.show.stability_picture import picture
+from tkamb.show.study_figures import picture
 from tkamb.studies import stability
 from tkamb.studies.extremes import Extreme, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key

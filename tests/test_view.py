@@ -21,13 +21,11 @@ from tkamb.knee.wrapping import TautPath
 from tkamb.run.maps import ContactMaps
 from tkamb.run.results_folder import read_results
 from tkamb.show.view import CAMERAS
-from tkamb.show.view.colours import SLACK, TENDON, rgb
-from tkamb.show.view.drawing import PressureMap
-from tkamb.show.view.payload import VIEW_PAYLOAD, Block, _insert_transform, map_levels
+from tkamb.show.view.drawing import SLACK, TENDON, PressureMap, rgb
+from tkamb.show.view.lines import _tendon, ligament_strands
+from tkamb.show.view.payload import VIEW_PAYLOAD, Block, _insert_transform, map_levels, shade
 from tkamb.show.view.run import open_run
-from tkamb.show.view.shading import shade
 from tkamb.show.view.show import Show, serve_in_background
-from tkamb.show.view.strands import _tendon, ligament_strands
 from viewed import copied_scene, shipped_run, short_results
 
 

@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from PIL import Image
 
 from tkamb.errors import InputError
-from tkamb.show.view import film
+from tkamb.show.view import page as film
 from tkamb.show.view.run import open_run
 from tkamb.show.view.show import Show
 from viewed import shipped_run

@@ -9,8 +9,8 @@ from shared_trials import SHANK, THIGH, two_flexors
 from tkamb.geometry.frames import transform
 from tkamb.knee.load import PointForces
 from tkamb.run.muscles.shared_muscles import SharedMuscles
-from tkamb.show.view.colours import SLACK, activation_scale, pressure_scale, rgb, strain_scale
-from tkamb.show.view.strands import VIEW_STRAND, muscle_strands
+from tkamb.show.view.drawing import SLACK, activation_scale, pressure_scale, rgb, strain_scale
+from tkamb.show.view.lines import VIEW_STRAND, muscle_strands
 
 
 def frames():

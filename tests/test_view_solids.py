@@ -15,12 +15,12 @@ from tkamb.io.scene.case import load_case
 from tkamb.run.metrics import METRICS
 from tkamb.run.read_scene import mechanics_of
 from tkamb.show.style import PRESSURE_MAP
-from tkamb.show.view import colours
+from tkamb.show.view import drawing as colours
 from tkamb.show.view.draw import draw
+from tkamb.show.view.lines import path_strands
+from tkamb.show.view.payload import SHADING, decimate, shade
 from tkamb.show.view.run import open_run
-from tkamb.show.view.shading import SHADING, decimate, shade
 from tkamb.show.view.solids import box, floor_and_foot, hull, revolved, solids, sphere_points
-from tkamb.show.view.strands import path_strands
 from viewed import MODELS, shipped_run
 
 DM = MODELS / "dm" / "scene.toml"

@@ -34,7 +34,7 @@ MEGABYTE = 1_000_000
 
 @dataclass(frozen=True)
 class FileLimitSettings:
-    """Sizes of the largest files that are read; a larger file is not of the stated kind."""
+    """Largest sizes of the files that are read."""
 
     text_bytes: float = 16 * MEGABYTE
     """Bytes of a scene, a URDF or a summary. Chosen: a thousand times the size of the shipped
@@ -476,7 +476,7 @@ def claim_directory(path: str | Path) -> Path:
             probe.write(b"tkamb")
     except (OSError, ValueError) as error:
         raise InputError(
-            f"output folder cannot be written ({_reason(error)})", path, "choose another with --out"
+            f"output folder cannot be written ({_reason(error)})", path, "choose another directory"
         ) from None
     return path
 

@@ -1,4 +1,4 @@
-"""`tkamb check`: from its arguments to lines, a picture or a page, and the exit status."""
+"""`tkamb check`: its arguments, and its lines, picture or page."""
 
 import argparse
 import json
@@ -11,14 +11,14 @@ from tkamb.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tkamb.show.check.scene_check import SceneCheck
+    from tkamb.show.scene_check import SceneCheck
 
 PICTURES = (".png", ".html")
 POLICY = (
     "default-src 'none'; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
     "img-src data:; base-uri 'none'; form-action 'none'"
 )
-"""Content security of the page, which stands by itself."""
+"""Content security policy of the page: nothing is loaded from elsewhere."""
 
 
 def add_check(commands: Any) -> None:
@@ -37,7 +37,7 @@ def add_check(commands: Any) -> None:
 def _check(options: argparse.Namespace) -> int:
     from tkamb.io.claim import check_output_file
     from tkamb.run.stages import Stages
-    from tkamb.show.check.scene_check import check_scene
+    from tkamb.show.scene_check import check_scene
 
     if options.out and options.out.suffix.lower() not in PICTURES:
         hint = f"name it like check{PICTURES[0]}"
@@ -56,7 +56,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _write_picture(check: "SceneCheck", path: Path) -> None:
     from tkamb.files import replaced_file, write_text
-    from tkamb.show.check.leg_picture import draw_leg
+    from tkamb.show.leg_picture import draw_leg
 
     figure = draw_leg(check.case, check.mechanics)
     if path.suffix.lower() == ".html":
@@ -73,7 +73,7 @@ def check_html(check: "SceneCheck", figure: "Figure") -> str:
 
     style = asset("tkamb.show", "report.css")
     return render(
-        "tkamb.show.check",
+        "tkamb.show",
         "check.html",
         policy=POLICY.format(style=policy_sources(style)),
         style=style,

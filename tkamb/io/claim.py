@@ -74,7 +74,7 @@ def check_occupants(folder: Path, command: str) -> None:
     }
     for other, name in foreign.items():
         what = f"holds what `tkamb {other}` wrote ({name})"
-        raise InputError(what, folder, "choose another folder with --out, or give --force")
+        raise InputError(what, folder, "choose another directory, or give force=True")
 
 
 def _frames_of(folder: Path) -> tuple[str, str]:
@@ -105,7 +105,7 @@ def _rows_of(folder: Path) -> tuple[str, str]:
     return ("stability" if re.search(r'"row": \{[^{}]*"kind": ', first) else "tradeoff"), name
 
 
-CHOOSE = "choose another folder with --out"
+CHOOSE = "choose another directory"
 LONGEST_WAIT = 5.0
 """s: longest time that a reader waits for a writer that is moving finished files into place."""
 
@@ -260,7 +260,7 @@ def _check_ours(path: Path, force: bool) -> None:
     others = sorted(entry.name for entry in path.iterdir())
     if others:
         what = f"is not empty and not tkamb's own (it holds {others[0]!r})"
-        raise InputError(what, path, "choose another folder with --out, or give --force")
+        raise InputError(what, path, "choose another directory, or give force=True")
 
 
 def is_ours(path: Path) -> bool:
@@ -317,7 +317,7 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
     if not head or (OWN_MARK in head if magic is None else head.startswith(magic)):
         return
     what = "exists already, and tkamb did not write it"
-    raise InputError(what, path, "give another name, or --force to replace it")
+    raise InputError(what, path, "give another name, or force=True to replace it")
 
 
 def _object(path: Path) -> dict[str, Any]:

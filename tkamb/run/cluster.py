@@ -36,7 +36,7 @@ class ClusterSettings:
 
 CLUSTER = ClusterSettings()
 
-LOST = "what is finished is kept: go on with --resume"
+LOST = "what is finished is kept: go on with resume=True"
 
 
 def answers_of_cluster(

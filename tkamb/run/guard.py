@@ -10,6 +10,7 @@ import io
 import json
 import logging
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -26,6 +27,18 @@ from tkamb.errors import TkambError
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Error numbers of a write when the disk, the quota or the limit of a file is reached."""
+
+OPTIONS = {
+    "camera": "--camera",
+    "frame": "--frame",
+    "frames": "--frames",
+    "method": "--method",
+    "overrides": "--set",
+    "restore_when": "--restore-when",
+    "samples": "--samples",
+    "workers": "--workers",
+}
+"""Argument of a Python function -> option of a command."""
 
 
 def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
@@ -46,7 +59,7 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
             finally:  # also when argparse exits: what it printed must have arrived
                 sys.stdout.flush()
     except TkambError as error:
-        say(str(error))
+        say(in_options(str(error), error.where))
         if isinstance(error, StreamError):
             _silence(sys.stdout)
         return error.exit_status
@@ -54,7 +67,7 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
         _silence(sys.stdout)
         return 0
     except KeyboardInterrupt as interrupt:
-        say(f"interrupted: {str(interrupt) or 'nothing is kept'}")
+        say(f"interrupted: {in_options(str(interrupt)) or 'nothing is kept'}")
         return 130
     except OSError as error:
         if error.errno not in NO_ROOM:
@@ -64,6 +77,21 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
         return 1
     except Exception as error:
         return _unforeseen(error, options)
+
+
+def in_options(message: str, where: object = None) -> str:
+    """Return a message that names arguments of Python functions with options of commands instead.
+
+    Args:
+        message: what is printed.
+        where: of the error; it may begin with the name of an argument.
+    """
+    name = where.partition(" ")[0] if isinstance(where, str) else ""
+    if name in OPTIONS:
+        message = OPTIONS[name] + message.removeprefix(name)
+    message = re.sub(r"\b(adjust|force|resume)=True\b", r"--\1", message)
+    message = message.replace("frames=slice(A, B, STEP)", "--frames A:B:STEP")
+    return message.replace("another directory", "another folder with --out")
 
 
 @contextmanager
@@ -178,7 +206,9 @@ def _unforeseen(error: Exception, options: argparse.Namespace) -> int:
 
 
 def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
-    """Return one line on an error that nobody foresaw; its traceback goes into a file.
+    """Return one line on an error that tkamb does not raise itself; its traceback goes into a file.
+
+    An error of a plug-in names the plug-in.
 
     Args:
         error: what was raised.
@@ -188,7 +218,10 @@ def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
     reason = " ".join(str(error).split())[:200]
     what = "not enough memory: take a coarser resolution or fewer frames"
     if not isinstance(error, MemoryError):
-        what = f"this was not foreseen: {name}{': ' if reason else ''}{reason}"
+        from tkamb.run.plug_ins import raised_in
+
+        plug_in, told = raised_in(error), f"{name}{': ' if reason else ''}{reason}"
+        what = f"{plug_in} raised {told}" if plug_in else f"this was not foreseen: {told}"
     log = _write_log(error, options)
     return f"{what}; {'no log could be written' if log is None else f'details are in {log}'}"
 

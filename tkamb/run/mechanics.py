@@ -11,7 +11,7 @@ import numpy as np
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import SIDES, Array, cross, inverse, knee_pose, transform
 from tkamb.knee.contact_points import NO_CONTACT, ContactPoints
-from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee
 from tkamb.knee.instant import Instant
 from tkamb.knee.knee import Knee
 from tkamb.knee.load import PointForces
@@ -84,7 +84,7 @@ class FrameLoads:
     """
 
     geometry: KneeGeometry
-    loads: KneeLoads
+    loads: SolvedLoads
     adjustment: "Adjustment | None"
     query_seconds: float
     seconds: float
@@ -232,7 +232,7 @@ class Mechanics:
         return NO_CONTACT if self.query is None else instant.contact_points(self.query, pose)
 
     def _effect(
-        self, geometry: KneeGeometry, loads: KneeLoads, recorded: ContactPoints
+        self, geometry: KneeGeometry, loads: SolvedLoads, recorded: ContactPoints
     ) -> "AdjustmentEffect | None":
         """Return what the adjustment changed; None where either pose has no solution."""
         if loads.problems or recorded.problems:

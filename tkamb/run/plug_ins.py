@@ -1,4 +1,4 @@
-"""Which code of another package computes contact or wear: the hash of that package.
+"""Plug-ins, which compute contact or wear: the hash of their code, and which one raised an error.
 
 The hash is part of a run's identity, as that of tkamb's code: a changed default in that package
 changes numbers, but neither the scene nor tkamb.
@@ -6,11 +6,14 @@ changes numbers, but neither the scene nor tkamb.
 
 import hashlib
 from collections.abc import Iterable
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
 CONTACT_CODE = "code of the contact model"
 """Its name in a run's identity."""
+GROUPS = {"tkamb.contact": "contact model", "tkamb.wear": "wear law"}
+"""Group of entry points -> what a plug-in of that group is."""
 SUFFIXES = (".py", ".so", ".pyd")
 
 
@@ -29,6 +32,29 @@ def foreign_code(thing: object) -> str | None:
     """Return the SHA-256 of the package of an object's class; None for one of tkamb's."""
     module = type(thing).__module__
     return None if module.partition(".")[0] == "tkamb" else package_code(module)
+
+
+def raised_in(error: BaseException) -> str | None:
+    """Return the plug-in that raised an error, with the line of its code; None: no plug-in did.
+
+    The deepest call of the traceback decides that is of tkamb or of a plug-in: a plug-in may have
+    raised the error by way of NumPy, say.
+    """
+    plug_ins = {
+        point.value.partition(":")[0].partition(".")[0]: f"{kind} '{point.name}'"
+        for group, kind in GROUPS.items()
+        for point in entry_points(group=group)
+    }
+    result, trace = None, error.__traceback__
+    while trace is not None:
+        package = str(trace.tb_frame.f_globals.get("__name__")).partition(".")[0]
+        if package == "tkamb":
+            result = None
+        elif package in plug_ins:
+            file = Path(trace.tb_frame.f_code.co_filename).name
+            result = f"{plug_ins[package]} ({package}, {file}, line {trace.tb_lineno})"
+        trace = trace.tb_next
+    return result
 
 
 def package_code(module: str) -> str:

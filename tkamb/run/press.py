@@ -364,7 +364,7 @@ def _adjustment_settings(
         )
     if not adjust:
         if restore_when is not None:
-            raise InputError("needs the femoral adjustment", "restore_when", "give --adjust too")
+            raise InputError("needs the femoral adjustment", "restore_when", "give adjust=True too")
         return None
     return (
         AdjustmentSettings()

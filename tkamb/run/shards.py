@@ -144,7 +144,7 @@ class Shards:
             return dict(read_json(path))
         except (ValueError, TypeError, InputError) as error:
             what = f"does not say which run the frames beside it belong to ({error})"
-            raise InputError(what, path, "leave out --resume to begin again") from None
+            raise InputError(what, path, "leave out resume=True to begin again") from None
 
 
 def check_same_run(
@@ -165,7 +165,7 @@ def check_same_run(
         raise InputError(
             f"cannot resume: the run in this folder has another {', another '.join(other)}",
             directory,
-            "give the same scene and options, or leave out --resume to begin again",
+            "give the same scene and options, or leave out resume=True to begin again",
         )
 
 

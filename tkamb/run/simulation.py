@@ -159,7 +159,7 @@ class _Run:
                 raise
             self.recorder.publish(self.results)
             progress_words = f"{len(self.recorder.rows)} of {len(self.indices)} frames"
-            raise KeyboardInterrupt(f"{progress_words} are kept; go on with --resume") from None
+            raise KeyboardInterrupt(f"{progress_words} are kept; go on with resume=True") from None
         self.recorder.finish()
         return self.recorder.publish(self.results)
 
@@ -277,7 +277,7 @@ def chosen_frames(frames: slice | range | None, count: int) -> range:
     if any(not -count <= end <= count for end in ends) or len(chosen) == 0:
         raise InputError(
             f"frames {frames.start}:{frames.stop}:{frames.step} are not in the motion",
-            "--frames",
+            "frames",
             f"it has frames 0 to {count - 1}; 0:{count} are all of them",
         )
     return chosen

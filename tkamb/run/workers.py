@@ -36,7 +36,7 @@ WORKER_LIMITS = WorkerLimitSettings()
 Numbered = tuple[int, Any]
 Progress = Callable[[Iterable[Numbered], int], Iterable[Numbered]]
 ENDED = "a worker process ended before its job was done"
-KEPT = "what is finished is kept: go on with --resume"
+KEPT = "what is finished is kept: go on with resume=True"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class PoolOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.workers <= WORKER_LIMITS.max_workers:
             raise InputError(
-                f"{self.workers} is not within 1 to {WORKER_LIMITS.max_workers}", "--workers"
+                f"{self.workers} is not within 1 to {WORKER_LIMITS.max_workers}", "workers"
             )
 
     def check(self) -> None:
@@ -208,7 +208,7 @@ def _attend(
             answers.put(pickle.load(process.stdout))
     except (OSError, EOFError, ValueError, pickle.UnpicklingError):
         again = f"is there memory for so many? {KEPT.capitalize()}"
-        answers.put(ComputationError(ENDED, "--workers", again))
+        answers.put(ComputationError(ENDED, "workers", again))
 
 
 def _send(stream: IO[bytes], value: object) -> None:

@@ -14,10 +14,10 @@ from tkamb.geometry.frames import Array
 from tkamb.io.given_material import given_material, material_as_json
 from tkamb.run.known_errors import as_json, is_large, known_error_words
 from tkamb.run.maps import ContactMaps
-from tkamb.show.design_figure import BANDS, design_bars, draw_designs, run_error
 from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA, Card
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.pressure_maps import TopView, draw_pressure
+from tkamb.show.study_figures import BANDS, design_bars, draw_designs, run_error
 from tkamb.show.style import CYCLE as COLOURS
 from tkamb.show.style import PRESSURE_MAP, legend_above, new_figure, settings, svg_text
 from tkamb.studies.cohort.outcome import Outcome

@@ -19,7 +19,6 @@ from tkamb.run.columns import (
 from tkamb.run.metrics import body_weight
 from tkamb.show.axis import HorizontalAxis
 from tkamb.show.panels import Line, Panel
-from tkamb.show.places import LABEL_PLACE, label_width, leave_unmeasured, overhang, set_place
 from tkamb.show.style import (
     BLACK,
     GREY,
@@ -29,6 +28,7 @@ from tkamb.show.style import (
     new_figure,
     settings,
 )
+from tkamb.show.svg import LABEL_PLACE, label_width, leave_unmeasured, overhang, set_place
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results

@@ -18,7 +18,6 @@ from tkamb.errors import InputError
 from tkamb.run.metrics import failed, flagged
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
 from tkamb.show.panels import Line, Panel, centre_panel, panels
-from tkamb.show.places import LABEL_PLACE, label_width, leave_unmeasured, set_place
 from tkamb.show.style import (
     BLACK,
     GREY,
@@ -27,7 +26,7 @@ from tkamb.show.style import (
     new_figure,
     settings,
 )
-from tkamb.show.svg import text_width
+from tkamb.show.svg import LABEL_PLACE, label_width, leave_unmeasured, set_place, text_width
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results

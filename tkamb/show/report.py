@@ -21,10 +21,8 @@ from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.panels import Panel, centre_panel, panels
 from tkamb.show.plots import WIDTH, Sheet
 from tkamb.show.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
-from tkamb.show.reading import conclusions
+from tkamb.show.sections import conclusions, flag_rows, motion_table, strain_table, wear_section
 from tkamb.show.style import svg_text
-from tkamb.show.tables import flag_rows, motion_table, strain_table
-from tkamb.show.wear import wear_section
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results

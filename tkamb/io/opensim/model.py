@@ -102,7 +102,7 @@ class Path:
 
 
 @dataclass(frozen=True, eq=False)
-class Muscle:
+class OpenSimMuscle:
     """A muscle with the four numbers all of OpenSim's classes share.
 
     Args:
@@ -129,7 +129,7 @@ class Muscle:
 
 
 @dataclass(frozen=True, eq=False)
-class Ligament:
+class OpenSimLigament:
     """A ligament, by one of two laws.
 
     Blankevoort1991Ligament has `stiffness_N` (N per strain) and `transition_strain`;
@@ -343,8 +343,8 @@ class OpenSimModel:
     couplers: tuple[CoordinateCoupler, ...]
     constant_distances: tuple[ConstantDistance, ...]
     markers: dict[str, Marker]
-    muscles: dict[str, Muscle]
-    ligaments: dict[str, Ligament]
+    muscles: dict[str, OpenSimMuscle]
+    ligaments: dict[str, OpenSimLigament]
     wrap_objects: dict[str, WrapObject]
     offset_frames: dict[str, tuple[str, Array]]
     left_out: tuple[str, ...]

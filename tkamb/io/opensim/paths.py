@@ -22,7 +22,13 @@ from numpy.typing import ArrayLike
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 from tkamb.io.opensim.kinematics import Kinematics, Motion
-from tkamb.io.opensim.model import ConditionalPathPoint, Ligament, MovingPathPoint, Muscle, Path
+from tkamb.io.opensim.model import (
+    ConditionalPathPoint,
+    MovingPathPoint,
+    OpenSimLigament,
+    OpenSimMuscle,
+    Path,
+)
 from tkamb.io.opensim.wrapping import WrappedStrings, strings_over
 
 
@@ -208,7 +214,7 @@ class LineSet:
     def __init__(self, kinematics: Kinematics, names: Iterable[str] | None = None) -> None:
         self.kinematics, model = kinematics, kinematics.model
         self.names = tuple(model.muscles if names is None else names)
-        owners: dict[str, Muscle | Ligament] = {**model.ligaments, **model.muscles}
+        owners: dict[str, OpenSimMuscle | OpenSimLigament] = {**model.ligaments, **model.muscles}
         for name in self.names:
             if name not in owners:
                 raise InputError(f"has no muscle or ligament '{name}'", model.name)

@@ -12,9 +12,9 @@ from tkamb.io.opensim.model import (
     AnyPathPoint,
     ConditionalPathPoint,
     Coordinate,
-    Ligament,
     MovingPathPoint,
-    Muscle,
+    OpenSimLigament,
+    OpenSimMuscle,
     Path,
     PathPoint,
     PathWrap,
@@ -102,14 +102,14 @@ def read_forces(
     frames: Frames,
     coordinates: Mapping[str, Coordinate],
     wraps: Mapping[str, WrapObject],
-) -> tuple[dict[str, Muscle], dict[str, Ligament], list[str]]:
+) -> tuple[dict[str, OpenSimMuscle], dict[str, OpenSimLigament], list[str]]:
     """Return muscles, ligaments, and "class 'name'" of the forces left out.
 
     Raises:
         InputError: a kind of muscle that is not read, or something wrong in a path.
     """
-    muscles: dict[str, Muscle] = {}
-    ligaments: dict[str, Ligament] = {}
+    muscles: dict[str, OpenSimMuscle] = {}
+    ligaments: dict[str, OpenSimLigament] = {}
     left_out = []
     reader = _PathReader(document, frames, coordinates, wraps)
     for element in document.objects(model, "ForceSet"):
@@ -140,9 +140,9 @@ def _enabled(document: Document, element: Element) -> bool:
     return applies and not document.flag(element, "isDisabled", False)
 
 
-def _muscle(document: Document, element: Element, path: Path) -> Muscle:
+def _muscle(document: Document, element: Element, path: Path) -> OpenSimMuscle:
     number = document.number
-    return Muscle(
+    return OpenSimMuscle(
         name=document.name(element),
         kind=element.tag,
         path=path,
@@ -155,7 +155,7 @@ def _muscle(document: Document, element: Element, path: Path) -> Muscle:
     )
 
 
-def _ligament(document: Document, element: Element, path: Path) -> Ligament:
+def _ligament(document: Document, element: Element, path: Path) -> OpenSimLigament:
     common: dict[str, Any] = {
         "name": document.name(element),
         "kind": element.tag,
@@ -164,7 +164,7 @@ def _ligament(document: Document, element: Element, path: Path) -> Ligament:
     }
     if element.tag == "Ligament":
         curve = document.held_function(element, "force_length_curve")
-        return Ligament(
+        return OpenSimLigament(
             slack_length_m=document.number(element, "resting_length"),
             stiffness_N=None,
             transition_strain=None,
@@ -173,7 +173,7 @@ def _ligament(document: Document, element: Element, path: Path) -> Ligament:
             scale_N=document.number(element, "pcsa_force", default=1.0),
             **common,
         )
-    return Ligament(
+    return OpenSimLigament(
         slack_length_m=document.number(element, "slack_length"),
         stiffness_N=document.number(element, "linear_stiffness"),
         transition_strain=document.number(element, "transition_strain", default=0.06),

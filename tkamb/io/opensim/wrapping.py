@@ -51,7 +51,7 @@ WRAP = WrapSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
+class WrapTouch:
     """Where strings (f) touch an object.
 
     Args:
@@ -69,7 +69,7 @@ class Touch:
     push: Array
 
 
-def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> Touch:
+def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> WrapTouch:
     """Return where strings touch a wrap object, in its frame.
 
     Args:
@@ -124,7 +124,7 @@ def _around(
 
 def _cylinder(
     start: Array, end: Array, radius: float, length: float, quadrant: tuple[int, int] | None
-) -> Touch:
+) -> WrapTouch:
     """Return strings around a cylinder along z; none where they touch beyond both its ends."""
     (near, angle), (far, last) = _polar(start), _polar(end)
     if quadrant is None or quadrant[0] == 2:
@@ -144,10 +144,10 @@ def _cylinder(
     )
     off = np.minimum(np.abs(heights[0]), np.abs(heights[1])) > length / 2.0
     arc = on_circle * np.hypot(1.0, rise)
-    return Touch((turn != 0.0) & ~off, entry, leave, arc, _no_push(start))
+    return WrapTouch((turn != 0.0) & ~off, entry, leave, arc, _no_push(start))
 
 
-def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> Touch:
+def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> WrapTouch:
     """Return strings around a sphere: in the plane of both ends and its centre.
 
     A string that must pass on one half goes the long way round if that is where it leads,
@@ -171,10 +171,10 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
         radius * (np.cos(a)[:, None] * along + np.sin(a)[:, None] * across)
         for a in (ahead, ahead + turn)
     )
-    return Touch(touches, entry, leave, radius * np.abs(turn), _no_push(start))
+    return WrapTouch(touches, entry, leave, radius * np.abs(turn), _no_push(start))
 
 
-def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
+def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     """Return strings through a torus about z, pressed against the inside of its ring.
 
     The ring is taken as a cylinder along its tangent at the place that it is pressed most:
@@ -182,7 +182,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
     """
     rows = np.arange(len(start))
 
-    def at(places: Array) -> tuple[Touch, Array, Array]:
+    def at(places: Array) -> tuple[WrapTouch, Array, Array]:
         """Return touches, lengths and frames with the ring taken straight at angles (f,)."""
         inward = -np.column_stack([np.cos(places), np.sin(places), np.zeros_like(places)])
         up = np.broadcast_to([0.0, 0.0, 1.0], inward.shape)
@@ -207,12 +207,12 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> Touch:
     centre = -ring * frame[rows, 0]
     entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (result.entry, result.exit))
     touches = result.touches & np.isfinite(lengths)
-    return Touch(touches, entry, leave, result.arc_m, _no_push(start))
+    return WrapTouch(touches, entry, leave, result.arc_m, _no_push(start))
 
 
 def _ellipsoid(
     start: Array, end: Array, axes: Array, quadrant: tuple[int, int] | None, moves: Mask
-) -> Touch:
+) -> WrapTouch:
     """Return strings around an ellipsoid: geodesics where the straight line would cut it."""
     p, q = start / axes, end / axes
     depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
@@ -238,7 +238,7 @@ def _ellipsoid(
             np.stack([p, q], axis=1) / (depth * (1.0 + WRAP.ellipsoid_clearance))[..., None] / axes
         )
         push[touches] = -(growth[:, None] * yields[touches])[..., None] * by_point[touches]
-    return Touch(touches, entry, leave, arc, push)
+    return WrapTouch(touches, entry, leave, arc, push)
 
 
 @dataclass(frozen=True)
@@ -389,7 +389,7 @@ class _Strings:
             self._touch(w, gap, free[result.touches], result)
             free = free[~result.touches]
 
-    def _touch(self, w: int, gap: int, rows: Index, found: Touch) -> None:
+    def _touch(self, w: int, gap: int, rows: Index, found: WrapTouch) -> None:
         on, poses = found.touches, self.poses[rows, w]
         self.entry[rows, w] = _moved(poses, found.entry[on])
         self.exit[rows, w] = _moved(poses, found.exit[on])

@@ -185,7 +185,7 @@ def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
             f"frames = {frames} resamples to {rate:.3g} Hz, and results at the frames are low-pass "
             f"filtered at {cutoff_Hz:g} Hz, which needs more than twice as many frames per second",
             "[motion] frames",
-            f"give {least} or more, or leave frames out; --frames A:B:STEP computes fewer of them",
+            f"give {least} or more, or leave frames out; frames=slice(A, B, STEP) computes fewer",
         )
 
 

@@ -14,9 +14,14 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_valid
 from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
-from tkamb.io.scene.measured import MeasuredTable
-from tkamb.io.scene.recording_tables import GroundReactionTable, MotionTable, TibiaTable
-from tkamb.io.scene.table import SceneTable
+from tkamb.io.recordings.recording_tables import (
+    GroundReactionTable,
+    MeasuredTable,
+    MotionTable,
+    PatientTable,
+    TibiaTable,
+)
+from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.tables import (
     ContactTable,
     GenericLigamentsTable,
@@ -28,7 +33,6 @@ from tkamb.io.scene.tables import (
     OutputTable,
     PatellarLigamentTable,
     PatellaTable,
-    PatientTable,
     QuadricepsTable,
     WearTable,
 )
@@ -305,7 +309,9 @@ def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
     for name in tables:
         content = content.setdefault(name, {})
         if not isinstance(content, dict):
-            raise InputError(f"'{dotted}' names a key of something that is not a table", "--set")
+            raise InputError(
+                f"'{dotted}' names a key of something that is not a table", "overrides"
+            )
     content[key] = value
 
 
@@ -316,7 +322,7 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
     first = min(result, key=lambda one: rank.get(one["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
     option = next((o for o in overrides if f"{o}.".startswith(f"{key}.") or o == key), None)
-    where = path if option is None else f"--set {option}"
+    where = path if option is None else f"overrides {option}"
     more = f" ({len(result) - 1} more after this one)" if len(result) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = list(_keys_of(first["loc"][:-1]))

@@ -96,14 +96,14 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     results = read_results(folder)
     count = len(results)
     if not -count <= frame < count:
-        raise InputError(f"there is no frame {frame}", "--frame", f"give one of 0 to {count - 1}")
+        raise InputError(f"there is no frame {frame}", "frame", f"give one of 0 to {count - 1}")
     frame %= count
     row, maps = map_rows(results).get(frame), results.maps
     if maps is None or row is None:
-        raise InputError(f"frame {frame} has no pressure map", folder, "choose another --frame")
+        raise InputError(f"frame {frame} has no pressure map", folder, "choose another frame")
     load = -float(maps.nodal_force_N[row, :, 1].sum())
     if not load > 0:
-        raise InputError(f"frame {frame} carries no load", folder, "choose another --frame")
+        raise InputError(f"frame {frame} carries no load", folder, "choose another frame")
     pair, spacing = _pair(results)
     pose = maps.femoral_pose[row]
     problem = press_problem(pair, load, pose, resolution_mm or spacing)

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.io.opensim.model import Muscle
+from tkamb.io.opensim.model import OpenSimMuscle
 
 BELLS = (
     (0.8150671134243542, 1.055033428970575, 0.162384573599574, 0.063303448465465),
@@ -75,7 +75,7 @@ def passive_force_length(length: Array) -> Array:
 
 
 def rigid_tendon_strength(
-    muscles: Sequence[Muscle], lengths_m: Array, speeds: Array
+    muscles: Sequence[OpenSimMuscle], lengths_m: Array, speeds: Array
 ) -> tuple[Array, Array]:
     """Return the forces (..., m), N, at full activation without the passive one, and the passive.
 

@@ -9,7 +9,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.importing.anatomy import Leg, find_leg
-from tkamb.io.opensim.model import AnyPathPoint, Joint, Muscle, OpenSimModel, PathPoint
+from tkamb.io.opensim.model import AnyPathPoint, Joint, OpenSimModel, OpenSimMuscle, PathPoint
 from tkamb.io.recordings.ground_reaction import GroundReaction
 
 EXTENSORS = "knee extensors"
@@ -77,7 +77,7 @@ def leg_muscles(leg: Leg) -> tuple[str, ...]:
     return tuple(name for name in names if name not in twins)
 
 
-def muscle_groups(leg: Leg, muscles: Sequence[Muscle]) -> dict[str, tuple[str, ...]]:
+def muscle_groups(leg: Leg, muscles: Sequence[OpenSimMuscle]) -> dict[str, tuple[str, ...]]:
     """Return group -> names of its muscles, by the bones that a muscle's path ends on.
 
     The extensors of the knee end on the patella or lead past it; whatever lies above the thigh
@@ -156,7 +156,7 @@ def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:
         )
 
 
-def _same_muscle(one: Muscle, other: Muscle) -> bool:
+def _same_muscle(one: OpenSimMuscle, other: OpenSimMuscle) -> bool:
     strong, weak = (
         np.array([m.max_isometric_force_N, m.optimal_fibre_length_m, m.tendon_slack_length_m])
         for m in (one, other)

@@ -12,7 +12,6 @@ import numpy as np
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
 from tkamb.io.scene.case import Case
-from tkamb.io.scene.si import in_si
 from tkamb.io.scene.tables import MusclesTable
 from tkamb.knee.crossing import (
     CrossingLines,
@@ -21,7 +20,7 @@ from tkamb.knee.crossing import (
     flexion_row,
     yielding_flexion_row,
 )
-from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
 from tkamb.run.muscles.knee_trial import KneeTrial
 from tkamb.run.muscles.recording import LegRecording, group_names, load_knee_trial
 from tkamb.run.muscles.sharing import EmgGuide, Sharing
@@ -136,7 +135,7 @@ class FrameMuscles:
         """Return the tension of the extensor group, N."""
         return float(share.force[self.trial.extensor].sum())
 
-    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, KneeLoads]:
+    def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
         """Return the geometry with the muscles' forces in it, and all loads.
 
         Contact points and lines stay, so the sharing is exact at once; again where a condyle
@@ -220,7 +219,7 @@ def load_muscles(case: Case) -> SharedMuscles:
         markers=scene.motion.file if markers else None,
         laboratory_axes=markers.laboratory_axes if markers else "+x,+y,+z",
         cutoff=scene.motion.cutoff_Hz,
-        ground=None if ground is None else in_si(ground),
+        ground=ground,
         insert_placement=case.insert_placement,
         mesh_axes="+x,+y,+z" if insert is None else insert.axes,
         sharing=sharing_of(table),

@@ -8,7 +8,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
-from tkamb.io.opensim.model import Muscle
+from tkamb.io.opensim.model import OpenSimMuscle
 from tkamb.run.muscles.hill import HILL
 from tkamb.run.muscles.static_optimisation import LoadSharing, share_load
 
@@ -117,7 +117,7 @@ class FrameProblems:
     `guide`: what EMG asks of the activations, if anything.
     """
 
-    muscles: list[Muscle]
+    muscles: list[OpenSimMuscle]
     coordinates: tuple[str, ...]
     sharing: Sharing
     moment: Array
@@ -176,7 +176,7 @@ class FrameProblems:
         return problem if self.guide is None else self.guide.applied(problem, k)
 
 
-def _weights(muscles: Sequence[Muscle], sharing: Sharing) -> Array:
+def _weights(muscles: Sequence[OpenSimMuscle], sharing: Sharing) -> Array:
     """Return w (m,), 1 on average."""
     if sharing.weights == "equal":
         return np.ones(len(muscles))

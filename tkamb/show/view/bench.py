@@ -27,18 +27,14 @@ from tkamb.geometry.frames import (
     transform,
 )
 from tkamb.io.recordings.ground_reaction import GroundReaction
-from tkamb.io.recordings.motion import KneeMotion
 from tkamb.io.recordings.tibia import BodyMotion
 from tkamb.io.scene.case import Case
 from tkamb.knee.load import LinkPoint
-from tkamb.show.view.bench_scene import STILL
+from tkamb.show.view.bench_scene import ROWS, STILL, still_motion
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.knee.ligaments import Ligament
-
-ROWS = 6
-"""Rows of the tables, all equal: computing accelerations needs at least so many."""
 
 
 @dataclass(frozen=True)
@@ -354,14 +350,6 @@ class Bench:
         else:
             return end
         return LinkPoint(end.link, position)
-
-
-def still_motion(coordinates: Array) -> KneeMotion:
-    """Return poses (f, 6) m and rad of a right knee as a motion without velocity."""
-    frames = len(coordinates)
-    nothing, still = np.zeros((frames, 6)), np.zeros(frames)
-    time = np.arange(frames, dtype=float)
-    return KneeMotion(time, coordinates, nothing, nothing, coordinates, still, still)
 
 
 def _upright() -> BodyMotion:

@@ -10,18 +10,19 @@ from tkamb.io.scene.case import Case
 from tkamb.run.metrics import body_weight, map_rows, medial_share
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
 from tkamb.show.headline import run_title
-from tkamb.show.view.arrows import contact_markers, force_arrows
 from tkamb.show.view.drawing import Drawing, PressureMap, Reading
-from tkamb.show.view.run import CaseResults, Progress
-from tkamb.show.view.solids import floor_and_foot, solids, worn_insert
-from tkamb.show.view.strands import (
+from tkamb.show.view.lines import (
     centre_markers,
     centres_of_pressure,
+    contact_markers,
     extensor_strands,
+    force_arrows,
     ligament_strands,
     muscle_strands,
     path_strands,
 )
+from tkamb.show.view.run import CaseResults, Progress
+from tkamb.show.view.solids import floor_and_foot, solids, worn_insert
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:

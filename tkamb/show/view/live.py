@@ -1,6 +1,7 @@
-"""The computations of `tkamb live`, apart from its page."""
+"""The computations of `tkamb live`: contact of one pose, and inserts of another thickness."""
 
 import argparse
+import logging
 import shutil
 import tempfile
 import weakref
@@ -15,8 +16,7 @@ from tkamb.contact.registry import contact_names
 from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, Index, knee_pose
 from tkamb.io.recordings.patient import load_urdf
-from tkamb.io.scene.case import Case
-from tkamb.io.scene.si import in_si
+from tkamb.io.scene.case import Case, with_insert
 from tkamb.knee.chain import Chain
 from tkamb.knee.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
@@ -26,8 +26,61 @@ from tkamb.run.mechanics import FrameLoads, Mechanics
 from tkamb.run.read_scene import SharedState, contact_side, mechanics_of
 from tkamb.show.view.bench import BENCH_LIMIT, ROWS, Bench, BenchRequest
 from tkamb.show.view.bench_scene import write_bench
-from tkamb.show.view.parametric_insert import parametric_insert, with_thickness
+from tkamb.studies.designs.design import DESIGN_FILE, load_design
+from tkamb.studies.designs.insert import Insert
+from tkamb.studies.designs.solids import write_stl
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+
+logger = logging.getLogger("tkamb")
+
+
+def parametric_insert(case: Case, folder: Path) -> Insert | None:
+    """Return the design of a case's insert; None where its mesh was not made from one.
+
+    The design is `DESIGN_FILE` beside the mesh. It must give this very mesh, byte for byte.
+
+    Args:
+        case: with [contact].
+        folder: for a mesh to compare with.
+    """
+    table = case.scene.implant.insert
+    assert table is not None
+    if not (table.mesh.parent / DESIGN_FILE).is_file():
+        return None
+    try:
+        insert = load_design(table.mesh.parent).insert
+        made = write_insert(insert, insert.thickness, folder)
+        if made.read_bytes() == table.mesh.read_bytes():
+            return insert
+        logger.warning(
+            "%s: not the mesh of %s beside it: no thickness slider", table.mesh, DESIGN_FILE
+        )
+    except (InputError, OSError) as error:
+        logger.warning("%s: %s: no thickness slider", table.mesh.parent / DESIGN_FILE, error)
+    return None
+
+
+def write_insert(insert: Insert, thickness_mm: float, folder: Path) -> Path:
+    """Write the insert at a thickness as STL, and return the file.
+
+    The dishes rise or sink with the thickness; the bottom, and with it the insert frame, stays.
+    """
+    path = folder / f"insert_{thickness_mm:g}_mm.stl"
+    write_stl(path, *replace(insert, thickness=thickness_mm).mesh())
+    return path
+
+
+def with_thickness(case: Case, insert: Insert, thickness_mm: float, folder: Path) -> Case:
+    """Return a case with its parametric insert at another thickness.
+
+    Args:
+        case: with [contact].
+        insert: its design.
+        thickness_mm: at the thinnest.
+        folder: for the mesh, which must outlive the case.
+    """
+    return with_insert(case, write_insert(insert, thickness_mm, folder))
+
 
 Setting = tuple[str, float, float | None]
 """What a contact model is prepared for: its name, spacing (mm) and the insert's thickness (mm)."""
@@ -119,7 +172,7 @@ class LiveKnee:
         motion, table = self.case.motion, self.case.scene.contact
         if not 0 <= frame < len(motion.time):
             raise InputError(
-                f"there is no frame {frame}", "--frame", f"give one of 0 to {len(motion.time) - 1}"
+                f"there is no frame {frame}", "frame", f"give one of 0 to {len(motion.time) - 1}"
             )
         assert table is not None
         values = dict(zip(KNEE_COORDINATES, motion.coordinates[frame].tolist(), strict=True))
@@ -358,7 +411,7 @@ def _numbers(
 
 def _without_muscles(case: Case) -> Case:
     """Return a case of bones, ligaments and contact alone: nothing else is on the bench."""
-    chain = Chain(load_urdf(in_si(case.scene.patient), False), False)
+    chain = Chain(load_urdf(case.scene.patient, False), False)
     update = {"patella": None, "muscles": None, "quadriceps": None, "muscle": ()}
     scene = case.scene.model_copy(update=update)
     return replace(case, scene=scene, chain=chain, muscles=(), patellar_ligament=None, patella=None)

@@ -2,25 +2,51 @@
 
 import json
 import math
+import shutil
+import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.errors import TkambError
-from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, knee_pose
-from tkamb.io.scene.case import Case
+from tkamb.errors import InputError, TkambError
+from tkamb.geometry.flat_bottom import insert_placement
+from tkamb.geometry.frames import (
+    KNEE_COORDINATES,
+    SIDES,
+    knee_coordinates,
+    knee_pose,
+)
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.knee.knee import Knee
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import SIDE_COLOURS
-from tkamb.show.view.bench import BenchRequest
-from tkamb.show.view.colours import INSERT, METAL, RECORDED, SLACK, rgb, strain_colours
-from tkamb.show.view.drawing import Drawing, Marker, PressureMap, Solid, Strand
+from tkamb.show.view.bench import BenchRequest, still_motion
+from tkamb.show.view.drawing import (
+    INSERT,
+    METAL,
+    RECORDED,
+    SLACK,
+    Drawing,
+    Marker,
+    PressureMap,
+    Solid,
+    Strand,
+    rgb,
+    strain_colours,
+)
 from tkamb.show.view.live import LiveAnswer, LiveKnee, setting
 from tkamb.show.view.page import PACKAGE, POLICY, meshcat_script
 from tkamb.show.view.payload import pack, packed_map
 from tkamb.show.view.server import NotYet, ViewServer
+from tkamb.show.view.show import serve_in_background
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
+
+if TYPE_CHECKING:
+    pass
+from tkamb.show.view.bench_scene import write_knee
 
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
 COARSE = ("foundation", 2.0)
@@ -272,8 +298,41 @@ def live(
     Raises:
         InputError: nothing to see there, or the scene has no [contact].
     """
-    from tkamb.show.view.show import serve_in_background
-
     server = open_live(Path(path), frame=frame, contact=contact, folder=folder).server()
     serve_in_background(server)
     return server
+
+
+def live_knee(knee: Knee, q: Any, load: float, folder: str | Path | None) -> ViewServer:
+    """Serve the live window of a knee beside the caller; see `tkamb.Knee.live`."""
+    window = LiveWindow(bench_of_knee(knee, q), Path(folder or Path("out") / "live"))
+    window.start = BenchRequest.read(asdict(window.start) | {"load_N": load})
+    server = window.server()
+    serve_in_background(server)
+    return server
+
+
+def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
+    """Return a knee on the bench.
+
+    Args:
+        knee: with a contact model that has a name.
+        q: (nq,) or (f, nq): the poses of the slider "recorded frame".
+
+    Raises:
+        InputError: no contact model, or one without a name; a q of another size; a part that a
+            scene does not accept.
+    """
+    if knee.contact is None or knee.femoral is None or knee.insert is None:
+        raise InputError("has no contact model", "Knee", "give contact= and implant=")
+    placement = insert_placement(knee.insert)
+    data = knee.create_data_for_kinematics()
+    poses = np.array([knee.at(one, data).pose for one in np.atleast_2d(np.asarray(q, float))])
+    coordinates = knee_coordinates(placement @ poses)
+    own = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
+    try:
+        case = load_case(load_scene(write_knee(knee, placement, coordinates, own)))
+    except InputError:
+        shutil.rmtree(own, ignore_errors=True)
+        raise
+    return LiveKnee(replace(case, motion=still_motion(coordinates)), own)

@@ -1,19 +1,156 @@
-"""The page around the scene, one HTML that needs nothing from elsewhere, and a picture of it."""
+"""The viewer as one self-contained HTML page, and pictures and films of it by a browser."""
 
 import base64
+import io
 import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import meshcat
+import numpy as np
+from PIL import Image
 
-from tkamb.errors import ComputationError
+from tkamb.errors import ComputationError, InputError, not_installed
+from tkamb.files import replaced_file
 from tkamb.show.pages import asset, policy_sources, render
+from tkamb.show.view.run import Progress
+
+if TYPE_CHECKING:
+    from tkamb.show.view.show import Show
+
+
+SIZE = (1280, 720)
+"""Pixels; MP4 wants even numbers."""
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """The film of the viewer."""
+
+    max_frame_rate: float = 50.0
+    """Frames per second. Chosen: screens show 60."""
+
+
+FILM = FilmSettings()
+
+READY = (
+    "new Promise((done, fail) => { setTimeout(() => fail('not drawn in 60 s'), 60000); "
+    "setInterval(() => document.body.dataset.ready && done(), 20); })"
+)
+"""Waits until the page is drawn: the page's security policy forbids the driver's own waiting."""
+INSTALL = "install chromium (Debian: apt install chromium)"
+
+
+def check_film(path: Path, option: str) -> None:
+    """Refuse a film that cannot be made here, before anything is drawn.
+
+    Args:
+        path: of the film, .gif or .mp4.
+        option: that asks for it.
+
+    Raises:
+        InputError: another ending, no browser, or a package of the extra is not installed.
+    """
+    if path.suffix.lower() != f".{option.removeprefix('--')}":
+        raise InputError(f"'{path.name}' does not end with .{option.removeprefix('--')}", option)
+    try:
+        find_browser()
+    except ComputationError as error:
+        raise InputError(str(error).split("; ")[0], option, INSTALL) from None
+    _playwright()
+    if path.suffix.lower() == ".mp4":
+        _encoder()
+
+
+def write_film(show: "Show", path: Path, progress: Progress = lambda frames: frames) -> None:
+    """Write every frame of a show at the motion's own speed.
+
+    Args:
+        show: what is drawn.
+        path: ends with .gif or .mp4.
+        progress: wraps the frame indices.
+
+    Raises:
+        InputError: as `check_film`, or the folder cannot be written.
+        ComputationError: the page is not drawn, or the encoder fails.
+    """
+    times = max((one.times for one in show.drawings), key=len)
+    rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 1.0
+    rate = float(np.clip(rate, 1.0, FILM.max_frame_rate))
+    pictures = film_frames(show.html(), len(times), progress)
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    with replaced_file(path) as temporary:
+        write(pictures, temporary, rate)
+
+
+def film_frames(html: str, count: int, progress: Progress) -> Iterator[bytes]:
+    """Yield a PNG of each frame of a page of `page_html`, as `screenshot` draws it."""
+    with tempfile.TemporaryDirectory(prefix="tkamb-film-") as folder, _playwright()() as driver:
+        page_path = Path(folder) / "page.html"
+        page_path.write_text(html, encoding="utf-8")
+        browser = driver.chromium.launch(
+            executable_path=find_browser(), args=list(SOFTWARE_GRAPHICS)
+        )
+        try:
+            page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+            page.goto(f"{page_path.as_uri()}#figure=1")
+            page.evaluate(READY)
+            for k in progress(range(count)):
+                page.evaluate(f"tkamb.go({k}); tkamb.viewer.render()")
+                yield page.screenshot()
+        finally:
+            browser.close()
+
+
+def _write_gif(pictures: Iterator[bytes], path: Path, rate: float) -> None:
+    """Write a GIF; the 256 colours of each picture are spread evenly over the colours that occur.
+
+    Chosen by frequency, as usual, most would be greys of the background, and scales would look
+    wrong."""
+    spread, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
+    first, *rest = (
+        Image.open(io.BytesIO(one)).convert("RGB").quantize(256, method=spread, dither=plain)
+        for one in pictures
+    )
+    duration = round(1e3 / rate)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
+
+
+def _write_mp4(pictures: Iterator[bytes], path: Path, rate: float) -> None:
+    command = [
+        _encoder(), "-v", "error", "-y", "-f", "image2pipe", "-framerate", f"{rate:.4f}",
+        "-c:v", "png", "-i", "-", "-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p",
+        "-movflags", "+faststart", "-f", "mp4", str(path),
+    ]  # fmt: skip
+    process = subprocess.run(command, input=b"".join(pictures), capture_output=True)
+    if process.returncode:
+        raise ComputationError(f"ffmpeg failed ({process.stderr.decode(errors='replace').strip()})")
+
+
+def _playwright() -> Any:
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        raise not_installed("playwright", "a film", "film") from None
+    return sync_playwright
+
+
+def _encoder() -> str:
+    """Return the path of an ffmpeg: the machine's, or that of the extra."""
+    result = shutil.which("ffmpeg")
+    if result is not None:
+        return result
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError:
+        raise not_installed("imageio-ffmpeg", "an .mp4", "film") from None
+    return str(get_ffmpeg_exe())
+
 
 PACKAGE = "tkamb.show.view"
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "start.js")

@@ -194,7 +194,7 @@ def check_frame(sources: Sequence[Source], frame: int) -> None:
 
 def no_frame(frame: int, most: int) -> InputError:
     """Return the error for a frame that is beyond the longest run's `most` frames."""
-    return InputError(f"there is no frame {frame}", "--frame", f"give one of 0 to {most - 1}")
+    return InputError(f"there is no frame {frame}", "frame", f"give one of 0 to {most - 1}")
 
 
 def match_frames(case: Case, results: Results) -> CaseResults:

@@ -101,7 +101,7 @@ class Show:
         if not -most <= frame < most:
             raise no_frame(frame, most)
         if camera not in CAMERAS:
-            raise InputError(f"no view '{camera}'", "--camera", f"there are: {', '.join(CAMERAS)}")
+            raise InputError(f"no view '{camera}'", "camera", f"there are: {', '.join(CAMERAS)}")
         return frame % most, camera
 
     def server(self, port: int = 0) -> "ViewServer":

@@ -22,11 +22,10 @@ from tkamb.io.scene.case import Case
 from tkamb.knee.chain import ChainState
 from tkamb.knee.equations import KneeGeometry
 from tkamb.run.maps import ContactMaps
+from tkamb.show.sections import WORN_NAME, wear_of_run
 from tkamb.show.style import BLACK
-from tkamb.show.view.arrows import centre_of_pressure
-from tkamb.show.view.colours import BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED
-from tkamb.show.view.drawing import Marker, Solid
-from tkamb.show.wear import WORN_NAME, wear_of_run
+from tkamb.show.view.drawing import BONE, BUTTON, FLOOR, INSERT, METAL, RECORDED, Marker, Solid
+from tkamb.show.view.lines import centre_of_pressure
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:

@@ -38,7 +38,7 @@ DESIGN_TOUCH = DesignTouchSettings()
 
 
 @dataclass(frozen=True)
-class Touch:
+class TouchingPose:
     """Pose at which both condyles touch: mm and rad; contact points (2, 3) medial, lateral."""
 
     si: float
@@ -82,8 +82,8 @@ class Articulation:
 
     def touch(
         self, ap: float, ml: float, axial_rotation: float, flexion: float, guess: float = 0.0
-    ) -> Touch:
-        """Return the Touch at the given AP and ML (mm), axial rotation and flexion (rad)."""
+    ) -> TouchingPose:
+        """Return the pose that touches at AP and ML (mm), axial rotation and flexion (rad)."""
 
         def pose(adduction: float) -> Array:
             return knee_pose([ap, 0.0, ml, axial_rotation, adduction, flexion])
@@ -97,7 +97,9 @@ class Articulation:
         adduction = brentq(difference, *bounds, xtol=1e-12)
         femoral = pose(adduction)
         medial, lateral = (self.lowest(femoral, flexion, side) for side in (MEDIAL, LATERAL))
-        return Touch(-(medial[0] + lateral[0]) / 2.0, adduction, np.stack([medial[1], lateral[1]]))
+        return TouchingPose(
+            -(medial[0] + lateral[0]) / 2.0, adduction, np.stack([medial[1], lateral[1]])
+        )
 
 
 DESIGN_FILE = "design.toml"

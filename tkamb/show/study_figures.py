@@ -1,4 +1,4 @@
-"""Designs of a cohort side by side: peak pressure and wear, each with its uncertainty."""
+"""Figures of studies: designs of a cohort side by side, and the cases of `tkamb stability`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,10 +10,19 @@ from matplotlib.figure import Figure
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.io.given_material import given_material, material_as_json
 from tkamb.run.known_errors import KnownError, known_error
-from tkamb.show.style import CYCLE as COLOURS
-from tkamb.show.style import legend_above, new_figure, settings
+from tkamb.show.style import (
+    BLUE,
+    CYCLE,
+    GREY,
+    ORANGE,
+    VERMILLION,
+    legend_above,
+    new_figure,
+    settings,
+)
 from tkamb.studies.cohort.plan import Cohort, CohortRun
 from tkamb.studies.cohort.statistics import Group
+from tkamb.studies.verdict import KINDS, VERDICT, Verdict
 
 WEAR = "volume_mm3_per_Mc"
 """Name of the worn volume in a group's wear; its ends by the wear factor add _low and _high."""
@@ -140,7 +149,7 @@ def _draw_bars(axes: Axes, bars: Sequence[Bar]) -> None:
         own = [bar for bar in bars if bar.series == name]
         shift = (k - 0.5 * (len(series) - 1)) * step
         x = [places.index(bar.place) + shift for bar in own]
-        colour = COLOURS[k % len(COLOURS)]
+        colour = CYCLE[k % len(CYCLE)]
         axes.vlines(x, [b.least for b in own], [b.most for b in own], color=colour, linewidth=1)
         axes.vlines(
             x, [b.low for b in own], [b.high for b in own], color=colour, linewidth=5, alpha=0.4
@@ -152,3 +161,51 @@ def _draw_bars(axes: Axes, bars: Sequence[Bar]) -> None:
     axes.set_ylim(0.0, 1.06 * max(bar.most for bar in bars))
     if any(series):
         legend_above(axes, 2)
+
+
+VERDICT_COLOURS = {"converged": BLUE, "flagged": ORANGE}
+
+
+def picture(verdicts: Sequence[Verdict]) -> Figure:
+    """Return one dot per case: its extreme parameter against the distance from the reference."""
+    groups = list(dict.fromkeys(_group(v) for v in verdicts))
+    with settings():
+        figure = new_figure(8.0, 1.6 + 0.2 * len(groups))
+        axis = figure.subplots()
+        for kind in KINDS:
+            some = [v for v in verdicts if v.kind == kind]
+            if not some:
+                continue
+            axis.plot(
+                [_distance(v) for v in some],
+                [groups.index(_group(v)) for v in some],
+                "o" if kind in VERDICT_COLOURS else "X",
+                color=VERDICT_COLOURS.get(kind, VERMILLION),
+                ms=4 if kind in VERDICT_COLOURS else 7,
+                alpha=0.75,
+                label=f"{kind.replace('_', ' ')} ({len(some)})",
+            )
+        axis.axvline(VERDICT.max_error, color=GREY, lw=1, ls="--")
+        top = len(groups) - 0.3
+        words = "wrong beyond 2 %; closed forms beyond their own bound "
+        axis.text(VERDICT.max_error, top, words, color=GREY, fontsize=7.5, ha="right")
+        axis.text(1.0, top, "no answer", color=GREY, fontsize=7.5, ha="center")
+        axis.set(xscale="log", xlim=(1e-9, 3.0), xlabel="largest distance from the reference")
+        axis.set_yticks(range(len(groups)), groups, fontsize=7.5)
+        axis.set_ylim(-0.7, len(groups) + 0.4)
+        figure.legend(loc="outside upper left", ncols=4)
+    return figure
+
+
+def _distance(verdict: Verdict) -> float:
+    return 1.0 if verdict.error is None else max(verdict.error, 2e-9)
+
+
+def _group(verdict: Verdict) -> str:
+    """Return the extreme parameters, or the run's kind."""
+    if verdict.contact == "run":
+        return " ".join(verdict.case.split()[:2])
+    if verdict.contact != "lattice":
+        return f"{verdict.contact}, any"
+    names = [part.split("=")[0].rsplit("_", 1)[0] for part in verdict.case.split(", ")]
+    return " and ".join(names)

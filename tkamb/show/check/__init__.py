@@ -1,1 +1,0 @@
-"""`tkamb check`: content of a scene and questions about it, before anything is computed."""

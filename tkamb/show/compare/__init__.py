@@ -1,1 +1,0 @@
-"""`tkamb compare`: folders of results side by side on one axis."""

@@ -1,0 +1,423 @@
+"""Sections of the report: conclusions, tables of the motion and of flagged frames, and wear."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tkamb.geometry.frames import Mask
+from tkamb.run import metrics
+from tkamb.run.agreement import AGREEMENT
+from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.show.headline import PRESSURE_AND_AREA
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import TYPE_CHECKING
+
+from tkamb.geometry.frames import Array
+from tkamb.run.metrics import (
+    body_weight,
+    medial_share,
+    residual_share,
+    tension_ratio,
+)
+from tkamb.show.axis import HorizontalAxis
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+import base64
+from typing import TYPE_CHECKING
+
+from tkamb.errors import InputError
+from tkamb.files import MEGABYTE, read_bytes, read_json
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+ALWAYS_NOT = (
+    "What another patient, another trial or another day would show: this is one knee in one motion."
+)
+
+
+def conclusions(results: "Results") -> tuple[list[str], list[str]]:
+    """Return the conclusions that the run supports and those that it does not, a sentence each."""
+    sentences = (
+        _conclude_force(results),
+        _conclude_split(results),
+        _conclude_pressure(results),
+        _conclude_certainty(results),
+    )
+    bears = [words for good, _ in sentences for words in good]
+    bears_not = [words for _, bad in sentences for words in bad]
+    questions = len(results.summary.get("questions") or [])
+    if questions:
+        many = "questions above are" if questions > 1 else "question above is"
+        bears_not.insert(0, f"Any conclusion, before the {many} answered.")
+    return bears, [*bears_not, ALWAYS_NOT]
+
+
+def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
+    if not np.isfinite(results["force_total_N"]).any():
+        return [], ["The contact force: it is not modelled here, or every frame failed."]
+    failures = metrics.failed(results)
+    bad = [f"Results in {_frame_count(failures)}, which failed."] if failures.any() else []
+    measured = _compared(results)
+    if measured:
+        parts = [f"{name} {one['rmse_BW']:.2f} BW" for name, one in measured.items()]
+        worse = [name for name, one in measured.items() if (one["r_squared"] or 0.0) < 0.0]
+        bad += [
+            f"The course of the {name} force: its constant mean would fit the measurement better."
+            for name in worse
+        ]
+        return [
+            f"The forces of this trial, with an error of {', '.join(parts)} (rms) against the "
+            f"measurement."
+        ], bad
+    if results.summary.get("muscle_groups"):
+        bad.append("How the muscles really shared the load: nothing was measured for comparison.")
+        return ["The total force if the muscles share the joint moments as the scene says."], bad
+    bad.append("The effect of hamstrings and gastrocnemius: only the quadriceps is modelled.")
+    return [
+        "The least force that this motion needs, with the quadriceps alone: co-contraction of "
+        "other muscles raises it."
+    ], bad
+
+
+def _compared(results: "Results") -> dict[str, Any]:
+    """Return the comparison of each force that was measured in some frame."""
+    result = results.summary.get("measured") or {}
+    return {name: one for name, one in result.items() if one["frames_compared"]}
+
+
+def _conclude_split(results: "Results") -> tuple[list[str], list[str]]:
+    if _compared(results).keys() & {"medial", "lateral"}:
+        return [], []
+    if not np.isfinite(metrics.medial_share(results, "equilibrium")).any():
+        return [], []
+    unknown = metrics.split_undetermined(results)
+    apart = (metrics.shares_apart(results) > AGREEMENT.share_difference) & ~unknown
+    bad = []
+    if unknown.any():
+        bad = [
+            f"The split by deformation in {_frame_count(unknown)}: half a degree of adduction "
+            "changes it."
+        ]
+    if apart.any():
+        bad.append(
+            f"The split in {_frame_count(apart)}: the estimates by equilibrium and by deformation "
+            "differ."
+        )
+    if apart.all():
+        return [], bad
+    how = ", by equilibrium of moments" if unknown.any() else ", as far as the knee's pose is right"
+    return [f"Which condyle carries more{' elsewhere' if apart.any() else ''}{how}."], bad
+
+
+def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
+    error = results.summary.get("known_error")
+    if error is None:
+        return [], ["Pressures and areas: contact is not modelled."]
+    bears = [
+        "Whether another design, pose or setting, computed in the same way, has higher pressure."
+    ]
+    if isinstance(error, str):
+        return bears, [f"Pressures and areas as absolute values: their error is {error}."]
+    words = f"{known_error_words(error, PRESSURE_AND_AREA)}; load, pose and shape add their own"
+    if is_large(error, PRESSURE_AND_AREA):
+        return bears, [f"Pressures and areas as absolute values: {words}."]
+    return [f"Pressures and areas of unworn surfaces: {words}.", *bears], []
+
+
+def _conclude_certainty(results: "Results") -> tuple[list[str], list[str]]:
+    if results.summary.get("uncertainty"):
+        return ["The effect of the varied inputs: the shaded bands."], []
+    return [], ["The uncertainty of these results: no input was varied (use tkamb uncertainty)."]
+
+
+def _frame_count(chosen: Mask) -> str:
+    """Return how many frames of a run (f,) are chosen, in words."""
+    count = int(chosen.sum())
+    if count == len(chosen):
+        return "any frame" if count > 1 else "the frame"
+    return f"{count} of {len(chosen)} frames"
+
+
+Entry = tuple[str, str, Array, int]
+"""Heading, unit, values (f,), digits."""
+
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts.
+
+    Args:
+        headings: of the columns; where they have units, (name, unit).
+        rows: as long as the headings, but for a strain table's first cell, the bundle.
+    """
+
+    headings: Sequence[Any]
+    rows: Sequence[Sequence[str]]
+
+
+def motion_table(results: "Results", axis: HorizontalAxis) -> Table:
+    """Return the frames nearest to 0, 10, ..., or at even times."""
+    entries = [entry for entry in _entries(results, axis) if np.isfinite(entry[2]).any()]
+    stops = axis.stops(13 if axis.kind == "flexion" else 11)
+    return Table(
+        [(name, unit) for name, unit, *_ in entries],
+        [[_number(values[k], digits) for *_, values, digits in entries] for k in stops],
+    )
+
+
+def strain_table(summary: Mapping[str, Any]) -> Table | None:
+    """Return the ligaments' strains in per cent, which reveal a wrong insertion."""
+    result = summary.get("ligament_strain")
+    if not result:
+        return None
+    return Table(
+        [f"{angle:g}°" for angle in result["flexion_deg"]],
+        [
+            [name, *("–" if one is None else _number(100.0 * one, 1) for one in strain)]
+            for name, strain in result["strain"].items()
+        ],
+    )
+
+
+def flag_rows(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str, str, str]]:
+    """Return the statuses other than "ok": reason, number of frames, frames, and their places."""
+    return [
+        (reason, str(len(frames)), _stretches(frames), _positions(frames, axis))
+        for reason, frames in reasons(results.status).items()
+    ]
+
+
+def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
+    """Return reason in plain words -> its frames, failures first.
+
+    Reasons that differ only in a number are one, with the range of the number.
+    """
+    result: dict[str, list[tuple[int, str]]] = {}
+    for frame, status in enumerate(statuses):
+        failure = status.startswith("failed")
+        for position, word in enumerate(status.removeprefix("failed:").split(";")):
+            words = word.strip().replace("_", " ")
+            if words and words != "ok":
+                words = f"failed: {words}" if failure and position == 0 else words
+                result.setdefault(NUMBER.sub("#", words), []).append((frame, words))
+    rows = {
+        _with_ranges([words for _, words in one]): [k for k, _ in one] for one in result.values()
+    }
+    return dict(sorted(rows.items(), key=lambda item: not item[0].startswith("failed")))
+
+
+def _with_ranges(variants: Sequence[str]) -> str:
+    """Return one text for texts that differ in their numbers: with the numbers' ranges."""
+    columns = zip(*(NUMBER.findall(words) for words in variants), strict=True)
+    ranges = []
+    for numbers in columns:
+        low, high = min(numbers, key=float), max(numbers, key=float)
+        ranges.append(low if low == high else f"{low}–{high}")
+    parts = NUMBER.split(variants[0])
+    return "".join(a + b for a, b in zip_longest(parts, ranges, fillvalue=""))
+
+
+def _runs(frames: Sequence[int]) -> list[tuple[int, int]]:
+    runs: list[tuple[int, int]] = []
+    for frame in frames:
+        if runs and runs[-1][1] == frame - 1:
+            runs[-1] = (runs[-1][0], frame)
+        else:
+            runs.append((frame, frame))
+    return runs
+
+
+def _stretches(frames: Sequence[int]) -> str:
+    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in _runs(frames))
+
+
+def _positions(frames: Sequence[int], axis: HorizontalAxis) -> str:
+    return ", ".join(
+        axis.at(a) if a == b else f"{axis.at(a)} to {axis.at(b)}" for a, b in _runs(frames)
+    )
+
+
+def _entries(results: "Results", axis: HorizontalAxis) -> list[Entry]:
+    weight = body_weight(results)
+    entries: list[Entry] = [("flexion", "deg", results["flexion_deg"], 1)]
+    if axis.kind != "flexion":
+        unit = "%" if axis.kind == "cycle" else "s"
+        digits = 0 if axis.kind == "cycle" else 2
+        entries.insert(0, (axis.kind, unit, axis.values, digits))
+    entries.append(("total force", "BW", results["force_total_BW"], 2))
+    for side in ("medial", "lateral"):
+        entries.append((side, "N", results[f"{side}_force_N"], 0))
+    entries.append(("medial share", "deform.", medial_share(results, "deformation"), 2))
+    entries.append(("medial share", "equil.", medial_share(results, "equilibrium"), 2))
+    for name, column, digits in (
+        ("area", "area_mm2", 0),
+        ("peak", "peak_pressure_MPa", 1),
+    ):
+        unit = "mm²" if name == "area" else "MPa"
+        for side in ("medial", "lateral"):
+            entries.append((f"{side} {name}", unit, results[f"{side}_{column}"], digits))
+    entries.append(("quadriceps", "BW", results["quadriceps_N"] / weight, 2))
+    entries.append(("PL/Q", "–", tension_ratio(results, "patellar_ligament_N"), 2))
+    entries.append(("PF/Q", "–", tension_ratio(results, "patellofemoral_N"), 2))
+    entries.append(("residual", "% of SI", 100 * residual_share(results), 1))
+    return entries
+
+
+def _number(value: float, digits: int) -> str:
+    if np.isnan(value):
+        return "–"
+    text = f"{value:.{digits}f}"
+    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
+
+
+WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
+
+
+@dataclass(frozen=True)
+class WearPageSettings:
+    """The wear page."""
+
+    max_bytes: float = 64 * MEGABYTE
+    """Bytes of a file of results. Chosen: those of 10,000 updates have 10 MB."""
+
+
+WEAR_PAGE = WearPageSettings()
+
+WEAR_ROWS = (
+    ("worn volume, mm³", "volume_mm3"),
+    ("worn mass, mg", "mass_mg"),
+    ("largest depth, mm", "max_depth_mm"),
+    ("mean depth where worn, mm", "mean_depth_mm"),
+    ("worn area, mm²", "worn_area_mm2"),
+    ("medial share of the volume", "medial_share"),
+    ("volume per million cycles, mm³", "volume_mm3_per_Mc"),
+    ("mass per million cycles, mg", "mass_mg_per_Mc"),
+    ("creep depth, mm", "creep_depth_mm"),
+    ("creep volume, mm³", "creep_volume_mm3"),
+)
+"""Label of a number, and its key."""
+FIRST_RATE = "first_volume_mm3_per_Mc"
+OTHER_WEAR = (
+    "The wear.json in this folder belongs to another scene, other frames or other meshes, or does "
+    "not state them; it is not shown."
+)
+
+
+def wear_section(results: "Results") -> dict[str, Any] | None:
+    """Return what the section shows; None where the folder holds no wear.
+
+    Wear of another scene or of other frames than the run's is not shown, and that is said.
+
+    Raises:
+        InputError: wear.json or its picture cannot be read.
+    """
+    result, folder = wear_of_run(results), results.directory
+    if result is None or folder is None:
+        return None
+    if not result:
+        return {"other": OTHER_WEAR}
+    picture = base64.b64encode(read_bytes(folder / PICTURE_NAME, WEAR_PAGE.max_bytes)).decode(
+        "ascii"
+    )
+    try:
+        return _wear_content(result, picture)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        hint = "run tkamb wear again, or remove it"
+        raise InputError("is not as tkamb wear writes it", folder / WEAR_NAME, hint) from None
+
+
+def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
+    """Return the section of wear.json and its picture in base 64."""
+    bands = wear["bands"] or {}
+    return {
+        "other": None,
+        "first": wear["first"],
+        "cycles": f"{wear['cycles']:,.0f}",
+        "banded": bool(bands),
+        "rows": [
+            (name, _significant(wear[key]), _wear_range(wear, key), _wear_band(bands, key))
+            for name, key in WEAR_ROWS
+        ],
+        "geometry": wear.get("geometry"),
+        "laws": [
+            (
+                one["law"],
+                _significant(one[FIRST_RATE]),
+                _wear_range(one, FIRST_RATE),
+                one["geometry"],
+            )
+            for one in wear.get("laws_side_by_side", ())
+        ],
+        "legend": _wear_legend(wear, bands),
+        "picture": f"data:image/png;base64,{picture}",
+        "alt": "maps of wear, sliding, cross-shear and pressure, and the worn volume over cycles",
+        "notes": [*wear["questions"], *wear["notes"]],
+    }
+
+
+def wear_of_run(results: "Results") -> dict[str, Any] | None:
+    """Return wear.json beside a run; empty where scene, files or frames are others, None without.
+
+    Wear of a scene's whole motion, or of a simulator's, holds beside any frames of a run.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    folder = results.directory
+    if folder is None or not (folder / WEAR_NAME).is_file():
+        return None
+    result = read_json(folder / WEAR_NAME, WEAR_PAGE.max_bytes, what="wear.json")
+    if not isinstance(result, dict) or not result.get("files_sha256"):
+        return {}
+    summary, scenes = results.summary, result.get("scene_sha256")
+    identity = summary.get("identity") or {}
+    files = identity.get("content of a file")
+    same = isinstance(scenes, list) and summary.get("scene_sha256") in scenes
+    if result.get("run_frames", ()) not in (None, identity.get("choice of frames")):
+        return {}
+    return result if same and files == result["files_sha256"] else {}
+
+
+def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
+    """Return in words the simulation, and its varied inputs."""
+    words = (
+        f"Law {wear['law']}, material {wear['material']}, {wear['control']} control, contact "
+        f"{wear['contact']} at {wear['resolution_mm']:g} mm, {wear['blocks']} blocks of cycles; "
+        f"status: {wear['status']}. Motion: {wear['source']}."
+    )
+    if "range_source" in wear:
+        words += f" Range: by the wear factor alone, {wear['range_source']}."
+    if not bands:
+        return f"{words} No band: no input was varied."
+    deviations = ", ".join(f"{name} {one:g}" for name, one in bands["standard_deviations"].items())
+    return (
+        f"{words} 5 to 95 % of {bands['samples']} samples; standard deviations: {deviations}. "
+        f"Not in the band: {bands['not_varied']}."
+    )
+
+
+def _wear_range(wear: dict[str, Any], key: str) -> str:
+    """Return the range that the wear factor alone gives a number."""
+    limits = wear.get(f"{key}_range")
+    return "–" if limits is None else f"{_significant(limits[0])} to {_significant(limits[1])}"
+
+
+def _wear_band(bands: dict[str, Any], key: str) -> str:
+    low, high = bands.get(f"{key}_p05"), bands.get(f"{key}_p95")
+    return "–" if low is None or high is None else f"{_significant(low)} to {_significant(high)}"
+
+
+def _significant(value: float | None) -> str:
+    return "not modelled" if value is None else f"{value:.4g}"
