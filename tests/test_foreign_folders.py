@@ -75,6 +75,12 @@ def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, how):
         ("uncertainty", {"samples": 3}),
         ("frames", 10**400),
         ("questions", "one"),
+        ("peaks_BW", {"total": "large"}),
+        ("peaks_BW", {"total": {"nominal": 2.0, "p05": 1.0}}),
+        ("discrepancy", "small"),
+        ("peak_pressure", {"MPa": None}),
+        ("gait", {"stance_s": [0.1]}),
+        ("saturated_muscles", ["soleus"]),
     ],
 )
 def test_a_summary_of_other_kinds_is_refused(copy, capfd, key, value):
@@ -84,6 +90,25 @@ def test_a_summary_of_other_kinds_is_refused(copy, capfd, key, value):
     _rehash(copy)
     for command in ("report", "methods"):
         refused(capfd, command, copy)
+
+
+@pytest.mark.parametrize("key", ["friction", "resolution_mm"])
+def test_a_contact_table_of_other_values_is_refused_by_wear(copy, tmp_path, capfd, key):
+    path = copy / "summary.json"
+    content = json.loads(path.read_text())
+    content["contact"] |= {key: -1}
+    path.write_text(json.dumps(content))
+    _rehash(copy)
+    said = refused(capfd, "wear", copy, "--cycles", 1, "--updates", 1, "--out", tmp_path / "made")
+    assert f"contact.{key}" in said
+
+
+def test_a_table_without_frames_is_refused(copy, capfd):
+    path = copy / "results.csv"
+    path.write_text(path.read_text().partition("\n")[0] + "\n")
+    _rehash(copy)
+    for command in ("report", "methods"):
+        assert "no frame" in refused(capfd, command, copy)
 
 
 def test_maps_of_another_shape_are_refused(copy, capfd):

@@ -58,6 +58,8 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it raises nothing
         raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
     columns = read_csv(directory / CSV_NAME)
+    if not len(next(iter(columns.values()), ())):
+        raise InputError("holds no frame", directory / CSV_NAME, "run it again")
     summary = read_summary(directory)
     maps = None
     if (directory / MAPS_NAME).exists():

@@ -68,6 +68,17 @@ PEAK = {
     "median": KNOWN,
     **optional({"p05": "number", "p95": "number", "nominal_percentile": "number"}),
 }
+BAND_ENDS = ("median", "p05", "p95")
+WIDE_ENDS = ("discrepancy_p05", "discrepancy_p95")
+NO_BAND = {f"{end}?": "null" for end in BAND_ENDS}
+NO_WIDE_BAND = {f"{end}?": "null" for end in WIDE_ENDS}
+NOMINAL = {"nominal": "number"}
+PEAK_BW = (
+    NOMINAL | NO_BAND | NO_WIDE_BAND,
+    NOMINAL | dict.fromkeys(BAND_ENDS, "number") | NO_WIDE_BAND,
+    NOMINAL | dict.fromkeys((*BAND_ENDS, *WIDE_ENDS), "number"),
+)
+"""A peak force: without bands, with the band from the inputs, or with both bands."""
 UNCERTAINTY = {
     "samples": "count",
     "not_varied": TEXTS,
@@ -75,6 +86,7 @@ UNCERTAINTY = {
     **optional(
         {
             "peak_force_total_BW": PEAK,
+            "peaks_BW": {ANY_KEY: PEAK_BW},
             "causes_of_failure": {ANY_KEY: "any"},
             "shares_of_variance": {ANY_KEY: {ANY_KEY: KNOWN}},
             "measured_inside": {ANY_KEY: {"frames": "count", "share": KNOWN}},
@@ -177,6 +189,21 @@ SUMMARY = optional(
         "failed_frames": ["any"],
         "flagged_frames": "count",
         "peak_force_total_BW": "number",
+        "peaks_BW": {ANY_KEY: PEAK_BW},
+        "peak_pressure": {
+            "MPa": "number",
+            "side": "text",
+            "frame": "count",
+            "time_s": "number",
+            **optional({"doubt": "text"}),
+        },
+        "discrepancy": {ANY_KEY: "any"} | optional({"words": "text"}),
+        "gait": {
+            "stance_s": [["number", "number"]],
+            "toe_off_percent": ["number"],
+            ANY_KEY: "any",
+        },
+        "saturated_muscles": {ANY_KEY: "count"},
         "not_modelled": TEXTS,
         "assumptions": TEXTS,
         "notes": TEXTS,

@@ -59,7 +59,9 @@ class HorizontalAxis:
         steps = np.diff(x)
         if self.kind == "flexion" and not (np.all(steps > 0) or np.all(steps < 0)):
             return np.unique(np.linspace(0, len(x) - 1, count).round().astype(np.int64))
-        low, high = float(np.min(x)), float(np.max(x))
+        if not np.isfinite(x).any():
+            return np.zeros(0, np.int64)
+        low, high = float(np.nanmin(x)), float(np.nanmax(x))
         step = round_step((high - low) / max(count - 1, 1))
         ticks = np.arange(np.ceil(low / step - 0.3), np.floor(high / step + 0.3) + 1) * step
         return self.nearest(ticks)

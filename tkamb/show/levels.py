@@ -82,6 +82,7 @@ class PageGrid:
         self, points: Array, triangles: NDArray[np.int64], sign: float, step_mm: float
     ) -> None:
         self._points, self._triangles, self._sign = points, triangles, sign
+        self._step = step_mm
         across, up = sign * points[:, 2] / MILLIMETRE, points[:, 0] / MILLIMETRE
         self.across = np.arange(across.min(), across.max() + step_mm, step_mm)
         self.up = np.arange(up.max(), up.min() - step_mm, -step_mm)
@@ -90,14 +91,14 @@ class PageGrid:
         self, rows: slice = slice(None), columns: slice = slice(None)
     ) -> tuple[float, float, float, float]:
         """Return left, right, bottom and top edge of a part's outermost cells, mm."""
-        half = 0.5 * (self.across[1] - self.across[0])
+        half = 0.5 * self._step
         across, up = self.across[columns], self.up[rows]
         return across[0] - half, across[-1] + half, up[-1] - half, up[0] + half
 
     @cached_property
     def _hits(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
         """Which grid points (rows, columns) lie over the insert, its points there, weights."""
-        step = self.across[1] - self.across[0]
+        step = self._step
         row = (self.up[0] - self._points[:, 0] / MILLIMETRE) / step
         column = (self._sign * self._points[:, 2] / MILLIMETRE - self.across[0]) / step
         corners = np.stack([row, column], axis=1)[self._triangles]

@@ -345,10 +345,11 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
     material = summary.get("material") or {}
     yield f"Femorotibial contact was {words}; points lay {contact['resolution_mm']:g} mm apart."
     yield _material_words(contact, material)
-    bearing = tables["implant"]["insert"]["bearing"]
+    insert = (tables.get("implant") or {}).get("insert") or {}
+    if "bearing" in insert:
+        yield f"The bearing was {insert['bearing']}."
     yield (
-        f"The bearing was {bearing}; Coulomb friction with a coefficient of "
-        f"{contact['friction']:g} acted against the sliding."
+        f"Coulomb friction with a coefficient of {contact['friction']:g} acted against the sliding."
     )
     if contact.get("adjust"):
         yield "The femoral component was adjusted by up to 0.5 mm and 0.5 deg (Sharma 2008)."

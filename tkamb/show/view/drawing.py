@@ -70,7 +70,8 @@ def activation_colours(activation: ArrayLike, limit: float) -> Colours:
 
 def _on_scale(values: ArrayLike, limit: float, scale: Colours, none: str = SLACK) -> Colours:
     values = np.asarray(values, float)
-    level = np.clip(np.nan_to_num(values) / (limit or 1.0) * 255.0, 0.0, 255.0).astype(int)
+    share = values / limit if np.isfinite(limit) and limit else values
+    level = (255.0 * np.clip(np.nan_to_num(share), 0.0, 1.0)).astype(int)
     return np.where((values > 0)[..., None], scale[level], rgb(none)).astype(np.uint8)
 
 

@@ -251,7 +251,7 @@ def ligament_strands(
     poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
     failures = failed(results)
     strains = [np.where(failures, np.nan, one.strain(one.length(poses))) for one in bundles]
-    limit = float(np.nanmax(strains, initial=0.01))
+    limit = float(np.max(strains, initial=0.01, where=np.isfinite(strains)))
     radius = BUNDLE * (0.5 if len(bundles) > VIEW_STRAND.many_bundles else 1.0)
     strands = []
     for bundle, strain in zip(bundles, strains, strict=True):
@@ -306,7 +306,8 @@ def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ..
             ends[k, :, 0] = transform(one.state.pose("tibia"), share.lines.shank)
             ends[k, :, 1] = transform(one.state.pose("femur"), share.lines.thigh)
             activation[k], force[k] = share.activation[share.crossing], share.force[share.crossing]
-    limit = max(float(activation.max()), VIEW_STRAND.least_activation)
+    known = np.isfinite(activation)
+    limit = float(np.max(activation, initial=VIEW_STRAND.least_activation, where=known))
     colours = activation_colours(np.where(force < VIEW_STRAND.slack_force, 0.0, activation), limit)
     strands = tuple(
         Strand(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import ValidationError
 
 from tkamb.contact.registry import contact_model, contact_options
 from tkamb.errors import InputError
@@ -311,7 +312,14 @@ def _of_results(
     scene = load_scene(scene_path, keys, preset_of_run(results.summary))
     table = results.summary.get("contact")
     if isinstance(table, dict):
-        scene = scene.model_copy(update={"contact": ContactTable.model_validate(table)})
+        try:
+            contact = ContactTable.model_validate(table)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in ("contact", *first["loc"]))
+            what = f"'{key}' of its summary.json: {first['msg']}"
+            raise InputError(what, folder, "run the scene again") from None
+        scene = scene.model_copy(update={"contact": contact})
     case = load_case(scene)
     if scene_hash(case) != results.summary.get("scene_sha256"):
         what = "was run with another scene than its file says now"
