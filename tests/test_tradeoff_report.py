@@ -47,7 +47,7 @@ def made_up_rows():
     settings = [("hertz", 2.0, 1e-3, 0.2), ("foundation", 2.0, 1e-2, 0.3)]
     settings += [("lattice", 2.0, 1e-2, 0.01), ("fe", 2.0, 1.0, 0.001)]
     rows = []
-    for case in ("sphere", "two condyles"):
+    for case in ("sphere", "two condyles", "conforming"):
         for contact, grid, seconds, error in settings:
             values = dict.fromkeys(read_references()[case].values, 1.0 + error)
             found = Measure("ok", 1.0, seconds, seconds, 100.0, values=values)
@@ -87,6 +87,12 @@ def test_numbers_of_a_short_axis_do_not_lie_on_each_other():
         boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
         assert len(boxes) > 1
         assert all(a.x1 < b.x0 for a, b in pairwise(boxes))
+
+
+def test_two_cases_give_no_recommendation():
+    rows = [row for row in made_up_rows() if row.job.case != "conforming"]
+    (advice,) = recommendations(rows)
+    assert "run the whole study" in advice and "hertz" not in advice
 
 
 def test_a_limit_that_nothing_keeps_names_the_nearest():

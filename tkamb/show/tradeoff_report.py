@@ -26,6 +26,9 @@ class TradeoffPictureSettings:
     short_axis_ratio: float = 30.0
     """Largest over smallest value up to which a logarithmic axis has numbers within its decades.
     Chosen: with more decades, those alone have numbers."""
+    min_bodies: int = 3
+    """Smallest number of different pairs of bodies that gives a recommendation. Chosen: the two of
+    the quick study suit `hertz`, whose errors on a knee are larger."""
 
 
 TRADEOFF_PICTURE = TradeoffPictureSettings()
@@ -187,8 +190,10 @@ def recommendations(rows: Sequence[Row]) -> list[str]:
     """Return a sentence for each limit: the fastest model that keeps it wherever it was tried.
 
     Only settings that were tried on all bodies are compared, by their median warm time over
-    one case of each.
+    one case of each. Two pairs of bodies give no recommendation: they may suit a simple model.
     """
+    if len({bodies_of(row.job.case) for row in rows}) < TRADEOFF_PICTURE.min_bodies:
+        return ["no recommendation from so few cases: run the whole study, without --quick"]
     settings = _settings_on_all_bodies(rows)
     return [
         f"for at most {100 * limit:g} % in {NAMES[key]}, {_fastest(settings, key, limit)}"

@@ -66,7 +66,7 @@ class PeerRun:
 
     Args:
         blocks: the last block of numbers of each kind in its .dat file, by the first word.
-        seconds: of the process.
+        seconds: s, time of the process.
         peak_rss_MB: of the process (1e6 bytes).
         iterations: equilibrium iterations, one factorisation each.
     """
@@ -186,10 +186,10 @@ class PeerAnswer:
     """Result of CalculiX.
 
     Args:
-        result: on the contact nodes of the lattice's grid, by the contract's definitions.
+        result: result on the contact nodes of the lattice's grid, as the built-in models define it.
         run: its times, memory and iterations.
         prepare_seconds: for the grid, the guess and the input.
-        nodes: of the insert.
+        nodes: number of nodes of the insert.
         balance: sum of the vertical contact forces over the load.
     """
 

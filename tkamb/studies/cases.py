@@ -62,7 +62,7 @@ def block(
         height: m, of arrays x and z.
         size: m, along x and z.
         spacing: m, of the vertices of the upper surface.
-        name: of the surface.
+        name: name of the surface.
     """
     x, z = (np.linspace(-s / 2, s / 2, max(3, round(s / spacing) + 1)) for s in size)
     gx, gz = np.meshgrid(x, z, indexing="ij")
@@ -152,7 +152,7 @@ class StudyCase:
     """One contact problem.
 
     Args:
-        name: of the case.
+        name: name of the case.
         label: one line.
         pair: the two bodies.
         pose: (4, 4) pose_femoral_in_insert; its y does not matter.

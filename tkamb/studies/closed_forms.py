@@ -86,7 +86,7 @@ class ClosedForm:
         modulus_MPa: Young's modulus.
         nu: Poisson's ratio; 0 under a plate.
         linear: Hooke's law instead of Ramberg-Osgood.
-        radius_mm: of the sphere; 0 under a plate.
+        radius_mm: radius of the sphere; 0: a plate.
         resolution_mm: cell size.
     """
 

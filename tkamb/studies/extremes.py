@@ -47,7 +47,7 @@ class Extreme:
         nu: Poisson's ratio.
         modulus_MPa: of the insert.
         linear: Hooke's law instead of Ramberg-Osgood.
-        radius_mm: of the condyles, sagittal.
+        radius_mm: sagittal radius of the condyles.
         waist: frontal radius of the condyles over the sagittal one.
         conformity: radius of the condyles over that of the dishes; 0: a flat insert.
         apart_mm: half the distance of the condyles; 0: a single one.

@@ -172,8 +172,8 @@ class Verdict:
         kind: one of `KINDS`.
         reason: plain words; empty where all is well.
         error: largest relative distance from the reference; None if there is nothing to compare.
-        seconds: of preparing and pressing, without the reference.
-        iterations: of the model's solver.
+        seconds: s, time of preparing and pressing, without the reference.
+        iterations: iterations of the model's solver.
         expected: the stored kind; None where there is none.
     """
 

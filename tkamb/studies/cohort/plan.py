@@ -174,7 +174,7 @@ class Cohort:
     """A cohort file and the runs that it makes.
 
     Args:
-        path: of the file.
+        path: path of the file.
         table: what it says.
         runs: all of them, in the order subject, trial, design, contact.
     """
@@ -222,7 +222,7 @@ def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
     """Read a cohort file and the scene of every run; no other file is opened.
 
     Args:
-        path: of the cohort file.
+        path: path of the cohort file.
         frames: A:B:STEP instead of the file's.
 
     Raises:

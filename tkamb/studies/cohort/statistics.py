@@ -43,7 +43,7 @@ class Group:
 
     Args:
         labels: what they have in common.
-        numbers: of the runs that gave results.
+        numbers: numbers of the runs that gave results.
         failed: how many gave none.
         axis: quantity that its bins divide: "flexion_deg", or "cycle_percent" of a cycle.
         edges: (b + 1,) of the bins, in the axis's unit.
@@ -77,7 +77,7 @@ class Spread:
     """A number over the runs of a group, each (...,) of the shape of one run's.
 
     Args:
-        runs: that have it.
+        runs: number of runs that have the value.
         mean: over them.
         sd: standard deviation with n - 1; NaN of fewer than two.
         low: smallest.

@@ -113,8 +113,8 @@ class Design:
     """One implant.
 
     Args:
-        name: of the folder.
-        title: of the implant that it stands for.
+        name: name of the folder.
+        title: title of the implant that it stands for.
         bearing: "fixed" or "mobile".
         symmetric: whether both condyles have one J-curve.
         articulation: femoral component and insert, mm.

@@ -56,7 +56,7 @@ class Cam:
     Args:
         centre_ap: x of its axis.
         centre_si: y of its axis.
-        radius: of the cylinder.
+        radius: radius of the cylinder.
     """
 
     centre_ap: float
@@ -228,12 +228,12 @@ class FemoralComponent:
 
     Args:
         medial_arcs: (from, to, radius) of the medial J-curve.
-        lateral_arcs: of the lateral one; the same arcs for symmetric condyles.
+        lateral_arcs: arcs of the lateral condyle; equal to the medial ones where symmetric.
         origin_phi: the centre of the medial arc that holds this normal is the origin.
         coronal_radius: across the ridges.
         ridge_half: ML distance of the ridges from the middle.
         ridge_half_at_flange_top: the same at the top of the flange.
-        groove_radius: of the trochlear groove, tangent to both ridges.
+        groove_radius: radius of the trochlear groove, tangent to both ridges.
         width_half: half the outer width.
         width_half_at_flange_top: the same at the top of the flange.
         taper_phi: ridges and edges widen from the first to the last of these normals.
@@ -241,10 +241,10 @@ class FemoralComponent:
         notch_phi: the notch (or box) opens at the first and is fully wide from the second on.
         notch_half: half its width.
         notch_fillet: radius of its rounded edge.
-        thickness: of the component.
+        thickness: thickness of the component.
         thickness_at_flange_top: the same at the top of the flange.
         blend_half: the groove within this distance blends unequal J-curves.
-        cam: of a posterior-stabilised component; None for one without.
+        cam: cam of a posterior-stabilised component; None: no cam.
     """
 
     medial_arcs: Arcs

@@ -32,10 +32,10 @@ class Post:
 
     Args:
         posterior: AP position of its posterior face at the foot.
-        anterior: of its anterior face.
+        anterior: position of its anterior face.
         half_width: ML.
         height: above the dishes' low point.
-        corner_radius: of its outline.
+        corner_radius: radius of the corners of its outline.
         draft: the faces lean inwards by this much over the height.
     """
 
@@ -67,15 +67,15 @@ class Insert:
 
     Args:
         medial_dish_radii: sagittal radius in front of and behind the low point.
-        lateral_dish_radii: of the lateral dish.
-        coronal_radius: of both dishes.
+        lateral_dish_radii: radii of the lateral dish.
+        coronal_radius: coronal radius of both dishes.
         thickness: at the thinnest.
-        low_point_ap: of both dishes.
+        low_point_ap: anterior position of the lowest points of both dishes.
         dish_half: ML distance of the dishes' low lines from the middle.
         eminence_height: above the dishes.
         depth_half: half the AP depth.
         width_half: half the ML width.
-        notch_depth: of the posterior notch.
+        notch_depth: depth of the posterior notch.
         notch_width: its width.
         edge_fillet: radius of the rounded edge.
         post: None for a design without.

@@ -147,7 +147,7 @@ def discrepancy_columns(
     Args:
         names: (m,) columns of results.csv.
         values: (n, m, f) of each sample.
-        summary: of the run.
+        summary: summary of the run.
         body_weight: N.
     """
     discrepancy = discrepancy_of(summary)
@@ -176,8 +176,8 @@ def peak_bands(
     """Return force -> its nominal peak with its bands at that frame, in body weights.
 
     Args:
-        columns: of results.csv.
-        bands: of bands.csv.
+        columns: columns of results.csv.
+        bands: columns of bands.csv.
         compared: force -> column of results.csv, in N.
         body_weight: N.
 
@@ -219,8 +219,8 @@ def measured_inside(
     """Return, for each measured force, the share of frames in which it lies within the band.
 
     Args:
-        columns: of results.csv, `measured_<name>_N` among them.
-        bands: of bands.csv.
+        columns: columns of results.csv, `measured_<name>_N` among them.
+        bands: columns of bands.csv.
         compared: force -> what it is compared with, as in the summary's `measured`.
 
     Returns:
@@ -247,8 +247,8 @@ class Influence:
 
     Args:
         result: column of results.csv.
-        name: of the input; "rest" for the variance that no function of one input explains.
-        share: of the result's variance over samples, all frames together.
+        name: the input, or "rest": the variance that no function of one input explains.
+        share: share of the result's variance over samples, all frames together.
         change: of the result per standard deviation of the input, its linear part, where the
             result's median is largest; NaN for the rest.
     """

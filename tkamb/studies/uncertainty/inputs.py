@@ -30,7 +30,7 @@ class VariedInput:
     """One input that varies.
 
     Args:
-        name: as in the tornado table.
+        name: name in the tornado table.
         deviation: its standard deviation, in `unit`.
         unit: "mm", "deg", "relative", or "1".
     """
@@ -202,7 +202,7 @@ class Draw:
         inputs: those that vary.
         normal: (d,) standard normal, one per input.
         noise: (f, p) standard normal per frame of the motion, of the pose inputs in their order.
-        constant_share: of a pose error's variance.
+        constant_share: share of a pose error's variance that is the same in all frames.
     """
 
     inputs: tuple[VariedInput, ...]

@@ -282,13 +282,13 @@ class Sampler:
 
     Args:
         scene: the scene.
-        frames: of the motion.
+        frames: frames of the motion.
         names: columns of results.csv that are wanted.
 
     Attributes:
-        names: as given.
-        case: as given.
-        inputs: that vary.
+        names: wanted columns, as given.
+        case: the scene's case, only with the chosen frames where that is possible.
+        inputs: inputs that vary.
 
     Raises:
         TkambError: whatever is wrong with the scene.
@@ -327,7 +327,7 @@ class Sampler:
         """Return the sample at a point; a frame begins its search at the one before.
 
         Args:
-            number: of the sample; workers need it, but it does not change the sample.
+            number: number of the sample; workers need it, but it does not change the sample.
             point: where it lies.
         """
         draw = self.draw(point)
@@ -371,7 +371,7 @@ class BandWorker:
 
     Args:
         scene: the scene.
-        frames: of the motion.
+        frames: frames of the motion.
     """
 
     def __init__(self, scene: Scene, frames: range) -> None:

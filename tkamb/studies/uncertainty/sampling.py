@@ -141,9 +141,9 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
 
     Args:
         method: "lhs" or "sobol".
-        count: of samples, at least 1.
+        count: number of samples, at least 1.
         dimensions: inputs.
-        seed: of all draws.
+        seed: seed of all draws.
 
     Raises:
         InputError: unknown method, or no samples.
@@ -179,7 +179,7 @@ def noise_of_point(
         columns: (p,) of the inputs that have noise.
         time: (f,) s, rising.
         correlation_time: s.
-        seed: of all draws.
+        seed: seed of all draws.
     """
     found = np.zeros((len(time), len(columns)))
     for number in dict.fromkeys(point.noise_of or ()):
@@ -197,11 +197,11 @@ def noise(number: int, time: Array, dimensions: int, correlation_time: float, se
     stationary whatever the steps in time.
 
     Args:
-        number: of the sample.
+        number: number of the sample.
         time: (f,) s, rising.
         dimensions: independent series.
         correlation_time: tau, s; 0: white.
-        seed: of all draws.
+        seed: seed of all draws.
     """
     draws = np.random.default_rng([seed, NOISE, number]).standard_normal((len(time), dimensions))
     if correlation_time == 0.0:

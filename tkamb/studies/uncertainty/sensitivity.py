@@ -30,12 +30,12 @@ class SobolIndex:
 
     Args:
         result: column of results.csv.
-        name: of the input.
-        first: by itself: Var(E(y | x_i)) / Var(y).
+        name: name of the input.
+        first: share of the input alone: Var(E(y | x_i)) / Var(y).
         first_error: its standard error.
         total: with all its interactions: E(Var(y | all but x_i)) / Var(y).
         total_error: its standard error.
-        rows: of the design in which every needed sample has a number.
+        rows: number of rows of the design in which every needed sample has a number.
     """
 
     result: str
@@ -70,7 +70,7 @@ def sobol_indices(
         values: (n (d + 2), m, f) in the order of
         `tkamb.studies.uncertainty.sampling.crossed_points`.
         count: n.
-        seed: of the bootstrap.
+        seed: seed of the bootstrap.
 
     References:
         Saltelli et al., Comput Phys Commun 181:259 (2010), doi:10.1016/j.cpc.2009.09.018;
@@ -230,8 +230,8 @@ def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
     Inputs that move it by less than `SCREENING.least_share` of the largest change are counted.
 
     Args:
-        rows: of `screen`.
-        width: of a bar, characters.
+        rows: rows that `screen` returned.
+        width: length of the longest bar, in characters.
     """
     lines: list[str] = []
     names = max((len(_named(row)) for row in rows), default=0)

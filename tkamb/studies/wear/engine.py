@@ -63,7 +63,7 @@ class ContactEngine:
     Args:
         model: any contact model.
         femoral: rigid femoral component, in the femoral frame.
-        material: of the insert.
+        material: material of the insert.
         bearing: fixed or mobile.
     """
 

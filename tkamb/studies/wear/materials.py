@@ -122,7 +122,7 @@ class WearMaterial:
         """Return one of its laws.
 
         Args:
-            name: of the law; None: the material's own choice.
+            name: name of the law; None: the law that the material names.
             wear_factor: mm³/(N m), in place of the material's `wear_factor_mm3_per_Nm`.
 
         Raises:

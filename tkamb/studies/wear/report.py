@@ -356,7 +356,7 @@ def draw_wear(
         surface: the insert, insert frame.
         maps: name -> value per vertex; what is not modelled is not among them.
         rows: the table.
-        path: of a PNG.
+        path: PNG file to write.
     """
     from matplotlib.figure import Figure
 

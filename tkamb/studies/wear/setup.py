@@ -44,9 +44,9 @@ class WearSetup:
         engine: contact model, femoral component, material.
         articular: the insert's surface.
         motion: one cycle.
-        side: of the knee; the bodies of a left one are mirrored.
+        side: side of the knee; the bodies of a left knee are mirrored.
         contact: name of the contact model.
-        resolution_mm: of its map.
+        resolution_mm: spacing of the points of its map.
         source: the file or folder that the motion comes from.
         scene_sha256: of the scene as it was given and with the contact that was asked for; a
             run's summary has one of them.
@@ -163,8 +163,8 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
     """Return what is worn by the motion of results that are at hand, all of whose frames count.
 
     Args:
-        scene: of the results, with the contact they were computed with.
-        path: of its file.
+        scene: scene of the results, with the contact that they were computed with.
+        path: file of the scene.
         results: with their maps.
         frames: most frames of a cycle.
 

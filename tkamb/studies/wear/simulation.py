@@ -68,7 +68,7 @@ class WearCase:
         engine: gives pressure maps.
         articular: the insert's surface, unworn.
         motion: one cycle.
-        law: of wear.
+        law: wear law.
         density: kg/m³.
         creep: law of creep; None: not modelled.
     """

@@ -65,7 +65,7 @@ class Springs:
     Args:
         springs: coordinate, "ap" or "axial_rotation", -> spring.
         sources: where the numbers come from.
-        table: as the file gives them, in its units.
+        table: the springs as the file gives them, in its units.
     """
 
     springs: Mapping[str, Spring]
@@ -125,7 +125,7 @@ class ForceDrive:
         applied: (f, 6) N and N·m on the femoral component, along each free coordinate.
         free: indices of the free coordinates, the superior-inferior one among them.
         zero: (6,) m and rad, origin of AP, ML and the springs.
-        springs: of the machine; None: it has none.
+        springs: springs of the machine; None: no springs.
         percent: (f,) of the cycle at each row; None: the rows are evenly spaced.
     """
 
@@ -220,7 +220,7 @@ class RestingPoses:
     """Finds the poses of a drive's rows on one insert, in order, each from the last one found.
 
     Args:
-        model: of the contact.
+        model: contact model.
         state: what its `prepare` returned for the insert.
         drive: what the machine does.
     """

@@ -179,7 +179,7 @@ class ViscoelasticLattice:
         Args:
             load: N; None: the pose is given.
             pose: (4, 4).
-            slope: by which the springs are softer than at once.
+            slope: stiffness of the springs over a step, relative to the instantaneous one.
             offset: (c, 3) m, displacement of the nodes without contact forces.
         """
         gaps, planes = undeformed(self._state.problem, pose)

@@ -132,7 +132,7 @@ def refined(surface: Surface, longest: float, chosen: Chosen) -> Surface:
     of the surface stay where they are. First vertices are those of the surface.
 
     Args:
-        surface: whose faces share their vertices.
+        surface: mesh whose faces share their vertices.
         longest: m.
         chosen: says of a surface's faces (k,) which are to be refined.
     """
