@@ -33,7 +33,7 @@ FOLDERS = {
     "tkamb.muscles": "tkamb.run.muscles",
     "tkamb.plausibility": "tkamb.run.plausibility",
 }
-"""Folder of release 0.1 -> where its modules are."""
+"""Folder of release 0.1 -> folder where its modules are now."""
 MODULES = {
     "tkamb.atomic": "tkamb.files",
     "tkamb.memory": "tkamb.geometry.memory",
@@ -84,11 +84,38 @@ MODULES = {
     "tkamb.importing.shank": "tkamb.io.importing.recorded_poses",
     "tkamb.importing.standing": "tkamb.io.importing.trial",
     "tkamb.importing.toml_text": "tkamb.io.toml_text",
+    "tkamb.inputs.cycle": "tkamb.io.recordings.gait_cycle",
+    "tkamb.inputs.gait": "tkamb.io.recordings.gait_cycle",
+    "tkamb.inputs.plate_loads": "tkamb.io.recordings.force_plates",
+    "tkamb.inputs.stl": "tkamb.io.recordings.polygon_files",
+    "tkamb.inputs.measured_force": "tkamb.io.recordings.measured",
+    "tkamb.inputs.emg": "tkamb.io.recordings.measured",
+    "tkamb.inputs.segments": "tkamb.io.recordings.patient",
+    "tkamb.inputs.leg_chain": "tkamb.io.recordings.inverse_kinematics",
+    "tkamb.scene.table": "tkamb.io.recordings.scene_table",
+    "tkamb.scene.recording_tables": "tkamb.io.recordings.recording_tables",
+    "tkamb.scene.measured": "tkamb.io.recordings.recording_tables",
+    "tkamb.scene.lines": "tkamb.io.scene.parts",
     "tkamb.datasets.dataset": "tkamb.io.datasets",
     "tkamb.datasets.get": "tkamb.io.datasets",
     "tkamb.compiled": "tkamb.geometry.compiled",
     "tkamb.threads": "tkamb.geometry.threads",
     "tkamb.named_classes": "tkamb.contact.named_classes",
+    "tkamb.cohort.folder": "tkamb.studies.cohort.run",
+    "tkamb.uncertainty.correlation": "tkamb.studies.uncertainty.sampling",
+    "tkamb.uncertainty.folder": "tkamb.studies.uncertainty.run",
+    "tkamb.uncertainty.indices": "tkamb.studies.uncertainty.sensitivity",
+    "tkamb.uncertainty.screening": "tkamb.studies.uncertainty.sensitivity",
+    "tkamb.uncertainty.varied_case": "tkamb.studies.uncertainty.sample",
+    "tkamb.wear.sample": "tkamb.studies.wear.bands",
+    "tkamb.wear.creep": "tkamb.studies.wear.materials",
+    "tkamb.wear.springs": "tkamb.studies.wear.simulator",
+    "tkamb.wear.force_control": "tkamb.studies.wear.simulator",
+    "tkamb.wear.profile": "tkamb.studies.wear.simulator",
+    "tkamb.wear.kept": "tkamb.studies.wear.run",
+    "tkamb.wear.viscoelastic_lattice": "tkamb.studies.wear.viscoelastic",
+    "tkamb.designs.sagittal": "tkamb.studies.designs.femoral",
+    "tkamb.designs.cam": "tkamb.studies.designs.femoral",
     "tkamb.cohort.report": "tkamb.show.cohort_report",
     "tkamb.studies.tradeoff_report": "tkamb.show.tradeoff_report",
     "tkamb.scene_options": "tkamb.commands.options",
@@ -104,7 +131,7 @@ MODULES = {
 
 
 def new_name(name: str) -> str | None:
-    """Return where a module of release 0.1 is now; None for one that has not moved."""
+    """Return the new name of a module of release 0.1; None: it has not moved."""
     if name in MODULES:
         return MODULES[name]
     part = name.removeprefix("tkamb.").removesuffix(".command")
@@ -130,9 +157,9 @@ class _Alias(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Give the module its own spec back, by which its files are found.
+        """Restore the module's own spec, by which its files are found.
 
-        It has been executed at its new place; the import has put the spec of the old name there.
+        The module has been executed under its new name; the import has replaced the spec.
         """
         module.__spec__ = self.own_spec
 
@@ -143,7 +170,7 @@ class _MovedFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a spec that leads to the new place; None for what has not moved."""
+        """Return a spec of the new module; None: it has not moved."""
         new = new_name(fullname)
         if new is None:
             return None
@@ -153,6 +180,6 @@ class _MovedFinder(MetaPathFinder):
 
 
 def accept_old_names() -> None:
-    """Let former import paths lead to the new places; once for a process."""
+    """Make former import paths work; once per process."""
     if not any(isinstance(finder, _MovedFinder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _MovedFinder())  # before the path of a moved folder is searched

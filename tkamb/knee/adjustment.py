@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SplitSensitivitySettings:
-    """How the medial share of the force changes with adduction."""
+    """The finite difference of the medial force by adduction."""
 
     adduction_step: float = 0.02 * DEGREE
     """rad: step of the finite difference. Chosen: small against the 0.2 to 0.5 deg that unload a
@@ -63,13 +63,13 @@ def split_sensitivity(
 ) -> float:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
-    Zero where one condyle carries everything: the value then holds until the other condyle touches.
-    NaN where the press with more adduction fails.
+    It is zero if one condyle carries all of the load, until the other condyle touches. It is NaN if
+    the press with more adduction fails.
 
     Args:
         probe: of the contact model.
         result: a contact; its load is the force along -y.
-        start: that came with it.
+        start: warm start that was returned with this contact; None: made from the contact.
     """
     load = -float(result.wrench_on_insert[1])
     place = knee_coordinates(result.pose)
@@ -82,14 +82,14 @@ def split_sensitivity(
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:
-    """Return what `split_sensitivity` does, from the tangent of a model that knows it.
+    """Return the same as `split_sensitivity`, for a contact model with an exact tangent.
 
-    With the tangents t of the wrenches F on the insert, at a constant superior-inferior load
-    the femur follows an adduction da by dy = -(sum t_y,a / sum t_y,y) da, and the medial force
-    changes by n . (t_a da + t_y dy).
+    Let t be the tangents of the wrenches on the insert. At a constant superior-inferior load an
+    adduction da lowers or lifts the femur by dy = -(sum t_y,a / sum t_y,y) da. The medial force
+    then changes by n . (t_a da + t_y dy).
 
     Args:
-        probe: of the contact model, exact.
+        probe: probe of a contact model whose tangent is exact.
         result: a contact.
     """
     place = knee_coordinates(result.pose)
@@ -103,6 +103,7 @@ def split_tangent(probe: "Probe", result: ContactResult) -> float:
         if condyle.stiffness is not None
     }
     total = sum(change[1] for change in changes.values())
+    # Adduction of one, and the height that keeps the load constant.
     follow = np.array([1.0, -total[0] / total[1]])
     return float(-condyles["medial"].normal @ changes["medial"] @ follow)
 
@@ -113,7 +114,7 @@ def _medial(result: ContactResult) -> float:
 
 @dataclass(frozen=True)
 class AdjustmentEffectSettings:
-    """What an adjustment of the pose changes."""
+    """How the effect of an adjustment is described."""
 
     jump_distance: float = 5.0 * MILLIMETRE
     """m: a contact point that moves farther than this has jumped to or from the eminence or lip.
@@ -125,12 +126,12 @@ ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
 
 @dataclass(frozen=True)
 class AdjustmentEffect:
-    """The adjusted frame against the recorded one.
+    """Difference of the adjusted frame from the recorded one.
 
     Args:
-        force: N, change of the total contact force; NaN where one of the frames has no solution.
+        force: N, change of the total contact force; NaN if one of the frames has no solution.
         share: change of medial / (medial + lateral) by coronal equilibrium.
-        cause: in words, the largest change of the contact.
+        cause: the largest change of the contact, in words.
     """
 
     force: float
@@ -144,13 +145,13 @@ def adjustment_effect(
     points_adjusted: Mapping[str, CondylePoint],
     points_recorded: Mapping[str, CondylePoint],
 ) -> AdjustmentEffect:
-    """Return what changes from the recorded to the adjusted contact points.
+    """Return the change of the loads from the recorded to the adjusted contact points.
 
     Args:
         adjusted: loads with the contact points of the adjusted pose.
-        recorded: loads with those of the recorded pose; all else is the same.
-        points_adjusted: side -> contact point.
-        points_recorded: side -> contact point.
+        recorded: loads with the contact points of the recorded pose, and all else the same.
+        points_adjusted: side -> contact point of the adjusted pose.
+        points_recorded: side -> contact point of the recorded pose.
     """
     total, before = (float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded))
     share = _share(adjusted, points_adjusted) - _share(recorded, points_recorded)
@@ -196,15 +197,15 @@ def press_adjusted(
 
     Args:
         model: any contact model.
-        state: what its `prepare` returned.
+        state: state that the model's `prepare` returned.
         load: N, superior-inferior.
-        adjustment: of the recorded pose, by `tkamb.geometry.adjustment.adjust`.
-        query: closest points of the same pair.
+        adjustment: adjustment of the recorded pose, from `tkamb.geometry.adjustment.adjust`.
+        query: closest points of the same pair of bodies.
         start: an earlier result or warm start, to save time.
 
     Returns:
-        The contact, whose flags hold those of the adjustment, the adjustment as it was checked,
-        and the start of the next press.
+        The contact with the flags of the adjustment added, the checked adjustment, and the warm
+        start of the next press.
 
     Raises:
         ComputationError: the femoral component does not lie over the insert.
@@ -216,7 +217,6 @@ def press_adjusted(
         return _flagged(result, adjustment), adjustment, start
     checked, restore, doubts = _check(query, adjustment, result)
     if restore:
-        # At the recorded rotation the limit of the turn has no effect.
         pose, translation, flags = moved_to_touch(query, checked.recorded, checked.settings)
         checked = replace(checked, pose=pose, translation=translation, restored=True, flags=flags)
         result, start = model.press_from(state, load, pose, start)
@@ -241,8 +241,7 @@ def _check(
     deeper = penetration - abs(adjustment.translation)
     angle_excess = (abs(angle) - abs(adjustment.coronal_angle)) * distance
     margin = settings.input_change
-    # Where the final angle is about as large as the turn and both are below what a mesh resolves,
-    # restoring the rotation changes nothing.
+    # If both angles are below the resolution of a mesh, restoring the rotation changes nothing.
     tilted = abs(angle) * distance > settings.level_difference
     outcomes = {
         _restored(settings.restore_when, *exceeded)
@@ -263,7 +262,7 @@ def _check(
 
 
 def _either_side(excess: float, margin: float) -> set[bool]:
-    """Return what `excess > 0` may be where the excess is known to within a margin, both m."""
+    """Return the possible values of `excess > 0` if the excess (m) has an error of `margin` (m)."""
     return {excess - margin > 0, excess > 0, excess + margin > 0}
 
 

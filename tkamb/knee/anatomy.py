@@ -1,9 +1,9 @@
-"""Where the knee is in a Pinocchio model: its frames, its joints, and which bodies are the shank.
+"""Finds the knee in a Pinocchio model: its frames, its joints, and the bodies of the shank.
 
-A knee divides the tree of a model in two. The shank is every body on the tibia's side of the knee
-(the foot among them), whatever joints lie below or above. The thigh is the body that the frame
-"femur" is fixed to: what the pelvis does to it is the load at the hip. So the same equations hold
-for a leg that stands on its foot, a leg that hangs from a pelvis, and a whole body.
+A knee divides the tree of a model in two. The shank is every body on the tibia's side of the knee,
+with the foot. The thigh is the body that the frame "femur" is fixed to. The pelvis acts on the
+thigh by the load at the hip. So the same equations hold for a leg that stands on its foot, a leg
+that hangs from a pelvis, and a whole body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from tkamb.errors import InputError, names_near
 NEEDED = ("femur", "tibia")
 """Parts of the knee whose frames a model must have."""
 PARTS = (*NEEDED, "femoral", "insert", "patella", "hip")
-"""Parts of the knee whose frames may be named."""
+"""Parts of the knee for which a user may name a frame."""
 INSERT_JOINT, PLANE_JOINT = "knee_ap", "patella_ap"
 """Joints of a tkamb URDF whose placements are the insert frame and the patella's plane."""
 
@@ -27,8 +27,8 @@ class Place:
     """A frame that is fixed to a joint of the model.
 
     Args:
-        joint: index.
-        placement: of the frame in the joint's frame.
+        joint: index of the joint in the model.
+        placement: pose of the frame in the joint's frame.
     """
 
     joint: int
@@ -40,18 +40,17 @@ class Anatomy:
     """The knee in a model.
 
     Args:
-        model: the user's, unchanged.
-        tibia: the tibia.
-        femur: the femur.
+        model: the user's model, unchanged.
+        tibia: frame of the tibia.
+        femur: frame of the femur.
         femoral: axes of the femoral component's mesh, fixed to the femur.
         insert: axes of the insert's mesh, fixed to the tibia.
         hip: hip centre, fixed to the femur.
-        patella: the patella; None where the model has none that moves against the femur.
-        patella_fixed: a frame "patella" that is fixed to the femur; None without one.
+        patella: frame of a patella that moves against the femur; None: the model has none.
         plane: the sagittal plane of the patella, fixed to the femur.
-        knee_joints: indices of the joints between tibia and femur, root-most first.
+        knee_joints: indices of the joints between tibia and femur, that nearest to the root first.
         shank: indices of the joints whose bodies are on the tibia's side.
-        names: part -> name of a frame, as given.
+        names: part -> name of its frame, as given by the user.
     """
 
     model: pin.Model
@@ -72,7 +71,7 @@ class Anatomy:
         return self.tibia.joint == 0
 
     def frame(self, name: str) -> Place:
-        """Return a frame by the name of its part in the knee, or by its name in the model.
+        """Return the frame of a part of the knee, or of a name in the model.
 
         Raises:
             InputError: no such frame.
@@ -101,8 +100,8 @@ def find_anatomy(
 
     Args:
         model: any Pinocchio model.
-        names: part -> name of a frame of the model, for parts of `PARTS`.
-        joints: names of the knee's joints; empty: the path from tibia to femur in the tree.
+        names: part of `PARTS` -> name of its frame in the model.
+        joints: names of the knee's joints, which are checked; empty: no check.
         plane: pose of the patella's sagittal plane in the frame "femur"; None: as documented in
             `tkamb.knee.parts.Extensor`.
 
@@ -161,7 +160,7 @@ def find_anatomy(
 
 
 def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
-    """Return a frame by name; of several with that name, the frame of a body."""
+    """Return a frame by name. If several have that name, the frame of a body is taken."""
     if not model.existFrame(name):
         names = [frame.name for frame in model.frames]
         hint = names_near(name, names)
@@ -212,7 +211,7 @@ def _check_joints(model: pin.Model, joints: Sequence[str], path: tuple[int, ...]
 def _shank(
     model: pin.Model, tibia: int, femur: int, path: tuple[int, ...], patella: Place | None
 ) -> tuple[int, ...]:
-    """Return the joints whose bodies stay connected to the tibia when the knee is cut.
+    """Return the joints of all bodies that remain connected to the tibia if the knee is cut.
 
     A body between femur and tibia belongs to the shank. Bodies carried by the femur, the patella or
     the universe do not.
@@ -231,7 +230,10 @@ def _shank(
 
 
 def _hip(femur: Place, path: tuple[int, ...]) -> Place:
-    """Return the joint that carries the femur, or its own frame where the knee's does."""
+    """Return the frame of the joint that carries the femur.
+
+    Where that joint belongs to the knee, return the femur's own frame.
+    """
     return femur if femur.joint in path else Place(femur.joint, pin.SE3.Identity())
 
 

@@ -1,4 +1,4 @@
-"""A knee put together on a user's model: its parts, and where they are at a configuration."""
+"""A knee on a user's model: its parts, and their places at a configuration."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,20 +39,20 @@ if TYPE_CHECKING:
     from tkamb.knee.patella import PatellaState
 
 PATELLAR_LIGAMENT = "patellar_ligament"
-"""Its name among the tensions."""
+"""Name of the patellar ligament among the tensions."""
 
 
 @dataclass(eq=False)
 class KneeData:
-    """What a caller hands from one call to the next to save time; made by `Knee.create_data`.
+    """Data that a caller passes from call to call to save time; `Knee.create_data` makes it.
 
-    It changes how long a call takes, and no answer beyond the solver's tolerance.
+    It changes a result at most within the solver's tolerance.
 
     Args:
-        data: Pinocchio's, of the user's model.
-        probe: of the contact model, which remembers the last contact; None without one.
-        patella: where the patella was found last.
-        seen: the last pose, as bytes, and the contact there.
+        data: Pinocchio data of the user's model.
+        probe: probe of the contact model, with the last contact as warm start; None: no contact.
+        patella: the last patella that was found; None: none yet.
+        seen: bytes of the last pose, and the contact there; None: none yet.
     """
 
     data: Any
@@ -62,7 +62,7 @@ class KneeData:
 
 
 class AssembledKnee:
-    """The parts of a knee on a Pinocchio model, and where they are; `tkamb.Knee` adds the loads.
+    """The parts of a knee on a Pinocchio model, and their places; `tkamb.Knee` adds the loads.
 
     The arguments are those of `tkamb.Knee`.
     """
@@ -113,13 +113,13 @@ class AssembledKnee:
         self._crossing, self._others = crossing_and_others(self.chain, self.ligaments)
 
     def with_ligaments(self, ligaments: "Iterable[Ligament]") -> Self:
-        """Return the same knee with other ligaments, which shares all else."""
+        """Return the same knee with other ligaments; everything else is shared."""
         other = copy.copy(self)
         other._take(ligaments)
         return other
 
     def with_contact(self, model: "ContactModel") -> Self:
-        """Return the same knee with another contact model, prepared when it is first needed."""
+        """Return the same knee with another contact model, which is prepared at its first use."""
         from tkamb.knee.contact import KneeContact
 
         other = copy.copy(self)
@@ -133,31 +133,31 @@ class AssembledKnee:
 
     @property
     def femoral(self) -> Any:
-        """The femoral component in its own frame, a right knee's; None: not given."""
+        """The femoral component in its own frame, mirrored for a left knee; None: not given."""
         return self._surfaces.femoral
 
     @property
     def insert(self) -> Any:
-        """The insert in the insert frame, a right knee's; None: not given."""
+        """The insert in the insert frame, mirrored for a left knee; None: not given."""
         return self._surfaces.insert
 
     @property
     def button(self) -> Any:
-        """The patellar button in the patella's frame, a right knee's; None: not given."""
+        """The patellar button in the patella's frame, mirrored for a left knee; None: not given."""
         return self._surfaces.button
 
     @property
     def query(self) -> "ClosestPointQuery":
-        """Closest points of femoral component and insert, made when first asked for."""
+        """Closest points of femoral component and insert, prepared at the first use."""
         return self._need_contact().pair.closest_points
 
     def create_data(self) -> KneeData:
-        """Return an object that a caller hands from call to call to save time."""
+        """Return an object that a caller passes from call to call to save time."""
         probe = None if self.contact is None else self.contact.probe()
         return KneeData(self.model.createData(), probe)
 
     def create_data_for_kinematics(self) -> KneeData:
-        """Return data without a contact."""
+        """Return data for calls that compute no contact."""
         return KneeData(self.model.createData())
 
     def pose(self, q: Array) -> pin.SE3:
@@ -168,35 +168,35 @@ class AssembledKnee:
     def coordinates(self, q: Array) -> Array:
         """Return the knee coordinates (6,) in the order of `KNEE_COORDINATES`, m and rad.
 
-        After Grood and Suntay; those of a left knee are those of its mirror image, whose clinical
-        signs are the same (`tkamb.geometry.frames`).
+        They follow Grood and Suntay (`tkamb.geometry.frames`). The coordinates of a left knee are
+        those of its mirror image, with the same clinical signs.
         """
         return self._kinematics(self.create_data_for_kinematics(), q).coordinates
 
     def at(self, q: Array, data: KneeData) -> KneePlace:
-        """Return where the knee is at q, and bring the placements in `data` up to date."""
+        """Return where the knee is at q, and update the placements in `data`."""
         return self._kinematics(data, q)
 
     def relative_jacobian(self, q: Array, data: KneeData | None = None) -> Array:
         """Return J (6, nv): J v is the femoral component's twist against the insert.
 
-        Of its point at the insert's origin, insert frame. So the generalised force of a wrench w
-        on the insert (and -w on the femur) is -J^T w, and that of the knee's stiffness K in
-        `pin.computeABADerivatives` is -J^T K J.
+        The twist is at the insert's origin, in the insert frame. The generalised force of a wrench
+        w on the insert and -w on the femur is -J^T w. A stiffness K of the knee changes the
+        generalised force by -J^T K J per displacement.
         """
         data = self.create_data_for_kinematics() if data is None else data
         return self.bridge.relative_jacobian(data.data, self._check(q, "q", self.model.nq))
 
     def link_poses(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
-        """Return link -> pose (4, 4) in the insert frame, of a right knee.
+        """Return link -> pose (4, 4) in the insert frame, as those of a right knee.
 
         Args:
-            q: (nq,), which places a patella of the model.
-            femur: (4, 4) of the femoral component in the insert frame.
+            q: (nq,) configuration, which places a patella of the model.
+            femur: (4, 4) pose of the femoral component in the insert frame.
             data: from `create_data`.
 
         Returns:
-            The poses, and whether the patella is among them; not where it is found nowhere.
+            The poses, and whether the patella was found and is among them.
         """
         place, patella = replace(self._kinematics(data, q), pose=femur), None
         if self.extensor is not None:
@@ -207,9 +207,9 @@ class AssembledKnee:
         return self._link_poses(place, patella), patella is not None
 
     def extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
-        """Return quadriceps and patellar ligament as they run (n, 3) m, insert frame.
+        """Return the paths (n, 3) m of quadriceps and patellar ligament, insert frame.
 
-        Empty without an extensor mechanism, or where the patella is found nowhere.
+        Empty without an extensor mechanism, or if the patella is not among the poses.
         """
         if self.extensor_lines is None or "patella" not in poses:
             return {}
@@ -217,7 +217,7 @@ class AssembledKnee:
         return {self.extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
 
     def nearest_points(self, coordinates: Array) -> dict[str, Array]:
-        """Return side -> (3,) m, where each undeformed condyle is nearest to the insert."""
+        """Return side -> point (3,) m where the undeformed condyle is nearest to the insert."""
         gaps = self.query.at(knee_pose(coordinates))
         centres = {"medial": gaps.medial.centre}
         return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
@@ -244,7 +244,7 @@ class AssembledKnee:
 
     @property
     def _finds_patella(self) -> bool:
-        """Whether the place of the patella is found, and not that of q."""
+        """Whether the patella's place follows from equilibrium, because q has none."""
         return self.anatomy.patella is None
 
     @property
@@ -282,12 +282,12 @@ class AssembledKnee:
         return poses
 
     def _with_lines(self, data: KneeData, tensions: Mapping[str, float], forces: Any) -> Any:
-        """Return forces on the joints with the pulls of the muscles' lines added.
+        """Return forces on the joints with the tensions of the muscles' lines added.
 
         Args:
-            data: with joint placements up to date.
+            data: data with joint placements up to date.
             tensions: muscle -> N.
-            forces: one per joint; None: none.
+            forces: one per joint; None: zero.
         """
         pulls = [name for name in self._lines if tensions.get(name, 0.0)]
         if not pulls:

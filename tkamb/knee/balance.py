@@ -1,17 +1,17 @@
-"""Equilibrium of a few coordinates under forces that depend on them: Newton, in a trust region.
+"""Equilibrium of a few coordinates under forces that depend on them: Newton in a trust region.
 
-Knows neither body nor contact. With r(q) the force that drives each coordinate and
-K = -dr/dq, a step d solves (K + lambda I) d = r, lambda the smallest that makes the step
-descend and keeps it inside the region. A step is judged by the work of the forces along it,
-by the trapezoidal rule, against what K predicts,
+With r(q) the force that drives each coordinate and
+K = -dr/dq, a step d solves (K + lambda I) d = r. lambda is the smallest value with which the step
+descends and stays inside the region. A step is judged by the ratio of the work of the forces along
+it, by the trapezoidal rule, to the work that K predicts,
 
     W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2 :
 
-forces with a potential lower it by W, so that the energy falls if W > 0 in every step. A trial
-that overshoots into a stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric:
-it may be stable but not positive definite, and work is then no measure. The step then goes along
-Newton's direction, in which |r| falls, and is judged by |r|. A search that does not converge is
-repeated once; then only whole Newton steps are judged by |r|, and shorter ones by work.
+If the forces have a potential, W is the energy that a step releases. A trial that overshoots into a
+stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric. K may then be stable but
+not positive definite, and work is no measure. In this case the step follows Newton's direction, in
+which |r| falls, and is judged by |r|. A search that does not converge is repeated once. In the
+second search only whole Newton steps are judged by |r|, and shorter ones by work.
 
 Everything is in metres and newtons: rotations are scaled by a lever arm.
 
@@ -31,11 +31,11 @@ from tkamb.geometry.frames import Array
 
 @dataclass(frozen=True)
 class BalanceSettings:
-    """The iteration that finds the released coordinates."""
+    """Tolerances and limits of the search for the released coordinates."""
 
     force_tolerance: float = 0.05
-    """N (moments are divided by the lever arm): residual below which a coordinate has converged;
-    the noise of the forces counts instead where it is larger. Chosen: far below what is
+    """N (moments are divided by the lever arm): residual below which a coordinate has converged. If
+    the noise of the forces is larger, the noise counts instead. Chosen: far below what is
     reported."""
     step_tolerance: float = 2e-6
     """m: Newton step below which a coordinate has converged. Chosen: below the size at which a
@@ -45,26 +45,25 @@ class BalanceSettings:
     per newton."""
     narrow_radius: float = 1e-6
     """m: trust radius below which an approximate stiffness is replaced by finite differences.
-    Chosen: the steps that it proposes do not reduce the residual."""
+    Chosen: an approximation that needs shorter steps no longer reduces the residual."""
     max_travel: float = 20e-3
     """m: largest distance of a coordinate from its initial guess; beyond it the search ends.
     Chosen: no load holds a coordinate that moves as far."""
     difference_step: float = 2e-6
-    """m: step of the finite differences where the stiffness is not given. Chosen: the same as the
-    tolerance of a step."""
+    """m: step of the finite differences of the force. Chosen: equal to `step_tolerance`."""
     max_prediction_error: float = 0.5
-    """1: an approximate stiffness is not used along a step if the change of force differs from the
-    predicted one by more than this share. Chosen: at half of the change the step would no longer
-    reduce the residual reliably."""
+    """1: relative difference of the change of force from its prediction above which all corrections
+    of an approximate stiffness are dropped. Chosen: with a larger error a step does not reduce the
+    residual reliably."""
     max_steps: int = 200
-    """Steps at most. Chosen: a lightly loaded knee that slides 16 mm over lattice cells of 2 mm
-    needs 80."""
+    """Maximum number of steps. Chosen: a lightly loaded knee that slides 16 mm over lattice cells
+    of 2 mm needs 80."""
 
 
 BALANCE = BalanceSettings()
 
 FIRST_RADIUS, WIDEST_RADIUS, NARROWEST_RADIUS = 0.5e-3, 3e-3, 1e-9
-"""m: the trust region at the start, and its limits."""
+"""m: first radius of the trust region, and its limits."""
 
 
 class BalanceStatus(Enum):
@@ -83,11 +82,11 @@ class Trial:
     """The forces at trial coordinates.
 
     Args:
-        force: (n,) N, drives each coordinate along its positive direction; NaN if unknown.
+        force: (n,) N, positive along each coordinate's positive direction; NaN if unknown.
         stiffness: (n, n) N/m, -d force / d coordinates; None: by finite differences.
-        exact: whether `stiffness` is the exact tangent. If not, it is an approximation, which the
-        search corrects from step to step.
-        force_noise: N, error of the force; a smaller force counts as zero.
+        exact: whether `stiffness` is the exact tangent. The search corrects an approximation from
+            step to step.
+        force_noise: N, error of the force; a force below it counts as zero.
     """
 
     force: Array
@@ -105,11 +104,11 @@ class Balance:
         force: (n,) N, residual.
         stiffness: (n, n) N/m.
         status: how it ended.
-        steps: Newton steps, taken or taken back.
+        steps: number of steps, accepted and rejected ones.
         trials: number of evaluations of the forces.
         smallest_stiffness: N/m, smallest real part of the stiffness' eigenvalues.
-        work: N·m done by the forces along each step taken, all positive.
-        at_rest: whether it has converged to the tolerances; if not, only to `residual_share`.
+        work: N·m, work of the forces along each accepted step.
+        at_rest: True: converged to the tolerances. False: converged to `residual_share` alone.
     """
 
     coordinates: Array
@@ -136,19 +135,21 @@ def find_balance(
     """Find the coordinates at which all forces are in equilibrium.
 
     Args:
-        forces: the trial at coordinates (n,), m.
-        start: (n,) m.
-        stiffness: (n, n) N/m of an earlier search near by. It is an initial guess that saves trials
-        where `forces` does not give a stiffness.
-        residual_share: share of the distance from the initial guess that may remain, for a search
-            that is repeated under other forces; 0: the tolerances alone decide.
-        reach: m, a repeated search ends where a coordinate is farther than this from the initial
-        guess.
+        forces: function of coordinates (n,), m, that returns a `Trial`.
+        start: (n,) m, initial guess.
+        stiffness: (n, n) N/m from an earlier search near by. It saves trials if `forces` gives no
+            stiffness.
+        residual_share: for a search that is repeated under other forces: the remaining step, as a
+            share of the distance from the initial guess, at which it ends; 0: the tolerances alone
+            decide.
+        reach: m, for such a search: it ends if a coordinate is farther than this from the initial
+            guess.
     """
     result = _Search(forces, np.array(start, float), stiffness, residual_share, reach).run()
     if result.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
         return result
-    # Newton's direction may lead away over the facets of a contact. Descent of energy does not.
+    # Newton's direction may lead away from the equilibrium over the facets of a contact; the
+    # direction of decreasing energy does not.
     again = _Search(
         forces, np.array(start, float), stiffness, residual_share, reach, downhill=True
     ).run()
@@ -223,6 +224,7 @@ class _Search:
             # Out of the contact model's range: the step is refused and a shorter one tried.
             self._radius = 0.25 * length
             return
+        # Relative reduction of the residual by the step.
         fall = 1.0 - float(np.linalg.norm(trial.force) / np.linalg.norm(self.force))
         # A Newton step of length `part` should reduce the residual by that share; half of it is
         # enough to accept the step whatever the work says.
@@ -247,7 +249,7 @@ class _Search:
                 self._guide, self.stiffness = trial.stiffness, trial.stiffness + self._missing
 
     def _next(self) -> tuple[Array, float]:
-        """Return the next step, and its share of Newton's step if |r| judges it; else 0."""
+        """Return the next step, and its share of Newton's step; 0 if work judges the step."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
         if symmetric > 0 or smallest_stiffness <= 0 or self._refused:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
@@ -303,8 +305,7 @@ class _Search:
     def _converged(self) -> bool:
         if np.abs(self.force).max() > max(BALANCE.force_tolerance, self._force_noise):
             return False
-        # Directions without stiffness are left out: there the Newton step says nothing, and `_kind`
-        # reports them.
+        # A direction without stiffness has no Newton step; `_kind` reports it.
         left_vectors, values, right_vectors = np.linalg.svd(self.stiffness)
         stiff = values > BALANCE.least_stiffness
         step = right_vectors[stiff].T @ ((left_vectors.T @ self.force)[stiff] / values[stiff])
@@ -314,7 +315,8 @@ class _Search:
         return float(np.abs(self.x - self._start).max())
 
     def _near(self) -> bool:
-        """Return whether the remaining step is small against the distance travelled so far."""
+        """Say whether the remaining step is small against the distance from the initial guess."""
+        # Newton's step estimates the remaining distance.
         way = self._left * float(np.linalg.norm(self.x - self._start))
         if way == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
             return False
@@ -353,10 +355,7 @@ class _Search:
 
 
 def newton_step(stiffness: Array, force: Array) -> Array | None:
-    """Return Newton's step (n,), m; None where a direction has no stiffness at all.
-
-    Rounding can make the smallest eigenvalue of such a stiffness positive.
-    """
+    """Return Newton's step (n,), m; None if the stiffness is singular."""
     try:
         return np.asarray(np.linalg.solve(stiffness, force))
     except np.linalg.LinAlgError:
@@ -364,7 +363,7 @@ def newton_step(stiffness: Array, force: Array) -> Array | None:
 
 
 def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
-    """Return the Newton step (n,), or a descending step within the radius.
+    """Return the Newton step (n,), m, or a shorter, descending step within the radius.
 
     Args:
         stiffness: (n, n) N/m, need not be symmetric.
@@ -394,8 +393,8 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
 def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
     """Return the smallest eigenvalue of the symmetric part, and the smallest real part of all.
 
-    Loads that follow the motion make a stiffness unsymmetric: a state is then stable against
-    divergence as long as the second is positive.
+    Follower loads make a stiffness unsymmetric. A state is then stable against divergence if the
+    second value is positive.
     """
     return _smallest_eigenvalues(stiffness.tobytes(), len(stiffness))
 
@@ -404,7 +403,6 @@ def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
 def _smallest_eigenvalues(entries: bytes, count: int) -> tuple[float, float]:
     """Return the same for one stiffness, cached: each step of a search needs it several times."""
     stiffness = np.frombuffer(entries).reshape(count, count)
-    # The stiffness of contact with a moving normal is not symmetric. Its symmetric part decides
-    # about a descent direction, its own eigenvalues about stability.
+    # The symmetric part decides whether a step descends, the eigenvalues decide about stability.
     symmetric = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])
     return symmetric, float(np.linalg.eigvals(stiffness).real.min())

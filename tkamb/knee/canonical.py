@@ -1,10 +1,10 @@
-"""The knee of any model as the chain that its equations are written for.
+"""The canonical chain: the knee of any model, as the equations need it.
 
     tibia -> (six knee coordinates) -> femur -> (patella's sagittal plane) -> patella
 
 The chain holds the inertia of thigh and patella. The wrench that the knee must exert on the shank,
 and on everything that the shank carries, comes from their equations of motion in the user's model.
-A left knee is mirrored on the way in and its loads on the way out, so that the chain always
+A left knee is mirrored when it is read, and its loads are mirrored back, so that the chain always
 describes a right knee.
 
 With s the twist of the femur against the tibia and s' its rate in the femur's axes, both from the
@@ -12,7 +12,7 @@ spatial velocities v and accelerations a of the two frames,
 
     s = v_F - X v_T,    s' = a_F - X a_T - v_F x s,    J qd = s,    J qdd = s' - J' qd
 
-give the rates of the knee coordinates, whatever joints the model has there.
+give the rates qd and qdd of the knee coordinates, whatever joints the model has there.
 """
 
 from collections.abc import Sequence
@@ -38,16 +38,16 @@ from tkamb.knee.load import LinkPoint, PointForces, wrenches
 
 @dataclass(frozen=True)
 class KneeSettings:
-    """How joint coordinates that make a given pose of the knee are found."""
+    """Newton's method for the joint coordinates that put the knee into a given pose."""
 
     pose_tolerance: float = 1e-12
-    """m and rad: residual of the joint coordinates that make a given pose of the knee. Chosen: near
-    the rounding of double precision."""
+    """m and rad: pose error below which the iteration has converged. Chosen: near the rounding of
+    double precision."""
     accepted_pose_error: float = 1e-8
-    """m and rad: at most what is left after the last Newton step of a pose that is reached. Chosen:
-    far below what changes a force."""
+    """m and rad: largest pose error that is accepted after the last Newton step. Chosen: far below
+    what changes a force."""
     max_pose_steps: int = 30
-    """Newton steps at most to find these coordinates. Chosen: poses that converge need fewer."""
+    """Maximum number of Newton steps. Chosen: poses that converge need fewer."""
 
 
 KNEE = KneeSettings()
@@ -67,12 +67,12 @@ def se3(pose: Array) -> pin.SE3:
 
 
 class CanonicalChain(Chain):
-    """The chain of one knee: see the module.
+    """The canonical chain of one knee, described at the top of this module.
 
     Args:
         anatomy: where the knee is in the user's model.
         is_left: whether the knee is a left one.
-        with_patella: the chain has a patella.
+        with_patella: whether the chain has a patella.
         component: axes of the femoral component, fixed to the femur's joint.
         insert: the insert frame, fixed to the tibia's joint.
     """
@@ -120,7 +120,7 @@ class CanonicalChain(Chain):
         return se3(mirrored_pose(pose) if self._left else pose)
 
     def _inertia(self, inertia: pin.Inertia, placement: pin.SE3) -> pin.Inertia:
-        """Return the inertia of a body in the axes of a frame that is placed on it."""
+        """Return the inertia of a body in the axes of a frame on it."""
         own = inertia.se3Action(placement.inverse())
         if not self._left:
             return own
@@ -145,7 +145,7 @@ def _add_body(model: pin.Model, name: str, joint: int, placement: pin.SE3 | None
 
 @dataclass(frozen=True, eq=False)
 class KneePlace:
-    """Where a knee is at one instant of the user's model, as a right knee's.
+    """Where a knee is at one instant; a left knee is described by its mirror image.
 
     Args:
         pose: (4, 4) of the femoral component in the insert frame.
@@ -159,7 +159,7 @@ class KneePlace:
 
 
 class Bridge:
-    """Carries poses, motions and loads between the user's model and the canonical chain.
+    """Converts poses, motions and loads between the user's model and the canonical chain.
 
     Args:
         anatomy: where the knee is in the user's model.
@@ -205,7 +205,11 @@ class Bridge:
         )
 
     def place(self, data: Any) -> KneePlace:
-        """Return where the knee is, from data whose joint placements are up to date."""
+        """Return where the knee is.
+
+        Args:
+            data: of the user's model, with joint placements up to date.
+        """
         insert = data.oMi[self.insert.joint] * self.insert.placement
         femur = data.oMi[self.component.joint] * self.component.placement
         pose = self._right(insert.actInv(femur))
@@ -237,8 +241,8 @@ class Bridge:
 
         Args:
             data: of the user's model.
-            patella: whether the chain has a patella. If the user's model has none it stands still,
-            at coordinates zero.
+            patella: whether the chain has a patella. If the user's model has none, its coordinates
+                and rates are zero.
         """
         anatomy, place = self.anatomy, self.place(data)
         tibia, still = anatomy.tibia, pin.Motion.Zero()
@@ -268,12 +272,12 @@ class Bridge:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
         Args:
-            q: of the chain, its root at rest.
-            place: (n,) the coordinates.
-            data: of the user's model.
-            base: the body that carries the other.
-            follower: the body that moves.
-            own: the n coordinates among the chain's joints.
+            q: (nq,) configuration of the chain, with its root at the neutral pose.
+            place: (n,) the coordinates, m and rad.
+            data: Pinocchio data of the user's model.
+            base: frame on the body that carries the other body.
+            follower: frame on the carried body.
+            own: which of the chain's joint coordinates these are.
         """
         twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data
@@ -287,7 +291,7 @@ class Bridge:
         return np.stack([place, v[columns], acceleration])
 
     def _relative(self, data: Any, base: Place, follower: Place) -> tuple[Array, Array]:
-        """Return s and s' of the module (6,), of one body against another, in the moved axes."""
+        """Return s and s' (6,) of the module's equations, in the axes of the carried body."""
         placement, still = data.oMi[follower.joint] * follower.placement, pin.Motion.Zero()
         own, own_rate = (
             follower.placement.actInv(still if not follower.joint else values[follower.joint])
@@ -319,7 +323,7 @@ class Bridge:
         return total
 
     def configuration(self, q: Array, target: Array) -> Array:
-        """Return q with the knee's joints moved so that the femur has a pose (4, 4).
+        """Return q with the knee's joints changed so that the femur has a given pose.
 
         Newton's method on the joints between tibia and femur.
 
@@ -342,6 +346,7 @@ class Bridge:
             pin.forwardKinematics(model, data, q)
             insert = data.oMi[self.insert.joint] * self.insert.placement
             femur = data.oMi[self.component.joint] * self.component.placement
+            # Pose error as a twist in the insert frame, which the joints must supply.
             error = pin.log6(placement * insert.actInv(femur).inverse()).vector
             if np.abs(error).max() < KNEE.pose_tolerance:
                 return q
@@ -361,8 +366,8 @@ class Bridge:
     def shank_needs(self, data: Any) -> Array:
         """Return the wrench (6,) that motion and weight of the shank need, insert frame.
 
-        The sum over the shank's bodies. Where the tibia is fixed to the universe, the negative of
-        the same sum over everything above the knee.
+        It is the sum over the shank's bodies. If the tibia is fixed to the universe, it is the
+        negative of the same sum over all bodies above the knee.
 
         Args:
             data: of the user's model, after `pin.forwardKinematics(model, data, q, v, a)`.
@@ -375,9 +380,9 @@ class Bridge:
         return self._sum(data, self._shank, needs)
 
     def on_shank(self, data: Any, external: Any) -> PointForces:
-        """Return the external forces on the shank as one at the insert's origin, insert frame.
+        """Return the sum of the external forces on the shank, at the insert's origin.
 
-        Where the tibia is fixed to the universe: the negative of those above the knee.
+        If the tibia is fixed to the universe, it is the negative of the sum above the knee.
 
         Args:
             data: of the user's model, with joint placements up to date.
@@ -387,7 +392,7 @@ class Bridge:
         return PointForces("tibia", np.zeros((1, 3)), wrench[None, :3], wrench[3:])
 
     def _sum(self, data: Any, joints: Sequence[int], forces: Sequence[pin.Force]) -> Array:
-        """Return the sum (6,) of forces on joints, each in its joint's frame, on the insert."""
+        """Return the sum (6,) of forces on joints about the insert's origin, insert frame."""
         insert = data.oMi[self.insert.joint] * self.insert.placement
         total = np.zeros(6)
         for joint, force in zip(joints, forces, strict=True):
@@ -396,7 +401,7 @@ class Bridge:
         return mirrored_spatial(total) if self.left else total
 
     def external_on(self, place: Place | None, data: Any, external: Any) -> Array:
-        """Return the external wrench (6,) on the body of a frame, insert frame."""
+        """Return the external wrench (6,) on the body that a frame is fixed to, insert frame."""
         joint = 0 if place is None else place.joint
         if external is None or not joint:
             return np.zeros(6)
@@ -437,7 +442,7 @@ class Bridge:
 
 
 def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
-    """Return link -> wrench (6,) about the insert's origin of loads in the insert frame."""
+    """Return link -> sum (6,) of its loads about the insert's origin, insert frame."""
     if isinstance(loads, dict):
         return loads
     total: dict[str, Array] = {}
@@ -448,9 +453,9 @@ def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
 
 
 def _solved(jacobian: Array, twist: Array) -> Array:
-    """Return the rates that make a twist, the nearest to it where there are fewer than six.
+    """Return the joint rates that produce a twist (6,).
 
-    NaN where a place or a rate is not known.
+    With fewer than six joints it is the least-squares solution. NaN if an input is not finite.
     """
     if not (np.isfinite(jacobian).all() and np.isfinite(twist).all()):
         return np.full(jacobian.shape[1], np.nan)
@@ -462,7 +467,7 @@ def _solved(jacobian: Array, twist: Array) -> Array:
 def canonical_state(
     chain: Chain, motion: ChainMotion, shank: Array, thigh: Array, patella: Array
 ) -> ChainState:
-    """Return the chain at one instant, with what the shank needs in the user's model.
+    """Return the chain at one instant, with the inertia of the shank from the user's model.
 
     Args:
         chain: the canonical chain.

@@ -1,7 +1,7 @@
 """The rigid-body chain in Pinocchio: motion in, inertial forces and load columns out.
 
-The root is always free (a free-flyer), so that the measured ground reaction enters as a
-load; an ankle joint in the URDF is locked, its motion is the root's.
+The root is a free joint at the tibia, so that the measured ground reaction enters as a load. Other
+joints of the URDF, such as the ankle, are locked.
 """
 
 import copy
@@ -47,9 +47,9 @@ class Chain:
 
     Args:
         urdf: text of a checked URDF (`tkamb.io.recordings.patient.load_urdf`).
-        with_patella: whether the patella moves; if not, it is fixed to the femur at its neutral
-        pose.
-        gravity: m/s², downwards in the laboratory.
+        with_patella: whether the patella moves. If not, it is fixed to the femur at its neutral
+            pose.
+        gravity: m/s², downward in the laboratory.
     """
 
     def __init__(self, urdf: str, with_patella: bool, gravity: float = STANDARD_GRAVITY) -> None:
@@ -74,8 +74,8 @@ class Chain:
 
         Args:
             mass_factor: factor on the mass and inertia of every segment.
-            insert_shift: (3,) m, in the insert's axes; the femur goes with the insert.
-            insert_turn: (3, 3) rotation about the insert's origin, in its axes; None: none.
+            insert_shift: (3,) m, displacement of the insert and the femur, in the insert's axes.
+            insert_turn: (3, 3) their rotation about the insert's origin, in its axes; None: none.
         """
         other, model = copy.copy(self), pin.Model(self.model)
         for joint in range(1, model.njoints):
@@ -91,7 +91,11 @@ class Chain:
         return other
 
     def scaled(self, length: float) -> "Chain":
-        """Return the chain of a body of the same shape and density, `length` times as large."""
+        """Return the chain of a geometrically similar body of the same density.
+
+        Args:
+            length: factor on all lengths.
+        """
         other, model = copy.copy(self), pin.Model(self.model)
         for joint in range(1, model.njoints):
             inertia, placement = model.inertias[joint], model.jointPlacements[joint]
@@ -109,7 +113,7 @@ class Chain:
         return other
 
     def _take(self, model: pin.Model) -> None:
-        """Use another model for this chain, and store where the insert and the tibia are."""
+        """Use a model for this chain, and store the poses of insert and tibia in its root."""
         self.model = model
         frames = enumerate(model.frames)
         self._frames = {frame.name: k for k, frame in frames if frame.type == pin.FrameType.BODY}
@@ -118,7 +122,11 @@ class Chain:
         self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
 
     def frame_id(self, link: str) -> int:
-        """Return Pinocchio's id of a link's frame, or raise InputError naming the links."""
+        """Return Pinocchio's id of a link's frame.
+
+        Raises:
+            InputError: no such link.
+        """
         if link not in self._frames:
             names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
             raise InputError(f"no link '{link}' in the URDF", None, names_near(link, names))
@@ -131,7 +139,7 @@ class Chain:
 
     @property
     def patella_joint_in_femur(self) -> Array:
-        """pose_joint_in_femur (4, 4): where the patella's sagittal plane lies on the femur."""
+        """pose_joint_in_femur (4, 4) of the joint in whose x-y plane the patella moves."""
         return self.model.jointPlacements[self.model.getJointId(PATELLA_JOINT_NAMES[0])].homogeneous
 
     def link_in(self, link: str, base: str) -> Array:
@@ -142,7 +150,7 @@ class Chain:
         return inverse(frames[1].placement.homogeneous) @ frames[0].placement.homogeneous
 
     def carrier(self, link: str) -> str:
-        """Return which of tibia, femur and patella a link is fixed to."""
+        """Return the name of the body that a link is fixed to: tibia, femur or patella."""
         own = self.model.frames[self.frame_id(link)].parentJoint
         for base in ("tibia", "femur", "patella"):
             if self.model.frames[self.frame_id(base)].parentJoint == own:
@@ -168,7 +176,7 @@ class Chain:
         return self._columns[:6]
 
     def patella_columns(self) -> list[int]:
-        """Rows of the three patella coordinates; none where the patella is fixed to the femur."""
+        """Rows of the three patella coordinates; empty if the patella is fixed to the femur."""
         return self._columns[6:]
 
     def at(self, motion: ChainMotion) -> "ChainState":
@@ -181,8 +189,8 @@ class Chain:
         root_in_tibia = pin.SE3(inverse(self._tibia_in_root))
         q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
         q[:7] = pin.SE3ToXYZQUAT(pin.SE3(motion.tibia) * root_in_tibia)
-        # Pinocchio's free joint wants the twist in the root's own axes, the recording gives the
-        # tibia's.
+        # Pinocchio's free joint takes the twist in the root's axes; the recording has it in the
+        # tibia's axes.
         v[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_velocity)).vector
         a[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_acceleration)).vector
         for name, column, (x, rate, acceleration) in zip(
@@ -197,14 +205,14 @@ class ChainState:
     """The chain at one instant. Poses and loads are in the insert frame.
 
     Attributes:
-        inertial: (nv,) RNEA(q, v, a): generalised forces that all loads together must supply.
+        inertial: (nv,) RNEA(q, v, a), the generalised forces that the sum of all loads equals.
     """
 
     def __init__(self, chain: Chain, q: Array, v: Array, a: Array) -> None:
         self.chain, self.q, self.v, self.a = chain, q, v, a
         self.data = chain.model.createData()
-        # Recursive Newton-Euler: M a + C + gravity, all that forces have to supply. The data are
-        # overwritten by the next call, hence the copy.
+        # Recursive Newton-Euler: M a + C + gravity. The next call overwrites the data, hence the
+        # copy.
         self.inertial: Array = pin.rnea(chain.model, self.data, q, v, a).copy()
         pin.computeJointJacobians(chain.model, self.data, q)
         pin.updateFramePlacements(chain.model, self.data)
@@ -243,16 +251,22 @@ class ChainState:
         return total
 
     def add_need(self, link: str, wrench: Array) -> None:
-        """Add a wrench (6,) that all loads together must also exert on a link.
+        """Add a wrench (6,) to what the sum of all loads must exert on a link.
 
         Args:
-            link: its name.
-            wrench: force (N) and moment about the insert's origin (N·m), insert frame.
+            link: name of the link.
+            wrench: (6,) force (N) and moment about the insert's origin (N·m), insert frame.
         """
         self.inertial = self.inertial + self._jacobian(link).T @ wrench
 
     def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
-        """Return a laboratory force (3,), its point (3,) and moment (3,) as load on the tibia."""
+        """Return the ground reaction as a load on the tibia.
+
+        Args:
+            force: (3,) N, laboratory axes.
+            point: (3,) m, where it acts, laboratory.
+            moment: (3,) N·m, free moment, laboratory axes.
+        """
         laboratory = self.laboratory_in_insert
         return PointForces(
             "tibia",

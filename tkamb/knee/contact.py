@@ -1,7 +1,7 @@
 """The femorotibial contact of a knee at one pose: wrench, friction, stiffness and damping.
 
-Everything is in the insert frame of a right knee; a twist or a small displacement is that of the
-femoral component's point at the insert's origin (m), then its rotation (rad).
+Everything is in the insert frame of a right knee; a twist or a small displacement has the
+linear part (m/s or m) of the femoral component's point at the insert's origin, then the rotation.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from tkamb.knee.load import wrench_of
 
 @dataclass(frozen=True)
 class DifferenceSettings:
-    """How the stiffness of a model without an exact tangent is found: by central differences."""
+    """Central differences, for the stiffness of a model without an exact tangent."""
 
     step: float = 4e-6
     """m: step of a translation. Chosen: large against the solver's residual error, small against
@@ -48,8 +48,8 @@ class KneeContact:
         model: the contact model.
         pair: femoral component and insert.
         friction: Coulomb coefficient.
-        state: what the model's `prepare` returned for the pair; None: it is prepared when it is
-            first asked for.
+        state: state that the model's `prepare` returned for the pair; None: it is prepared at the
+            first use.
     """
 
     def __init__(
@@ -61,15 +61,15 @@ class KneeContact:
 
     @property
     def state(self) -> Any:
-        """What the model has prepared."""
+        """State that the model's `prepare` returned."""
         if self._state is None:
             self._state = self.model.prepare(self.pair)
         return self._state
 
     def changed(self, friction: float, modulus_factor: float = 1.0) -> "KneeContact":
-        """Return the same contact with another friction, and an insert of another modulus.
+        """Return the same contact with another friction, and perhaps another modulus of the insert.
 
-        What is prepared is shared, unless the modulus differs.
+        The prepared state is shared, unless the modulus differs.
         """
         if modulus_factor == 1.0:
             return KneeContact(self.model, self.pair, friction, self._state)
@@ -99,10 +99,11 @@ class KneeContact:
             raise ComputationError("the pose of the femur is not finite", "contact")
         contact: ProbedContact = probe.at(place)
         if not contact.known:
-            raise ComputationError(self._why(probe, place), "contact")
+            raise ComputationError(self._why(place), "contact")
         return contact
 
-    def _why(self, probe: Any, place: Array) -> str:
+    def _why(self, place: Array) -> str:
+        """Return in words why there is no contact at a pose (4, 4)."""
         result = self.model.evaluate(self.state, place)
         words = "; ".join(result.flags) or result.status.value.replace("_", " ")
         if result.status is ContactStatus.OK:
@@ -114,8 +115,8 @@ class KneeContact:
         """Return the wrench (6,) on the insert, friction included.
 
         Args:
-            contact: at the pose.
-            twist: (6,) of the femur against the insert.
+            contact: the contact at the pose.
+            twist: (6,) twist of the femur against the insert.
         """
         total = np.zeros(6)
         for load in contact.loads:
@@ -133,9 +134,9 @@ class KneeContact:
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
         """Return the derivative (6, 6) of the wrench on the insert by the femur's twist.
 
-        Friction alone has one. With the sliding velocity v of a condyle's point, t its part across
-        the normal and s = sqrt(t.t + v0²), the force mu N t/s changes with v by
-        mu N (P/s - t t^T/s³), P the projector across the normal.
+        Only friction depends on the twist. Let v be the sliding velocity of a condyle's point, t
+        its part across the normal, s = sqrt(t.t + v0²) and P the projector across the normal. The
+        friction force mu N t/s changes with v by mu N (P/s - t t^T/s³).
         """
         total = np.zeros((6, 6))
         for load in contact.loads if self.friction else ():
@@ -146,6 +147,7 @@ class KneeContact:
             speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
             across = np.eye(3) - np.outer(normal, normal)
             slope = across / speed - np.outer(tangential, tangential) / speed**3
+            # Chain rule: the twist moves the contact point, whose velocity decides the friction.
             total += self.friction * load.force * point_jacobian.T @ slope @ point_jacobian
         return total
 
@@ -155,12 +157,14 @@ class KneeContact:
         """Return the derivative (6, 6) of the wrench on the insert by a displacement of the femur.
 
         Args:
-            probe: warm start.
-            place: (4, 4) pose.
-            contact: there.
-            twist: (6,) of the femur, held constant.
-            exact: do not use an approximate tangent of the model.
+            probe: probe of the model, used as warm start.
+            place: (4, 4) pose of the femoral component.
+            contact: the contact there.
+            twist: (6,) twist of the femur, which stays constant.
+            exact: True: central differences replace an approximate tangent of the model.
         """
+        # Friction turns with the contact normal, which the tangent of the model does not contain.
+        # With friction the exact stiffness therefore needs differences.
         rubs = bool(self.friction and np.any(twist) and contact.loads)
         if contact.tangent and not (exact and (rubs or not contact.exact)):
             total = np.zeros((6, 6))
@@ -182,14 +186,14 @@ class KneeContact:
 
 
 def _cross_matrix(vector: Array) -> Array:
-    """Return the matrix (3, 3) of vector x."""
+    """Return the matrix (3, 3) of the cross product with a vector."""
     return np.cross(vector, -np.eye(3))
 
 
 def batch_differences(
     wrenches: Callable[[Array], Array], place: Array, settings: DifferenceSettings
 ) -> Array:
-    """Return what `differences` does, of a function that takes all poses (12, 4, 4) at once."""
+    """Return the same as `differences`, for a function that takes all poses (12, 4, 4) at once."""
     sizes = settings.step * np.array([1.0, 1.0, 1.0, *np.full(3, 1.0 / settings.arm)])
     steps = np.concatenate([np.diag(sizes), -np.diag(sizes)])
     turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
@@ -203,9 +207,9 @@ def differences(
     """Return the derivative (6, 6) of a wrench by a small displacement, by central differences.
 
     Args:
-        wrench: of a pose (4, 4).
-        place: (4, 4) where.
-        settings: the step.
+        wrench: function of a pose (4, 4) that returns a wrench (6,).
+        place: (4, 4) pose at which it is differentiated.
+        settings: step of the differences.
     """
     columns = []
     for k in range(6):

@@ -15,20 +15,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ContactPointSettings:
-    """Contact points, lift-off and friction of the condyles."""
+    """Limits of lift-off, gap and sliding speed of the condyles."""
 
     lift_off_angle: float = 0.5 * DEGREE
-    """rad: a condyle is off the insert where the coronal angle of the two gaps exceeds this
-    and its gap exceeds `lift_off_gap`. It is the error of fluoroscopy (Sharma 2008, 4.3)."""
+    """rad: a condyle is lifted off if the coronal angle of the two gaps exceeds this and its gap
+    exceeds `lift_off_gap`. Source: error of fluoroscopy (Sharma 2008, 4.3)."""
     lift_off_gap: float = 0.5 * MILLIMETRE
-    """m: gap of a condyle that is off the insert, see `lift_off_angle`. It is the error of
+    """m: gap above which a condyle may be lifted off, see `lift_off_angle`. Source: error of
     fluoroscopy (Sharma 2008, 4.3)."""
     max_gap: float = 3e-3
-    """m: a femoral component farther from the insert than this, or deeper in it, is misplaced.
-    Chosen: it is more than the errors of fluoroscopy."""
+    """m: a femoral component with a larger gap or penetration is misplaced. Chosen: larger than the
+    errors of fluoroscopy."""
     standstill_speed: float = 1e-3
-    """m/s: friction fades below this sliding speed. Chosen: its direction is not defined at
-    rest."""
+    """m/s: v0 of the regularised friction, which fades below this sliding speed. Chosen: far below
+    the sliding of a moving knee."""
 
 
 CONTACT_POINT = ContactPointSettings()
@@ -57,8 +57,7 @@ class CondylePoint:
         friction against the sliding, fading below v0 = 1 mm/s.
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal
-        # Regularised Coulomb friction: the force fades to zero at standstill, where its direction
-        # would jump.
+        # Without v0 the direction of the force would jump where the sliding reverses.
         speed = np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2)
         return np.asarray(self.normal - friction * tangential / speed)
 
@@ -69,8 +68,8 @@ class ContactPoints:
 
     Args:
         condyles: side -> contact point; empty when contact is not modelled.
-        lifted: sides that are clearly off the insert.
-        problems: plain words; empty when all is well.
+        lifted: sides that are lifted off the insert.
+        problems: why the pose cannot be used, in words; empty: it can.
     """
 
     condyles: dict[str, CondylePoint]
@@ -90,8 +89,8 @@ def contact_points(
     Args:
         query: closest points of the pair.
         pose: (4, 4) pose_femoral_in_insert.
-        sliding: point (3,) m, insert frame -> velocity (3,) m/s of the femur's relative to the
-            insert's there.
+        sliding: function of a point (3,) m, insert frame. It returns the velocity (3,) m/s of the
+            femur against the insert there.
     """
     gaps = query.at(pose)
     condyle_gaps = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})

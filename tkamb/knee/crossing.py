@@ -56,10 +56,10 @@ class CrossingLines:
     """Lines from the shank to the thigh at one frame.
 
     Args:
-        shank: (c, 3) m, where they leave the shank or the foot, tibia link.
-        thigh: (c, 3) m, where they reach the thigh or the pelvis, femur link.
-        knee: (4, 4) pose of the femur link in the tibia link at which both ends were computed from
-        the muscles' paths; None: not known.
+        shank: (c, 3) m, points where they leave the shank or the foot, tibia link.
+        thigh: (c, 3) m, points where they reach the thigh or the pelvis, femur link.
+        knee: (4, 4) pose of the femur link in the tibia link for which the points were computed;
+            None: not known.
     """
 
     shank: Array
@@ -67,10 +67,11 @@ class CrossingLines:
     knee: Array | None = None
 
     def turned(self, state: "ChainState") -> float:
-        """Return the turn of the knee since the ends were computed, rad; NaN: unknown.
+        """Return the rotation of the knee since the points were computed, rad; NaN: unknown.
 
-        Ends that wrap a bone or pass a via point would move along it as the knee turns. Here they
-        stay on their links, so that a line's direction errs by about this angle at most.
+        The end of a line that wraps a bone or passes a via point moves as the knee turns. Here the
+        ends are fixed to their links, so that the error of a line's direction is about this angle
+        at most.
         """
         if self.knee is None:
             return float("nan")
@@ -79,7 +80,7 @@ class CrossingLines:
         return float(change.magnitude())
 
     def unit_wrenches(self, tibia: Array, femur: Array) -> Array:
-        """Return the wrench (..., c, 6) of one newton of each on the insert, about its origin.
+        """Return the wrenches (..., c, 6) of one newton of each line on the insert.
 
         Args:
             tibia: (4, 4) pose of the tibia link in the insert frame.
@@ -92,14 +93,14 @@ class CrossingLines:
         return wrench_of(start, along)
 
     def unit_loads(self, state: "ChainState") -> list[tuple[PointForces, ...]]:
-        """Return what one newton of each does to tibia and femur, insert frame."""
+        """Return the loads of one newton of each line on tibia and femur, insert frame."""
         return [
             (PointForces("tibia", p[None], u[None]), PointForces("femur", q[None], -u[None]))
             for p, q, u in zip(*self._ends(state), strict=True)
         ]
 
     def loads(self, state: "ChainState", force: Array) -> tuple[PointForces, PointForces]:
-        """Return what forces (c,), N, along them do to tibia and femur, insert frame."""
+        """Return the loads of forces (c,), N, along the lines on tibia and femur, insert frame."""
         start, end, along = self._ends(state)
         pulls = force[:, None] * along
         return PointForces("tibia", start, pulls), PointForces("femur", end, -pulls)
@@ -114,18 +115,18 @@ class CrossingLines:
 
 @dataclass(frozen=True, eq=False)
 class MuscleShare:
-    """What each muscle of a leg carries at one frame.
+    """The force of each muscle of a leg at one frame.
 
     Args:
-        muscles: m names.
-        activation: (m,).
+        muscles: names of the m muscles.
+        activation: (m,) activations, 0 to 1.
         force: (m,) N.
-        coordinates: n names of those that are balanced.
-        moment: (n,) N·m, joint moment that muscles and reserves supply together.
-        reserve: (n,) N·m, part of it that no muscle supplies.
-        flexion: place of the knee's flexion among the coordinates.
-        crossing: (c,) places of the muscles that cross the knee, without the extensor group.
-        lines: lines of action of the crossing muscles.
+        coordinates: names of the n balanced coordinates of the leg.
+        moment: (n,) N·m, joint moments, which muscles and reserves supply together.
+        reserve: (n,) N·m, part of the moments that no muscle supplies.
+        flexion: index of the knee's flexion among the coordinates.
+        crossing: (c,) indices of the muscles that cross the knee, without the extensor group.
+        lines: lines of action of these c muscles.
         status: "ok" or "failed: …".
     """
 
@@ -141,12 +142,12 @@ class MuscleShare:
     status: str = "ok"
 
     def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
-        """Return what the crossing muscles and the knee's reserve do to tibia and femur."""
+        """Return the loads of the crossing muscles and the knee's reserve on tibia and femur."""
         both = self.lines.loads(state, self.force[self.crossing])
         return (*both, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
 
     def wrench(self, tibia: Array, femur: Array) -> Array:
-        """Return the wrench (..., 6) of the same on the insert, about its origin.
+        """Return the wrench (..., 6) of these loads on the insert, about its origin.
 
         Args:
             tibia: (4, 4) pose of the tibia link in the insert frame.
@@ -159,18 +160,18 @@ class MuscleShare:
 
     @property
     def _knee_reserve(self) -> Array:
-        """(3,) N·m on the tibia, about the insert's z as the residual moment of flexion is."""
+        """(3,) N·m on the tibia, about the insert's z."""
         return self.reserve[self.flexion] * unknowns.AXES["ml"]
 
 
 @dataclass(frozen=True, eq=False)
 class FlexionRow:
-    """The knee's row of the muscles' sharing.
+    """The knee's row of the static optimisation.
 
     Args:
         moment: N·m on the tibia about the insert's z, which muscles and reserve supply together.
-        extensor_arm: m, of the extensor group.
-        arms: (c,) m, of the crossing muscles.
+        extensor_arm: m, moment arm of the extensor group.
+        arms: (c,) m, moment arms of the crossing muscles.
     """
 
     moment: float
@@ -181,20 +182,21 @@ class FlexionRow:
 def flexion_row(
     geometry: KneeGeometry, lines: CrossingLines, friction: float, lifted: frozenset[str]
 ) -> FlexionRow:
-    """Return the row at one frame, the extensor mechanism taut.
+    """Return the row at one frame with a taut extensor mechanism.
 
     Args:
-        geometry: the frame, with an extensor mechanism; the forces of other muscles in it do
-            not enter.
-        lines: of the muscles that cross the knee.
+        geometry: the frame with an extensor mechanism; forces of other muscles are ignored.
+        lines: lines of action of the muscles that cross the knee.
         friction: Coulomb coefficient of the femorotibial contact.
-        lifted: sides that carry nothing.
+        lifted: sides that carry no load.
 
     Raises:
-        ComputationError: the patella has no place there, or the equations are singular.
+        ComputationError: the patella was not found, or the equations are singular.
     """
     if geometry.extensor is None:
         raise ComputationError("; ".join(geometry.problems) or "no patella", "muscles")
+    # Forces of the other muscles are the unknown of the row, so that the equations must not hold
+    # them.
     alone = replace(geometry, share=None)
     system = KneeSystem(alone, friction, LoadState(lifted, frozenset()))
     if not system.solution.regular:
@@ -210,16 +212,16 @@ def flexion_row(
 def yielding_flexion_row(
     geometry: KneeGeometry, lines: CrossingLines, base: float, per_wrench: Array
 ) -> FlexionRow:
-    """Return the row at one frame whose released coordinates yield to the muscles.
+    """Return the row at one frame if the released coordinates yield to the muscles.
 
-    The patella's equilibrium relates the extensor group's tension to the ligament's: Q = a T + b.
+    By the patella's equilibrium the extensor group's tension is Q = a T + b, T the tension of the
+    patellar ligament.
 
     Args:
-        geometry: the frame, with an extensor mechanism; its contact is not used.
-        lines: of the muscles that cross the knee.
+        geometry: the frame with an extensor mechanism; its contact is not used.
+        lines: lines of action of the muscles that cross the knee.
         base: N, tension of the patellar ligament without the other muscles.
-        per_wrench: (6,) N per N and per N·m, what a wrench on the insert, about its origin,
-            adds to it.
+        per_wrench: (6,) 1 and 1/m, change of that tension by a wrench on the insert.
 
     Raises:
         ComputationError: the equations of the patella are singular.
@@ -232,10 +234,7 @@ def yielding_flexion_row(
 
 
 def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
-    """Return a and b (N) of the extensor group's tension Q = a T + b, T the ligament's.
-
-    They follow from the patella's own three equations, which contain no other load of the leg.
-    """
+    """Return a and b (N) of Q = a T + b, from the three equations of the patella."""
     extensor, state = geometry.extensor, geometry.state
     assert extensor is not None
     femur_ml = state.pose("femur")[:3, 2]
@@ -261,24 +260,27 @@ def _solved_for_reserve(alone: float, gains: Array, slope: float) -> FlexionRow:
 
 
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
-"""Names beside the muscles': weight, inertia and ground; all bundles; a cam on the post, if it is
-modelled; the extensor group."""
+"""Names of contributions other than single muscles: weight, inertia and ground reaction; all
+ligaments; a cam on the post; the extensor group."""
 
 
 def condyle_contributions(
     geometry: KneeGeometry, loads: SolvedLoads, friction: float
 ) -> dict[str, dict[str, float]]:
-    """Return side -> load -> what it adds to the side's normal force, N; the sum is that force.
+    """Return side -> load -> its contribution to the normal force of that side, N.
+
+    The contributions to a side add up to its normal force.
 
     Args:
-        geometry: a frame with contact, extensor mechanism and the other muscles' share.
-        loads: its solution; a side that is lifted has no contributions.
+        geometry: a frame with contact, extensor mechanism and the other muscles.
+        loads: its solution; a lifted side has no contributions.
         friction: Coulomb coefficient of the femorotibial contact.
     """
     share, extensor = geometry.share, geometry.extensor
     if share is None or extensor is None or loads.problems:
         return {}
     slack = frozenset(extensor.muscles) if loads.slack else frozenset[str]()
+    # With every known load at zero the solution is the contribution of weight, inertia and ground.
     bare = replace(geometry, share=None, ligaments=(), post=())
     system = KneeSystem(bare, friction, LoadState(loads.lifted, slack))
     lines = share.lines.unit_loads(geometry.state)

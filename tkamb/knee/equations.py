@@ -1,12 +1,12 @@
 """One frame of the knee: known geometry in, every unknown load out.
 
-15 equations (free root 6, knee 6, patella 3) and 15 unknowns: hip force and moment,
-one muscle, patellar ligament, patellofemoral force (2), medial and lateral normal force,
-and three residuals. A smaller model has fewer unknowns:
+The full model has 15 equations (6 of the free root, 6 of the knee, 3 of the patella) and 15
+unknowns: hip force and moment (6), one muscle, patellar ligament, patellofemoral force (2), medial
+and lateral normal force, and three residuals. A smaller model has fewer:
 
-- no muscles: the patella is left out, the flexion moment joins the residuals;
-- no contact: the knee's force and its coronal and axial moments (with muscles), or its
-  whole intersegmental wrench (without), act at the femoral origin.
+- without muscles the chain has no patella, and the flexion moment is one more residual;
+- without contact a force and the coronal and axial moments act at the femoral origin, and without
+  muscles the flexion moment, too.
 """
 
 from collections.abc import Iterable, Mapping
@@ -39,8 +39,8 @@ class EquationSettings:
     """The equations of motion of the leg."""
 
     residual_shift: float = 0.010
-    """m: shift along y of the point where the residuals act, by which their sensitivity is
-    measured."""
+    """m: shift along y of the point where the residuals act, by which the column
+    `residual_sensitivity_N` is defined."""
 
 
 EQUATION = EquationSettings()
@@ -51,14 +51,14 @@ PATELLAR = ("patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
 @dataclass(frozen=True, eq=False)
 class Extensor:
-    """The extensor mechanism at one frame, without the muscles' forces, insert frame.
+    """The extensor mechanism at one frame, insert frame; tensions are unknown.
 
     Args:
-        patellar_ligament: loads of one newton of patellar-ligament tension.
+        patellar_ligament: loads on the links at a tension of one newton.
         contact_point: (3,) m, patellofemoral contact.
-        contact_normal: (3,) unit, out of the femur into the patella, sagittal.
-        muscles: names of the muscles that insert on the patella, the extensor group.
-        wrap: rad, angle over which they wrap the femur.
+        contact_normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
+        muscles: names of the extensor group, the muscles that insert on the patella.
+        wrap: rad, angle over which the extensor group wraps the femur.
     """
 
     patellar_ligament: tuple[PointForces, ...]
@@ -74,21 +74,21 @@ class Extensor:
 
 @dataclass(frozen=True, eq=False)
 class KneeGeometry:
-    """Everything that the equations of one frame need, insert frame.
+    """Input of the equations of one frame, insert frame.
 
     Args:
         state: the chain at this frame.
-        ground: ground reaction on the shank, if measured.
-        ligaments: known ligament loads.
-        condyles: side -> contact point; empty when contact is not modelled.
-        lifted: sides that are clearly off the insert.
-        extensor: the extensor mechanism, if modelled.
-        muscles: one newton of tension on each muscle's line of action.
+        ground: ground reaction on the shank; None: not measured.
+        ligaments: loads of the ligaments on the links.
+        condyles: side -> contact point; empty: contact is not modelled.
+        lifted: sides that the recorded gap keeps off the insert.
+        extensor: the extensor mechanism; None: not modelled.
+        muscles: the unknown tension of each muscle on its line of action.
         coordinates: (6,) knee coordinates of this geometry, m and rad.
         tensions: ligament name -> N.
-        share: the other muscles, with their forces, if modelled.
-        post: known loads of a cam on the insert's post, if modelled.
-        problems: plain words, why the equations cannot be set up; empty when all is well.
+        share: the other muscles with their forces; None: not modelled.
+        post: loads of a cam on the insert's post; empty: not modelled, or no contact.
+        problems: why the equations cannot be set up, in words; empty: they can.
     """
 
     state: ChainState
@@ -107,20 +107,20 @@ class KneeGeometry:
 
 @dataclass(frozen=True, eq=False)
 class SolvedLoads:
-    """Loads from the equations of one frame; NaN where they are singular.
+    """Loads from the equations of one frame; NaN where there is no solution.
 
     Args:
-        values: magnitude of each unknown, N or N·m.
+        values: unknown -> magnitude, N or N·m.
         contact_force: (3,) N of the condyles on the femur, insert frame, without residuals.
         external_flexion: N·m, moment that tends to flex, about the femoral ML axis.
         external_adduction: N·m, moment that tends to adduct, about the floating axis.
-        sensitivity: N, largest change of the total contact force when the residuals' point
-            moves by ±10 mm along y.
-        condition: condition number (unit columns).
-        lifted: sides that carry nothing.
-        slack: the extensor group carries nothing, because it would have to push.
-        ambiguous: other load states, too, have no wrong sign.
-        problems: plain words; empty when all is well.
+        sensitivity: N, largest change of the total contact force if the residuals act 10 mm higher
+            or lower.
+        condition: condition number of the matrix with unit columns.
+        lifted: sides that carry no load.
+        slack: whether the extensor group carries no load, because it would have to push.
+        ambiguous: whether another load state, too, has no wrong sign.
+        problems: why there is no solution, in words; empty: there is one.
     """
 
     values: dict[str, float]
@@ -136,10 +136,10 @@ class SolvedLoads:
 
 
 def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
-    """Return all loads of one frame: those of the load state without a wrong sign.
+    """Return all loads of one frame, in the load state without a wrong sign.
 
-    If several states have no wrong sign, the one that leaves out fewest loads is taken, and
-    `ambiguous` is true. If none has, the frame has no number. See `tkamb.knee.unknowns`.
+    If several states have no wrong sign, that with the fewest zero loads is taken, and `ambiguous`
+    is true. If every state has a wrong sign, there is no solution. See `tkamb.knee.unknowns`.
 
     Args:
         geometry: the frame.
@@ -148,15 +148,15 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     off = geometry.lifted
     extensors = geometry.extensor.muscles if geometry.extensor else ()
     first, *others = load_states(geometry.condyles, off, extensors)
-    # The state in which everything carries load is tried first; most frames need no other.
+    # The state in which all loads act is tried first; most frames need no other.
     full = KneeSystem(geometry, friction, first)
     condition = full.solution.condition
     if not full.solution.regular:
         return replace(unsolved(("singular equations",)), condition=condition)
     if not wrong_signs(first, full.solution):
         return full.loads()
-    # A contact that would pull, or a muscle that would push, carries nothing. All combinations are
-    # solved, and the one that contradicts no sign is taken.
+    # A contact that would pull, or a muscle that would push, carries no load. All combinations are
+    # solved, and one without a wrong sign is taken.
     systems = {first: full} | {state: KneeSystem(geometry, friction, state) for state in others}
     solutions = {state: system.solution for state, system in systems.items()}
     wrong = {state: contradictions(state, solutions, off) for state in systems}
@@ -165,7 +165,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
         reasons = ", ".join(f"{state.label}: {wrong[state][0]}" for state in systems)
         problem = f"no load state has all signs right ({reasons})"
         return replace(unsolved((problem,)), condition=condition)
-    # More than one admissible state: the first carries most, and the frame is flagged.
+    # The first admissible state has the fewest zero loads.
     return replace(admissible[0].loads(), ambiguous=len(admissible) > 1)
 
 
@@ -174,7 +174,7 @@ def solved_unknowns(geometry: KneeGeometry, loads: SolvedLoads, friction: float)
 
     Args:
         geometry: the frame.
-        loads: what its equations say; without problems.
+        loads: solution of its equations, without problems.
         friction: Coulomb coefficient of the femorotibial contact.
     """
     extensors = geometry.extensor.muscles if geometry.extensor else ()
@@ -183,7 +183,7 @@ def solved_unknowns(geometry: KneeGeometry, loads: SolvedLoads, friction: float)
 
 
 def unsolved(problems: Iterable[str]) -> SolvedLoads:
-    """Return a frame without a number, and why."""
+    """Return the loads of a frame without a solution: NaN, with the reasons."""
     nan = np.nan
     state = (frozenset[str](), False, False)
     return SolvedLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
@@ -194,27 +194,27 @@ def dome_sensitivity(
 ) -> tuple[float, float] | None:
     """Return the change of muscle and patellofemoral force as the button sits higher, N/m.
 
-    The patellofemoral force passes through the button's contact with the femur, and muscle and
-    patellar ligament are weighed against each other by their arms about that line. Both run
-    along the patella, so a button that sits higher or lower on it (the patella's y axis) moves
-    the line sideways; a button that sits deeper (x) moves the line along itself and changes little.
-    The place of the button is not known to a millimetre.
+    The patellofemoral force passes through the contact of the button with the femur. The arms about
+    that line decide the ratio of muscle and patellar-ligament tension. A button that sits higher or
+    lower on the patella (its y axis) shifts the line sideways and changes the arms. A button that
+    sits deeper (x) shifts the line along itself and changes little. The position of the button is
+    not known to a millimetre.
 
-    The line moves along the patella's y axis with the patella's place kept: with A x = b the
-    frame's equations, dx = -A⁻¹ dA x. Measured per millimetre on the shipped knee, from extension
-    to 120 deg: Q 1.6 to 5.6 % and PF 1.0 to 4.3 % along y; Q 0.1 to 2.2 % along x. A patella that
-    may move to its new equilibrium turns by up to 1 deg per millimetre, which cancels most of the
-    change: along y Q then changes by at most 1.6 % and PF by 1.3 % (along x: PF by 7 %, in
-    extension). The value returned here is therefore an upper estimate for Q.
+    Here the line is shifted along the patella's y axis and the patella does not move. With A x = b
+    the frame's equations, dx = -A⁻¹ dA x. Measured per millimetre on the shipped knee, from
+    extension to 120 deg: the quadriceps changes by 1.6 to 5.6 % and the patellofemoral force by 1.0
+    to 4.3 %. A patella that moves to its new equilibrium turns by up to 1 deg per millimetre, which
+    cancels most of this: the quadriceps then changes by 1.6 % at most. The value for the quadriceps
+    is therefore an upper estimate.
 
     Args:
         geometry: the frame.
-        loads: what its equations say.
+        loads: solution of its equations.
         friction: Coulomb coefficient of the femorotibial contact.
 
     Returns:
-        Of the extensor group's tension and of the patellofemoral force, zero where it is slack.
-        None without an extensor mechanism.
+        Changes of the extensor group's tension and of the patellofemoral force; zero if it is
+        slack. None without an extensor mechanism.
     """
     extensor, state = geometry.extensor, geometry.state
     if extensor is None:
@@ -236,12 +236,12 @@ def dome_sensitivity(
 
 
 class KneeSystem:
-    """The square system of one frame under given assumptions, solved.
+    """The linear equations of one frame in one load state, and their solution.
 
     Args:
         geometry: the frame.
         friction: Coulomb coefficient.
-        assumed: loads that are assumed to be zero.
+        assumed: the load state, the loads that are assumed to be zero.
     """
 
     def __init__(self, geometry: KneeGeometry, friction: float, assumed: LoadState) -> None:
@@ -252,27 +252,26 @@ class KneeSystem:
         unknown_forces = self.unknowns = [*hip, *self._extensor(), *self._knee()]
         self.names = [unknown.name for unknown in unknown_forces]
         ground = [geometry.ground] if geometry.ground else []
-        # Unit couples about x and z; by them the residual forces are shifted along y in
-        # `sensitivity`.
+        # Unit couples about x and z, by which `sensitivity` shifts the residual forces along y.
         couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]
         pulls = geometry.share.loads(state) if geometry.share else ()
         given_loads = (*geometry.ligaments, *geometry.post, *pulls)
         groups = [*(unknown.loads for unknown in unknown_forces), *couples, ground, given_loads]
         columns = state.generalised(groups)
         self._columns, self._couples = columns[:, :-4], columns[:, -4:-2]
-        # M a - ground reaction: what hip and knee have to supply together.
+        # Generalised forces that hip and knee supply together: inertia less the ground reaction.
         self._outside = state.inertial - columns[:, -2]
-        # Known loads of the knee (ligaments, post, muscles) change sides of the equation.
+        # Known loads of the knee (ligaments, post, muscles) are subtracted, too.
         self._right = self._outside - columns[:, -1]
         self.solution = solve(self.names, self._columns, self._right)
 
     @property
     def carrying(self) -> list[str]:
-        """Sides that carry load."""
+        """Names of the condyles that carry load."""
         return [side for side in self.geometry.condyles if side not in self.lifted]
 
     def loads(self) -> SolvedLoads:
-        """Return the loads of this set."""
+        """Return the solution as loads, with the zero loads among them."""
         values = self.solution.values
         flexion, adduction = self.external_moments()
         return SolvedLoads(
@@ -304,7 +303,7 @@ class KneeSystem:
         return np.asarray(-np.linalg.solve(self._columns, loads))
 
     def sensitivity(self) -> float:
-        """Return the largest change (N) of the total force as the residuals' point moves.
+        """Return the largest change (N) of the total force as the residuals shift along y.
 
         A shift s along y adds the couples s y x (x, z) = s (-z, x) to the residual forces.
         """
@@ -331,8 +330,8 @@ class KneeSystem:
         origin, where the three axes meet.
         """
         hip = self._columns[:, :6]
-        # The first six equations are those of the floating base. The knee's internal loads vanish
-        # in them, so that they give the hip's six unknowns.
+        # The knee's internal loads vanish in the six equations of the free root, so that these
+        # give the hip's six unknowns.
         at_hip = np.linalg.solve(hip[:6], self._outside[:6])
         knee = self._outside - hip @ at_hip
         rows = self.geometry.state.chain.knee_columns()

@@ -1,4 +1,4 @@
-"""The extensor mechanism over all frames: place of the patella, and lines of action."""
+"""The extensor mechanism: its lines of action, and the patella over the frames of a motion."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -29,15 +29,15 @@ Rates = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 @dataclass(frozen=True, eq=False)
 class ExtensorParts:
-    """What the extensor mechanism of a knee is made of.
+    """The parts of the extensor mechanism of a knee.
 
     Args:
-        muscle: the one that pulls the patella.
+        muscle: the muscle that pulls the patella.
         ligament: the patellar ligament.
-        chain: the patient.
-        femoral: femoral component, femur link.
-        button: patellar button, patella link.
-        insert: insert, insert frame; None: the ligament wraps nothing.
+        chain: chain of the knee.
+        femoral: femoral component, in the femur link's frame.
+        button: patellar button, in the patella link's frame.
+        insert: insert, in the insert frame; None: the ligament wraps nothing.
     """
 
     muscle: Muscle
@@ -49,7 +49,7 @@ class ExtensorParts:
 
 
 class Posed(Protocol):
-    """The knee at one instant, as far as lines run over it."""
+    """Poses of the links at one instant."""
 
     def pose(self, link: str) -> Array:
         """Return pose_link_in_insert (4, 4)."""
@@ -62,10 +62,10 @@ class ExtensorLines:
         parts: the mechanism.
 
     Attributes:
-        muscle: its line of action.
-        ligament: the patellar ligament's.
-        mechanism: what the place of the patella is found with.
-        prepared: the patellofemoral contact, shared by all lines of the same surfaces.
+        muscle: line of action of the muscle.
+        ligament: line of action of the patellar ligament.
+        mechanism: the mechanism as the search for the patella takes it.
+        prepared: the patellofemoral contact, shared by all objects with the same surfaces.
 
     Raises:
         InputError: a line starts inside what it wraps.
@@ -86,12 +86,12 @@ class ExtensorLines:
     def solved(
         self, pose: Array, guess: PatellaState | None = None, near: Array | None = None
     ) -> PatellaState:
-        """Return the patella where its moments balance, the femur at a pose (4, 4).
+        """Return the patella in equilibrium.
 
         Args:
-            pose: pose_femur_in_insert.
-            guess: the patella at a pose near by.
-            near: (3,) coordinates near by, without it; None searches all rotations.
+            pose: (4, 4) pose_femur_in_insert.
+            guess: the patella at a pose near by, as initial guess.
+            near: (3,) m and rad, initial guess without `guess`; None: all rotations are searched.
         """
         if guess is None or not guess.status.found:
             return solve_patella(self.mechanism, pose, near)
@@ -100,15 +100,16 @@ class ExtensorLines:
     def loads(
         self, flexion: float, state: Posed, patella: PatellaState
     ) -> tuple[Extensor, Unknown]:
-        """Return the mechanism and its muscle, both per unit tension.
+        """Return the mechanism and its muscle, for the equations of one frame.
 
         Args:
             flexion: rad, for messages.
-            state: the chain there.
-            patella: where it is.
+            state: the chain at that frame.
+            patella: the patella there.
 
         Raises:
-            ComputationError: no patella at this frame, or a line's end inside what it wraps.
+            ComputationError: the patella was not found, or an end of a line lies inside the
+                outline that it wraps.
         """
         if not patella.status.found:
             raise ComputationError(
@@ -132,19 +133,19 @@ class ExtensorLines:
         tension: float,
         patellar_tension: float | None = None,
     ) -> list[PointForces]:
-        """Return what a tension of the muscle does to femur, patella and tibia.
+        """Return the loads of a muscle tension on femur, patella and tibia.
 
-        The patella is massless: the patellofemoral force is what the two tendons leave.
+        The patella is massless: the patellofemoral force balances the two tensions.
 
         Args:
             poses: link -> pose (4, 4) in the insert frame.
-            patella: where it is.
+            patella: the patella there.
             flexion: rad, for messages.
             tension: N, of the muscle.
-            patellar_tension: N, of the patellar ligament; None: as the patella carries it on.
+            patellar_tension: N, of the patellar ligament; None: from the patella's equilibrium.
 
         Raises:
-            ComputationError: the patella cannot carry it on.
+            ComputationError: the patella has no equilibrium with forces of the right signs.
         """
         extensor, muscle = self.loads(flexion, _Poses(poses), patella)
         pulls = scaled(muscle.loads, tension)
@@ -158,6 +159,8 @@ class ExtensorLines:
         else:
             pulls += scaled(extensor.patellar_ligament, patellar_tension)
             pull = sum(load.forces.sum(axis=0) for load in pulls if load.link == "patella")
+            # The groove takes no force along the femur's ML axis; the patella is guided in its
+            # plane.
             across = poses["femur"][:3, 2]
             force = -(pull - (pull @ across) * across)
         point = patella.contact_point[None]
@@ -168,14 +171,14 @@ class ExtensorLines:
         ]
 
     def paths_at(self, poses: Mapping[str, Array]) -> tuple[TautPath, TautPath]:
-        """Return what `paths` does, of link -> pose (4, 4) in the insert frame."""
+        """Return the same as `paths`, from link -> pose (4, 4) in the insert frame."""
         return self.paths(_Poses(poses))
 
     def paths(self, state: Posed) -> tuple[TautPath, TautPath]:
-        """Return muscle and patellar ligament as they run, in the insert frame.
+        """Return the taut paths of muscle and patellar ligament, in the insert frame.
 
         Raises:
-            ComputationError: a line's end inside what it wraps.
+            ComputationError: an end of a line lies inside the outline that it wraps.
         """
         links = {point.link for line in (self.muscle, self.ligament) for point in line.points}
         poses = {link: state.pose(link) for link in links | {"femur"}} | {"insert": np.eye(4)}
@@ -196,7 +199,7 @@ class ExtensorLines:
         return inverse(self._chain.insert_in_tibia) @ on_tibia
 
     def _check_fixed_ends(self) -> None:
-        """Raise if the end that does not move against an outline lies within it."""
+        """Raise if an end that is fixed to the wrapped bone lies inside its outline."""
         ends, name = [], self.muscle.name
         if self.muscle.wrap is not None:
             last = self.muscle.points[self.muscle.wrap.stretch]
@@ -244,11 +247,12 @@ class ExtensorFrames:
         lines: the extensor mechanism.
         time: (f,) s.
         poses: (f, 4, 4) pose_femur_in_insert.
-        recorded: (f, 3, 3) patella coordinates, rates and accelerations; None: to be found.
-        rates: from time (n,) and coordinates (n, 3) to them filtered, and their derivatives.
+        recorded: (f, 3, 3) patella coordinates, rates and accelerations; None: they are solved.
+        rates: function of time (n,) and coordinates (n, 3). It returns the filtered coordinates
+            and their first and second derivatives.
 
     Attributes:
-        lines: as given.
+        lines: the extensor mechanism.
         states: the patella at each frame; a recorded one is evaluated on first use.
 
     Raises:
@@ -270,14 +274,14 @@ class ExtensorFrames:
             self._joints = self._differentiate(time, poses, rates)
 
     def moved(self, lines: ExtensorLines, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
-        """Return the frames of a solved patella with its lines or the femur a little elsewhere.
+        """Return a solved patella for slightly changed lines or poses of the femur.
 
-        In the given frames the patella is solved again, with its place here as initial guess; its
-        joint moves by as much. Rates, and the patella in the other frames, are kept.
+        In the given frames the patella is solved again, with its present place as initial guess.
+        Rates, and the patella in the other frames, stay the same.
 
         Args:
-            lines: the mechanism.
-            poses: (f, 4, 4) pose_femur_in_insert.
+            lines: the changed mechanism.
+            poses: (f, 4, 4) changed pose_femur_in_insert.
             frames: frames in which the patella is solved again.
         """
         other = copy.copy(self)
@@ -296,21 +300,22 @@ class ExtensorFrames:
         return np.asarray(self._joints[k])
 
     def at(self, k: int) -> "PatellaOfFrame":
-        """Return what finds the patella of frame k."""
+        """Return the object that finds the patella of frame k."""
         return PatellaOfFrame(self, k)
 
     def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
         """Return the patella of frame k with the femur at another pose (4, 4).
 
-        Recorded coordinates are kept; a solved patella is found anew, from `guess` or from
-        where it was at the recorded pose.
+        A recorded patella keeps its coordinates. A solved patella is solved again, with `guess` or
+        its place at the recorded pose as initial guess.
         """
         mechanism = self.lines.mechanism
         if self._contacts is not None:
             return patella_at(mechanism, pose, self._contacts.places[k], self._contacts[k])
         own = self.states[k]
         if guess is not None and own.status.found:
-            # An initial guess from a distant frame may fail where the frame's own one converges.
+            # If the search from a distant guess fails, that from the frame's own place may
+            # converge.
             near = guess.coordinates
             solution = solve_patella(mechanism, pose, near, guess.slopes, anywhere=False)
             if solution.status.found:
@@ -355,8 +360,8 @@ class PatellaOfFrame:
     """Finds the patella of one frame of a motion.
 
     Args:
-        frames: of the motion.
-        k: which.
+        frames: the patella over all frames.
+        k: number of the frame.
     """
 
     frames: ExtensorFrames
@@ -368,7 +373,7 @@ class PatellaOfFrame:
         return self.frames.lines
 
     def patella(self, pose: Array | None = None, guess: PatellaState | None = None) -> PatellaState:
-        """Return the patella with the femur at a pose (4, 4); None: as recorded."""
+        """Return the patella with the femur at a pose (4, 4); None: at the recorded pose."""
         if pose is None:
             return self.frames.states[self.k]
         return self.frames.patella(self.k, pose, guess)
@@ -376,12 +381,12 @@ class PatellaOfFrame:
 
 @lru_cache(maxsize=1)
 def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> PatellofemoralContact:
-    """Return the contact of two surfaces, prepared once for the many samples of a scene.
+    """Return the prepared contact of two surfaces, cached for the many samples of a scene.
 
     Args:
-        femoral: femoral component, femur link's frame; compared by identity in the cache.
-        button: patellar button, likewise.
-        joint: (4, 4) pose_joint_in_femur, its bytes.
+        femoral: femoral component, femur link's frame; the cache compares its identity.
+        button: patellar button, patella link's frame; the cache compares its identity.
+        joint: bytes of pose_joint_in_femur (4, 4).
     """
     joint_in_femur = np.frombuffer(joint).reshape(4, 4)
     return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
@@ -391,7 +396,7 @@ class _RecordedContacts:
     """The contact at each recorded place, computed on first use.
 
     Args:
-        contact: of the two surfaces, unused.
+        contact: contact of the two surfaces, without stored distances.
         places: (f, 3) m and rad, recorded coordinates of the patella.
     """
 
@@ -407,11 +412,11 @@ class _RecordedContacts:
 
 @lru_cache(maxsize=1)
 def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
-    """Return the contacts at recorded places; they do not depend on the knee's pose.
+    """Return the contacts at recorded places, which do not depend on the knee's pose.
 
     Args:
-        prepared: the contact; compared by identity in the cache.
-        coordinates: (f, 3) m and rad, their bytes.
+        prepared: the prepared contact; the cache compares its identity.
+        coordinates: bytes of the coordinates (f, 3), m and rad.
     """
     return _RecordedContacts(prepared.unused(), np.frombuffer(coordinates).reshape(-1, 3))
 
@@ -443,7 +448,7 @@ class _RecordedStates(Sequence[PatellaState]):
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
-    """Solve frame after frame, each from the one before."""
+    """Return the patella at each frame, with the frame before as initial guess."""
     states: list[PatellaState] = []
     for pose in poses:
         near = (states[-1].coordinates, states[-1].slopes) if states else ()
@@ -452,7 +457,7 @@ def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]
 
 
 class _Poses:
-    """Poses of links in the insert frame, as `ExtensorLines` asks for them."""
+    """Poses of links in the insert frame, as a `Posed` object."""
 
     def __init__(self, poses: Mapping[str, Array]) -> None:
         self._poses = poses
@@ -463,5 +468,5 @@ class _Poses:
 
 
 def _on_tibia(load: PointForces) -> PointForces:
-    """Return the load with the link "insert", which is fixed to the tibia, renamed "tibia"."""
+    """Return a load on the link "insert", which is fixed to the tibia, as one on "tibia"."""
     return replace(load, link="tibia") if load.link == "insert" else load

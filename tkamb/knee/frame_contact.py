@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PostSideSettings:
-    """On which side of the post the cam is."""
+    """Limits for cam and post."""
 
     pose_error: float = 0.5 * MILLIMETRE
-    """m: error of a position from fluoroscopy; a deeper overlap of cam and post becomes a question
-    to the user. Chosen: above its usual error."""
+    """m: overlap of cam and post at a recorded pose above which a flag is set. Chosen: the usual
+    error of a position from fluoroscopy."""
 
 
 POST_SIDE = PostSideSettings()
@@ -48,10 +48,10 @@ def cam_on_post(
         pair: femoral component and insert.
         post: of the insert, insert frame.
         material: of the insert.
-        ready: the same prepared already, perhaps of another material.
+        ready: an earlier result, perhaps with another material; None: there is none.
 
     Raises:
-        InputError: see `CamPost`.
+        InputError: as `CamPost`.
     """
     if ready is not None:
         return ready if ready.material == material else ready.of_material(material)
@@ -63,9 +63,9 @@ def cam_on_post(
 def post_contact(
     cam_post: "CamPost | None", pose: "Array", released: Sequence[str]
 ) -> "PostContact | None":
-    """Return cam and post at a pose (4, 4), with a question if a recorded AP makes them overlap.
+    """Return cam and post at a pose (4, 4), with a flag if a recorded AP makes them overlap.
 
-    None where they are not modelled.
+    None if they are not modelled.
     """
     if cam_post is None:
         return None
@@ -87,21 +87,21 @@ class FrameContact:
     """The contact side of one frame.
 
     Args:
-        result: the contact, None where it could not be computed.
-        medial: (n,) which map points lie under the medial condyle.
-        adjustment: the femoral adjustment, checked and perhaps restored; None if not asked for.
-        seconds: computing time.
-        problem: why there is no result, or empty.
-        flags: plain words that a reader must know.
-        iterations: iterations between body and contact until convergence; 0 if not coupled.
+        result: the contact; None: it could not be computed.
+        medial: (n,) whether a map point lies under the medial condyle.
+        adjustment: the femoral adjustment after its check; None: none was asked for.
+        seconds: computing time, s.
+        problem: why there is no result, in words; empty: there is one.
+        flags: remarks on the result, in words.
+        iterations: number of iterations between loads and contact; 0: not coupled.
         load_change: N, change of the load in the last iteration.
         point_change: m, change of the centres of pressure in the last iteration.
-        equilibrium: the search for the released coordinates, if there are any.
-        sensitivity: N/rad, of the medial force to adduction (`split_sensitivity`); NaN where
-            adduction is released, or there is one condyle.
-        start: where a contact of the next frame may begin; None where there is no result.
-        triangles: (k, 3) of the map.
-        post: cam and post, where the scene asks for their contact.
+        equilibrium: result of the search for released coordinates; None: there are none.
+        sensitivity: N/rad, change of the medial force with adduction (`split_sensitivity`); NaN if
+            adduction is released, or with one condyle.
+        start: warm start of the next frame; None: there is no result.
+        triangles: (k, 3) triangles of the map.
+        post: contact of cam and post; None: not modelled.
     """
 
     result: ContactResult | None

@@ -1,7 +1,7 @@
-"""A knee at one instant, at the pose of q or near it: its loads and lines of action.
+"""A knee at one instant: its geometry and loads, at the pose of q or at other knee coordinates.
 
-The shank moves as q, v and a say, whatever the knee coordinates of a search for equilibrium. The
-wrench that the knee must exert on it is therefore computed once.
+The motion of the shank follows from q, v and a alone. The wrench that the knee must exert on the
+shank is therefore computed once, and holds for all knee coordinates that a search tries.
 """
 
 from collections.abc import Mapping
@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 
 
 class PatellaFinder(Protocol):
-    """Where the patella is at one instant.
-
-    Attributes:
-        lines: the extensor mechanism.
-    """
+    """Finds the patella at one instant."""
 
     @property
     def lines(self) -> "ExtensorLines":
@@ -42,7 +38,7 @@ class PatellaFinder(Protocol):
     def patella(
         self, pose: Array | None = None, guess: "PatellaState | None" = None
     ) -> "PatellaState":
-        """Return the patella with the femur at a pose (4, 4); None: at the instant's own."""
+        """Return the patella with the femur at a pose (4, 4); None: at the pose of q."""
 
 
 class SharingMuscles(Protocol):
@@ -51,32 +47,32 @@ class SharingMuscles(Protocol):
     def share(
         self, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
     ) -> "MuscleShare":
-        """Return what each muscle carries with the knee as it stands."""
+        """Return the force of each muscle at a fixed pose of the knee."""
 
     def share_of_yielding_knee(
         self, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> "MuscleShare":
-        """Return what each muscle carries while released coordinates yield to it."""
+        """Return the force of each muscle if the released coordinates yield to the forces."""
 
     def at(self, share: "MuscleShare") -> "MuscleShare":
-        """Return the forces of a share along the lines of this instant."""
+        """Return a share with the lines of action of this instant."""
 
     def tension(self, share: "MuscleShare") -> float:
-        """Return what the extensor group pulls with, N."""
+        """Return the tension of the extensor group, N."""
 
     def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
-        """Return the geometry with the muscles' forces in it, and all loads."""
+        """Return the geometry with the muscles' forces added, and all loads."""
 
 
 @dataclass(frozen=True, eq=False)
 class PatellaAt:
-    """Finds the patella of one instant by its place in q, or without one.
+    """Finds the patella of one instant, from its coordinates in q or by equilibrium.
 
     Args:
         lines: the extensor mechanism.
-        pose: (4, 4) of the femur in the insert frame, by q.
-        coordinates: (3,) of the patella by q; None where the model has none.
-        solved: whether it is solved again at other poses; if not, it stays fixed to the femur.
+        pose: (4, 4) pose of the femur in the insert frame at q.
+        coordinates: (3,) patella coordinates of q, m and rad; None: q has none.
+        solved: True: the patella is solved again at other poses. False: it is fixed to the femur.
     """
 
     lines: "ExtensorLines"
@@ -87,7 +83,7 @@ class PatellaAt:
     def patella(
         self, pose: Array | None = None, guess: "PatellaState | None" = None
     ) -> "PatellaState":
-        """Return the patella with the femur at a pose (4, 4); None: at that of q."""
+        """Return the patella with the femur at a pose (4, 4); None: at the pose of q."""
         pose = self.pose if pose is None else pose
         if self.coordinates is None:
             return self.lines.solved(pose, guess)
@@ -102,16 +98,16 @@ class Instant:
 
     Args:
         chain: the canonical chain.
-        motion: how it moves.
+        motion: motion of the chain.
         shank: (6,) wrench that motion and weight of the shank need, insert frame.
         thigh: (6,) external wrench on the thigh, insert frame.
         on_patella: (6,) external wrench on the patella, insert frame.
-        ligaments: the bundles, on links of the chain.
+        ligaments: the bundles, with ends on links of the chain.
         extensor: finds the patella; None: not modelled.
         friction: Coulomb coefficient.
-        two_condyles: whether there are two.
-        ground: what acts on the shank from outside; None: nothing.
-        muscles: those of the leg that share the load; None: the quadriceps alone acts.
+        two_condyles: whether the femoral component has two condyles.
+        ground: external load on the shank; None: no load.
+        muscles: muscles of the leg that share the load; None: the quadriceps alone acts.
     """
 
     chain: Chain
@@ -139,11 +135,11 @@ class Instant:
     def geometry(
         self, coordinates: Array | None = None, patella: "PatellaState | None" = None
     ) -> KneeGeometry:
-        """Return the knee without its contact, perhaps at other coordinates than those of q.
+        """Return the knee without its contact.
 
         Args:
-            coordinates: (6,) m and rad; None: those of q.
-            patella: where the patella is; None: as it is found there.
+            coordinates: (6,) knee coordinates, m and rad; None: those of q.
+            patella: the patella; None: it is found.
         """
         place = self.coordinates if coordinates is None else coordinates
         motion = self.motion
@@ -173,7 +169,7 @@ class Instant:
         return replace(geometry, extensor=extensor, muscles=(muscle,))
 
     def _pulls(self, state: "ChainState") -> tuple[dict[str, float], tuple[PointForces, ...]]:
-        """Return the ligaments' tensions (N) by name, and what they do to the links."""
+        """Return ligament -> tension (N), and their loads on the links."""
         if not self.ligaments:
             return {}, ()
         from tkamb.knee.ligaments import ligament_loads
@@ -184,14 +180,14 @@ class Instant:
         return dict(zip(names, tensions.tolist(), strict=True)), loads
 
     def contact_points(self, query: "ClosestPointQuery", pose: Array) -> ContactPoints:
-        """Return where the undeformed condyles meet the insert at a pose (4, 4), with its rates."""
+        """Return the contact points of the undeformed bodies at a pose (4, 4)."""
         return contact_points(query, pose, lambda point: self.sliding(self.coordinates, point))
 
     def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
-        """Return a geometry with the muscles' shares in it, and its loads.
+        """Return a geometry with the muscles' forces added, and its loads.
 
         Args:
-            geometry: of `geometry`, with its contact points.
+            geometry: result of `geometry`, with contact points.
         """
         if geometry.problems:
             return geometry, unsolved(geometry.problems)
@@ -200,9 +196,13 @@ class Instant:
         return self.muscles.solve(geometry, self.friction)
 
     def sliding(self, coordinates: Array, point: Array) -> Array:
-        """Return the velocity (3,) m/s of the femur's point (3,) relative to the insert's.
+        """Return the velocity (3,) m/s of a point of the femur against the insert.
 
-        The rates are those of q and v, wherever the knee is.
+        The rates of the knee coordinates are those of q and v.
+
+        Args:
+            coordinates: (6,) knee coordinates, m and rad.
+            point: (3,) m, insert frame.
         """
         velocity, spin = knee_twist(coordinates, self.motion.joints[1, :6])
         return np.asarray(velocity + cross(spin, point - coordinates[:3]))
@@ -213,8 +213,8 @@ class Instant:
         """Return the resultants of a contact as the contact points of the equations.
 
         Args:
-            coordinates: (6,) where the knee is.
-            condyles: side -> what it does to the insert there.
+            coordinates: (6,) knee coordinates, m and rad.
+            condyles: side -> its load on the insert there.
         """
         return {
             side: CondylePoint(
@@ -233,10 +233,10 @@ class Instant:
         """Return a geometry with the resultants of a contact as its contact points.
 
         Args:
-            geometry: of `geometry`.
-            coordinates: (6,) where the knee is.
-            condyles: side -> what it does to the insert there; the others carry nothing.
-            points: side -> (3,) m, where a condyle that carries nothing is nearest to the insert.
+            geometry: result of `geometry`.
+            coordinates: (6,) knee coordinates, m and rad.
+            condyles: side -> its load on the insert there; a side without one carries no load.
+            points: side -> (3,) m, point where an unloaded condyle is nearest to the insert.
         """
         up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
         separated = {
@@ -249,17 +249,18 @@ class Instant:
     def post_loads(
         self, coordinates: Array, post: "CondyleWrench | None"
     ) -> tuple[PointForces, ...]:
-        """Return what a cam on the post does to tibia and femur, with friction as a condyle's.
+        """Return the loads of a cam on the post on tibia and femur, with friction.
 
         Args:
-            coordinates: (6,) where the knee is.
-            post: what the cam does to the insert there; None: nothing.
+            coordinates: (6,) knee coordinates, m and rad.
+            post: load of the cam on the insert there; None: no contact.
         """
         if post is None:
             return ()
         sliding = self.sliding(coordinates, post.point)
         touch = CondylePoint(post.point, post.normal, sliding, 0.0)
         force = -post.force * touch.direction(self.friction)
+        # The couple that the cam's pressure has about the centre of pressure.
         twist = post.wrench[3:] - cross(post.point, post.wrench[:3])
         return (
             PointForces("tibia", post.point[None], force[None], twist),

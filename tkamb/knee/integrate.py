@@ -1,13 +1,14 @@
-"""Forward dynamics of a model with a knee: one implicit step, an example to copy and change.
+"""Forward dynamics of a model with a knee: one implicit time step, as an example to copy.
 
 With v_m = (1 - theta) v + theta v' the step solves
 
     v' = v + h a(q + theta h v_m, v_m),    q' = q + h v_m
 
-for v' by Newton's method, a from `pin.aba` with `Knee.external_forces`. theta = 1/2 is the implicit
-midpoint rule, of second order, which keeps the energy of a frictionless contact; theta = 1 is
-implicit Euler, of first order, which dissipates energy and so finds the knee's equilibrium. An
-explicit step would have to resolve the contact, which oscillates at 100 Hz or more under a thigh.
+for v' by Newton's method, where a is the result of `pin.aba` with `Knee.external_forces`. theta =
+1/2 is the implicit midpoint rule, of second order, which conserves the energy of a frictionless
+contact. theta = 1 is implicit Euler, of first order, which dissipates energy and so converges to
+the knee's equilibrium. An explicit step would have to resolve the contact, which oscillates at 100
+Hz or more under the mass of a thigh.
 
 Reference: Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed., II.1.1 (2006),
 doi:10.1007/3-540-30666-8.
@@ -39,7 +40,7 @@ class ImplicitStepSettings:
 IMPLICIT_STEP = ImplicitStepSettings()
 
 REUSE_BELOW = 0.2
-"""1: the Jacobian is kept while each Newton step reduces the residual to less than this share."""
+"""1: the Jacobian is used again while each Newton step reduces the residual below this share."""
 
 
 def implicit_step(
@@ -58,18 +59,18 @@ def implicit_step(
     """Return q and v one step later.
 
     Args:
-        knee: on the model that moves.
-        q: (nq,).
-        v: (nv,).
-        step: s.
-        tau: (nv,) of the joints; None: none.
-        external: forces on the joints beside the knee's, as `fext` of `pin.aba`.
-        tensions: of muscles, as `Knee.external_forces` takes them.
+        knee: the knee, whose model moves.
+        q: (nq,) configuration.
+        v: (nv,) velocity.
+        step: time step, s.
+        tau: (nv,) torques and forces of the joints, N·m and N; None: zero.
+        external: forces on the joints beside those of the knee, as `fext` of `pin.aba`.
+        tensions: muscle -> N, as for `Knee.external_forces`.
         theta: 0.5: implicit midpoint; 1: implicit Euler.
-        friction_of_joints: (nv,) viscous, N·s/m or N·m·s/rad, of the joints.
+        friction_of_joints: (nv,) viscous friction of the joints, N·s/m or N·m·s/rad; None: zero.
         data: from `Knee.create_data`, to save time.
-        linear: one step of Newton's method alone, the linearly implicit method of first order: a
-            third of the time, and no check that the step's equation is met.
+        linear: True: one Newton step, the linearly implicit method of first order. It takes a third
+            of the time or less, and does not check the residual of the step.
 
     Raises:
         ComputationError: Newton's method does not converge, or the contact model is out of range:
@@ -81,8 +82,6 @@ def implicit_step(
     cache, ahead, last = model.createData(), np.array(v, float), np.inf
     change, slope = np.zeros(model.nv), None
     for _ in range(IMPLICIT_STEP.max_newton_steps):
-        # theta 0.5 is the implicit midpoint rule, without numerical damping; 1 is implicit Euler,
-        # which damps.
         middle = (1.0 - theta) * v + theta * ahead
         place = pin.integrate(model, q, theta * step * middle)
         try:
@@ -104,18 +103,18 @@ def implicit_step(
             size < 1e3 * IMPLICIT_STEP.velocity_tolerance and size >= last
         ):
             return pin.integrate(model, q, step * middle), ahead
-        if slope is None or size > REUSE_BELOW * last:  # else the slope still serves
+        if slope is None or size > REUSE_BELOW * last:
             jacobian = knee.relative_jacobian(place)
             stiffness = knee.stiffness(place, middle, data, exact=False)
             stiffness = stiffness + _turning(knee, own, data)
             damping = knee.damping(place, middle, data)
             pin.computeABADerivatives(model, cache, place, middle, torque, forces)
-            # Pinocchio's derivatives hold the forces constant; the knee's stiffness adds how they
-            # change.
+            # In Pinocchio's derivatives the forces are constant; the knee's stiffness and damping
+            # add their change.
             by_q = cache.ddq_dq - cache.Minv @ jacobian.T @ stiffness @ jacobian
             by_v = cache.ddq_dv - cache.Minv @ (jacobian.T @ damping @ jacobian + np.diag(drag))
-            # Derivative of the residual by the end velocity: place depends on it with theta step,
-            # velocity with theta.
+            # Derivative of the residual by the end velocity, on which the place depends by
+            # theta * step and the velocity by theta.
             slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
         last = size
         change = -np.linalg.solve(slope, missed)
@@ -130,7 +129,7 @@ def implicit_step(
 
 
 def _turning(knee: Knee, forces: Any, data: KneeData) -> Array:
-    """Return the stiffness (6, 6) due to the turn of the femur itself, insert frame.
+    """Return the stiffness (6, 6) due to the rotation of the femur, insert frame.
 
     Derivatives of `pin.aba` hold a force fixed in the joint's frame, while the knee's force on the
     femur is fixed in the insert's: displaced by xi it turns back by xi x* w against the femur.

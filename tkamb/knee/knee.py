@@ -3,8 +3,9 @@
     knee = tkamb.Knee(model, side="right", implant=..., ligaments=[...], contact=..., friction=0.05)
     tau = pin.rnea(model, data, q, v, a, knee.external_forces(q, v))
 
-SI units; NumPy arrays and Pinocchio types in and out. No file is read, nothing is printed, and no
-call changes the next: what may save time is a `KneeData` that the caller makes and hands over.
+All units are SI; arguments and results are NumPy arrays and Pinocchio types. No call reads a file,
+prints, or changes the result of the next call. A `KneeData`, which the caller creates and passes,
+saves time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,17 +38,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """A knee whose released coordinates are in equilibrium.
+    """Result of `Knee.equilibrium`.
 
     Args:
-        q: (nq,) configuration of the user's model; the joints of the knee have moved.
-        coordinates: (6,) knee coordinates there, those of a right knee, m and rad.
-        loads: the knee's loads there.
-        contact: the contact there; None where there is no equilibrium.
-        residual: N, the largest force (moments over 25 mm) left on a released coordinate.
-        stiffness: (n, n) of the released coordinates, scaled alike, N/m.
-        problem: why this is no equilibrium, or empty.
-        search: all about the search.
+        q: (nq,) configuration of the user's model in equilibrium.
+        coordinates: (6,) knee coordinates there, as those of a right knee, m and rad.
+        loads: loads of the knee there.
+        contact: the contact there; None: no equilibrium was found.
+        residual: N (moments are divided by 25 mm), largest residual force on a released
+            coordinate.
+        stiffness: (n, n) N/m, of the n released coordinates, with rotations times 25 mm.
+        problem: why no equilibrium was found, in words; empty: one was found.
+        search: details of the search.
     """
 
     q: Array
@@ -63,35 +65,36 @@ class Equilibrium:
 class Knee(AssembledKnee):
     """A total knee replacement on a user's Pinocchio model.
 
-    The knee lies between the frames "femur" and "tibia" of the model, whatever joints are between
-    them, above and below. Its parts stand in these frames, found by name or given by `frames`:
+    The knee lies between the frames "femur" and "tibia" of the model. There may be any joints
+    between them, above and below. Its parts are placed by these frames, which are found by their
+    names or given by `frames`:
 
     - `femur`, `tibia`: needed; attachment points may lie on any frame that is fixed to them;
-    - `femoral`: axes of the femoral component's mesh, fixed to the femur; else `femur`;
-    - `insert`: axes of the insert's mesh, fixed to the tibia; else the placement of a joint
-      "knee_ap" on the tibia; else `tibia`;
-    - `patella`: a body that moves against the femur; else the extensor mechanism finds its place;
-    - `hip`: hip centre, fixed to the femur; else the joint that carries the femur.
+    - `femoral`: axes of the femoral component's mesh, fixed to the femur. Default: `femur`;
+    - `insert`: axes of the insert's mesh, fixed to the tibia. Default: the placement of a joint
+      "knee_ap" on the tibia, or `tibia`;
+    - `patella`: a body that moves against the femur. Default: the equilibrium of the extensor
+      mechanism gives the place of the patella;
+    - `hip`: hip centre, fixed to the femur. Default: the joint that carries the femur.
 
-    What is not given is not modelled, not imported and not computed.
+    A part that is not given is not modelled, and its code is not imported.
 
     Args:
         model: any Pinocchio model; it is not changed.
-        side: of the body, "right" or "left".
-        implant: meshes, see `Implant`.
-        ligaments: bundles, with slack lengths.
+        side: "right" or "left".
+        implant: meshes, material and bearing of the implant.
+        ligaments: ligament bundles with slack lengths.
         extensor: quadriceps, patella and patellar ligament.
-        contact: a contact model (`tkamb.contact_model`), its name, or a model with what it has
-            prepared for this implant (`Knee.contact` of another knee); None: no contact.
+        contact: a contact model (`tkamb.contact_model`), its name, or the `contact` of another knee
+            with the same implant, which is prepared already; None: no contact.
         friction: Coulomb coefficient of the femorotibial contact.
-        muscles: lines of given tension between any frames of the model, straight from point to
-            point.
+        muscles: straight lines of given tension between any frames of the model.
         frames: part of the knee -> name of its frame in the model.
-        joints: names of the knee's joints, for a check; they are found in the tree.
+        joints: names of the joints between tibia and femur, which are checked; empty: no check.
         cache: whether a lattice keeps its prepared operators on disk for the next time.
 
     Raises:
-        InputError: what is given does not fit together, in one line.
+        InputError: the arguments do not fit together.
     """
 
     def external_forces(
@@ -101,16 +104,17 @@ class Knee(AssembledKnee):
         tensions: Mapping[str, float] | float | None = None,
         data: KneeData | None = None,
     ) -> Any:
-        """Return what contact, ligaments and muscles do to the bodies at q and v.
+        """Return the forces of contact, ligaments and muscles on the bodies at q and v.
 
-        The contact follows from the overlap of the bodies at q, its friction from v. The patella
-        has no mass here: it passes the quadriceps' tension on to patellar ligament and femur.
+        The contact follows from the overlap of the bodies at q, and its friction from v. The
+        patella is massless here: it transmits the quadriceps' tension to patellar ligament and
+        femur.
 
         Args:
-            q: (nq,).
-            v: (nv,).
-            tensions: muscle -> N; a number alone is the quadriceps'. Muscles that are not named
-                are slack. With "patellar_ligament" -> N beside the quadriceps, as in
+            q: (nq,) configuration.
+            v: (nv,) velocity.
+            tensions: muscle -> N, or a number, the tension of the quadriceps. Other muscles are
+                slack. If "patellar_ligament" is given beside the quadriceps, as in
                 `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
             data: from `create_data`, to save time.
 
@@ -120,8 +124,7 @@ class Knee(AssembledKnee):
 
         Raises:
             InputError: q or v of the wrong size, or an unknown muscle.
-            ComputationError: the contact model is out of its range, or there is no place for the
-                patella.
+            ComputationError: the contact model is out of its range, or the patella is not found.
         """
         data = self.create_data() if data is None else data
         place = self._kinematics(data, q, v)
@@ -140,7 +143,7 @@ class Knee(AssembledKnee):
     def _beside_the_contact(
         self, data: KneeData, place: KneePlace, pulled: Mapping[str, float]
     ) -> list[PointForces]:
-        """Return what ligaments off the femorotibial gap and the extensor mechanism do."""
+        """Return the loads of the extensor mechanism, and of ligaments that end on the patella."""
         pulls, patella = self._pulls(pulled), None
         if not self._others and not pulls:
             return []
@@ -164,21 +167,20 @@ class Knee(AssembledKnee):
     ) -> Array:
         """Return the derivative (6, 6) of the femorotibial wrench by the relative twist.
 
-        The wrench is that of contact, its friction and ligaments between femur and tibia on the
-        insert: force (N), moment about the insert's origin (N·m). The displacement is that of
-        the femoral component against the insert: its point at the insert's origin (m), then its
-        rotation (rad). Both are in the insert frame; v stays. Positive: pressed in, the femur
-        pushes the insert with more force that way.
+        The wrench on the insert is the sum of contact, friction and ligaments between femur and
+        tibia: force (N) and moment about the insert's origin (N·m). The displacement of the femoral
+        component against the insert is that of its point at the insert's origin (m) and its
+        rotation (rad). Both are in the insert frame; v is constant.
 
         Args:
-            q: (nq,).
-            v: (nv,).
+            q: (nq,) configuration.
+            v: (nv,) velocity.
             data: from `create_data`, to save time.
-            exact: False: the tangent that the contact model brings, where it brings one, even
-                where it is a guide only (the softened lattice's).
+            exact: False: a tangent of the contact model is used even if it is approximate, as that
+                of the lattices with a softening material.
 
         Raises:
-            ComputationError: see `external_forces`.
+            ComputationError: as `external_forces`.
         """
         data = self.create_data() if data is None else data
         place = self._kinematics(data, q, v)
@@ -193,8 +195,8 @@ class Knee(AssembledKnee):
     def damping(self, q: Array, v: Array, data: KneeData | None = None) -> Array:
         """Return the derivative (6, 6) of the femorotibial wrench by the rate of the twist.
 
-        As `stiffness`, by the femur's velocity against the insert (m/s, rad/s): of friction,
-        which alone depends on it.
+        As `stiffness`, but the derivative by the femur's velocity against the insert (m/s, rad/s).
+        Only friction depends on the velocity.
         """
         data = self.create_data() if data is None else data
         place = self._kinematics(data, q, v)
@@ -213,24 +215,24 @@ class Knee(AssembledKnee):
         contact: "ContactResult | None" = None,
         data: KneeData | None = None,
     ) -> KneeLoads:
-        """Return the loads of the knee that a motion asks for.
+        """Return the loads of the knee in a given motion.
 
-        The shank's and the patella's equations of motion, for as many unknown loads (see
-        docs/equilibrium.md). Ligaments and given muscles are known, contact points are the
-        closest points of the undeformed bodies.
+        They solve the equations of motion of shank and patella (docs/equilibrium.md). Ligaments and
+        given muscles are known loads. Contact points are the closest points of the undeformed
+        bodies, or the resultants of `contact`.
 
         Args:
-            q: (nq,).
-            v: (nv,).
-            a: (nv,).
-            external: forces on the joints, each in its joint's frame, as `fext` of `pin.rnea`:
-                the ground reaction, and all else that acts on the shank. None: nothing does.
-            tensions: muscle of `muscles` -> N. The quadriceps is what is sought.
-            contact: its resultants take the place of the closest points.
+            q: (nq,) configuration.
+            v: (nv,) velocity.
+            a: (nv,) acceleration.
+            external: forces on the joints, each in its joint's frame, as `fext` of `pin.rnea`: the
+                ground reaction and all other external forces. None: there are none.
+            tensions: muscle of `muscles` -> N. The quadriceps is unknown and cannot be given.
+            contact: a contact from `press` or `evaluate`; None: closest points.
             data: from `create_data`, to save time.
 
         Returns:
-            The loads; a state without a solution holds NaN and says why in `problems`.
+            The loads. Without a solution they are NaN, and `problems` says why.
 
         Raises:
             InputError: an argument of the wrong size, an unknown muscle, or a contact given to a
@@ -256,11 +258,11 @@ class Knee(AssembledKnee):
         load: float,
         guess: "Guess | None" = None,
     ) -> "ContactResult":
-        """Return the contact when the femur carries a load, at the rotation, AP and ML of q.
+        """Return the contact under a load, at the rotations, AP and ML of q.
 
         Args:
-            q: (nq,).
-            load: N, along the insert's y axis, pressing; not negative.
+            q: (nq,) configuration.
+            load: N, compressive force along the insert's y axis, 0 or more.
             guess: an earlier result or warm start, to save time.
 
         Returns:
@@ -275,12 +277,12 @@ class Knee(AssembledKnee):
     def press_from(
         self, q: Array, load: float, start: "Guess | None" = None
     ) -> "tuple[ContactResult, WarmStart]":
-        """Return what `press` does, and the warm start of a press near by.
+        """Return the same as `press`, and the warm start of the next press near by.
 
         Args:
-            q: (nq,).
-            load: N, as of `press`.
-            start: the warm start that the last press returned; it saves time.
+            q: (nq,) configuration.
+            load: N, as for `press`.
+            start: warm start that the last press returned, to save time.
         """
         contact = self._need_contact()
         if not (np.isfinite(load) and load >= 0):
@@ -289,9 +291,9 @@ class Knee(AssembledKnee):
         return contact.model.press_from(contact.state, float(load), place.pose, start)
 
     def evaluate(self, q: Array, guess: "Guess | None" = None) -> "ContactResult":
-        """Return the contact at q: pressure, area and forces by the overlap of the bodies there.
+        """Return the contact at q: pressure, area and forces from the overlap of the bodies.
 
-        As `press`, but for the height, which is that of q.
+        The result is as that of `press`, but the height is that of q.
         """
         contact = self._need_contact()
         place = self._kinematics(self.create_data_for_kinematics(), q)
@@ -309,22 +311,22 @@ class Knee(AssembledKnee):
     ) -> Equilibrium:
         """Return the pose at which the released coordinates are in equilibrium, with its loads.
 
-        Flexion stays as in q, and so do the coordinates that are not released; the
-        superior-inferior position always follows from the contact. The shank moves as q, v and a
-        say, and the search is quasi-static for the released coordinates (docs/equilibrium.md).
+        Flexion and the coordinates that are not released stay as in q. The superior-inferior
+        position is always released. The motion of the shank is that of q, v and a. The released
+        coordinates are quasi-static (docs/equilibrium.md).
 
         Args:
-            q: (nq,), where the search begins.
-            v: (nv,).
-            a: (nv,).
-            external: see `inverse_dynamics`.
-            released: of "ap", "ml", "axial_rotation", "adduction" ("si" is understood).
-            tensions: see `inverse_dynamics`.
+            q: (nq,) configuration, the initial guess.
+            v: (nv,) velocity.
+            a: (nv,) acceleration.
+            external: as for `inverse_dynamics`.
+            released: names of "ap", "ml", "axial_rotation", "adduction"; "si" is always released.
+            tensions: as for `inverse_dynamics`.
             data: from `create_data`, to save time.
 
         Raises:
-            InputError: an unknown coordinate, no contact model, or a knee of the model with too
-                few degrees of freedom to reach the pose.
+            InputError: an unknown coordinate, no contact model, or too few degrees of freedom
+                between tibia and femur to reach the pose.
             ComputationError: the femur does not lie over the insert.
         """
         from tkamb.knee.released import ReleasedKnee
@@ -363,29 +365,29 @@ class Knee(AssembledKnee):
     def show(self, viewer: Any, q: Array, **options: Any) -> None:
         """Draw the knee at q in a user's `pin.visualize.MeshcatVisualizer`.
 
-        Adds implant, ligaments, lines, force arrows and the pressure map below the viewer's root
-        node; see `tkamb.knee.show.show_knee` for the options.
+        It adds implant, ligaments, lines, force arrows and the pressure map below the viewer's root
+        node. `tkamb.knee.show.show_knee` describes the options.
         """
         from tkamb.knee.show import show_knee
 
         show_knee(self, viewer, q, **options)
 
     def live(self, q: Array, load: float = 1000.0, folder: Any = None) -> Any:
-        """Serve a page on which the knee is pressed and moved by hand; see docs/live.md.
+        """Serve a page on which the knee is moved and loaded by hand (docs/live.md).
 
-        The load acts along the insert's y axis; ligaments between femur and tibia pull. Nothing
-        that is done there changes this object.
+        The load acts along the insert's y axis, beside the ligaments between femur and tibia. The
+        page does not change this object.
 
         Args:
-            q: (nq,), or (f, nq) for the slider "recorded frame".
-            load: N, at first.
-            folder: for what is kept; None: out/live.
+            q: (nq,) configuration, or (f, nq) for the slider "recorded frame".
+            load: N, first value of the load.
+            folder: folder for saved scenes; None: out/live.
 
         Returns:
-            The server: its address is `url`, and it answers until `close()`.
+            The server. Its address is `url`; it answers until `close()`.
 
         Raises:
-            InputError: no contact model, or one without a name (`tkamb.contact_model`).
+            InputError: no contact model, or a model that was not made by `tkamb.contact_model`.
         """
         return import_module("tkamb.show.view.live_window").live_knee(self, q, load, folder)
 
@@ -400,17 +402,18 @@ class Knee(AssembledKnee):
         patella: PatellaFinder | None = None,
         muscles: SharingMuscles | None = None,
     ) -> Instant:
-        """Return the knee at one instant: what its equations and a search for equilibrium ask.
+        """Return the knee at one instant, on which its equations and searches work.
 
         Args:
-            q: (nq,).
-            v: (nv,).
-            a: (nv,).
-            external: see `inverse_dynamics`.
-            tensions: see `inverse_dynamics`; among what is external.
+            q: (nq,) configuration.
+            v: (nv,) velocity.
+            a: (nv,) acceleration.
+            external: as for `inverse_dynamics`.
+            tensions: as for `inverse_dynamics`.
             data: from `create_data`, to save time.
-            patella: finds the patella; None: it is where q says, or found where q has none.
-            muscles: those of the leg that share the load; None: the quadriceps alone acts.
+            patella: finds the patella; None: its place is that of q, or of equilibrium if q has
+                none.
+            muscles: muscles of the leg that share the load; None: the quadriceps alone acts.
 
         Raises:
             InputError: an argument of the wrong size, or an unknown muscle.
@@ -450,7 +453,7 @@ class Knee(AssembledKnee):
         )
 
     def _contact_at(self, data: KneeData, place: KneePlace) -> "ProbedContact":
-        """Return the contact at a place; the last one is remembered in the caller's data."""
+        """Return the contact at a place; the caller's data store the last one."""
         key = place.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
             assert self.contact is not None
@@ -471,12 +474,12 @@ class Knee(AssembledKnee):
         return mirrored_spatial(mirrored_spatial(matrix).T).T
 
     def _solved(self, instant: Instant, geometry: KneeGeometry, data: KneeData) -> KneeLoads:
-        """Return the loads of a geometry, and what they do to the user's joints."""
+        """Return the loads of a geometry, and their forces on the user's joints."""
         geometry, loads = instant.solved(geometry)
         return knee_loads(geometry, loads, self.friction, self.bridge, data.data)
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
-        """Return the knee at rest, from first touch at the other coordinates of q."""
+        """Return the knee in equilibrium, with first touch at the pose of q as initial guess."""
         from tkamb.knee.starts import InitialPoses
 
         pair = self._need_contact().pair

@@ -36,14 +36,14 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 @dataclass(frozen=True)
 class LigamentSettings:
-    """Force-length curve and reference pose of ligaments."""
+    """Toe strain and reference pose of ligaments."""
 
     toe_strain: float = 0.03
-    """1: eps1 of Blankevoort's curve; the toe region ends at twice this strain, the same for
-    every ligament."""
+    """1: eps1; the toe region ends at twice this strain. The value of Blankevoort & Huiskes (1991),
+    the same for every ligament."""
     max_reference_distance: float = 15.0 * DEGREE
-    """rad: a recorded frame whose flexion is farther from the reference flexion is no reference
-    pose. Chosen: 15 deg: farther away a ligament has another strain."""
+    """rad: largest difference of a frame's flexion from the reference flexion, at which the frame
+    serves as reference pose. Chosen: farther away a ligament has another strain."""
 
 
 LIGAMENT = LigamentSettings()
@@ -77,14 +77,14 @@ class Ligament:
     """One bundle on a straight line between a point of one link and a point of another.
 
     Args:
-        name: as in the scene.
-        proximal: its proximal end.
-        distal: its distal end.
-        law: which of the two laws.
+        name: name of the bundle.
+        proximal: proximal end.
+        distal: distal end.
+        law: force-length law, "two-line" or "quadratic-toe".
         stiffness: N/m for "two-line", N per unit strain for "quadratic-toe".
-        slack_length: m; NaN where a reference strain is given instead.
-        reference_strain: strain at the reference pose.
-        reference_flexion: rad, of the reference pose.
+        slack_length: m; NaN: it follows from the reference strain.
+        reference_strain: 1, strain at the reference pose.
+        reference_flexion: rad, flexion of the reference pose.
     """
 
     name: str
@@ -122,13 +122,13 @@ class Ligament:
 
 @dataclass(frozen=True, eq=False)
 class BundleArrays:
-    """Several bundles at once, with their ends in two freely chosen frames.
+    """Arrays of m bundles, with all proximal ends in one frame and all distal ends in another.
 
     Args:
-        proximal: (m, 3) m, one end of each.
-        distal: (m, 3) m, the other end.
-        two_line: (m,) which law.
-        stiffness: (m,) N/m or N per unit strain, as the law takes it.
+        proximal: (m, 3) m, proximal ends.
+        distal: (m, 3) m, distal ends.
+        two_line: (m,) whether the law is "two-line".
+        stiffness: (m,) N/m ("two-line") or N per unit strain ("quadratic-toe").
         slack_length: (m,) m.
     """
 
@@ -140,7 +140,7 @@ class BundleArrays:
 
     @classmethod
     def of(cls, bundles: Sequence[Ligament], proximal: Array, distal: Array) -> "BundleArrays":
-        """Return bundles with their ends (m, 3)."""
+        """Return the arrays of bundles whose ends (m, 3) are given."""
         return cls(
             proximal.reshape(-1, 3),
             distal.reshape(-1, 3),
@@ -153,8 +153,8 @@ class BundleArrays:
         """Return tensions (..., m) N and the pulls (..., m, 3) N on the distal ends.
 
         Args:
-            proximal: (..., m, 3) m, and
-            distal: (..., m, 3) m, the ends in one frame.
+            proximal: (..., m, 3) m, proximal ends.
+            distal: (..., m, 3) m, distal ends in the same frame.
         """
         along = proximal - distal
         length = np.linalg.norm(along, axis=-1)
@@ -163,10 +163,10 @@ class BundleArrays:
         return tension, (tension / length)[..., None] * along
 
     def wrench(self, poses: Array) -> Array:
-        """Return the wrench (..., 6) about the origin of the distal ends' frame, on its body.
+        """Return the wrench (..., 6) on the body of the distal ends, about its frame's origin.
 
         Args:
-            poses: (..., 4, 4) of the proximal ends' frame in the distal ends'.
+            poses: (..., 4, 4) pose of the frame of the proximal ends in that of the distal ends.
         """
         proximal = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.proximal)
         proximal = proximal + poses[..., None, :3, 3]
@@ -177,10 +177,9 @@ class BundleArrays:
 def ligament_loads(
     ligaments: Sequence[Ligament], poses: Mapping[str, Array]
 ) -> tuple[Array, tuple[PointForces, ...]]:
-    """Return all tensions (n,) N and what they do to the links, at one frame.
+    """Return the tensions (n,) N and one load per link.
 
-    The forces on a bundle's ends are equal and opposite, and lie on the line through both;
-    they are gathered into one load per link.
+    The forces on the two ends of a bundle are equal and opposite, along the line through both ends.
 
     Args:
         ligaments: the bundles.
@@ -204,10 +203,10 @@ def ligament_loads(
 def build_ligaments(
     ligaments: Sequence[Ligament], poses: Mapping[str, Array], flexion: Array
 ) -> tuple[Ligament, ...]:
-    """Return bundles with slack lengths, computed from the reference strain where one is given.
+    """Return the bundles with slack lengths.
 
-    A reference strain eps_r holds at the frame nearest to the reference flexion, where the
-    bundle has length L_r: L0 = L_r/(1 + eps_r).
+    A slack length that is not given follows from the reference strain eps_r. It holds at the frame
+    nearest to the reference flexion. With the length L_r there, L0 = L_r/(1 + eps_r).
 
     Args:
         ligaments: the bundles.
@@ -215,8 +214,8 @@ def build_ligaments(
         flexion: (f,) rad, of the same frames.
 
     Raises:
-        InputError: unknown link, an end that lies on the other one, or no recorded frame near
-            the reference flexion.
+        InputError: an unknown link, both ends at the same point, or no recorded frame near the
+            reference flexion.
     """
     flexion = np.asarray(flexion, float)
     return tuple(_with_slack_length(bundle, poses, flexion) for bundle in ligaments)
@@ -248,7 +247,7 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
 
 
 def nearest_frame(flexion: Array, target: float) -> int:
-    """Return the index of the frame whose flexion (f,) is nearest to the wanted one, rad."""
+    """Return the index of the frame whose flexion (f,), rad, is nearest to a target, rad."""
     return int(np.nanargmin(np.abs(flexion - target)))
 
 
@@ -259,17 +258,17 @@ def strain_table(
     at_deg: Sequence[float] = (0.0, 60.0, 90.0),
     within_deg: float = 10.0,
 ) -> dict[str, tuple[float, ...]]:
-    """Return strain per bundle at given flexions, which reveals a wrong insertion.
+    """Return the strain of each bundle at a few flexions, which reveals a wrong insertion.
 
     Args:
         ligaments: the bundles.
         poses: link -> pose_link_in_insert (f, 4, 4).
         flexion: (f,) rad, of the same frames.
-        at_deg: flexions; the nearest recorded frame of each is taken.
-        within_deg: NaN where no recorded frame is nearer than this.
+        at_deg: flexions, deg; the recorded frame nearest to each is taken.
+        within_deg: deg, largest difference of that frame's flexion; NaN if it is larger.
 
     Returns:
-        name -> strain at each flexion.
+        bundle -> strain at each flexion.
     """
     frames = [nearest_frame(flexion, angle * DEGREE) for angle in at_deg]
     reached = [
@@ -291,7 +290,7 @@ def _frame(poses: Mapping[str, Array], k: int) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class LigamentSideSettings:
-    """Whether a collateral ligament is on its side of the knee."""
+    """Check of the side of a collateral ligament."""
 
     wrong_side_distance: float = 8.0 * MILLIMETRE
     """m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen:
@@ -377,7 +376,8 @@ BUNDLES = {
     "ACL_anteromedial": _Bundle((-0.20, 0.11, 0.20), (0.22, -0.08, -0.05), 83.15, 0.06),
     "ACL_posterolateral": _Bundle((-0.11, -0.03, 0.23), (0.05, -0.08, 0.08), 83.15, 0.10),
 }
-"""Right knee, z lateral; x anterior, y superior, from the condylar axis and the insert frame."""
+"""Ends of a right knee, x anterior, y superior, z lateral: proximal from the condylar axis, distal
+from the insert frame, in half widths of the part."""
 
 
 def generic_ligaments(
@@ -392,7 +392,7 @@ def generic_ligaments(
         femoral: femoral component in the femur link's frame (right knee).
         insert: insert in the insert frame.
         pose_insert_in_tibia: (4, 4).
-        chosen: ligaments that the patient has, of MCL, LCL, PCL, ACL.
+        chosen: names of the patient's ligaments, of MCL, LCL, PCL, ACL.
 
     Returns:
         Bundles between the links "femur" and "tibia"; the reference pose is extension.
@@ -431,10 +431,10 @@ def condylar_axis(femoral: Surface) -> Array:
     """Return the centre (3,) of the circle that the posterior condyles roll on, m.
 
     It is a point of the condylar axis, which is parallel to z. At a flexion phi let u be the
-    direction of the femur that faces down. The support of the component in this direction is
-    h(u) = max over the vertices p of u . p. For a circle of centre c and radius r it is
-    u . c + r. c and r are fitted by least squares to the supports at 20 to 100 deg of flexion. z is
-    the middle of the component's width.
+    downward direction in the femur's frame. The support of the component in this direction is h(u)
+    = max over the vertices p of u . p. For a circle of centre c and radius r it is u . c + r. c and
+    r are fitted by least squares to the supports at 20 to 100 deg of flexion. z is the middle of
+    the component's width.
 
     Args:
         femoral: in the femur's frame.

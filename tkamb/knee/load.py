@@ -14,7 +14,7 @@ class LinkPoint:
     """A point fixed to a link.
 
     Args:
-        link: name in the URDF.
+        link: name of the link.
         position: (3,) m, in the link's frame.
     """
 
@@ -23,7 +23,7 @@ class LinkPoint:
 
 
 Point = LinkPoint | tuple[str, Sequence[float]]
-"""A point on a frame of the model."""
+"""A point on a frame of the model: a `LinkPoint`, or the frame's name and three coordinates, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class PointForces:
     """Forces on one link, at one frame of the motion.
 
     Args:
-        link: name of the URDF link that takes them.
+        link: name of the link on which they act.
         points: (m, 3) m, where they act, in the insert frame.
         forces: (m, 3) N, or N per unit of an unknown magnitude, in the insert frame.
         moment: (3,) N·m, free moment on the same link.
@@ -79,7 +79,7 @@ def total_wrench(loads: Sequence[PointForces], point: Array) -> Array:
 
 
 def link_point(point: Point) -> LinkPoint:
-    """Return a point on a frame, whichever way it was given.
+    """Return a point on a frame as a `LinkPoint`.
 
     Raises:
         InputError: not a frame's name and three finite numbers.

@@ -1,4 +1,4 @@
-"""Loads of a knee at one instant, in the axes and signs of the user's knee."""
+"""Loads of a knee at one instant, in the axes of the user's knee."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,40 +12,40 @@ from tkamb.knee.load import PointForces, scaled
 from tkamb.knee.unknowns import MUSCLE, muscle_load
 
 MIRRORED = ("ml", "axial", "coronal")
-"""Parts of a load's name that change sign between a left knee and its mirror image: force along
-z, moments about y and x. Hip moments are named by their axes."""
+"""Last parts of the names of loads that change sign between a left knee and its mirror image:
+forces along z, moments about y and x."""
 NAN = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
 class KneeLoads:
-    """Loads of the knee at one instant, SI, in the insert frame; NaN where they have no solution.
+    """Loads of the knee at one instant, SI, in the insert frame; NaN without a solution.
 
     The insert frame is x anterior, y superior, z to the subject's right, for left knees too.
 
     Args:
-        contact_force: (3,) N, of the condyles on the femur, without residuals.
-        normal_force: side -> N, of each condyle along its contact normal, by equilibrium.
-        quadriceps: N; NaN without an extensor mechanism, as the next three.
-        patellar_ligament: N.
-        patellofemoral: N, along the contact normal.
-        patellofemoral_tangential: N, across it in the sagittal plane.
-        ligaments: bundle -> N.
-        residuals: what an exact model would make zero: ap, ml (N), axial, and perhaps coronal,
-            flexion (N·m), on the tibia.
-        hip_force: (3,) N on the femur at the hip centre: all loads that cross the hip.
-        hip_moment: (3,) N·m.
-        external_flexion: N·m, moment that tends to flex the knee.
-        external_adduction: N·m, moment that tends to adduct it.
+        contact_force: (3,) N, force of the insert on the femur, without residuals.
+        normal_force: side -> N, force of each condyle along its contact normal, by equilibrium.
+        quadriceps: N, tension; NaN without an extensor mechanism, as the next three.
+        patellar_ligament: N, tension.
+        patellofemoral: N, force along the contact normal.
+        patellofemoral_tangential: N, force across the normal, in the sagittal plane.
+        ligaments: bundle -> tension, N.
+        residuals: loads on the tibia that are zero in an exact model: ap, ml (N), axial and, in
+            some load states, coronal and flexion (N·m).
+        hip_force: (3,) N, sum of all loads across the hip, on the femur at the hip centre.
+        hip_moment: (3,) N·m, their moment about the hip centre.
+        external_flexion: N·m, external moment, positive in flexion.
+        external_adduction: N·m, external moment, positive in adduction.
         condition: condition number of the equations.
-        lifted: condyles that carry nothing.
-        slack: the extensor mechanism carries nothing.
-        ambiguous: other sets of loads, too, have no wrong sign.
-        problems: why there is no solution; empty when there is one.
-        external_forces: `pin.StdVec_Force`: contact, ligaments and extensor mechanism as found, as
-            `fext` of the model. With them and the external loads `pin.rnea` leaves the residuals.
+        lifted: condyles that carry no load.
+        slack: whether the extensor mechanism carries no load.
+        ambiguous: whether another load state, too, has no wrong sign.
+        problems: why there is no solution, in words; empty: there is one.
+        external_forces: `pin.StdVec_Force` of contact, ligaments and extensor mechanism, as `fext`
+            of the model. With these and the external loads `pin.rnea` leaves the residuals.
         residual_forces: `pin.StdVec_Force` of the residuals.
-        hip_forces: `pin.StdVec_Force` of the loads on the thigh at the hip.
+        hip_forces: `pin.StdVec_Force` of the loads across the hip, on the thigh.
         equations: the solution of the equations, of a right knee.
         geometry: the geometry of the equations.
     """
@@ -75,12 +75,12 @@ class KneeLoads:
 
     @property
     def contact_total(self) -> float:
-        """N, magnitude of the contact force."""
+        """Magnitude of the contact force, N."""
         return float(np.linalg.norm(self.contact_force))
 
     @property
     def tensions(self) -> dict[str, float]:
-        """Muscle and patellar ligament -> N, as `Knee.external_forces` takes them.
+        """Muscle or "patellar_ligament" -> N, as for `Knee.external_forces`.
 
         Empty without an extensor mechanism.
         """
@@ -94,16 +94,17 @@ class KneeLoads:
 def knee_loads(
     geometry: KneeGeometry, solved: SolvedLoads, friction: float, bridge: Bridge, data: Any
 ) -> KneeLoads:
-    """Return solved loads as those of the user's knee, and what they do to the model's joints.
+    """Return the solved loads in the axes of the user's knee, and as forces on its joints.
 
     Args:
-        geometry: the geometry of the equations.
-        solved: their solution, of a right knee.
+        geometry: geometry of the equations.
+        solved: solution of the equations, of a right knee.
         friction: Coulomb coefficient of the femorotibial contact.
-        bridge: to the user's model.
-        data: Pinocchio's, with joint placements up to date.
+        bridge: conversion to the user's model.
+        data: Pinocchio data with joint placements up to date.
     """
     unknowns = [] if solved.problems else solved_unknowns(geometry, solved, friction)
+    # Each unknown belongs to the group that its name begins with; ligaments are known loads.
     groups: dict[str, list[PointForces]] = {"external": [], "residual": [], "hip": []}
     if unknowns:
         groups["external"] += geometry.ligaments

@@ -1,4 +1,4 @@
-"""Muscles, tendons and their paths: points on links, what they wrap, strength, given tensions.
+"""Muscles and their lines of action, as columns of the equations or with given tensions.
 
 A line of action is a massless string through points of the links, perhaps around the outline
 of one of them. A unit tension on it, with the reactions of what it passes, is one column of the
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MuscleBandSettings:
-    """A muscle as a band around the femur."""
+    """The outline that a muscle wraps."""
 
     sections: int = 7
-    """Sagittal planes across the band whose sections are wrapped. Chosen: more sections change the
-    lines by little."""
+    """Number of sagittal sections across the band, whose common outline is wrapped. Chosen: more
+    sections change the lines by little."""
 
 
 MUSCLE_BAND = MuscleBandSettings()
@@ -39,12 +39,12 @@ MUSCLE_BAND = MuscleBandSettings()
 
 @dataclass(frozen=True, eq=False)
 class SagittalWrap:
-    """How a line wraps an implant part: in front of its sagittal outline.
+    """Wrapping of a line around the front of an implant part's sagittal outline.
 
     Args:
-        band: m, half the width of the sections, about the line's own sagittal plane.
-        half_thickness: m, of the tendon, off the outline.
-        bone: wrapped beside the part, in the frame of the link that carries it.
+        band: m, half of the medial-lateral width over which sections are taken, about the line.
+        half_thickness: m, half of the tendon's thickness, the distance of the line from the part.
+        bone: surface that is wrapped together with the part, in the same frame; None: none.
     """
 
     band: float
@@ -55,9 +55,9 @@ class SagittalWrap:
         """Return the convex outline (n, 2) m of the part and the bone, grown by the tendon.
 
         Args:
-            part: in the frame whose x-y plane holds the outline.
-            middle: m, z of the line's own sagittal plane there.
-            below: m, what lies above this y is left out.
+            part: the part, in the frame whose x-y plane holds the outline.
+            middle: m, z of the line in that frame.
+            below: m, greatest y; parts of the surfaces above are left out.
         """
         surfaces = [part] if self.bone is None else [part, self.bone]
         planes = middle + np.linspace(-self.band, self.band, MUSCLE_BAND.sections)
@@ -66,14 +66,15 @@ class SagittalWrap:
 
 @dataclass(frozen=True, eq=False)
 class Muscle:
-    """A muscle as the scene gives it.
+    """A muscle or tendon through points on links.
 
     Args:
-        name: of the muscle.
-        points: its path from origin to insertion, at least two.
-        wrap: how its stretch off the femur wraps the femoral component; None: straight.
-        strength: N, maximal isometric force; NaN where none is given.
-        group: of muscles that are shown together; empty: its own.
+        name: name of the muscle.
+        points: points from origin to insertion, at least two.
+        wrap: wrapping of the femoral component by the stretch that leaves the femur; None: it is
+            straight.
+        strength: N, maximal isometric force; NaN: unknown.
+        group: name of the muscles that are shown together; empty: it is shown by itself.
     """
 
     name: str
@@ -88,10 +89,10 @@ class PatellarLigament:
     """The patellar ligament: one line from the patella to the tibial tuberosity.
 
     Args:
-        proximal: on the patella.
-        distal: on the tibia.
-        wrap: how it wraps the insert's front lip; None: straight.
-        length: m, where the patella's motion is to be found; else NaN.
+        proximal: end on the patella.
+        distal: end on the tibia.
+        wrap: wrapping of the insert's front lip; None: it is straight.
+        length: m, constant length, from which the place of the patella follows; NaN: not needed.
     """
 
     proximal: LinkPoint
@@ -102,12 +103,12 @@ class PatellarLigament:
 
 @dataclass(frozen=True, eq=False)
 class Wrap:
-    """An outline that one stretch of a line passes in front of.
+    """An outline that one stretch of a line wraps.
 
     Args:
-        link: to which the outline is fixed; it takes the reaction.
-        outline: (n, 2) m, convex, in the link's x-y plane.
-        stretch: which: 0 is that from the first point to the second.
+        link: name of the link that the outline is fixed to, which takes the reaction.
+        outline: (n, 2) m, convex polygon in the link's x-y plane.
+        stretch: number of the stretch; 0 runs from the first point to the second.
     """
 
     link: str
@@ -120,9 +121,9 @@ class Line:
     """A line of action: a string through points of the links.
 
     Args:
-        name: of the muscle or ligament, for messages.
-        points: from the proximal end to the distal one, at least two.
-        wrap: what it wraps; None: straight from point to point.
+        name: name of the muscle or ligament, for messages.
+        points: points from the proximal to the distal end, at least two.
+        wrap: outline that it wraps; None: it runs straight from point to point.
     """
 
     name: str
@@ -130,7 +131,7 @@ class Line:
     wrap: Wrap | None = None
 
     def path(self, poses: Mapping[str, Array]) -> "TautPath":
-        """Return the taut path in the insert frame, at one frame of the motion.
+        """Return the taut path in the insert frame.
 
         Args:
             poses: link -> pose_link_in_insert (4, 4).
@@ -160,10 +161,10 @@ class Line:
         )
 
     def loads(self, path: "TautPath") -> tuple[PointForces, ...]:
-        """Return the forces of a unit tension on the links: zero force and moment in sum.
+        """Return the forces of a unit tension on the links; their sum is zero.
 
-        Both ends are pulled along the path; every point between, and every corner of the
-        outline, is pressed by the change of direction there. The ends come first.
+        The tension pulls both ends along the path. At every point and corner between, the force is
+        the change of direction. The two ends come first.
         """
         links = [point.link for point in self.points]
         if self.wrap:
@@ -183,10 +184,10 @@ class Line:
 
 
 def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
-    """Return the index of the stretch that leaves the femur.
+    """Return the number of the stretch that leaves the femur.
 
     Raises:
-        InputError: none does.
+        InputError: no stretch leaves it.
     """
     carriers = [chain.carrier(point.link) for point in points]
     for i, (one, other) in enumerate(pairwise(carriers)):
@@ -196,11 +197,11 @@ def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
 
 
 def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
-    """Return a muscle's line of action; it wraps the femoral component in the patella's plane.
+    """Return a muscle's line of action, which wraps the femoral component in the patella's plane.
 
     Args:
         muscle: the muscle.
-        chain: the patient.
+        chain: chain of the knee.
         femoral: femoral component in the femur link's frame.
     """
     if muscle.wrap is None:
@@ -216,10 +217,10 @@ def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
 
 
 def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
-    """Raise unless one muscle alone crosses the knee, from the femur to the patella.
+    """Raise unless there is one muscle, from the femur to the patella.
 
-    Then the equations of a frame are square. More of them share the joint moments in a way
-    that equilibrium does not determine.
+    With one muscle the equations of a frame are square. Equilibrium does not determine how several
+    muscles share the joint moments.
 
     Raises:
         InputError: several muscles, one that crosses no joint, or one that inserts elsewhere.
@@ -248,21 +249,21 @@ def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
 
 @dataclass(frozen=True, eq=False)
 class TensionLine:
-    """A line of given tension, straight from point to point.
+    """A straight line of given tension between points of a user's model.
 
     Args:
-        places: the frames that its points are fixed to.
-        positions: (3,) m each, of the points in these frames.
+        places: frame of each point.
+        positions: (3,) m, position of each point in its frame.
     """
 
     places: tuple[Place, ...]
     positions: tuple[Array, ...]
 
     def forces(self, data: Any, tension: float) -> list[tuple[int, pin.Force]]:
-        """Return joints, and the forces on them in their own frames.
+        """Return the joints, and the force on each in the joint's frame.
 
         Args:
-            data: Pinocchio's, with joint placements up to date.
+            data: Pinocchio data with joint placements up to date.
             tension: N.
         """
         placements = [data.oMi[place.joint] for place in self.places]
@@ -274,6 +275,7 @@ class TensionLine:
         ]
         steps = np.diff(np.array(points), axis=0)
         along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+        # The tension pulls each end along the line. A point between takes the change of direction.
         pulls = tension * np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
         return [
             (place.joint, placement.actInv(pin.Force(pull, cross(point, pull))))
@@ -284,10 +286,10 @@ class TensionLine:
 
 
 def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, TensionLine]:
-    """Return muscle -> its line.
+    """Return muscle -> line of given tension.
 
     Raises:
-        InputError: fewer than two points, a wrap, or no such frame.
+        InputError: a muscle has fewer than two points or a wrap, or names an unknown frame.
     """
     lines = {}
     for muscle in muscles:
@@ -306,11 +308,11 @@ def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, Tens
 def checked_tensions(
     tensions: Mapping[str, float] | float | None, extensor: tuple[str, ...], lines: Iterable[str]
 ) -> dict[str, float]:
-    """Return muscle -> N.
+    """Return muscle -> tension, N, after a check.
 
     Args:
-        tensions: as given; a number alone is the quadriceps'.
-        extensor: names of the extensor mechanism's lines, the quadriceps first.
+        tensions: muscle -> N, or a number, the tension of the quadriceps.
+        extensor: names of the lines of the extensor mechanism, the quadriceps first.
         lines: names of the other muscles.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a `tkamb.Knee` is made of: its parts as plain data, and how they come to the chain.
+"""The parts of a `tkamb.Knee` as plain data, and their conversion to the canonical chain.
 
 Lengths are in metres, forces in newtons. A point on a frame of the user's model is a `LinkPoint` or
 a pair of the frame's name and three coordinates, ("femur", (0.0, 0.01, -0.042)).
@@ -38,8 +38,8 @@ class PartSettings:
     """Checks of the implant meshes."""
 
     max_length: float = 0.5
-    """m: no part of an implant is longer. Chosen: a longer mesh is probably in millimetres and is
-    refused."""
+    """m: a longer mesh is refused, because it is probably in millimetres. Chosen: no part of an
+    implant is longer."""
 
 
 PART = PartSettings()
@@ -55,10 +55,10 @@ class Implant:
         insert: closed polyethylene insert, in the axes of the frame "insert": x anterior, y
             superior, z to the subject's right. Its flat bottom is found and faces -y.
         patella: patellar button, in the axes of the frame "patella", its joint side facing -x.
-        material: of the insert, a name (`tkamb.contact.materials.MATERIALS`) or a `Material`.
-        bearing: "fixed" (bottom glued) or "mobile" (bottom slides).
-        placed: True: the insert frame of the results is the frame "insert" itself. False: its
-        origin is the centre of the flat bottom of the mesh.
+        material: material of the insert, a name (`tkamb.contact.materials.MATERIALS`) or a
+        `Material`. bearing: "fixed" (bottom glued) or "mobile" (bottom slides). placed: True: the
+        insert frame of the results is the frame "insert" itself. False: its
+            origin is the centre of the flat bottom of the mesh.
     """
 
     femoral: Mesh = None
@@ -70,7 +70,7 @@ class Implant:
 
     @property
     def insert_material(self) -> "Material":
-        """The material itself."""
+        """The material as an object."""
         from tkamb.contact.materials import material
 
         return material(self.material) if isinstance(self.material, str) else self.material
@@ -85,13 +85,13 @@ class Extensor:
     equilibrium of a massless patella, with the given length of the ligament.
 
     Args:
-        quadriceps: from the femur to the patella.
-        patellar_ligament: from the patella to the tibia; its `length` is needed where the place
-            of the patella is found.
-        plane: pose of the plane's frame in the frame "femur"; None: of the joint "patella_ap"
-            where the model has one, else the frame "femur" itself.
-        solved: True: a patella of the model is solved again where `Knee.equilibrium` moves the
-        femur. False: it stays fixed to the femur.
+        quadriceps: muscle from the femur to the patella.
+        patellar_ligament: line from the patella to the tibia; its `length` is needed if the place
+            of the patella is not part of q.
+        plane: pose of the plane's frame in the frame "femur"; None: that of the joint "patella_ap",
+            or the frame "femur" if the model has no such joint.
+        solved: True: if `Knee.equilibrium` moves the femur, the patella of the model is solved
+            again. False: it is fixed to the femur.
     """
 
     quadriceps: Muscle
@@ -107,8 +107,8 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
     (`tkamb.geometry.repair`).
 
     Args:
-        mesh: see `Mesh`; a `Surface` is taken as it is.
-        name: what to call it in messages.
+        mesh: a `Mesh`; a `Surface` is returned unchanged.
+        name: name of the mesh in messages.
         closed: whether it must enclose a volume.
 
     Raises:
@@ -163,11 +163,11 @@ def mirrored_surface(surface: Surface) -> Surface:
 
 @dataclass(frozen=True)
 class AssemblySettings:
-    """How parts are put together."""
+    """Tolerance of the assembly."""
 
     frame_tolerance: float = 1e-9
-    """m and rad: an insert frame this near to that of its flat bottom is the same frame. Chosen:
-    above rounding."""
+    """m and rad: an insert frame that differs from that of the flat bottom by less is the same.
+    Chosen: above rounding."""
 
 
 ASSEMBLY = AssemblySettings()
@@ -175,7 +175,7 @@ ASSEMBLY = AssemblySettings()
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The implant's surfaces as those of a right knee; None: not given.
+    """The implant's surfaces, mirrored for a left knee; None: not given.
 
     Args:
         femoral: femoral component, in its own frame.
@@ -191,10 +191,10 @@ class Surfaces:
 def surfaces_of(
     implant: Implant, is_left: bool, with_contact: bool, with_extensor: bool
 ) -> Surfaces:
-    """Return the surfaces of an implant, its insert where it was given.
+    """Return the surfaces of an implant, with the insert in the frame "insert".
 
     Raises:
-        InputError: one that is needed is missing or cannot be used.
+        InputError: a needed mesh is missing or cannot be used.
     """
     needs = {"femoral": with_contact or with_extensor}
     needs |= {"insert": with_contact, "patella": with_extensor}
@@ -215,7 +215,7 @@ def surfaces_of(
 def placed_insert(
     anatomy: Anatomy, implant: Implant, insert: Surface | None, is_left: bool
 ) -> tuple[Place, Surface | None]:
-    """Return the insert frame on the tibia, and the insert in it."""
+    """Return the insert frame on the tibia, and the insert's surface in that frame."""
     place = anatomy.insert
     if insert is None or implant.placed:
         return place, insert
@@ -224,6 +224,7 @@ def placed_insert(
     placement = insert_placement(insert)
     if np.abs(placement - np.eye(4)).max() < ASSEMBLY.frame_tolerance:
         return place, insert
+    # The placement was found in the mirrored mesh; a left knee has its mirror image.
     mesh_in_insert = mirrored_pose(placement) if is_left else placement
     moved = Place(place.joint, place.placement * se3(inverse(mesh_in_insert)))
     return moved, insert.moved(placement)
@@ -262,6 +263,7 @@ def crossing_and_others(
         return None, others
     from tkamb.knee.ligaments import BundleArrays
 
+    # Both ends in the frames between which the pose of the knee leads: femoral and insert frame.
     shank = inverse(chain.insert_in_tibia)
     ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
     for bundle in crossing:
@@ -276,7 +278,7 @@ def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "E
     """Return the lines of an extensor mechanism on the chain.
 
     Raises:
-        InputError: a line that does not fit the knee.
+        InputError: a line does not fit the knee.
     """
     from tkamb.knee.extensor import ExtensorLines, ExtensorParts
     from tkamb.knee.muscles import check_muscles
@@ -310,7 +312,7 @@ def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "E
 def prepared_contact(
     contact: "ContactModel | KneeContact | str", implant: Implant, surfaces: Surfaces, cache: bool
 ) -> "KneeContact":
-    """Return a contact model, prepared for the surfaces of an implant, or as it was given."""
+    """Return a contact model that is prepared for the surfaces of an implant."""
     from tkamb.contact.pair import ContactPair
     from tkamb.contact.registry import contact_model
     from tkamb.knee.contact import KneeContact

@@ -1,8 +1,8 @@
-"""The patella's forces at a place in the femur's sagittal plane, massless and without friction.
+"""Forces on a massless patella without friction, at a place in the femur's sagittal plane.
 
-A place is the three joint coordinates patella_ap, patella_si and patella_rotation. At every place
-the muscle, patellar ligament and contact forces are in force equilibrium. The residual moment
-vanishes where the patella is in equilibrium (see `patella_search`).
+A place has three coordinates: patella_ap, patella_si and patella_rotation. Muscle, patellar
+ligament and contact are in force equilibrium at every place. At the place of equilibrium the
+residual moment vanishes, too (`tkamb.knee.patella_search`).
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from tkamb.knee.wrapping import TautPath, path_in_link
 
 @dataclass(frozen=True)
 class PatellaSettings:
-    """Equilibrium of the patella."""
+    """When the forces on the patella are not determined."""
 
     least_determinant: float = 1e-6
-    """1: determinant of contact normal and ligament direction (unit vectors) below which the two
-    are one line. Chosen: above rounding."""
+    """1: determinant of the unit vectors of contact normal and ligament, below which they are
+    parallel. Chosen: above rounding."""
 
 
 PATELLA = PatellaSettings()
 
 
 class PatellaStatus(Enum):
-    """How the search ended: a place was found, or the condition that could not be met."""
+    """How the search for the patella ended: with a place, or with a condition that is not met."""
 
     OK = "ok"
     SEVERAL = "several_solutions"
@@ -43,7 +43,7 @@ class PatellaStatus(Enum):
 
     @property
     def found(self) -> bool:
-        """Whether there is a place; else the value says which condition failed."""
+        """Whether a place was found. If not, the value says which condition is not met."""
         return self in (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
 
 
@@ -52,19 +52,20 @@ class PatellaState:
     """The patella at one frame.
 
     Args:
-        coordinates: (3,) patella_ap, patella_si (m), patella_rotation (rad); NaN if not found.
-        contact_point: (3,) m, on the line of action, insert frame.
+        coordinates: (3,) patella_ap, patella_si (m), patella_rotation (rad); NaN: not found.
+        contact_point: (3,) m, on the line of action of the contact force, insert frame.
         contact_normal: (3,) unit, out of the femur into the patella, in the femur's sagittal
             plane, insert frame.
         contact_on_patella: (3,) m, the same point in the patella's frame.
-        gap: m, positive when apart.
-        ligament_ratio: patellar ligament tension per tension of the muscle, massless patella.
-        patellofemoral_ratio: patellofemoral force per tension of the muscle, massless patella.
-        shift: m along z, mediolateral shift, first order; not part of the motion.
-        tilt: rad about y, likewise.
+        gap: m, distance of button and femoral component, negative in penetration.
+        ligament_ratio: patellar ligament tension per muscle tension, for a massless patella.
+        patellofemoral_ratio: patellofemoral force per muscle tension, for a massless patella.
+        shift: m along z, first-order estimate of the mediolateral shift; the patella stays in the
+            sagittal plane.
+        tilt: rad about y, first-order estimate of the tilt.
         status: how the search ended.
-        slopes: (3, 3) approximate derivatives of gap, ligament length and moment (m, per unit
-        tension) by the coordinates; they shorten a search near by. None if not known.
+        slopes: (3, 3) approximate derivatives of gap, ligament length and moment per unit tension
+            (m) by the coordinates, which shorten a search near by; None: unknown.
     """
 
     coordinates: Array
@@ -82,18 +83,18 @@ class PatellaState:
 
 @dataclass(frozen=True, eq=False)
 class ExtensorMechanism:
-    """What stays the same over all frames.
+    """The extensor mechanism as the search for the patella takes it; the same in all frames.
 
     Args:
         contact: button against femoral component, in the patellar joint's frame.
         pose_joint_in_femur: (4, 4), the patellar joint's frame on the femur link.
-        muscle_origin: (3,) m, femur link; of the stretch that leaves the femur.
+        muscle_origin: (3,) m, start of the stretch that leaves the femur, femur link.
         muscle_insertion: (3,) m, patella link.
         ligament_proximal: (3,) m, patella link.
         ligament_distal: (3,) m, insert frame.
-        ligament_length: m.
-        femoral_outline: (n, 2) m, in the femur link's x-y plane; None: no wrapping.
-        insert_outline: (n, 2) m, in the insert's x-y plane; None: no wrapping.
+        ligament_length: m, constant length of the patellar ligament.
+        femoral_outline: (n, 2) m, in the femur link's x-y plane; None: the muscle wraps nothing.
+        insert_outline: (n, 2) m, in the insert's x-y plane; None: the ligament wraps nothing.
     """
 
     contact: PatellofemoralContact
@@ -109,7 +110,7 @@ class ExtensorMechanism:
 
 @dataclass(frozen=True, eq=False)
 class PatellaBalance:
-    """Forces on the patella per unit tension of the muscle, in the joint's frame."""
+    """Forces on the patella per unit muscle tension, in the patellar joint's frame."""
 
     coordinates: Array
     contact: PatellarContact
@@ -127,13 +128,13 @@ def patella_at(
     coordinates: Array,
     contact: PatellarContact,
 ) -> PatellaState:
-    """Return the state of a patella whose place was recorded; its gap is as recorded.
+    """Return the state of a patella at given coordinates, whatever its gap and moment are.
 
     Args:
         mechanism: the extensor mechanism.
         pose_femur_in_insert: (4, 4).
         coordinates: (3,) of the patella, m and rad.
-        contact: of the button there.
+        contact: contact of the button there.
     """
     frame = PatellaFrame(mechanism, pose_femur_in_insert)
     balance = frame.balance_at(np.asarray(coordinates, float), contact)
@@ -142,10 +143,10 @@ def patella_at(
 
 
 def touching_patella(coordinates: Array, point: Array, normal: Array) -> PatellaState:
-    """Return the state of a patella of which only place and contact are known.
+    """Return the state of a patella whose place and contact alone are known.
 
     Args:
-        coordinates: (3,) of the patella, m and rad.
+        coordinates: (3,) patella coordinates, m and rad.
         point: (3,) m, contact point, insert frame.
         normal: (3,) unit, into the patella, insert frame.
     """
@@ -167,11 +168,11 @@ class PatellaFrame:
         self.tuberosity = transform(self.insert, mechanism.ligament_distal)
 
     def balance(self, coordinates: Array) -> PatellaBalance:
-        """Return the forces in force equilibrium, and the residual moment (m)."""
+        """Return the forces at coordinates (3,), and the residual moment per unit tension (m)."""
         return self.balance_at(coordinates, self.mechanism.contact.at(coordinates))
 
     def balance_at(self, coordinates: Array, contact: PatellarContact) -> PatellaBalance:
-        """Return what `balance` does, with the contact there known already."""
+        """Return the same as `balance`, for a known contact."""
         m = self.mechanism
         patella_pose = m.contact.pose(coordinates)
         muscle = path_in_link(
@@ -192,8 +193,7 @@ class PatellaFrame:
         # Force equilibrium in the sagittal plane, per newton of muscle: two equations for ligament
         # and contact.
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
-        # The residual moment about the origin decides the patella's rotation: it vanishes in
-        # equilibrium.
+        # The residual moment about the origin vanishes in equilibrium.
         moment = (
             _cross(muscle.points[-1], pull)
             + ligament_force * _cross(ligament.points[0], hold)
@@ -210,7 +210,7 @@ class PatellaFrame:
         )
 
     def state(self, balance: PatellaBalance, status: PatellaStatus) -> PatellaState:
-        """Return the result in the insert frame."""
+        """Return the state of a balance, in the insert frame."""
         contact = balance.contact
         in_patella = inverse(self.mechanism.contact.pose(balance.coordinates))
         return PatellaState(

@@ -1,16 +1,16 @@
-"""Equilibrium of the patella when its motion was not recorded.
+"""The search for the equilibrium of a patella whose motion was not recorded.
 
-Three unknowns per frame, the joint coordinates patella_ap, patella_si and patella_rotation,
-and three equations of a massless patella without friction:
+A frame has three unknowns, the coordinates patella_ap, patella_si and patella_rotation, and three
+equations of a massless patella without friction:
 
     gap to the femoral component = 0
     length of the patellar ligament = its given length
     muscle, ligament and contact force meet in one point (moment balance in the plane)
 
-By virtual work the third says that the muscle's length is stationary among all places
-that satisfy the first two; a stable patella is at a minimum of it. Near a known place, Newton
-steps with Broyden's slopes solve all three at once. Elsewhere the search turns the patella in the
-direction of the residual moment until the moment changes sign.
+By virtual work, the third equation says that the muscle's length is stationary among all places
+that satisfy the first two. A stable patella is at a minimum of this length. Near a known place,
+Newton steps with Broyden's slopes solve the three equations together. Elsewhere the search turns
+the patella in the direction of the residual moment until the moment changes sign.
 """
 
 from collections.abc import Sequence
@@ -34,43 +34,44 @@ from tkamb.knee.patella import (
 
 @dataclass(frozen=True)
 class PatellaSearchSettings:
-    """The search for the patella's place."""
+    """Tolerances and limits of the search for the patella."""
 
     length_tolerance: float = 1e-8
-    """m: residual of gap and ligament length below which the search has converged. Chosen: far
-    below what changes a force."""
+    """m: error of gap and ligament length below which the search has converged. Chosen: far below
+    what changes a force."""
     rotation_tolerance: float = 1e-7
-    """rad: tolerance of the rotation at which the moment vanishes. Chosen: far below what changes a
-    force."""
+    """rad: step of the rotation below which the search has converged. Chosen: far below what
+    changes a force."""
     max_chord_lengths: float = 8.0
-    """Chord lengths: largest extrapolation along a chord. Chosen: farther away the chord does not
-    predict."""
+    """1: largest extrapolation along a chord, in lengths of the chord. Chosen: farther away the
+    prediction fails."""
     max_evaluations: int = 14
-    """Largest number of evaluations from one initial guess near by. Chosen: searches that converge
-    need fewer."""
+    """Maximum number of Newton steps from a guess near by. Chosen: searches that converge need
+    fewer."""
     lever_arm: float = 0.02
-    """m: arm that makes a rotation comparable to a length when slopes are updated from a step.
-    Chosen: half the width of a patella."""
+    """m: arm that makes a rotation comparable to a length in Broyden's update. Chosen: half the
+    width of a patella."""
     max_distance: float = 5e-3
-    """m: largest distance of a place from the button's first touch. Chosen: a place farther away
-    lies behind the femur."""
+    """m: largest distance of a place from the button's first touch at that rotation. Chosen: a
+    place farther away lies behind the femur."""
 
 
 PATELLA_SEARCH = PatellaSearchSettings()
 
 
 LONGEST_STEP = np.array([5e-3, 5e-3, np.deg2rad(4.0)])
-"""m, m and rad: largest change of the coordinates in one step."""
+"""m, m and rad: largest step of the coordinates."""
 
 
 FIRST_STEP = np.deg2rad(0.5)
 NEAR_TURN = np.deg2rad(12.0)
 WIDEST_TURN = np.deg2rad(40.0)
-"""rad: first step of the search, and largest distance of the search from its initial guess."""
+"""rad: first step of the rotation, and the largest distances from the initial guess, by Newton
+steps with known slopes and by turning."""
 
 
 class _Lost(ComputationError):
-    """A search that ended without a place: which condition was not met."""
+    """A search found no place; `status` is the condition that is not met."""
 
     def __init__(self, status: PatellaStatus) -> None:
         super().__init__(status.value)
@@ -87,11 +88,11 @@ def solve_patella(
     """Return the patella's place at one frame.
 
     Args:
-        mechanism: points, lengths, outlines and surfaces.
-        pose_femur_in_insert: (4, 4) of the femur link.
-        guess: (3,) coordinates of the previous frame; None searches all rotations.
-        slopes: its `slopes`, if it has them.
-        anywhere: search all rotations where the search from the guess fails.
+        mechanism: the extensor mechanism.
+        pose_femur_in_insert: (4, 4) pose of the femur link.
+        guess: (3,) m and rad, initial guess; None: all rotations are searched.
+        slopes: (3, 3) `slopes` of the guess; None: unknown.
+        anywhere: whether all rotations are searched if the search from the guess fails.
 
     Returns:
         The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
@@ -102,7 +103,7 @@ def solve_patella(
         try:
             balance = search.follow(guess, slopes)
         except ComputationError:
-            balance = None  # the initial guess failed: all rotations are searched
+            balance = None
     if balance is None:
         if not anywhere:
             return _nothing(PatellaStatus.MOMENT)
@@ -119,10 +120,10 @@ def solve_patella(
 
 
 class _Closing:
-    """Newton steps that solve gap and ligament length in the plane, with Broyden's slopes.
+    """Newton steps for gap and ligament length at a constant rotation, with Broyden's slopes.
 
-    The contact's unit normal and the ligament's direction are the first slopes. The flanks of the
-    groove make the slope of the gap up to a fifth smaller, which Broyden's updates correct.
+    The first slopes are the contact's unit normal and the ligament's direction. On the flanks of
+    the groove the slope of the gap is up to a fifth smaller, which Broyden's updates correct.
     """
 
     def __init__(self, ligament_length: float) -> None:
@@ -136,7 +137,7 @@ class _Closing:
         return bool(np.abs(self.errors).max() < PATELLA_SEARCH.length_tolerance)
 
     def step(self, balance: PatellaBalance) -> Array:
-        """Return the step (2,) in ap and si from a balance, 5 mm at most."""
+        """Return the next step (2,) in ap and si, m, limited to 5 mm."""
         before, stretch = self.errors, balance.ligament.length - self._length
         self.errors = np.array([balance.contact.gap, stretch])
         largest, last = float(np.abs(self.errors).max()), float(np.abs(before).max())
@@ -157,10 +158,10 @@ class _Search(PatellaFrame):
     """The search at one frame."""
 
     def at_rotation(self, start: Array, rotation: float) -> PatellaBalance:
-        """Return the balance where gap and ligament length hold at a rotation (Newton, Broyden).
+        """Return the balance with zero gap and the given ligament length at a rotation (rad).
 
         Raises:
-            ComputationError: they do not, or a line cannot run there.
+            ComputationError: there is none, or an end of a line lies inside its outline.
         """
         closing = _Closing(self.mechanism.ligament_length)
         coordinates = np.array([start[0], start[1], rotation])
@@ -174,11 +175,11 @@ class _Search(PatellaFrame):
         raise _Lost((PatellaStatus.GAP, PatellaStatus.LIGAMENT)[worst])
 
     def follow(self, guess: Array, slopes: Array | None = None) -> PatellaBalance:
-        """Return the stable equilibrium near a guess: the patella turns until the moment vanishes.
+        """Return the stable equilibrium near a guess, where the moment vanishes.
 
         Args:
-            guess: (3,) coordinates.
-            slopes: of a place near by; with them Newton's method is tried first.
+            guess: (3,) coordinates, m and rad.
+            slopes: (3, 3) of a place near by, for Newton's method; None: unknown.
 
         Raises:
             ComputationError: there is none within `WIDEST_TURN`.
@@ -216,15 +217,15 @@ class _Search(PatellaFrame):
         try:
             brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
-            # The patella that is followed from one end arrives at another place at the other end,
-            # where the moment has a different sign.
+            # From one end the search reaches another place at the other end, where the moment has
+            # the same sign.
             raise _Lost(PatellaStatus.MOMENT) from None
         return last
 
     def _chord(
         self, first: PatellaBalance, second: PatellaBalance, reach: float = 1.0
     ) -> PatellaBalance | None:
-        """Return the stable balance on the chord of two, at most `reach` times its length away."""
+        """Return the stable balance within `reach` lengths of a chord; None: there is none."""
         turn = float(second.coordinates[2] - first.coordinates[2])
         way = (second.coordinates - first.coordinates)[:2] / turn
         slope = (second.moment - first.moment) / turn
@@ -240,13 +241,13 @@ class _Search(PatellaFrame):
     def _closed_in(
         self, start: Array, slopes: Array, span: Sequence[float]
     ) -> PatellaBalance | None:
-        """Return the stable balance near a place: Newton's steps in all three, Broyden's slopes.
+        """Return the stable balance near a place by Newton's method with Broyden's slopes.
 
-        None where that leaves the span, leads to an unstable place, or does not converge.
+        None if a step leaves the span, if the place is unstable, or without convergence.
 
         Args:
-            start: (3,) coordinates.
-            slopes: (3, 3) of gap, ligament length and moment, about.
+            start: (3,) coordinates, m and rad.
+            slopes: (3, 3) approximate slopes of gap, ligament length and moment.
             span: rad, least and greatest rotation from the start.
         """
         scale = np.array([1.0, 1.0, PATELLA_SEARCH.lever_arm])
@@ -273,12 +274,14 @@ class _Search(PatellaFrame):
         return None
 
     def scan(self) -> tuple[PatellaBalance, bool]:
-        """Return the stable balance with the shortest muscle, and whether there are more.
+        """Return the stable balance with the shortest muscle, and whether there are others.
 
         Raises:
-            _Lost: there is none; it names the condition that the best attempt did not meet.
+            _Lost: there is none; `status` is the condition that the best attempt did not meet.
         """
         flexion = np.arctan2(self.in_insert[1, 0], self.in_insert[0, 0])
+        # The patella turns with the tibia by about two thirds of the flexion; the scan is centred
+        # there.
         rotations = -0.65 * flexion + np.deg2rad(np.arange(-50.0, 50.1, 10.0))
         places: list[PatellaBalance | None] = []
         misses = []
@@ -290,6 +293,7 @@ class _Search(PatellaFrame):
                 misses.append(_condition(error))
         balances = []
         for first, second in pairwise(places):
+            # A moment that falls through zero belongs to a stable equilibrium.
             if first and second and first.moment > 0.0 >= second.moment:
                 try:
                     balances.append(self.between(first, second))
@@ -301,14 +305,18 @@ class _Search(PatellaFrame):
         return min(balances, key=lambda b: b.muscle.length), len(balances) > 1
 
     def first_touch(self, rotation: float) -> PatellaBalance:
-        """Return the balance at a rotation; the patella approaches from the front on its ligament.
+        """Return the balance at a rotation, where a patella from the front touches first.
+
+        The patella swings on its ligament about the tuberosity.
 
         Raises:
-            ComputationError: it touches nothing, or gap or length do not hold where it does.
+            ComputationError: the button touches nothing, or there is no balance near the touch.
         """
         m = self.mechanism
         rotated = m.contact.pose(np.array([0.0, 0.0, rotation]))
         proximal = transform(rotated, m.ligament_proximal)
+        # The ligament has a constant length: its end on the patella lies on a circle about the
+        # tuberosity.
         radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
 
         def place(lean: float) -> Array:
@@ -336,11 +344,11 @@ _CONDITIONS = (
     PatellaStatus.GAP,
     PatellaStatus.MOMENT,
 )
-"""Conditions in the order in which a search checks them; the latest one that failed is named."""
+"""Conditions in the order in which a search checks them. The last one that failed is reported."""
 
 
 def _condition(error: ComputationError) -> PatellaStatus:
-    """Return the condition that a search missed; errors of the lines have no status."""
+    """Return the condition that is not met; errors of the lines have no status."""
     return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
 
 
@@ -350,7 +358,7 @@ def _slopes_in_plane(balance: PatellaBalance) -> Array:
 
 
 def _stable(slopes: Array) -> bool:
-    """Say whether the moment opposes a turn at constant gap and ligament length."""
+    """Say whether the moment opposes a rotation at constant gap and ligament length."""
     plane = slopes[:2, :2]
     if abs(np.linalg.det(plane)) < PATELLA.least_determinant:
         return False

@@ -1,28 +1,27 @@
-"""Contact point of the patella on the femoral component, and line of action of its force.
+"""Contact of the patellar button with the femoral component, and line of action of its force.
 
-Everything is in the patellar joint's frame: the femur's, x anterior, y superior, z right;
-the patella moves in it in the sagittal plane only (x, y, rotation about z).
+Everything is in the patellar joint's frame, x anterior, y superior, z right, which is fixed to the
+femur. The patella moves in the sagittal plane of this frame (x, y, rotation about z).
 
-The joint side of the button is sampled. Sample i has the signed distance d_i from the
-femoral component, there the nearest point p_i and its normal n_i. The single closest point
-of two faceted, nearly conforming surfaces jumps by centimetres from frame to frame; so the
-contact is the mean over a thin patch, with weights w_i ~ exp(-d_i/tau), for the samples on
-either side of the patella's middle:
+The joint side of the button is sampled. Sample i has the signed distance d_i from the femoral
+component, with the nearest point p_i and the normal n_i there. The closest point of two faceted,
+nearly conforming surfaces jumps by centimetres from frame to frame. So the contact is a weighted
+mean over the samples of each side of the patella's middle, with weights w_i ~ exp(-d_i/tau):
 
     g = sum w_i d_i - tau,    p = sum w_i p_i,    n = sum w_i n_i
 
-For a paraboloid of any curvature g is the distance of the closest points, exactly. A patella
-in its groove touches on its left and on its right. How the force is shared, lambda on the
-left and 1 - lambda on the right, follows from soft tissue that lets the patella shift by c
-times the lateral force and tilt by d times the tilting moment, per unit contact force:
+For a paraboloid of any curvature, g is exactly the distance of the closest points. A patella in its
+groove touches on its left (-z) and on its right side. The left side has the share lambda of the
+force. The share follows from soft tissue with which the patella shifts by c times the lateral force
+and tilts by d times the tilting moment, per unit contact force:
 
     gap = min over 0 <= lambda <= 1 of
           lambda g_l + (1 - lambda) g_r + (c/2) n_z² + (d/2) a²
     n_z = lambda n_lz + (1 - lambda) n_rz      a = lambda z_l + (1 - lambda) z_r
 
-z measured from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is
-the direction of the patellofemoral force. Shift and tilt are first-order estimates; they are
-reported, but the patella is not moved.
+with z from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is the
+direction of the patellofemoral force. Shift and tilt are reported as first-order estimates; the
+patella itself stays in the sagittal plane.
 """
 
 import copy
@@ -39,7 +38,7 @@ from tkamb.geometry.surface import Surface, sharp_edges
 
 @dataclass(frozen=True)
 class PatellofemoralSettings:
-    """Patellofemoral contact with smoothed gaps."""
+    """Samples and weights of the patellofemoral contact, and its soft tissue."""
 
     patch_depth: float = 5e-5
     """m: tau of the module's equations. Chosen: a contact of relative radius R is averaged over
@@ -48,16 +47,16 @@ class PatellofemoralSettings:
     """m: spacing of the button's samples in the patella's coronal plane. Chosen: about the facets
     of a mesh."""
     sample_range: float = 14.0 * patch_depth
-    """m: samples farther than this behind the nearest one get no weight. Chosen: their weight is
-    exp(-14) = 8e-7, by which the gap of a patch of twenty samples jumps by 3e-11 m."""
+    """m: a sample whose distance exceeds the least one by more has no weight. Chosen: its weight
+    would be exp(-14) = 8e-7, and the gap of a patch of twenty samples jumps by 3e-11 m."""
     coarse_samples: int = 60
-    """Samples of a coarse evaluation. Chosen: enough for an initial guess."""
+    """Number of samples of the quick check for touch. Chosen: enough for an initial guess."""
     lateral_compliance: float = 0.01
-    """m: c of the module's equations, the shift if the contact force were purely lateral. Chosen:
-    soft enough to keep the search smooth."""
+    """m: c of the module's equations, the shift under a purely lateral contact force. Chosen: soft
+    enough to keep the search smooth."""
     tilt_compliance: float = 10.0
-    """rad/m: d of the module's equations, the tilt (5.7 deg) if the whole force acted 10 mm beside
-    the middle. Chosen: soft enough to keep the search smooth."""
+    """rad/m: d of the module's equations; a force 10 mm beside the middle tilts by 5.7 deg. Chosen:
+    soft enough to keep the search smooth."""
     least_sagittal_part: float = 1e-9
     """1: sagittal part of a unit normal below which the normal has no sagittal direction. Chosen:
     above rounding."""
@@ -67,7 +66,7 @@ PATELLOFEMORAL = PatellofemoralSettings()
 
 
 STRAIGHT = 1e-12
-"""m: if the share changes the gap by less than this, the nearer side carries all of the force."""
+"""m: curvature of the gap over the share below which the nearer side carries all of the force."""
 
 FIELDS = 11
 """Count of the numbers that describe the contact; see `_shared`."""
@@ -81,12 +80,12 @@ class PatellarContact:
     """The contact at one position of the patella, in the patellar joint's frame.
 
     Args:
-        gap: m, positive when apart.
-        point: (3,) m, on the line of action, at the height of the facets' contact points.
+        gap: m, negative in penetration.
+        point: (3,) m, point of the line of action next to the mean of both sides' points.
         normal: (3,) unit, in the sagittal plane, out of the femur into the patella.
-        share_left: lambda, the share of the facet on the -z side.
-        shift: m along z, shift of the patella that soft tissue would allow; first order.
-        tilt: rad about y, tilt that it would allow; first order.
+        share_left: lambda, share of the force on the -z side.
+        shift: m along z, first-order estimate of the patella's shift.
+        tilt: rad about y, first-order estimate of the patella's tilt.
         on_edge: share of the force on sharp or open edges of the femoral mesh.
     """
 
@@ -102,19 +101,19 @@ class PatellarContact:
 class PatellofemoralContact:
     """Contact between button and femoral component, prepared for many positions.
 
-    The distance of a sample is computed again only if the sample may have a weight at the new
-    position. How far the sample has moved bounds its distance. That saves time and does not change
-    the result, because samples beyond `PATELLOFEMORAL.sample_range` have no weight.
+    The distance of a sample is computed again only if the sample can have a weight at the new
+    position: the change of its distance is at most its displacement. This saves time without a
+    change of the result.
 
     Args:
-        femoral: femoral component in the patellar joint's frame; triangles share vertices.
-        patellar: button in the patella's frame, x anterior: its joint side faces -x.
+        femoral: femoral component in the patellar joint's frame, with shared vertices.
+        patellar: button in the patella's frame; its joint side faces -x.
         ml: m, z of the patella's frame in the joint's frame.
-        lateral_yield: m, c in the module's equation.
-        tilt_yield: rad/m, d in the module's equation.
+        lateral_yield: m, c of the module's equation.
+        tilt_yield: rad/m, d of the module's equation.
 
     Raises:
-        InputError: the button has no surface that faces the femur on both sides.
+        InputError: the button does not lie on both sides of the sagittal plane.
     """
 
     def __init__(
@@ -138,8 +137,8 @@ class PatellofemoralContact:
         count = len(self._samples)
         never, zeros = np.full((count, 3), np.inf), np.zeros(count)
         places = np.zeros((count, 3)), np.zeros((count, 3))
-        # Position of each sample at its last evaluation, its distance, nearest point, normal there,
-        # and whether that is on an edge.
+        # Of each sample: position at its last evaluation, distance, nearest point, normal, and
+        # whether the nearest point is on an edge.
         self._seen = never, zeros, *places, np.zeros(count)
 
     def unused(self) -> "PatellofemoralContact":
@@ -158,7 +157,7 @@ class PatellofemoralContact:
         """Return the contact at (ap, si, rotation), m and rad.
 
         Raises:
-            ComputationError: it pushes straight sideways, which no line in the plane can balance.
+            ComputationError: the force has no sagittal part.
         """
         contact = np.empty(FIELDS)
         length = _shared(self._sides_at(coordinates), self.ml, self._yield, contact)
@@ -168,7 +167,7 @@ class PatellofemoralContact:
         return PatellarContact(gap, contact[5:8], contact[8:], left_share, shift, tilt, on_edge)
 
     def touches(self, coordinates: Array) -> bool:
-        """Return whether any of a few samples lies in the femur: a quick check for searches."""
+        """Say whether any of a few samples lies inside the femur, as a quick check."""
         few = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
         samples = transform(self.pose(np.asarray(coordinates, float)), few)
         low, high = self._nearest.surface.bounds
@@ -179,7 +178,7 @@ class PatellofemoralContact:
         return bool((apart < 0.0).any())
 
     def _sides_at(self, coordinates: Array) -> Array:
-        """Return gap, point, normal and share on edges (2, 8) of both sides, distances renewed."""
+        """Return gap, point, normal and share on edges (2, 8), left and right."""
         samples = transform(self.pose(np.asarray(coordinates, float)), self._samples)
         seen_at, distance = self._seen[:2]
         which = _which_matter(samples, self._left, PATELLOFEMORAL.sample_range, seen_at, distance)
@@ -209,15 +208,15 @@ class PatellofemoralContact:
 def _which_matter(
     samples: Array, on_left: NDArray[np.bool_], reach: float, seen_at: Array, distance: Array
 ) -> Index:
-    """Return the samples whose distances are out of date and could matter.
+    """Return the samples whose distances must be computed again.
 
     A sample that has moved by m since its distance was d has a distance between d - m and d + m.
-    A sample that cannot come within reach of the nearest one of its side keeps its stored distance.
+    These bounds show which samples cannot have a weight.
 
     Args:
-        samples: (n, 3) m, samples at their place.
-        on_left: (n,) whether they are on the -z side.
-        reach: m, behind the nearest one, beyond which a sample does not matter.
+        samples: (n, 3) m, present positions of the samples.
+        on_left: (n,) whether a sample is on the -z side.
+        reach: m, excess over the least distance beyond which a sample has no weight.
         seen_at: (n, 3) m, position of each sample at its last evaluation; inf: none.
         distance: (n,) m, signed distance at that position.
     """
@@ -227,13 +226,12 @@ def _which_matter(
         if seen_at[n, 0] < np.inf:
             displacement[n] = np.sqrt(np.sum((samples[n] - seen_at[n]) ** 2))
             side = 0 if on_left[n] else 1
-            # Upper bound of the gap of this side: the triangle inequality bounds how far a distance
-            # changes when a sample moves.
+            # Upper bound of the least distance of this side.
             nearest[side] = min(nearest[side], distance[n] + displacement[n])
     for n in range(count):
-        # Lower bound of this sample's distance against it: beyond the range the weight is zero.
+        # The lower bound of this sample's distance shows that it has no weight.
         beyond = distance[n] - displacement[n] >= nearest[0 if on_left[n] else 1] + reach
-        if displacement[n] != 0.0 and not beyond:  # nor where it is NaN
+        if displacement[n] != 0.0 and not beyond:  # a NaN is computed again, too
             which[number] = n
             number += 1
     return which[:number]
@@ -259,28 +257,27 @@ def _take(
     """Store the distances, nearest points and normals of samples.
 
     Args:
-        which: (m,) samples.
-        samples: (n, 3) m, where all of them are.
-        apart: (m,) m, their distances.
+        which: (m,) indices of the samples.
+        samples: (n, 3) m, positions of all samples.
+        apart: (m,) m, unsigned distances of the samples.
         faces: (m,) triangles of their nearest points.
-        weights: (m, 3) barycentrics there.
-        triangles: (k, 3, 3) m, of the femoral component.
-        smooth_normals: (k, 3, 3) at the corners, sharp edges kept.
-        vertex_normals: (k, 3, 3) likewise, means over each vertex.
+        weights: (m, 3) barycentric coordinates of their nearest points.
+        triangles: (k, 3, 3) m, triangles of the femoral component.
+        smooth_normals: (k, 3, 3) unit normals at the corners, which differ across sharp edges.
+        vertex_normals: (k, 3, 3) unit normals at the corners, means over each vertex.
         sharp: (k, 3) whether the edge opposite each corner is sharp or open.
-        seen_at: (n, 3) m, to be written, as what follows.
-        distance: (n,) m, signed.
-        foot: (n, 3) m, nearest point.
-        normal: (n, 3) unit, there.
-        on_edge: (n,) 1 where that is on a sharp or open edge.
+        seen_at: (n, 3) m, output: positions of the samples.
+        distance: (n,) m, output: signed distances.
+        foot: (n, 3) m, output: nearest points.
+        normal: (n, 3) output: unit normals at the nearest points.
+        on_edge: (n,) output: 1 if the nearest point is on a sharp or open edge, else 0.
     """
     outward = np.empty(3)
     for m in range(len(which)):
         n, face, edge = which[m], faces[m], False
         for corner in range(3):
             edge |= sharp[face, corner] and weights[m, corner] < EDGE_MARGIN
-        # On a sharp edge the normal is not that of one face; the vertices' mean turns without a
-        # jump.
+        # Across a sharp edge the mean over the vertices turns without a jump.
         normals = vertex_normals[face] if edge else smooth_normals[face]
         along, length = 0.0, 0.0
         for k in range(3):
@@ -292,7 +289,7 @@ def _take(
             length += outward[k] ** 2
         for k in range(3):
             normal[n, k] = outward[k] / np.sqrt(length)
-        # The sign comes from the smooth normal: a sample behind the femur's surface is inside.
+        # A sample behind the surface is inside the femur.
         distance[n] = -apart[m] if along < 0.0 else apart[m]
         on_edge[n] = 1.0 if edge else 0.0
 
@@ -311,14 +308,14 @@ def _mean_over_sides(
     """Write g, p, n and the share on edges (2, 8), left and right.
 
     Args:
-        on_left: (n,) see `_which_matter`.
+        on_left: (n,) as for `_which_matter`.
         depth: m, tau of the module's equation.
-        reach: m.
-        distance: (n,) m.
-        foot: (n, 3) m.
-        normal: (n, 3).
-        on_edge: (n,).
-        means: (2, 8) to be written.
+        reach: m, as for `_which_matter`.
+        distance: (n,) m, as for `_take`.
+        foot: (n, 3) m, as for `_take`.
+        normal: (n, 3) as for `_take`.
+        on_edge: (n,) as for `_take`.
+        means: (2, 8) output.
     """
     for side in range(2):
         nearest, total = np.inf, 0.0
@@ -346,17 +343,17 @@ def _mean_over_sides(
 
 @compiled_as_written
 def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float:
-    """Share the force by the module's equation, and return the sagittal part of its direction.
+    """Write the contact with the share of the module's equation; return the normal's sagittal part.
 
     Args:
         sides: (2, 8) gap, point, normal and share on edges, left and right.
-        middle: m, z of the patella's.
+        middle: m, z of the patella's middle.
         yields: (2,) c and d.
-        contact: (`FIELDS`,) to be written: gap, share of the left, shift, tilt, share on edges,
+        contact: (`FIELDS`,) output: gap, share of the left, shift, tilt, share on edges,
             point (3,) and normal (3,) of the line of action in the sagittal plane.
     """
-    # The gap is a parabola in the left side's share of the force; its minimum is where the button
-    # comes to equilibrium in shift and tilt.
+    # The gap is a parabola in the share of the left side; at its minimum, shift and tilt are in
+    # equilibrium.
     curvature, slope = 0.0, sides[0, 0] - sides[1, 0]
     for k in range(2):
         at, offset = (6, 0.0) if k == 0 else (3, middle)
@@ -366,7 +363,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
     if curvature < STRAIGHT:
         left_share = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
     else:
-        # A facet cannot pull, so that the share stays in [0, 1].
+        # A side cannot pull, so that the share stays in [0, 1].
         left_share = min(max(-slope / curvature, 0.0), 1.0)
     mean = left_share * sides[0] + (1.0 - left_share) * sides[1]
     moment, length = 0.0, np.sqrt(mean[4] ** 2 + mean[5] ** 2)
@@ -391,7 +388,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
 
 
 def _joint_side(patellar: Surface) -> Array:
-    """Return samples (n, 3) of the surface that a view along the patella's +x shows."""
+    """Return samples (n, 3), m, of the surface that is seen along the patella's +x."""
     low, high = patellar.bounds
     axes = [
         np.arange(

@@ -1,18 +1,17 @@
 """Relaxation of the muscle forces that a search for equilibrium holds constant.
 
-The muscle sharing depends on the knee's equilibrium, and the equilibrium on the sharing. Under a
-light load the knee is compliant, and computing both in turn would oscillate. The forces f are
-therefore changed only by a part omega of the difference to the required ones, f',
+The muscle sharing depends on the knee's equilibrium, and the equilibrium depends on the sharing.
+Under a light load the knee is compliant, and computing both in turn would oscillate. Each pass
+therefore changes the forces f by a part omega of the difference from the required forces f',
 
     f <- f + omega (f' - f),   omega <- -omega d . (d' - d) / |d' - d|²,
 
-with d and d' the last two differences f' - f: Aitken's secant for a vector. At the end f = f'.
+with d and d' the last two differences f' - f (Aitken's secant for a vector). At the end f = f'.
 
-The compliance of the knee to the muscles decides the muscles' arms, and depends itself on the
-equilibrium. In the first passes the measured compliance is used. Later it is changed only by half
-of the difference to the measured one, then by a quarter, so that it converges where the contact's
-stiffness changes fast with the pose. If it still does not converge (a condyle is about to lift and
-the pose jumps), it is kept constant. `doubt` is the difference that remains.
+The compliance of the knee enters the muscles' arms, and depends itself on the equilibrium. The
+first passes use the measured compliance. Later passes change it by half of the difference from the
+measured one, then by a quarter, so that it converges if the contact's stiffness changes fast with
+the pose. After these passes it stays constant. `doubt` is the remaining difference.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -35,31 +34,30 @@ class MuscleIterationSettings:
     """The iteration between muscle forces and knee equilibrium."""
 
     muscle_force_tolerance: float = 1.0
-    """N: largest difference, over the muscles, of the force that is needed from the force that is
-    applied, at which the iteration has converged. Chosen: it is a thousandth of a usual muscle
-    force."""
+    """N: largest difference of a muscle's required force from its applied force at which the
+    iteration has converged. Chosen: a thousandth of a usual muscle force."""
 
 
 MUSCLE_ITERATION = MuscleIterationSettings()
 
 LEAST, MOST = 0.05, 1.0
-"""The limits of omega."""
+"""Least and largest omega."""
 
 
 STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
-"""Up to this number of passes, the compliance is changed by this share of the difference."""
+"""Up to this number of passes the compliance changes by this share of the difference."""
 TURNS = np.array(
     [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
 )
-"""Makes answers to forces and to moments comparable."""
+"""m: arms that make the responses to forces and to moments comparable."""
 
 
 class Relaxation:
     """The muscles' forces over the passes of one search.
 
     Attributes:
-        settled: whether the required forces agree with the applied ones, so that they are applied.
-        doubt: relative difference of the measured compliance from the one that is used; 0: none.
+        settled: whether the required forces agree with the applied forces.
+        doubt: relative difference of the measured compliance from the compliance in use.
     """
 
     def __init__(self) -> None:
@@ -70,10 +68,11 @@ class Relaxation:
         self._passes, self.doubt = 0, 0.0
 
     def yielding(self, measured: Array | None) -> Array | None:
-        """Return the compliance of the knee that is used in the next pass.
+        """Return the compliance of the knee for the next pass.
 
         Args:
-            measured: compliance at the last equilibrium, see `ReleasedForces.tension_per_wrench`.
+            measured: (6,) compliance at the last equilibrium, from
+                `ReleasedForces.tension_per_wrench`; None: unknown.
         """
         self._passes, self.doubt = self._passes + 1, 0.0
         last, self._yields = self._yields, measured
@@ -91,7 +90,7 @@ class Relaxation:
         """Return the forces of the next pass.
 
         Args:
-            required: the sharing at the equilibrium under the forces of the last pass.
+            required: sharing at the equilibrium under the forces of the last pass.
         """
         applied, self._held, self.settled = self._held, required, False
         if applied is None:

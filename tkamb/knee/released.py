@@ -5,16 +5,14 @@ Adduction, axial rotation, anterior-posterior and medial-lateral position follow
 if the scene releases them. If not, they are kept as recorded, and the force or moment that keeps
 them is a residual of the equations of motion.
 
-Within one search the patella is fixed to the femur, its ligament turns with it, and the other
-muscles' forces are constant. Then the patella and the lines are solved again at the new pose, and
-the load is shared again among the muscles with the new contact, until the knee no longer moves. In
-equilibrium the sharing's tension of the extensor group is therefore that of the knee's equations.
-Inertia and sliding speed are those of the recorded rates: the released coordinates are
-quasi-static. Friction is Coulomb's: mu times each condyle's resultant, against the recorded
-sliding, on the line of action of the resultant. Without friction, the forces have a potential
-except for follower loads.
+The search is repeated in passes. Within one pass the patella is fixed to the femur, and the forces
+of the other muscles are constant. Then patella and lines are solved again at the new pose, and the
+load is shared again among the muscles with the new contact, until the knee does not move between
+passes. So the shared tension of the extensor group agrees with the knee's equations.
 
-The contact comes as a probe; this file does not know the models.
+Inertia and sliding speed follow from the recorded rates: the released coordinates are quasi-static.
+Coulomb friction is mu times the resultant of each condyle, against the recorded sliding, on the
+line of action of the resultant.
 """
 
 from collections.abc import Sequence
@@ -45,19 +43,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReleasedKneeSettings:
-    """The knee with released coordinates and its patella."""
+    """Tolerances and limits of the passes between knee, patella and muscles."""
 
     knee_tolerance: float = 2e-6
-    """m: the iteration between knee and patella has converged when the knee moves by less. Chosen:
-    the same as the tolerance of the knee's own step."""
+    """m: movement of the knee between passes below which they have converged. Chosen: the same as
+    the tolerance of a step of the search."""
     contact_force_tolerance: float = 0.1
-    """N: it must also change the contact force by less than this, or by less than
-    `contact_force_share` of it. Chosen: a ten-thousandth of a usual contact force."""
+    """N: change of the contact force below which passes have converged, or `contact_force_share` of
+    the force if that is larger. Chosen: a ten-thousandth of a usual contact force."""
     residual_tolerance: float = 0.5
-    """N (moments are divided by the lever arm): largest force left on a released coordinate at the
-    returned pose, with patella, lines and contact found anew there. Above it, and above
-    `residual_share` of the contact force and what the contact model's tolerance leaves open, the
-    frame has no result. Chosen: measured residuals are below 0.1 N."""
+    """N (moments are divided by the lever arm): largest residual force on a released coordinate at
+    the returned pose, with patella, lines and contact computed there. A frame has no result if the
+    residual exceeds the largest of this, `residual_share` of the contact force, and the error of
+    the contact force. Chosen: measured residuals are below 0.1 N."""
     residual_share: float = 1e-3
     """1: see `residual_tolerance`. Chosen: the patella's changes from facet to facet alter the
     force by 2e-4 of it."""
@@ -65,23 +63,21 @@ class ReleasedKneeSettings:
     """1: see `contact_force_tolerance`. Chosen: the patella's changes from facet to facet alter the
     force by about as much."""
     max_passes: int = 24
-    """Passes between knee and patella at most. Chosen: each halves the remaining change where the
-    knee is soft."""
+    """Maximum number of passes. Chosen: for a compliant knee a pass halves the change."""
     inner_tolerance_share: float = 0.1
-    """1: residual of a pass as a share of its own change. Chosen: with muscles a few passes are
-    needed in any case, so that a pass need not converge further."""
+    """1: remaining step of a pass with muscles, as a share of its movement, at which the pass ends.
+    Chosen: more passes follow in any case."""
     muscle_force_range: float = 3e-3
-    """m: distance from a contact like the last frame's within which extrapolated muscle forces
-    hold. Chosen: contacts move by less from frame to frame."""
+    """m: distance from the initial guess within which the muscle forces of the last frame are a
+    good guess. Chosen: the knee moves by less from frame to frame."""
     slack_force: float = 1e-3
-    """N: an extensor group with a smaller tension is slack. Chosen: far below any force that
-    matters."""
+    """N: an extensor group with a smaller tension is slack. Chosen: far below what is reported."""
     initial_load_error: float = 0.5
     """1: largest relative difference between the load at an initial guess and the load of the last
     frame. Chosen: from there the search converges."""
     max_height_steps: int = 4
-    """Largest number of heights that are tried to bring the load within `initial_load_error`.
-    Chosen: each costs one contact."""
+    """Maximum number of heights that are tried to bring the load within `initial_load_error`.
+    Chosen: each costs one evaluation of the contact."""
 
 
 RELEASED_KNEE = ReleasedKneeSettings()
@@ -91,24 +87,24 @@ SUPERIOR = KNEE_COORDINATES.index("si")
 
 @dataclass(frozen=True, eq=False)
 class KneeEquilibrium:
-    """One frame with its released coordinates in equilibrium.
+    """Result of the search for the released coordinates of one frame.
 
     Args:
-        coordinates: (6,) m and rad.
-        geometry: the leg there, without its contact.
-        patella: where it is; None if not modelled.
+        coordinates: (6,) knee coordinates, m and rad.
+        geometry: input of the equations there, without the contact.
+        patella: the patella there; None: not modelled.
         contact: the contact there.
-        balance: the last search.
-        passes: number of solutions of patella and lines.
+        balance: the last pass.
+        passes: number of passes.
         trials: number of evaluations of the contact.
-        change: N, what the last pass changed in the contact force.
-        problem: why this is no result, or empty.
-        doubt: see `Relaxation`.
-        residual: N, largest generalised force (moments over the lever arm) that is left on a
-            released coordinate at the returned pose: patella, lines and contact as they are
-            there; inf where it was not measured.
-        second: where another initial guess led, in words; empty: to this equilibrium, or there
-            was no need to try (`InitialPoses`).
+        change: N, change of the contact force in the last pass.
+        problem: why this is no result, in words; empty: it is one.
+        doubt: `Relaxation.doubt` at the end.
+        residual: N (moments are divided by the lever arm), largest residual force on a released
+            coordinate at the returned pose, with patella, lines and contact computed there; inf:
+            not measured.
+        second: a second equilibrium that another initial guess leads to, in words; empty: none was
+            found (`InitialPoses`).
     """
 
     coordinates: Array
@@ -134,11 +130,11 @@ class ReleasedKnee:
     """Finds the released coordinates of a knee, instant by instant.
 
     Args:
-        probe: of the contact model.
-        names: the released coordinates, "si" understood.
+        probe: probe of the contact model.
+        names: the released coordinates; "si" is always one of them.
 
     Attributes:
-        released: their indices.
+        released: indices of the released coordinates.
     """
 
     def __init__(self, probe: "Probe", names: Sequence[str]) -> None:
@@ -158,19 +154,21 @@ class ReleasedKnee:
 
         Args:
             instant: the knee.
-            start: (6,) coordinates; the released ones are where the search begins.
-            points: side -> (3,) m, where a condyle that carries nothing is nearest to the
-                insert: residual forces act in the middle of both condyles' points.
-            before: the frame before, whose patella and stiffness are guesses.
+            start: (6,) knee coordinates, initial guess of the released ones.
+            points: side -> (3,) m, point where an unloaded condyle is nearest to the insert. The
+                residual forces act in the middle of both condyles' points.
+            before: result of the frame before, used as initial guess.
 
         Raises:
-            ComputationError: no muscle forces carry the frame.
+            ComputationError: no muscle forces balance the frame.
         """
         place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
+        # `slack` starts again in every frame: a ligament that pushed in the last one may pull now.
         knee, slack, trials, passes = before, False, 0, 0
         touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
         if instant.muscles and before:
             place, touch = self._carrying(place, before.contact)
+        # Only near a known contact do the muscle forces of the last frame hold in the first pass.
         reach = RELEASED_KNEE.muscle_force_range if touch else np.inf
         while passes < RELEASED_KNEE.max_passes:
             knee, pushes = self._pass(instant, place, middle, slack, knee, touch, mixing, reach)
@@ -183,8 +181,7 @@ class ReleasedKnee:
             middle = _middle(knee.contact, points, place)
             ways.append(max(travel, np.abs(middle - last).max() if self._keeps else 0.0))
             if pushes:
-                # A line that would push drives the knee away: slack, it begins from the same
-                # initial guess.
+                # A ligament that would push cannot act: the search begins again without it.
                 slack, knee, touch = True, before, None
                 place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
                 ways = [np.inf, np.inf]
@@ -213,7 +210,7 @@ class ReleasedKnee:
     def _measured(
         self, instant: Instant, knee: KneeEquilibrium, middle: Array, slack: bool
     ) -> KneeEquilibrium:
-        """Return the knee with patella, lines and residual as they are at its own pose."""
+        """Return the knee with patella, lines and residual computed at its pose."""
         if knee.problem:
             return knee
         patella = None
@@ -224,18 +221,18 @@ class ReleasedKnee:
         if knee.geometry.share is not None:
             geometry = replace(geometry, share=knee.geometry.share)
             joint = replace(joint, share=knee.geometry.share)
-        left = self._forces(instant, joint, knee.coordinates, knee.contact).left()
+        residual = self._forces(instant, joint, knee.coordinates, knee.contact).residual()
         problem = "; ".join(geometry.problems)
-        return replace(knee, geometry=geometry, patella=patella, residual=left, problem=problem)
+        return replace(knee, geometry=geometry, patella=patella, residual=residual, problem=problem)
 
     def _carrying(
         self, place: Array, like: "ProbedContact"
     ) -> "tuple[Array, ProbedContact | None]":
-        """Return the place, raised or lowered to about the contact force of another contact.
+        """Return a place raised or lowered to about the contact force of another contact.
 
         Returns:
-            Coordinates (6,) and the contact there; None if the same condyles do not carry, or the
-            model does not know its tangent.
+            Coordinates (6,), and the contact there. The contact is None if other condyles carry
+            load there, or if the contact has no tangent.
         """
         load = float(like.wrench[1])
         for _ in range(RELEASED_KNEE.max_height_steps):
@@ -270,7 +267,7 @@ class ReleasedKnee:
         mixing: Relaxation,
         reach: float,
     ) -> tuple[KneeEquilibrium, bool]:
-        """Return the equilibrium with the patella at `place`; say if its ligament would push."""
+        """Return the equilibrium of a pass, and whether the patellar ligament would push."""
         patella, guess = None, before.patella if before else None
         if instant.extensor is not None:
             patella = instant.extensor.patella(knee_pose(place), guess)
@@ -305,7 +302,7 @@ class ReleasedKnee:
             np.nan,
             problem,
         )
-        # with other muscles their sharing says whether the quadriceps is slack
+        # With other muscles, the sharing decides whether the quadriceps is slack.
         ended = balance.at_rest or balance.status is not BalanceStatus.OK
         return knee, ended and not muscles and contact.known and forces.pushes(balance)
 
@@ -318,22 +315,21 @@ class ReleasedKnee:
         applied: "MuscleShare | None",
         mixing: Relaxation,
     ) -> "MuscleShare":
-        """Return the force of each muscle; the released coordinates yield to the muscles.
+        """Return the force of each muscle, while the released coordinates yield to these forces.
 
-        Contact points are kept if no contact is known yet, or if the contact model has no tangent.
-        If they make the equations singular, the knee's forces pass through the femoral origin.
+        If no equilibrium is known yet, or if the contact has no tangent, the contact points are
+        constant. If the equations are then singular, the contact force acts at the femoral origin.
 
         Args:
             instant: the knee.
-            geometry: the frame without its contact.
-            joint: its equations, the extensor mechanism taut.
-            touch: the contact there; None where the search begins without a contact like that of
-            the last frame.
-            applied: sharing of the last pass, in this frame or the one before.
+            geometry: input of the equations, without the contact.
+            joint: equations of the released coordinates with a taut extensor mechanism.
+            touch: the contact there; None: no contact like that of the last frame is known.
+            applied: sharing of the last pass, in this frame or the frame before.
             mixing: relaxation of forces and compliance.
 
         Raises:
-            ComputationError: no muscle forces carry the frame.
+            ComputationError: no muscle forces balance the frame.
         """
         place, muscles, friction = geometry.coordinates, instant.muscles, instant.friction
         assert muscles is not None
@@ -360,7 +356,7 @@ class ReleasedKnee:
 
     @property
     def _keeps(self) -> bool:
-        """Whether residual forces act: a translation or rotation is kept as recorded."""
+        """Whether residual forces act, because a coordinate is kept as recorded."""
         return len(self.released) < 5
 
     def _joint(
@@ -386,14 +382,14 @@ class ReleasedKnee:
 
 
 def ahead(ways: Sequence[float]) -> float:
-    """Return the distance that converging passes still have to go, per distance of the last pass.
+    """Return the remaining distance of converging passes, per distance of the last pass.
 
-    With q the larger of the last two ratios of successive distances, the geometric series that
-    remains is q / (1 - q). It is 1 where a pass did not at least halve the distance of the one
-    before, or where there were fewer than three passes: the last pass itself must then be short.
+    Let q be the larger of the last two ratios of successive distances. The remaining geometric
+    series has the sum q / (1 - q). The result is 1 if there were fewer than three passes, or if a
+    pass did not halve the distance of the pass before.
 
     Args:
-        ways: m, distances of the last three passes; inf where there was none.
+        ways: m, distances of the last three passes; inf: no such pass.
     """
     first, second, last = ways
     if not 0.0 < second <= 0.5 * first < np.inf or last > 0.5 * second:

@@ -6,14 +6,14 @@ recorded. Contact, ligaments, muscles and the patellar ligament must add up to i
 
     R(q, y) = w_external + w_ligaments(q) + w_muscles(q) + w_contact(q) + B y = 0   (on the insert)
 
-The columns B are the loads that may keep the prescribed coordinates in place: the patellar
-ligament's line (flexion), and the residuals of the equations of motion for the others. The
-extensor muscle and the patellofemoral force are internal to the femur's side. A released
+The columns B are the loads that keep the prescribed coordinates: the patellar ligament for flexion,
+and the residuals of the equations of motion for the others. The extensor muscle and the
+patellofemoral force act within the femur's side. A released
 coordinate i is driven by the generalised force
 
     r_i = -J_i(q) . R(q, y),   y such that the prescribed coordinates have none,
 
-J of `knee_axes`: zero at equilibrium, and along +q_i where the femur wants to go.
+with J of `knee_axes`. It is zero at equilibrium, and positive if it drives the femur towards +q_i.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PatellarLine:
-    """The patellar ligament where it leaves the patella: a straight line to an anchor.
+    """The first straight stretch of the patellar ligament below the patella.
 
     Args:
-        end: (3,) m, on the patella, carried by the femur, femur frame.
-        anchor: (3,) m, the next point on the shank, tuberosity or front lip, insert frame.
+        end: (3,) m, end on the patella, which is taken as fixed to the femur; femur frame.
+        anchor: (3,) m, next point on the shank, the tuberosity or the front lip; insert frame.
     """
 
     end: Array
@@ -60,10 +60,10 @@ class JointEquilibrium:
     Args:
         external: (6,) w_external on the insert, force and moment about its origin.
         ligaments: the bundles.
-        line: the patellar ligament, which balances flexion; None: a moment balances it.
-        keeping: (6, m) the other columns of B, of unit magnitude.
+        line: the patellar ligament, which balances flexion; None: a moment balances flexion.
+        keeping: (6, m) the other columns of B, unit loads.
         released: indices of the n released coordinates.
-        share: the muscles across the knee beside the quadriceps, if modelled.
+        share: the muscles across the knee beside the quadriceps; None: not modelled.
         tibia: (4, 4) pose of the tibia link in the insert frame.
     """
 
@@ -101,13 +101,13 @@ class JointEquilibrium:
         return np.asarray(-axes[list(self.released)] @ through)
 
     def kept_and_left(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
-        """Return what `kept` does, and the residual wrench R (6,) on the insert."""
+        """Return y as `kept`, and the residual wrench R (6,) on the insert."""
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         reactions = _magnitudes(axes[self._prescribed], columns, wrench)
         return reactions, wrench + columns @ reactions
 
     def whole(self, coordinates: Array, contact: Array) -> Array:
-        """Return generalised forces (m, 6) on all coordinates, with y of the last of m places.
+        """Return the generalised forces (m, 6) on all coordinates, with y of the last place.
 
         Args:
             coordinates: (m, 6) knee coordinates.
@@ -144,7 +144,7 @@ class JointEquilibrium:
 
 def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
     """Return y with rows (columns y + wrench) = 0."""
-    # Prescribed coordinates are held: their reactions make the generalised forces on them vanish.
+    # The reactions make the generalised forces on the prescribed coordinates vanish.
     right = np.einsum("...ij,...j->...i", rows, wrench)
     return np.asarray(-np.linalg.solve(rows @ columns, right[..., None])[..., 0])
 
@@ -166,8 +166,8 @@ def joint_equilibrium(
         coordinates: (6,) knee coordinates of the geometry.
         released: indices of the released coordinates; flexion is never among them.
         middle: (3,) m, where the residual forces act, insert frame.
-        slack: the extensor mechanism carries nothing.
-        external: (6,) see `external_wrench`.
+        slack: whether the extensor mechanism carries no load.
+        external: (6,) result of `external_wrench`.
     """
     line = None if slack or geometry.extensor is None else patellar_line(geometry, coordinates)
     columns = [
@@ -189,8 +189,8 @@ def joint_equilibrium(
 def unit_keeper(name: str, middle: Array) -> Array:
     """Return the wrench (6,) on the insert of the residual that keeps one knee coordinate.
 
-    As in the equations of motion: forces along the insert's axes at `middle`, moments about
-    its x (adduction), y (axial rotation) and z (flexion).
+    As in the equations of motion, the residuals are forces along the insert's axes at `middle`, and
+    moments about its x (adduction), y (axial rotation) and z (flexion).
     """
     axis = unknowns.AXES[
         {"adduction": "ap", "axial_rotation": "si", "flexion": "ml"}.get(name, name)
@@ -215,7 +215,7 @@ def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
 def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     """Return the wrench (6,) on the insert that ground, weight and inertia exert on the shank.
 
-    The same wherever the knee is in that frame.
+    It does not depend on the knee coordinates.
     """
     state = geometry.state
     hip = unknowns.hip(state.point("hip", np.zeros(3)))
@@ -223,7 +223,7 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     columns = state.generalised([*(unknown.loads for unknown in hip), ground])
     # As in `KneeSystem`: what hip and knee supply together, less the ground reaction.
     without = state.inertial - columns[:, -1]
-    # The first six equations hold no internal loads of the knee, so that they give the hip's alone.
+    # The six equations of the free root hold no internal loads of the knee and give the hip's.
     at_hip = np.linalg.solve(columns[:6, :6], without[:6])
     knee = (without - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
     # Generalised forces are axes times wrench; solved for the wrench on the tibia.
@@ -233,7 +233,7 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
 def crossing_bundles(
     geometry: KneeGeometry, ligaments: "Sequence[Ligament]", coordinates: Array
 ) -> "BundleArrays":
-    """Return the bundles that cross the knee, their ends in the femur and insert frames.
+    """Return the bundles that cross the knee, with ends in the femur and insert frames.
 
     An end on the patella is taken as fixed to the femur.
     """
@@ -256,7 +256,7 @@ def crossing_bundles(
 
 @dataclass(frozen=True)
 class ReleasedForceSettings:
-    """The forces on released coordinates."""
+    """Scaling and step of the forces on released coordinates."""
 
     lever_arm: float = 0.025
     """m: arm that makes rotations comparable to translations. Chosen: half the usual distance of
@@ -299,13 +299,17 @@ J = TypeVar("J", bound=Joint)
 class FreeForces(Generic[J]):
     """Generalised forces on the free coordinates of a joint at trial places.
 
+    Coordinates and forces are scaled: rotations are multiplied by the lever arm, moments are
+    divided by it.
+
     Args:
         joint: loads beside the contact.
-        probe: of the contact model.
-        place: (6,) knee coordinates; those not free stay.
+        probe: probe of the contact model.
+        place: (6,) knee coordinates, m and rad; coordinates that are not free keep these values.
         friction: Coulomb coefficient.
-        sliding: from coordinates (6,) and point (3,) to the femur's velocity there (3,), m/s.
-        touch: the contact at that place, where it is known already.
+        sliding: function of coordinates (6,) and a point (3,). It returns the velocity (3,), m/s,
+            of the femur there against the insert.
+        touch: the contact at `place`, if it is known.
 
     Attributes:
         seen: scaled coordinates as bytes -> contact there.
@@ -335,9 +339,9 @@ class FreeForces(Generic[J]):
         """Return the equilibrium of the free coordinates, with the given place as initial guess.
 
         Args:
-            stiffness: (n, n) N/m of a search near by.
-            residual_share: see `find_balance`.
-            reach: m, see `find_balance`.
+            stiffness: (n, n) N/m, from a search near by; None: unknown.
+            residual_share: as for `find_balance`.
+            reach: m, as for `find_balance`.
         """
         return find_balance(self.trial, self._start, stiffness, residual_share, reach)
 
@@ -358,6 +362,7 @@ class FreeForces(Generic[J]):
         if stiffness is None:
             force = self._joint.imbalance(place, wrench) / self._scale
             return Trial(force, force_noise=force_noise)
+        # The joint's loads at displaced coordinates, and in the last row at the place itself.
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
         forces = self._joint.imbalance(place + steps, wrench) / self._scale
@@ -367,8 +372,8 @@ class FreeForces(Generic[J]):
         tangent = -(change + gain @ stiffness @ twists.T)
         return Trial(forces[-1], tangent, contact.exact, force_noise)
 
-    def left(self) -> float:
-        """Return the largest scaled force, N, at the place where the search would begin."""
+    def residual(self) -> float:
+        """Return the largest scaled force, N, at the given place."""
         return float(np.abs(self.trial(self._start).force).max())
 
     def at(self, balance: Balance) -> Array:
@@ -396,21 +401,21 @@ class FreeForces(Generic[J]):
 
 
 class ReleasedForces(FreeForces[JointEquilibrium]):
-    """Generalised forces on the released coordinates of a leg, its patella fixed to the femur."""
+    """Forces on the released coordinates of a leg whose patella is fixed to the femur."""
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
-        """Return v (6,): a further wrench dw on the insert adds v . dw to the ligament's tension.
+        """Return v (6,): a wrench dw on the insert adds v . dw to the patellar ligament's tension.
 
         The released coordinates move by dq to the new equilibrium. With K = -df/dq of the
         generalised forces f = -J w of contact, ligaments and muscles,
 
             -J dw - K dq - J B dy = 0
 
-        gives dq and the change dy of the loads that keep the other coordinates; the tension of the
-        patellar ligament is one of them. None where the contact model does not know its tangent.
+        gives dq and the change dy of the loads that keep the other coordinates. The tension of the
+        patellar ligament is one of these. The result is None if the contact has no tangent.
 
         Args:
-            contact: at the place where the search begins, in equilibrium.
+            contact: the contact at the given place, in equilibrium.
         """
         place = self._place
         wrench, stiffness = self._with_friction(place, contact)
@@ -424,24 +429,25 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         change = (
             forces[:-1] - forces[-1]
         ).T / RELEASED_FORCE.difference_step - axes @ stiffness @ twists.T
+        # Unknowns are dq and dy; the ligament's tension is the last of dy.
         matrix = np.hstack([-change, axes @ self._joint.columns(place)])
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 
     def tension_at_rest(self, contact: "ProbedContact", per_wrench: Array) -> float:
         """Return the tension (N) of the patellar ligament at the equilibrium near by.
 
-        A residual wrench at the place counts as a further wrench to which the knee yields.
+        The residual wrench at the given place is added as a wrench to which the knee yields.
 
         Args:
-            contact: at the place where the search begins.
-            per_wrench: (6,), see `tension_per_wrench`.
+            contact: the contact at the given place.
+            per_wrench: (6,) result of `tension_per_wrench`.
         """
         wrench, _ = self._with_friction(self._place, contact)
         reactions, remainder = self._joint.kept_and_left(self._place, wrench)
         return float(reactions[-1] + per_wrench @ remainder)
 
     def pushes(self, balance: Balance) -> bool:
-        """Return whether the patellar ligament, where it is taut, would have to push."""
+        """Say whether a taut patellar ligament would have to push."""
         if self._joint.line is None:
             return False
         place = self.at(balance)

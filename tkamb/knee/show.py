@@ -23,19 +23,18 @@ LIGAMENT, MUSCLE, ARROW = 0x2E7D32, 0xB71C1C, 0x1A1A1A
 
 @dataclass(frozen=True)
 class KneeDrawingSettings:
-    """Drawing of the knee in the viewer."""
+    """Sizes of what is drawn."""
 
     arrow_radius: float = 1.5e-3
-    """m: radius of the arrows of forces. Chosen: it is seen well in the view."""
+    """m: radius of the arrows of forces. Chosen: it is easy to see."""
     strand_radius: float = 8e-4
-    """m: radius of ligaments, muscles and the patellar ligament. Chosen: it is seen well in the
-    view."""
+    """m: radius of ligaments, muscles and the patellar ligament. Chosen: it is easy to see."""
 
 
 KNEE_DRAWING = KneeDrawingSettings()
 
 PRESSURE_COLOURS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])
-"""RGB from no pressure to the peak: three colours of viridis, even in lightness."""
+"""RGB from no pressure to the peak: three colours of viridis, whose lightness increases evenly."""
 
 
 def show_knee(
@@ -50,22 +49,23 @@ def show_knee(
 ) -> None:
     """Draw a knee at q.
 
-    Below the viewer's root node: implant, pressure map, ligaments, lines of the extensor mechanism
-    and an arrow for the force on each condyle. A second call with the same node replaces the first.
+    Implant, pressure map, ligaments, lines of the extensor mechanism and an arrow for the force on
+    each condyle appear below the viewer's root node. A second call with the same node replaces the
+    first.
 
     Args:
         knee: the knee.
         viewer: a `pin.visualize.MeshcatVisualizer`, or a `meshcat.Visualizer`.
         q: (nq,).
-        contact: the contact to draw, from `Knee.press` or `Knee.evaluate`; None: at q. Its height
-            is the femur's in the picture.
-        node: its name in the scene's tree.
+        contact: contact from `Knee.press` or `Knee.evaluate`, whose pose of the femur is drawn;
+            None: the contact at q.
+        node: name of the node in the viewer's tree.
         newton: m, length of an arrow per newton.
         peak: Pa, pressure of the last colour; None: the largest there is.
         opacity: of the femoral component, 0 to 1.
 
     Raises:
-        InputError: a viewer that is neither.
+        InputError: the viewer is neither.
     """
     window, root = _window(viewer)
     tree = window[root][node] if root else window[node]

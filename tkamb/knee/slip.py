@@ -1,20 +1,18 @@
 """Rolling and slipping of the femoral condyles on the insert, by arc lengths.
 
-From frame to frame the lowest point of a condyle travels an arc a_f on the femoral surface,
-and its projection travels an arc a_i on the insert. Both are taken in the insert's sagittal
-plane and are positive when the contact moves backwards, which is how flexion moves it.
-Rolling: equal arcs. What axial rotation alone would do, about the geometric centre of the
-femoral component, is subtracted from a_i:
+From frame to frame the lowest point of a condyle moves by an arc a_f on the femoral surface, and
+its projection moves by an arc a_i on the insert. Both are arcs in the insert's sagittal plane,
+positive if the contact moves backwards, as in flexion. In rolling both arcs are equal. The part of
+a_i that is due to axial rotation about the geometric centre of the femoral component is subtracted:
 
     slip = sum (a_f - (a_i - a_axial)),   a_axial = d(alpha) (z_condyle - z_centre) / cos(slope)
 
-alpha positive: femur external. Positive slip: the femur's surface slides forwards on the
-insert, so that its rate is the x velocity of the femur's contact point relative to the
-insert, without its axial part: `sliding_velocity` computes it without arcs.
+alpha is positive if the femur rotates externally. Slip is positive if the femur's surface slides
+forwards on the insert. Its rate is the x velocity of the femur's contact point against the insert,
+without the axial part; `sliding_velocity` computes this rate without arcs.
 
-An arc between two points of a smooth profile whose tangent turns by d is taken as that of
-the circle through both: chord (d/2)/sin(d/2). Exact on circles; on a profile of changing
-curvature it errs by the third power of the step.
+The arc between two points of a profile whose tangent turns by d is chord (d/2)/sin(d/2). This is
+exact on a circle. On a profile of changing curvature the error is of third order in the step.
 """
 
 from dataclasses import dataclass
@@ -31,14 +29,14 @@ UP = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class CondyleSlip:
-    """Rolling and slipping of one condyle; cumulated from the first frame, NaN where lost.
+    """Rolling and slipping of one condyle over f frames, cumulated from the first frame.
 
-    Of the first f frames of a motion.
+    NaN from the frame on in which the condyle is beside the insert.
 
     Args:
-        femoral_arc: (f,) m, on the femoral surface, positive backwards.
-        insert_arc: (f,) m, on the insert, positive backwards.
-        axial_part: (f,) m, the part of `insert_arc` that is due to axial rotation.
+        femoral_arc: (f,) m, arc on the femoral surface, positive backwards.
+        insert_arc: (f,) m, arc on the insert, positive backwards.
+        axial_part: (f,) m, part of `insert_arc` that is due to axial rotation.
         slip: (f,) m, femoral_arc - (insert_arc - axial_part).
     """
 
@@ -48,11 +46,11 @@ class CondyleSlip:
 
     @property
     def slip(self) -> Array:
-        """Return (f,) m, positive when the femur's surface slides forwards."""
+        """Return the slip (f,) m, positive if the femur's surface slides forwards."""
         return np.asarray(self.femoral_arc - (self.insert_arc - self.axial_part))
 
     def slip_velocity(self, time: Array) -> Array:
-        """Return (f,) m/s, by central differences of the slip over the motion's time, s."""
+        """Return the rate of the slip (f,) m/s by central differences over the time (f,), s."""
         return np.asarray(np.gradient(self.slip, time[: len(self.slip)]))
 
 
@@ -60,7 +58,7 @@ class InsertProfile:
     """The insert's upper surface as a height over x and z.
 
     Args:
-        insert: in the insert frame.
+        insert: insert, in the insert frame.
     """
 
     def __init__(self, insert: Surface) -> None:
@@ -68,10 +66,10 @@ class InsertProfile:
         self._above = float(insert.bounds[1, 1]) + 1e-3
 
     def at(self, points: Array) -> tuple[Array, Array]:
-        """Return height y (n,) m and sagittal slope angle (n,) rad; NaN beside the insert.
+        """Return the height y (n,) m and the sagittal slope (n,) rad; NaN beside the insert.
 
         Args:
-            points: (n, 3) m, insert frame; their y does not matter.
+            points: (n, 3) m, insert frame; y is ignored.
         """
         start = np.array(points, float)
         start[:, 1] = self._above
@@ -94,8 +92,8 @@ def condyle_slip(
     Args:
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
-        split: z between the condyles in the femoral frame, None for one condyle (medial).
-        coordinates: (f, 6) knee coordinates, m and rad, as recorded.
+        split: m, z between the condyles in the femoral frame; None: one condyle, the medial one.
+        coordinates: (f, 6) recorded knee coordinates, m and rad.
     """
     lowest = LowestPoints(femoral, split)
     poses, profile = knee_pose(coordinates), InsertProfile(insert)
@@ -116,7 +114,7 @@ def slip_of_points(
     """Return rolling and slipping of one condyle from its lowest points.
 
     Args:
-        points: (f, 3) m, lowest points, insert frame.
+        points: (f, 3) m, lowest points of the condyle, insert frame.
         poses: (f, 4, 4) pose_femoral_in_insert.
         axial_rotation: (f,) rad, positive: femur external.
         centre_z: (f,) m, geometric centre of the component, insert frame.
@@ -125,10 +123,9 @@ def slip_of_points(
     height, slope = profile.at(points)
     on_insert = np.column_stack([points[:, 0], height])
     travelled = arc(np.diff(on_insert, axis=0), np.diff(slope))
-    # x is anterior; an arc counts as positive when the contact moves backwards, as in roll-back.
     backwards = -np.sign(np.diff(points[:, 0]))
-    # Axial rotation moves the contact point forwards by the lateral distance from the femoral
-    # centre, along the slope of the insert.
+    # Axial rotation moves the contact point in proportion to its lateral distance from the centre
+    # of the femoral component, along the slope of the insert.
     lever = _mean(points[:, 2] - centre_z) / np.cos(_mean(slope))
     return CondyleSlip(
         _cumulate(femoral_arcs(points, poses)),
@@ -140,15 +137,14 @@ def slip_of_points(
 def femoral_arcs(points: Array, poses: Array) -> Array:
     """Return the arcs (f-1,) m between successive lowest points, on the femoral surface.
 
-    There the surface's normal is the insert's -y, whatever the pose: the profile's tangent
-    turns as the femur does about its ML axis. Positive backwards; of a chord that is turned
-    axially, its part in the insert's sagittal plane.
+    At a lowest point the surface's normal is the insert's -y, so that the profile's tangent turns
+    by the rotation of the femur about its ML axis. An arc is positive backwards. The chord is taken
+    in the insert's sagittal plane.
 
     Args:
         points: (f, 3) m, lowest points, insert frame.
         poses: (f, 4, 4) pose_femoral_in_insert.
     """
-    # Femoral axes, in which a contact point's path is the arc that has rolled.
     back = inverse(poses)
     in_femur = transform(back, points[:, None])[:, 0]
     # The angle of the downward normal in femoral axes is the turn of the arc.
@@ -162,7 +158,7 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
 
 
 def arc(chord: Array, turn: Array) -> Array:
-    """Return the length (n,) of circular arcs over chords (n, 2) whose tangent turns (n,) rad."""
+    """Return the lengths (n,) m of circular arcs from chords (n, 2), m, and turns (n,), rad."""
     # Arc over chord of a circle: (turn / 2) / sin(turn / 2).
     half = 0.5 * np.abs(turn)
     stretch = np.where(half > 1e-6, half / np.where(half > 1e-6, np.sin(half), 1.0), 1.0)
@@ -172,13 +168,13 @@ def arc(chord: Array, turn: Array) -> Array:
 def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> Array:
     """Return the forward sliding (f,) m/s of the femur's contact point, without axial rotation.
 
-    Rigid-body kinematics: (v + w x r)_x - w_y (z_condyle - z_centre).
+    By rigid-body kinematics it is (v + w x r)_x - w_y (z_condyle - z_centre).
 
     Args:
         velocity: (f, 3) m/s of the femoral origin relative to the insert, insert frame.
         spin: (f, 3) rad/s of the femur relative to the insert, insert frame.
         arm: (f, 3) m from the femoral origin to the contact point.
-        lever: (f,) m, z from the component's geometric centre to the contact point.
+        lever: (f,) m, z of the contact point relative to the component's geometric centre.
     """
     return np.asarray((velocity + np.cross(spin, arm))[:, 0] - spin[:, 1] * lever)
 
@@ -188,7 +184,7 @@ def forward_sliding(coordinates: Array, rates: Array, centre: Array, contact: Ar
 
     Args:
         coordinates: (6,) knee coordinates, m and rad.
-        rates: (6,) their rates.
+        rates: (6,) rates of the knee coordinates, m/s and rad/s.
         centre: (3,) m, geometric centre of the component, femoral frame.
         contact: (3,) m, insert frame.
     """
@@ -207,21 +203,22 @@ def roll_slip_motion(
     coordinates: Array,
     slip: Array,
 ) -> Array:
-    """Return the motion of Sharma (2008): rotations given, AP rolls and slips, SI from contact.
+    """Return the motion of Sharma (2008): AP follows from rolling and slip, SI from first touch.
 
-    The mean of the condyles' contact points moves backwards by the femoral arc less the
-    slip, along the insert; the femur comes down to first touch in every frame. The first
-    frame's AP is kept.
+    The mean of the condyles' contact points moves backwards along the insert by the femoral arc
+    less the slip. In every frame the femur is lowered to first touch. AP of the first frame is
+    given.
 
     Args:
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
-        split: z between the condyles in the femoral frame, None for one condyle.
-        coordinates: (f, 6) knee coordinates; rotations and ML are taken from them.
-        slip: (f,) m, cumulated, positive forwards; zero: pure rolling.
+        split: m, z between the condyles in the femoral frame; None: one condyle.
+        coordinates: (f, 6) knee coordinates, m and rad, whose rotations and ML are used.
+        slip: (f,) m, cumulated slip, positive forwards; zero: pure rolling.
 
     Returns:
-        (f, 6) knee coordinates; NaN from where the femur leaves the insert.
+        (f, 6) knee coordinates, m and rad; NaN from the frame on in which the femur leaves the
+        insert.
     """
     changed = np.array(coordinates, float)
     poses, profile = knee_pose(changed), InsertProfile(insert)
@@ -241,9 +238,9 @@ def roll_slip_motion(
 
 
 def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
-    """Return, as means of the condyles, the lowest point from the origin and its arcs.
+    """Return arms (f, 3) m and femoral arcs (f-1,) m, means over the condyles.
 
-    Both depend on the rotations alone: arms (f, 3) m and femoral arcs (f-1,) m.
+    An arm leads from the femoral origin to the lowest point. Both depend on the rotations alone.
     """
     condyle_points = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
     points = np.array(condyle_points).swapaxes(0, 1)
@@ -252,9 +249,8 @@ def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
 
 
 def _roll(profile: InsertProfile, x: float, z: float, backwards: float) -> float:
-    """Return x after an arc backwards along the insert's surface at z (midpoint rule)."""
+    """Return x (m) after an arc backwards along the insert's surface at z (midpoint rule)."""
     _, slope = profile.at(np.array([[x, 0.0, z]]))
-    # Midpoint rule: the slope half-way along the arc decides its projection on x.
     middle = x - 0.5 * backwards * np.cos(slope[0])
     _, slope = profile.at(np.array([[middle, 0.0, z]]))
     return float(x - backwards * np.cos(slope[0]))

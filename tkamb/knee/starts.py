@@ -1,4 +1,4 @@
-"""Initial guesses of the released coordinates, and the equilibrium that is found from them."""
+"""Initial guesses of the released coordinates, and the search from each of them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -22,31 +22,31 @@ if TYPE_CHECKING:
 ASTRAY = (
     BalanceStatus.OUT_OF_RANGE,
     BalanceStatus.NOT_CONVERGED,
-    BalanceStatus.RUNS_AWAY,  # may also happen from a bad initial guess
+    BalanceStatus.RUNS_AWAY,
 )
-"""Failures of a search after which another initial guess is tried."""
+"""Failures after which another initial guess is tried."""
 
 
 @dataclass(frozen=True)
 class InitialPoseSettings:
-    """Initial guesses of the released coordinates."""
+    """Limits of the initial guesses of the released coordinates."""
 
     max_extrapolation: float = 2e-3
-    """m: an initial guess is extrapolated at most this far from the last frame. Chosen: a guess
-    that is far off costs more than it gains."""
+    """m: largest extrapolation from the last frame. Chosen: a guess far from the
+    solution costs more than it saves."""
     first_penetration: float = 5e-5
     """m: penetration of the initial guess of a first frame. Chosen: a loaded contact of
-    polyethylene is deeper, a loose one is found from it too."""
+    polyethylene is deeper, and the search finds a lightly loaded one from it, too."""
     max_continuation: float = 1e-3
-    """m (rotations times the lever arm): a search that ends farther from its initial guess has
-    not merely followed the last frame; other initial guesses then say whether there is a second
-    equilibrium. Chosen: frame by frame the shipped knee moves by 0.5 mm at most."""
+    """m (rotations times the lever arm): if a search ends farther from its initial guess, other
+    initial guesses are tried, because there may be a second equilibrium. Chosen: frame by frame the
+    shipped knee moves by 0.5 mm at most."""
     other_shift: float = 5e-3
-    """m: anterior and posterior of the recorded pose, where a frame without earlier ones is
-    searched from again. Chosen: about a third of a dish."""
+    """m: shift of the recorded pose in anterior and posterior direction, for two more initial
+    guesses of a first frame. Chosen: about a third of a dish."""
     same_place: float = 0.5e-3
-    """m (rotations times the lever arm): equilibria farther apart are two. Chosen: well above what
-    the tolerances leave open."""
+    """m (rotations times the lever arm): two equilibria that are farther apart are different.
+    Chosen: well above the tolerances of the search."""
 
 
 INITIAL_POSE = InitialPoseSettings()
@@ -55,12 +55,12 @@ AP = KNEE_COORDINATES.index("ap")
 
 
 class InitialPoses:
-    """The initial guesses of a search, the likeliest first.
+    """The initial guesses of a search, the most likely first.
 
     Args:
-        knee: it searches from an initial guess.
+        knee: searches from an initial guess.
         pair: femoral component and insert.
-        post: cam and post, if they are modelled.
+        post: cam and post; None: not modelled.
     """
 
     def __init__(self, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None") -> None:
@@ -71,16 +71,18 @@ class InitialPoses:
     ) -> KneeEquilibrium:
         """Return the equilibrium from the first initial guess that converges.
 
-        Where it lies farther than `INITIAL_POSE.max_continuation` from that start, the search is
-        repeated from the starts that are left; one that ends elsewhere is described in `second`.
+        If the equilibrium is farther than `INITIAL_POSE.max_continuation` from that guess, the
+        search is repeated from other guesses. If one of these leads to another equilibrium,
+        `second` of the result describes it.
 
         Args:
             instant: the knee.
-            previous: the last three frames that were found.
-            points: side -> where a condyle that carries nothing is nearest to the insert.
+            previous: results of up to three frames before, the last one last.
+            points: side -> (3,) m, point where an unloaded condyle is nearest to the insert.
 
         Raises:
-            ComputationError: no start lies over the insert, or no muscle forces carry the frame.
+            ComputationError: no initial guess lies over the insert, or no muscle forces balance the
+                frame.
         """
         knee, failure = None, "the femoral component does not lie over the insert"
         recorded = instant.coordinates
@@ -103,7 +105,7 @@ class InitialPoses:
         return replace(knee, second=self._second(instant, knee, others, points))
 
     def _beside(self, instant: Instant) -> list[Array]:
-        """Return the recorded pose moved forwards and backwards, just touching."""
+        """Return the recorded pose shifted anteriorly and posteriorly, at first touch."""
         places = [instant.coordinates.copy(), instant.coordinates.copy()]
         for place, sign in zip(places, (1.0, -1.0), strict=True):
             place[AP] += sign * INITIAL_POSE.other_shift * (AP in self._knee.released)
@@ -116,7 +118,7 @@ class InitialPoses:
         starts: list[Array],
         points: dict[str, Array],
     ) -> str:
-        """Return in words another equilibrium to which other starts lead; empty: there is none."""
+        """Return a second equilibrium, from other initial guesses, in words; empty: none."""
         for place in starts:
             if not np.isfinite(place).all():
                 continue
@@ -137,9 +139,9 @@ class InitialPoses:
         return ""
 
     def _starts(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
-        """Yield initial guesses: extrapolated from the last frames, the last frame, as recorded.
+        """Yield the initial guesses: extrapolated, of the last frame, and as recorded.
 
-        The first keeps its height; the others are moved to first touch.
+        The extrapolated guess keeps its height. The others are moved to first touch.
         """
         rows = list(self._knee.released)
         for number, place in enumerate([carried_on(previous), previous[-1]] if previous else []):
@@ -149,9 +151,9 @@ class InitialPoses:
         yield self.on_the_insert(recorded)
 
     def on_the_insert(self, place: Array) -> Array:
-        """Return coordinates (6,) whose superior-inferior one makes the condyles just touch.
+        """Return coordinates (6,), m and rad, with the height changed to first touch.
 
-        Where AP is released and a cam overlaps the post, AP makes them just touch, too.
+        If AP is released and a cam overlaps the post, AP is changed to their first touch, too.
         """
         touching = self._on_the_dishes(place)
         if self._post is None or AP not in self._knee.released:
@@ -174,14 +176,17 @@ def _apart(first: Array, second: Array) -> float:
 
 
 def carried_on(previous: list[Array]) -> Array:
-    """Return the coordinates (6,) after those of up to three frames.
+    """Return coordinates (6,) extrapolated from up to three frames.
 
-    The last step is repeated, scaled by how well the step before predicted it, and limited to
-    `INITIAL_POSE.max_extrapolation`, because a lightly loaded knee moves irregularly.
+    The last step is repeated times a factor from 0 to 1, the projection of the last step on the
+    step before. It is limited to `INITIAL_POSE.max_extrapolation`, because a lightly loaded knee
+    moves irregularly.
     """
     if len(previous) < 3:
         return previous[-1]
     before, step = ((b - a) * SCALE for a, b in pairwise(previous))
+    # A knee that moves steadily has part = 1; one that turns back has part < 0, and the last place
+    # is the guess.
     part = float(before @ step) / max(float(before @ before), 1e-18)
     longest = INITIAL_POSE.max_extrapolation / max(float(np.linalg.norm(step)), 1e-9)
     return previous[-1] + min(max(part, 0.0), 1.0, longest) * (previous[-1] - previous[-2])

@@ -30,7 +30,7 @@ from tkamb.knee.load import PointForces
 
 @dataclass(frozen=True)
 class UnknownsSettings:
-    """Solvability of the equations for the unknown forces."""
+    """When the equations count as singular."""
 
     max_condition: float = 1e4
     """1: condition number (unit columns) above which a frame counts as singular. Chosen: it grows
@@ -47,8 +47,8 @@ class Unknown:
     """A load of unknown magnitude.
 
     Args:
-        name: of the magnitude in the solution.
-        loads: what one unit of it does to each link, insert frame.
+        name: name of the magnitude in the solution.
+        loads: loads on the links at a magnitude of one, insert frame.
     """
 
     name: str
@@ -97,7 +97,7 @@ AXES = {"ap": np.array([1.0, 0, 0]), "si": np.array([0, 1.0, 0]), "ml": np.array
 """Insert axes: x anterior, y superior, z to the right."""
 
 MUSCLE = "muscle_"
-"""First part of the names of the muscles' tensions."""
+"""First part of the name of a muscle's tension among the unknowns."""
 
 
 def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces, ...]:
@@ -122,7 +122,7 @@ def muscle_load(name: str) -> str:
 
 
 def hip(point: Array) -> list[Unknown]:
-    """Return hip force and moment on the femur at the hip centre (3,)."""
+    """Return the six loads of the hip on the femur, at the hip centre (3,)."""
     zero = np.zeros((1, 3))
     forces = [
         Unknown(f"hip_force_{name}", (PointForces("femur", point[None], axis[None]),))
@@ -136,11 +136,11 @@ def hip(point: Array) -> list[Unknown]:
 
 
 def intersegmental(point: Array, rotation_axes: dict[str, Array]) -> list[Unknown]:
-    """Return the knee's force and moment on the femur, as if one joint carried all of it.
+    """Return the knee's force and moment on the femur, for a knee without contact.
 
     Args:
-        point: (3,) knee centre.
-        rotation_axes: name -> unit axis, the three moments' axes.
+        point: (3,) m, knee centre.
+        rotation_axes: name -> unit axis (3,) of a moment.
     """
     forces = [
         Unknown(f"knee_force_{name}", pair("femur", "tibia", point, axis))
@@ -157,12 +157,11 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
     """Return the patellofemoral force in the femur's sagittal plane.
 
     Args:
-        point: (3,) contact point.
+        point: (3,) m, contact point.
         normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
-        femur_ml: (3,) the femur's ML axis.
+        femur_ml: (3,) unit, medial-lateral axis of the femur.
     """
-    # The second component, along the groove, is zero in a frictionless contact. Its size shows how
-    # far the place is from equilibrium.
+    # The second component, along the groove, is zero for a massless patella in equilibrium.
     tangent = cross(femur_ml, normal)
     return [
         Unknown("patellofemoral", pair("patella", "femur", point, normal)),
@@ -171,14 +170,13 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
 
 
 def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
-    """Return the loads that hold the patella's own weight when the extensor mechanism is slack.
+    """Return the loads that balance the patella's weight if the extensor mechanism is slack.
 
     Args:
-        point: (3,) where it rests on the femur.
-        femur_ml: (3,) the femur's ML axis, normal to the patella's plane.
+        point: (3,) m, contact point on the femur.
+        femur_ml: (3,) unit, medial-lateral axis of the femur.
     """
-    # Any two directions across the medial-lateral axis span what holds an unloaded patella in its
-    # plane.
+    # Any two directions in the sagittal plane serve.
     first = cross(femur_ml, AXES["ap"])
     first /= np.linalg.norm(first)
     return [
@@ -195,12 +193,12 @@ def condyle(side: str, contact: CondylePoint, friction: float) -> Unknown:
 
 
 def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
-    """Return what an exact model would make zero, on the tibia.
+    """Return the residuals, loads on the tibia that are zero in an exact model.
 
     Args:
-        point: (3,) where the residual forces act: midpoint of the contact points.
-        lifted: one condyle is off, a coronal moment takes the place of its force.
-        extensor: muscles act; without them the flexion moment joins the residuals.
+        point: (3,) m, where the residual forces act: the midpoint of the contact points.
+        lifted: whether a condyle is lifted off; a coronal moment then replaces its force.
+        extensor: whether muscles act; without them a flexion moment is one more residual.
     """
     unknowns = [
         Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
@@ -216,13 +214,13 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
 
 @dataclass(frozen=True)
 class LoadStateSettings:
-    """Which parts of the extensor carry load."""
+    """Limits for the signs of the loads."""
 
     force_rounding: float = 1e-6
-    """N: a force of the wrong sign that is smaller counts as zero. Chosen: above rounding."""
+    """N: a smaller force of the wrong sign counts as zero. Chosen: above rounding."""
     patella_moment: float = 0.25
-    """N m: moment of the patella's own weight and inertia, up to 5 N on an arm of 45 mm. Chosen: it
-    separates an extensor that carries from one that is slack."""
+    """N·m: a slack extensor mechanism may lack an extension moment up to this. Chosen: weight and
+    inertia of the patella, up to 5 N on an arm of 45 mm, make such a moment."""
 
 
 LOAD_STATE = LoadStateSettings()
@@ -232,11 +230,11 @@ PATELLAR_LOADS = ("patellar_ligament", "patellofemoral")
 
 
 class LoadState(NamedTuple):
-    """Loads that are zero.
+    """An assumption about which loads are zero.
 
     Args:
-        lifted: sides of the condyles that carry nothing.
-        slack: muscles of the extensor mechanism, where it carries nothing; else empty.
+        lifted: sides of the condyles that carry no load.
+        slack: names of the muscles of a slack extensor mechanism; empty: it is taut.
     """
 
     lifted: frozenset[str]
@@ -244,7 +242,7 @@ class LoadState(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The loads that are zero, in words."""
+        """The zero loads, in words."""
         left_out = [f"{side} lifted" for side in sorted(self.lifted)]
         left_out += [f"{muscle} slack" for muscle in sorted(self.slack)]
         return " and ".join(left_out) or "all loaded"
@@ -253,15 +251,15 @@ class LoadState(NamedTuple):
 def load_states(
     sides: Iterable[str], off: frozenset[str], extensors: Iterable[str]
 ) -> list[LoadState]:
-    """Return the sets to try, fewest zero loads first, a slack muscle before a lifted condyle.
+    """Return the load states to try, the preferred ones first.
 
-    If several sets hold, the first is preferred: the recorded gap shows contact, while nothing
-    recorded shows the muscle's activity.
+    States with fewer zero loads come first, and a slack muscle comes before a lifted condyle: the
+    recorded gap shows contact, while no recording shows the activity of the muscle.
 
     Args:
-        sides: of the condyles that are modelled.
+        sides: names of the modelled condyles.
         off: sides that the recorded gap keeps off the insert.
-        extensors: names of the extensor muscles; none: the mechanism is not modelled.
+        extensors: names of the extensor muscles; empty: they are not modelled.
     """
     near = [side for side in sides if side not in off]
     lifted = [off, *(off | {side} for side in near if len(near) == 2)]
@@ -277,7 +275,7 @@ def _muscles(values: Mapping[str, float]) -> list[str]:
 
 
 def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
-    """Return the contradictions to a set's own assumptions, with their size; empty if they hold."""
+    """Return the loads of the wrong sign in a load state, in words; empty: there is none."""
     if not solution.regular:
         return ["singular equations"]
     values = solution.values
@@ -288,7 +286,7 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
         if values.get(name, 0.0) < -LOAD_STATE.force_rounding
     ]
     if state.slack:
-        # on the tibia, about insert z; without contact it is given on the femur
+        # The residual acts on the tibia, the moment of a knee without contact on the femur.
         extension = values.get("residual_flexion", 0.0) - values.get("knee_moment_flexion", 0.0)
         if extension > LOAD_STATE.patella_moment:
             wrong.append(f"extension moment {extension:.3g} N·m needed")
@@ -298,11 +296,13 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
 def contradictions(
     state: LoadState, solutions: Mapping[LoadState, Solution], off: frozenset[str]
 ) -> list[str]:
-    """Return what is wrong with one of the sets: its signs, or a load left out that would act.
+    """Return why a load state cannot hold, in words; empty: it can.
+
+    A load has the wrong sign, or a load that is assumed to be zero would act with the right sign.
 
     Args:
-        state: the set.
-        solutions: of all sets.
+        state: the load state.
+        solutions: load state -> solution, of all states.
         off: sides that the recorded gap keeps off the insert.
     """
     wrong = wrong_signs(state, solutions[state])

@@ -1,17 +1,17 @@
 """The taut path of a massless string around a bone's convex sagittal outline.
 
-The bone is a general cylinder: a convex polygon in its own x-y plane, extruded along z. The
-string starts at one point, keeps the bone on its right-hand side (seen with x to the right
-and y up: it passes in front of the bone on its way down) and ends at another point. Its
-shortest length is found by unrolling: with S the length of the taut path in the x-y plane,
+The bone is a general cylinder: a convex polygon in its own x-y plane, extruded along z. The string
+passes in front of the bone: seen with x to the right and y up, a string that runs down has the bone
+on its right-hand side. The shortest length follows from unrolling the cylinder. With S the length
+of the taut path in the x-y plane,
 
     L = sqrt(S² + dz²),   z linear in S.
 
-Around a polygon dL is exact and continuous: at a change of the tangent corner, and where
-wrapping begins, both candidate paths coincide, so the moment arm has no jump.
+The length changes continuously: where the tangent corner changes, and where wrapping begins, both
+candidate paths coincide. So the moment arm has no jump.
 
-Frictionless: the tension is the same all along, and the bone is pressed at the corners by
-the change of the string's direction, which has no z component.
+There is no friction: the tension is the same along the string. At each corner the string presses on
+the bone with the change of its direction, which has no z component.
 """
 
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ class TautPath:
     """A taut path at one instant.
 
     Args:
-        points: (m, 3) m, from start to end, with the corners it touches between.
+        points: (m, 3) m, start, touched corners of the outline, end.
         length: m.
-        wrap_angle: rad, by which the bone turns the string in its sagittal plane; 0 if straight.
+        wrap_angle: rad, change of direction in the bone's sagittal plane; 0 if straight.
     """
 
     points: Array
@@ -53,12 +53,12 @@ class TautPath:
 
     @property
     def start_direction(self) -> Array:
-        """Unit vector (3,) that leaves the start: the way a tension pulls the start."""
+        """Unit vector (3,) along the string at its start: a tension pulls the start this way."""
         return np.asarray(self.directions[0])
 
     @property
     def end_direction(self) -> Array:
-        """Unit vector (3,) that arrives at the end: a tension pulls the end the other way."""
+        """Unit vector (3,) along the string at its end: a tension pulls the end the other way."""
         return np.asarray(self.directions[-1])
 
     def moved(self, pose_here_in_there: Array) -> "TautPath":
@@ -74,8 +74,8 @@ def straight_path(start: Array, end: Array) -> TautPath:
 def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
     """Return the taut path around an outline, all in the bone's frame.
 
-    Which way round: the angle swept about the outline's centre from start to end, clockwise
-    (x to the right, y up), is taken between -90 and 270 deg.
+    The clockwise angle from start to end about the outline's centre (x to the right, y up) decides
+    on which side the string passes. It is taken between -90 and 270 deg.
 
     Args:
         start: (3,) m.
@@ -101,7 +101,7 @@ def is_inside(point: Array, outline: Array) -> bool:
 def path_in_link(
     start: Array, end: Array, outline: Array | None, pose_link_in_here: Array
 ) -> TautPath:
-    """Return the taut path between points given here around an outline fixed to a link.
+    """Return the taut path between two points around an outline that is fixed to a link.
 
     Args:
         start: (3,) m, in the frame "here".
@@ -120,7 +120,7 @@ def path_in_link(
 
 @compiled_as_written
 def _height(point: Array, outline: Array, edge: int) -> float:
-    """Return twice the area that an edge spans with a point: negative if it is seen from there."""
+    """Return twice the area of the triangle of an edge and a point; negative: it is outside."""
     following = (edge + 1) % len(outline)
     x, y = point[0] - outline[edge, 0], point[1] - outline[edge, 1]
     return float(x * (point[1] - outline[following, 1]) - y * (point[0] - outline[following, 0]))
@@ -145,8 +145,7 @@ def _sweep(start: Array, end: Array, outline: Array) -> float:
 
 @compiled_as_written
 def _crosses(start: Array, end: Array, outline: Array) -> bool:
-    """Clip the straight segment by the outline's half planes (Cyrus-Beck)."""
-    # Clipping of a segment by the half-planes of a convex polygon (Cyrus and Beck).
+    """Say whether a segment crosses the outline: clipping by half-planes (Cyrus and Beck 1978)."""
     entry_at, exit_at = 0.0, 1.0
     for edge in range(len(outline)):
         above, below = _height(start, outline, edge), _height(end, outline, edge)
@@ -163,9 +162,9 @@ def _crosses(start: Array, end: Array, outline: Array) -> bool:
 def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float, int]:
     """Return the taut path's points (m, 3), length and turn, and which end is inside.
 
-    It is straight where the segment leaves the outline on its right, or never comes to it. Else
-    the edges seen from the start begin (counter-clockwise) at the corner whose tangent has the
-    outline on its right; those seen from the end stop at the corner of the other tangent.
+    The path is straight if the segment misses the outline. Otherwise it touches the outline from
+    the corner of the tangent through the start to the corner of the tangent through the end. At
+    these corners the outline's edges change from visible to hidden.
 
     Args:
         start: (3,) m.
@@ -181,8 +180,6 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
     # deg: more than 90 deg backwards means around the front.
     if _sweep(start, end, outline) >= -0.5 * np.pi and not _crosses(start, end, outline):
         return ends, straight, 0.0, NEITHER
-    # The path leaves the bone at the corners that the ends see as its tangents: there the outline's
-    # edges change from visible to hidden.
     count, first, last = len(outline), -1, -1
     for edge in range(count):
         before, after = (edge - 1) % count, (edge + 1) % count
@@ -194,8 +191,7 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
     points, turn, along = np.empty((corners + 2, 3)), 0.0, np.zeros(corners + 2)
     points[0], points[-1] = start, end
     for corner in range(corners):
-        # The outline is counter-clockwise and the string runs over its front, so against that
-        # order.
+        # The outline is counter-clockwise; the string runs down its front, in the opposite order.
         points[corner + 1, :2] = outline[(first - corner) % count]
     for k in range(1, corners + 2):
         x, y = points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1]
@@ -203,8 +199,7 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
         if k <= corners:
             ahead = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
             turn -= np.arctan2(x * ahead[1] - y * ahead[0], x * ahead[0] + y * ahead[1])
-    # On the unrolled cylinder a geodesic is a straight line: z grows in proportion to the length in
-    # the plane.
+    # The geodesic of the unrolled cylinder is a straight line, so z is linear in the plane length.
     for k in range(1, corners + 1):
         points[k, 2] = start[2] + (end[2] - start[2]) * along[k] / along[-1]
     return points, np.hypot(along[-1], end[2] - start[2]), turn, NEITHER
