@@ -21,15 +21,15 @@ from tkamb.geometry.frames import Array, Mask
 
 @dataclass(frozen=True, eq=False)
 class ContactForces:
-    """What the active set found.
+    """Solution of the contact problem.
 
     Args:
-        force: (n,) N along the normals, >= 0.
-        gap: (n,) m along the normals, >= 0.
+        force: (n,) N, lambda along the normals, >= 0.
+        gap: (n,) m, gamma along the normals, >= 0.
         approach: m, D.
-        active: (n,) nodes in contact.
-        sets: how many sets were solved.
-        converged: whether the set stopped changing.
+        active: (n,) whether a node is in contact.
+        sets: number of active sets that were solved.
+        converged: whether the active set has stopped changing.
     """
 
     force: Array
@@ -48,15 +48,18 @@ def solve_contact(
     active: Mask,
     approach: float = 0.0,
 ) -> ContactForces:
-    """Solve the complementarity problem.
+    """Return forces, gaps and approach that fulfil the contact conditions.
 
     Args:
-        compliance: A (n, n), m/N.
-        gap: (n,) m at zero force and approach.
-        normal_y: c (n,), y of the femoral normals, negative.
+        compliance: (n, n) m/N, A.
+        gap: (n,) m, gap at zero force and approach.
+        normal_y: (n,) 1, c: y of the femoral normals, negative.
         load: N along -y, or None when the approach is given.
         active: (n,) first guess of the nodes in contact.
         approach: m, used when the load is None.
+
+    Raises:
+        LinAlgError: the compliance of the nodes in contact is singular.
     """
     active, seen, careful, done, sets = active.copy(), set[bytes](), False, False, 0
     while True:

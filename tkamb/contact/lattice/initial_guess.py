@@ -1,4 +1,4 @@
-"""Where a solution begins: which nodes may be touched, and what an earlier one left."""
+"""The initial guess of a press: candidate nodes, and the state of an earlier solution."""
 
 from dataclasses import dataclass, replace
 
@@ -13,14 +13,14 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 @dataclass(frozen=True, eq=False)
 class LatticeStart(WarmStart):
-    """Where a solution ended, and the next one of the same problem may begin.
+    """The end of a solution, at which the next solution of the same problem may begin.
 
     Args:
-        problem: whose solution it was; it serves no other.
-        loads: (n, 3) N, nonlinear loads that its last state asks for; None: linear material.
-        moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
-        depth: m, how far the femoral component went below the lowest contact node.
-        region: outside of which h is zero, or None.
+        problem: the problem that was solved. The start is used for no other problem.
+        loads: (n, 3) N, nonlinear loads h + r of the last state; None for a linear material.
+        moved: (c, 3) m, displacement of the candidates; 0 at the other contact nodes.
+        depth: m, distance of the femoral component below the lowest contact node.
+        region: elements outside of which h is zero, or None.
         softening: s, see `Residual`.
     """
 
@@ -33,28 +33,28 @@ class LatticeStart(WarmStart):
 
 
 def lattice_start(state: LatticeState, start: Guess | None) -> LatticeStart | None:
-    """Return the start if it is one of this prepared state; an answer alone is none."""
+    """Return the start if it belongs to this prepared state, else None."""
     own = isinstance(start, LatticeStart) and start.problem is state.problem
     return start if own else None  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """Where the iteration starts.
+    """The state at which the iteration starts.
 
     Args:
-        candidates: (m,) positions among the contact nodes.
-        response: of the candidates to forces on them.
+        candidates: (m,) nodes that may come into contact, as positions among the contact nodes.
+        response: displacements of the candidates under forces on them.
         active: (m,) first guess of the active set.
         planes: femoral planes over the undeformed candidates.
-        loads: (n, 3) h, N, of an earlier solution, or None.
+        loads: (n, 3) N, nonlinear loads h of an earlier solution, or None.
         moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
-        reach: m, every node with a smaller vertical gap is a candidate.
-        region: outside of which h is zero, or None.
+        reach: m; every node with a smaller vertical gap is a candidate.
+        region: elements outside of which h is zero, or None.
+        offset: (m, 3) m, displacement of the candidates without contact forces, or None. For a
+            linear material that has crept.
         softening: s of an earlier solution, see `Residual`.
-        offset: (m, 3) m, displacement of the candidates of a linear material that no contact
-            force made, or None.
-        region_only: the residual of the region is enough, that of the whole solid is not measured.
+        region_only: whether the residual of the region alone stops the iteration.
     """
 
     candidates: Index
@@ -71,7 +71,7 @@ class InitialGuess:
 
     @property
     def cold(self) -> "InitialGuess":
-        """The same without what an earlier solution left."""
+        """The same guess without the state of an earlier solution."""
         return replace(self, loads=None, moved=None, region=None, softening=1.0, region_only=False)
 
 
@@ -88,12 +88,12 @@ def initial_guess(
     """Return candidates, their response and a first active set.
 
     Args:
-        cache: where responses come from.
-        gaps: (c,) vertical gaps, m.
-        planes: over all contact nodes, undeformed.
-        depth: m, how deep the femoral component may go below the lowest gap.
-        at_pose: the femoral component stays at the pose: candidates overlap it already.
-        start: where an earlier solution ended, or None.
+        cache: compliance of the contact nodes.
+        gaps: (c,) m, vertical gaps.
+        planes: femoral planes over all contact nodes, undeformed.
+        depth: m, expected distance of the femoral component below the lowest gap.
+        at_pose: whether the femoral component stays at the pose and overlaps the candidates.
+        start: end of an earlier solution, or None.
         margin: see `LatticeSolverSettings.candidate_margin`.
         region_only: see `InitialGuess`.
     """
@@ -114,9 +114,9 @@ def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: floa
     """Return a depth (m) at which an elastic foundation of modulus E would carry the load.
 
     Args:
-        problem: for the material and the thickness under each node.
-        gaps: (c,) vertical gaps, m.
-        areas: (c,) m².
+        problem: solid; its modulus and the thickness under each node are used.
+        gaps: (c,) m, vertical gaps.
+        areas: (c,) m², area of each contact node.
         load: N.
     """
     order = np.argsort(gaps)
@@ -124,7 +124,7 @@ def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: floa
     thickness = np.maximum(problem.surface_points[order, 1], 1e-3)
     height, k = gaps[order], problem.solid.material.young_modulus * areas[order] / thickness
     total, moment = np.cumsum(k), np.cumsum(k * height)
-    # What all springs so far carry when the next one is reached.
+    # Force of the springs with smaller gaps when the next spring comes into contact.
     last = int(np.searchsorted(total * height - moment, load))
     last = max(min(last, len(order)) - 1, 0)
     return float((load + moment[last]) / total[last] - height[0])

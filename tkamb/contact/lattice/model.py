@@ -52,7 +52,8 @@ from tkamb.units import MILLIMETRE
 TOUCHING = 1e-13
 """m; bodies that overlap by less carry nothing: 1e-6 N at 1e7 N/m."""
 COARSE = 1e-3
-"""From this tolerance on the factor is kept in 16 bits: they leave an imbalance of 3e-4."""
+"""1: from this `tolerance` on the factor is stored in 16-bit integers. What their rounding leaves
+of residual force is stated at `LatticeSolverSettings.force_tolerance`."""
 REACH = 1.08
 """Candidates must cover this many times the approach that was found."""
 

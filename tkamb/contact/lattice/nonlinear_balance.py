@@ -1,18 +1,20 @@
-"""Residual forces of the displaced solid, and the loads that take them away.
+"""Residual forces of the displaced solid, and the nonlinear loads h that make them vanish.
 
-The solid is linear but for loads h that stand for what its material carries less:
+The stiffness is that of the linear solid. Loads h replace the stress that the nonlinear material
+carries less:
 
     K u = f + h,    r = f - f_int(u)
 
 K is the factorised linear stiffness, f the contact forces, f_int the forces of the displaced
 solid under its nonlinear law. At equilibrium r = 0 and h = K u - f_int(u). Every pass solves
-K u = f + h and takes h + r as the next h (modified Newton), accelerated by Anderson's method
-(Walker & Ni, SIAM J Numer Anal 49:1715, 2011, doi:10.1137/10078356X).
+K u = f + h and takes h + s r as the next h (modified Newton), accelerated by Anderson's method
+(Walker & Ni, SIAM J Numer Anal 49:1715, 2011, doi:10.1137/10078356X). The softening s is the ratio
+of secant and tangent stiffness along u, so that K/s approximates the tangent stiffness.
 
-An element's share of h falls with a power of its strain (4.5 for polyethylene). So passes work on
-the `Region` of the elements that count. What the rest asks for, and what the rounding of the
-factor leaves, changes little from pass to pass: it is measured with the whole solid
-(`NonlinearBalance.measure`) and then held constant.
+An element's share of h falls with a power of its strain (4.5 for polyethylene). So passes evaluate
+the `Region` of the elements with the largest shares. The shares of the other elements and the
+residual by rounding of the factor change little from pass to pass. They are measured with the whole
+solid (`NonlinearBalance.measure`) and then held constant.
 """
 
 from dataclasses import dataclass, replace
@@ -28,14 +30,14 @@ from tkamb.geometry.frames import Array, Mask
 
 @dataclass(frozen=True)
 class Residual:
-    """What is measured of a state, and stops the iteration.
+    """The measured residuals of a state. They stop the iteration.
 
     Args:
         force: |f - f_int(u)| over the free unknowns, relative to |f|.
         work: |(f - f_int(u)) · u|, relative to f · u, times the softening
             s = (f_int(u) · u) / (uᵀ K_T u): an estimate of the relative error of the approach.
-        gap: largest distance of an active node from the femoral surface (overlap of the others),
-            relative to the largest displacement of an active node.
+        gap: largest distance of an active node from the femoral surface, or largest overlap of
+            another node, relative to the largest displacement of an active node.
     """
 
     force: float
@@ -46,13 +48,13 @@ class Residual:
     def of(
         cls, outside: Array, field: Array, force: Array, moved: Array, softening: float
     ) -> "Residual":
-        """Return the residual of forces outside of balance.
+        """Return force and work of residual nodal forces.
 
         Args:
-            outside: f - f_int(u) (n, 3), N, zero where held.
-            field: (n, 3) u, m.
-            force: (m, 3) contact forces, N.
-            moved: (m, 3) displacement of their nodes, m.
+            outside: (n, 3) N, f - f_int(u), zero at held unknowns.
+            field: (n, 3) m, u.
+            force: (m, 3) N, contact forces.
+            moved: (m, 3) m, displacement of their nodes.
             softening: s.
         """
         size = max(float(np.linalg.norm(force)), 1e-300)
@@ -71,11 +73,11 @@ class Residual:
 
 
 class LinearBalance:
-    """Hooke's law needs no loads h: only rays and contact are repeated.
+    """The balance of a linear material, which needs no loads h: passes repeat rays and contact.
 
     Attributes:
-        offset: (m, 3) m, displacement of the candidates that no contact force made.
-        moved: (m, 3) m, theirs in all.
+        offset: (m, 3) m, displacement of the candidates without contact forces.
+        moved: (m, 3) m, total displacement of the candidates.
     """
 
     residual, field, loads, region, softening = Residual(0.0), None, None, None, 1.0
@@ -89,24 +91,26 @@ class LinearBalance:
         self.moved = moved
 
     def measure(self) -> None:
-        """There is nothing more to measure."""
+        """Do nothing: the residual of a linear material is zero."""
 
     advance = measure
 
 
 class NonlinearBalance:
-    """The loads h of one solution, brought into balance with the displacement they cause.
+    """The iteration for the nonlinear loads h of one solution.
 
     Args:
         problem: solid and operator.
-        guess: response of the candidates; h of an earlier solution and its region.
+        guess: response of the candidates; h, region and softening of an earlier solution.
         settings: tolerances.
 
     Attributes:
-        moved: (m, 3) m, displacement of the candidates: by the compliance, then as measured.
-        field: (n, 3) m, displacement of the region's nodes; of all after `measure`.
-        residual: force and work of the region; of the whole solid after `measure`.
-        loads: (n, 3) N, h + r after `measure`: where a next solution may begin.
+        moved: (m, 3) m, displacement of the candidates: by the compliance; after `measure` by the
+            factor.
+        field: (n, 3) m, displacement of the region's nodes; after `measure` of all nodes.
+        residual: force and work of the region; after `measure` of the whole solid.
+        loads: (n, 3) N, h + r; after `measure` a start of the next solution.
+        softening: s of the last measurement.
     """
 
     def __init__(
@@ -122,7 +126,7 @@ class NonlinearBalance:
         self._take(self._constant if guess.loads is None else guess.loads)
 
     def _take(self, h: Array) -> None:
-        """Take loads (n, 3), N; on other nodes than the region's they are zero."""
+        """Set h (n, 3), N, on the nodes of the region; it is zero elsewhere."""
         self._h, nodes = np.zeros_like(h), self._region.nodes
         self._h[nodes] = h[nodes]
         self._half = self._problem.operator.start(self._h, self._region.fronts)
@@ -171,22 +175,24 @@ class NonlinearBalance:
         outside[self._candidates] += self._force
         self.loads, self._measured = self._h + outside, True
         self._found(outside)
-        # The factor is kept with less precision than the compliance.
+        # The factor is stored with less precision than the compliance: correct the compliance's
+        # displacement by the difference.
         measured = self.field[self._candidates]
         self._rounding, self.moved = self._rounding + measured - self.moved, measured
 
     def _found(self, outside: Array) -> None:
-        """Note the residual (n, 3), N, relative to the contact forces and their work."""
+        """Set the residual from residual nodal forces (n, 3), N."""
         for loads in (outside, self.loads):
             loads.ravel()[self._problem.held_unknowns] = 0.0
         last, self._size = self.residual, float(np.linalg.norm(self._force))
         new = Residual.of(outside, self.field, self._force, self.moved, self.softening)
-        # The work changes its sign from time to time: it has not fallen more than the force.
+        # The work may vanish by chance where it changes its sign. So it is taken to fall no faster
+        # than the force.
         fall = min(new.force / max(last.force, 1e-300), 1.0) if np.isfinite(last.force) else 0.0
         self.residual = replace(new, work=max(new.work, fall * last.work if fall else 0.0))
 
     def advance(self) -> None:
-        """Take the next loads h: h + s r, accelerated."""
+        """Set the next loads h: h + s r, accelerated."""
         if self._measured:
             self._choose_region()
         nodes = self._region.nodes
@@ -199,7 +205,7 @@ class NonlinearBalance:
         self._take(following)
 
     def _choose_region(self) -> None:
-        """Choose the elements that count, and hold constant what the others ask for."""
+        """Choose the region, and hold the loads of the other elements constant."""
         most = self._settings.force_tolerance * self._size
         if self._region.whole or self._beyond(self._region, self.loads - self._h) > most:
             region = self.region
@@ -214,7 +220,7 @@ class NonlinearBalance:
 
     @property
     def region(self) -> Region:
-        """The elements that count at the displacement that was measured."""
+        """The elements with the largest shares of h at the measured displacement."""
         if not self._measured:
             return self._region
         settings, shares = self._settings, self._shares
@@ -255,11 +261,11 @@ def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
 
 
 def elements_that_count(size: Array, allowed: float) -> Mask:
-    """Return which elements (c,) count: all but the smallest, which together are below a bound.
+    """Return which elements (c,) belong to the region: all but the smallest shares of h.
 
     Args:
-        size: (c,) norm of each element's share of h, N.
-        allowed: N, root of the sum of squares of those left out.
+        size: (c,) N, norm of each element's share of h.
+        allowed: N, largest root of the sum of squares of the shares that are left out.
     """
     order = np.argsort(size)
     counts = np.zeros(len(size), bool)

@@ -1,14 +1,14 @@
-"""The lattice's contact at neighbouring poses, with its stiffness while the nodes stay in contact.
+"""The lattice's contact at neighbouring poses, and its stiffness for an unchanged active set.
 
 A femoral displacement v(x) = t + r cross x moves the contact's planes. Nodes in contact stay on
 them; with n the femoral normals, lambda the forces along them and C the compliance of the nodes,
 
     dF = n dlambda + lambda dn,    n . (C dF - v) = 0,    dn = r cross n - G (v - n (n . v)),
 
-G the change of the femoral normal along the surface: the femur slides over the nodes, which are
-taken to move along the normal only. C is that of the linear operator. A material that has
-softened is softer than this stiffness says, and nodes come into contact or leave it: the forces
-are those of `evaluate`, the stiffness is a guide to where they vanish.
+G the change of the femoral normal along the surface. The femur slides over the nodes, which are
+assumed to move along the normal only. C is the compliance of the linear operator. A softened
+material is softer than this stiffness, and nodes may come into contact or leave it. So the forces
+come from `evaluate`, and the stiffness only gives the direction of the search.
 """
 
 from dataclasses import replace
@@ -24,19 +24,19 @@ from tkamb.contact.result import ContactResult, Guess, WarmStart, medial_points
 from tkamb.geometry.frames import Array, Index
 
 TURN_STEP = 5e-5
-"""m: between the places where femoral normals are compared; well below a cell."""
+"""m: step of the finite difference of femoral normals. Chosen: well below a cell."""
 REGION_HOLDS_WITHIN = 0.1
-"""Of a cell: how far a search may go from the pose at which the whole solid was measured last. Up
-to there the residual of the whole solid stays within 1.2 times the tolerance
+"""Cells: largest distance of a search from the pose at which the whole solid was measured last.
+Within it the residual of the whole solid stays within 1.2 times the tolerance
 (`tests/test_lattice_probe.py`), and an evaluation takes half the time."""
 REGION_HOLDS_TO = 1.1
-"""How much the contact forces may have grown since."""
+"""1: largest ratio of the contact forces to those at that pose."""
 LEVER_ARM = 0.03
 """m, from the femoral axis to the contact: turns a rotation into a distance."""
 
 
 class FindsForces(Presses, Protocol):
-    """A model that can leave out all but the forces."""
+    """A contact model that can compute the forces alone."""
 
     def evaluate_from(
         self, state: Any, pose: Array, start: Guess | None = None, forces_only: bool = False
@@ -51,7 +51,7 @@ class LatticeProbe(Probe):
         model: of the lattice family, nodes pressed along the femoral normal.
         state: what its `prepare` returned.
         start: an earlier result or warm start.
-        accuracy: the model's tolerance, share of the contact force.
+        accuracy: 1, the model's tolerance, as a share of the contact force.
     """
 
     def __init__(
@@ -63,10 +63,10 @@ class LatticeProbe(Probe):
         """Pose at which the whole solid was measured last, and norm of the forces there, N."""
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
-        """Return the forces at a pose; the whole solid is measured unless that was done near by."""
+        """Return the forces at a pose. Near the last measured pose, measure the region alone."""
         if self._measured is not None:
             way = (pose - self._measured[0])[:3] * [LEVER_ARM, LEVER_ARM, LEVER_ARM, 1.0]
-            way[1, 3] = 0.0  # what the height changes, the forces tell
+            way[1, 3] = 0.0  # a change of height is seen in the forces
             if np.linalg.norm(way) <= REGION_HOLDS_WITHIN * self._state.lattice.spacing.min():
                 result, start = self._finds.evaluate_from(self._state, pose, self.start, True)
                 if np.linalg.norm(result.nodal_force) <= REGION_HOLDS_TO * self._measured[1]:
@@ -76,7 +76,7 @@ class LatticeProbe(Probe):
         return result, start
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
-        """Return what a result says of the condyles, with their stiffness."""
+        """Return the condyles' forces of a result, with their stiffness."""
         condyles = condyle_wrenches(result, self._state.pair.split)
         exact = self._state.problem.solid.material.is_linear
         nodes = np.flatnonzero(result.nodal_force.any(axis=1))
@@ -104,7 +104,7 @@ def force_changes(state: LatticeState, result: ContactResult, moved: Array, node
         state: prepared contact.
         result: a contact that converged.
         moved: (c, 3) m, displacement of the contact nodes there.
-        nodes: (m,) the contact nodes that carry.
+        nodes: (m,) loaded contact nodes.
 
     Returns:
         N per m of its point at the insert's origin, then N per rad.
@@ -133,7 +133,7 @@ def force_changes(state: LatticeState, result: ContactResult, moved: Array, node
 def _normal_gradient(problem: ContactProblem, where: Array, pose: Array) -> Array:
     """Return the change (m, 3, 3) of the femoral normal per m along x, y and z; 0 along y.
 
-    Where a place lies beside the femoral component the normal is taken not to change.
+    Beside the femoral component the normal is assumed not to change.
     """
     gradient = np.zeros((len(where), 3, 3))
     for axis in (0, 2):

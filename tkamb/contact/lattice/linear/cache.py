@@ -70,7 +70,8 @@ class FactorCacheSettings:
     part of a usual disk."""
     largest_error: float = 2e-3
     """1: largest relative error of an operator that is read (`operator_error`). Chosen: storage in
-    16 bits leaves 5e-4 for every Poisson's ratio and bearing; four times that is a damaged file."""
+    16 bits leaves 5e-4 (random displacement) for every Poisson's ratio and bearing; four times that
+    is a damaged file."""
     orphan_seconds: float = 60.0
     """s: age from which a half-written file that nobody has locked is removed. Chosen: writing a
     file takes less."""
