@@ -16,7 +16,7 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import Array, pose
 from tkamb.geometry.surface import Surface
-from tkamb.studies.bodies import Height, block
+from tkamb.studies.cases import Height, block
 from tkamb.units import DEGREE, MILLIMETRE
 
 Situation = Literal["interior", "flank", "edge"]

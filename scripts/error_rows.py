@@ -14,7 +14,7 @@ from error_cases import ErrorCase, error_cases
 from tkamb.contact.flags import TOO_NARROW
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import InputError
-from tkamb.studies.quantities import Quantities, errors, quantities
+from tkamb.studies.measures import Quantities, errors, quantities
 
 
 @dataclass(frozen=True)

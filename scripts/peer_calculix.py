@@ -29,11 +29,10 @@ from tkamb.contact.pair import ContactPair  # noqa: E402
 from tkamb.contact.registry import contact_model  # noqa: E402
 from tkamb.files import claim_directory, write_text  # noqa: E402
 from tkamb.geometry.memory import peak_rss  # noqa: E402
-from tkamb.studies.calculix import find_program  # noqa: E402
+from tkamb.studies.calculix import find_program, press_by_calculix  # noqa: E402
 from tkamb.studies.cases import StudyCase  # noqa: E402
 from tkamb.studies.kept_rows import KeptRows, row_key  # noqa: E402
 from tkamb.studies.measures import ONE_THREAD  # noqa: E402
-from tkamb.studies.peer import press_by_calculix  # noqa: E402
 from tradeoff_blocks import with_block  # noqa: E402
 
 PEER = "CalculiX C3D8I"

@@ -20,7 +20,7 @@ from tkamb.show.tradeoff_report import (
 )
 from tkamb.studies.body_trade import HEADS as BODY_HEADS
 from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.row import KEYS, TIMING, Row, beats, on_front
+from tkamb.studies.tradeoff import KEYS, TIMING, Row, beats, on_front
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")

@@ -15,9 +15,8 @@ from tkamb.io.opensim.motion import CoordinateMotion
 from tkamb.io.opensim.read import read_osim
 from tkamb.io.recordings.filtering import differentiate_coordinates
 from tkamb.io.recordings.ground_reaction import GroundReaction, load_ground_reaction
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.io.recordings.tables import read_table
-from tkamb.io.scene.recording_tables import GroundReactionTable
-from tkamb.io.scene.si import in_si
 from tkamb.run.muscles.leg import foot_loads
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
@@ -52,10 +51,8 @@ def gait(start: float = 1.9, end: float = 4.2) -> Gait:
     q = differentiate_coordinates(time, fit.state, CUTOFF_HZ, inside)[0]
     reactions = {
         side: load_ground_reaction(
-            in_si(
-                GroundReactionTable(
-                    file=path, plates=plates, laboratory_axes=AXES, cutoff_Hz=CUTOFF_HZ
-                )
+            GroundReactionTable(
+                file=path, plates=plates, laboratory_axes=AXES, cutoff_Hz=CUTOFF_HZ
             ),
             inside,
             "right",

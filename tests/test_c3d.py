@@ -12,10 +12,9 @@ from tkamb.errors import InputError
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
 from tkamb.io.recordings.markers import matched_labels
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.io.recordings.samples import OddSample
 from tkamb.io.recordings.tables import read_table
-from tkamb.io.scene.recording_tables import GroundReactionTable
-from tkamb.io.scene.si import in_si
 from tkamb.run.plausibility.movement import sample_questions
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
@@ -111,14 +110,14 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
         file=path, plates=(1, 2), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
     )
     time = read_c3d(path).analog_time
-    ground = load_ground_reaction(in_si(table), time, "right")
+    ground = load_ground_reaction(table, time, "right")
     force, point, free = pushes()
     into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     np.testing.assert_allclose(ground.force, force @ into.T, atol=1e-3)
     np.testing.assert_allclose(ground.point, point @ into.T, atol=1e-5)
     np.testing.assert_allclose(ground.moment[:, 1], free, atol=1e-3)
     assert ground.loaded.all()
-    on_plate = in_si(table.model_copy(update={"force": "on the plate"}))
+    on_plate = table.model_copy(update={"force": "on the plate"})
     with pytest.raises(InputError, match="leave out force"):
         load_ground_reaction(on_plate, time, "right")
 
@@ -147,7 +146,7 @@ def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
             cutoff_Hz="none",
             surface_mm=surface,
         )
-        both[surface] = load_ground_reaction(in_si(table), np.array([0.05, 0.1]), "right")
+        both[surface] = load_ground_reaction(table, np.array([0.05, 0.1]), "right")
     flat, step = both.values()
     np.testing.assert_allclose(step.force, flat.force)
     np.testing.assert_allclose(step.point[:, 1] - flat.point[:, 1], 0.4)
@@ -159,7 +158,7 @@ def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
         np.testing.assert_allclose(found.moment[:, [0, 2]], 0.0, atol=1e-9)
     table = GroundReactionTable(file=tmp_path / "x.mot", cutoff_Hz="none", surface_mm=1.0)
     with pytest.raises(InputError, match="surface_mm"):
-        load_ground_reaction(in_si(table), np.array([0.05]), "right")
+        load_ground_reaction(table, np.array([0.05]), "right")
 
 
 def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
@@ -168,7 +167,7 @@ def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none", unloaded_N=195.0
     )
     recording = read_c3d(path)
-    ground = load_ground_reaction(in_si(table), recording.analog_time, "right")
+    ground = load_ground_reaction(table, recording.analog_time, "right")
     assert 0 < ground.loaded.sum() < len(ground.loaded)
     into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     about = ground.moment + np.cross(ground.point, ground.force)
@@ -288,7 +287,7 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, mistake):
 def test_the_plates_must_be_named_and_there(tmp_path, plates, words):
     table = GroundReactionTable(file=two_plates(tmp_path), plates=plates, cutoff_Hz="none")
     with pytest.raises(InputError, match=words):
-        load_ground_reaction(in_si(table), np.zeros(1), "right")
+        load_ground_reaction(table, np.zeros(1), "right")
 
 
 def test_a_plate_that_pushes_down_is_refused(tmp_path):
@@ -298,7 +297,7 @@ def test_a_plate_that_pushes_down_is_refused(tmp_path):
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
     )
     with pytest.raises(InputError, match="down"):
-        load_ground_reaction(in_si(table), np.array([0.05]), "right")
+        load_ground_reaction(table, np.array([0.05]), "right")
 
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's recordings are not beside the project")

@@ -17,8 +17,7 @@ from tkamb.run.decks.febio import contact_quads
 from tkamb.run.decks.frame import frame_press
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
-from tkamb.studies.calculix import run_calculix
-from tkamb.studies.peer import peer_result
+from tkamb.studies.calculix import peer_result, run_calculix
 
 COARSE_MM = 4.0
 WITH_CALCULIX = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")

@@ -15,7 +15,7 @@ from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import inverse, knee_pose, pose, transform
 from tkamb.io.recordings.meshes import load_surface
 from tkamb.io.scene import load_scene
-from tkamb.studies.designs.sagittal import normal
+from tkamb.studies.designs.femoral import normal
 
 ROOT = Path(__file__).parents[1]
 MODEL = ROOT / "models" / "deep_knee_bend"

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from design_radii import circle_radius, measured_radii
 from tkamb.cli import main
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
 from tkamb.geometry.post import find_post
 from tkamb.io.recordings.meshes import load_surface
 from tkamb.studies.designs.design import load_design
-from tkamb.studies.designs.radii import circle_radius, measured_radii
-from tkamb.studies.designs.sagittal import SagittalProfile
+from tkamb.studies.designs.femoral import SagittalProfile
 from validation.design_cells import Assumption, PressedDesign, nominal, table_force
 from validation.design_tables import FOLDERS, pairs_in_order
 from validation.dissertation import designs

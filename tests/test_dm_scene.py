@@ -18,7 +18,6 @@ from tkamb.io.recordings.tables import read_table
 from tkamb.io.recordings.tibia import load_tibia
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.io.scene.si import in_si
 from tkamb.knee.ligaments import build_ligaments, quadratic_toe_force
 from tkamb.run.plausibility.movement import marker_questions
 
@@ -89,7 +88,7 @@ def test_the_mirrored_reading_closes_the_gaps_as_well_and_half_of_it_does_not():
     spread = {}
     for turned in ((), roles[:1], roles[1:2], roles):
         table = mirrored.motion.model_copy(update={"signs_turned": turned})
-        motion = load_motion(in_si(table), "right", placed @ turn, turn)
+        motion = load_motion(table, "right", placed @ turn, turn)
         found = [query.at(place) for place in knee_pose(motion.raw_coordinates[62:101:3])]
         spread[turned] = 1e3 * np.std([gap.medial.gap - gap.lateral.gap for gap in found])
     assert spread[roles] == pytest.approx(spread[()], abs=0.05)
@@ -163,8 +162,8 @@ def test_stride_is_the_most_representative_one():
     vertical = plate.column("ground_force_2_vy")
     strikes = plate.time()[1:][(vertical[1:] >= 20) & (vertical[:-1] < 20)]
     at = np.linspace(strikes[:-1], strikes[1:], 50, endpoint=False, axis=1).ravel()
-    force = load_ground_reaction(in_si(scene.ground_reaction), at, "right").force
-    up = load_tibia(in_si(scene.tibia), at, "right", 6.0).pose[:, :3, 1]
+    force = load_ground_reaction(scene.ground_reaction, at, "right").force
+    up = load_tibia(scene.tibia, at, "right", 6.0).pose[:, :3, 1]
     lean = np.arctan2(up[:, [0, 2]], up[:, [1]])
     strides = len(strikes) - 1
     forces, leans = force.reshape(strides, 50, 3), lean.reshape(strides, 50, 2)

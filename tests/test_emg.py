@@ -12,8 +12,7 @@ from recordings import write_c3d
 from shared_trials import STRENGTHS, two_flexors
 from tkamb.errors import InputError
 from tkamb.io.recordings.measured import Envelopes, envelope, load_envelopes
-from tkamb.io.scene.measured import EmgTable
-from tkamb.io.scene.si import in_si
+from tkamb.io.recordings.recording_tables import EmgTable
 from tkamb.run.muscles.sharing import SHARING, EmgGuide
 from tkamb.run.recorded import compare_emg, fitted_normalisation
 
@@ -93,12 +92,12 @@ def test_channels_of_a_c3d_stand_on_its_clock_over_their_largest_value(tmp_path)
     path = write_c3d(
         tmp_path / "a.c3d", markers, first_frame=50, ratio=12, analog={"VL": 3e-4 * burst(1.5)}
     )
-    found = load_envelopes(in_si(table(path, offset_s=0.04)), TIME)
+    found = load_envelopes(table(path, offset_s=0.04), TIME)
     values = found.values["VL"]
     assert values.max() == pytest.approx(1.0)
     assert found.time[values.argmax()] == pytest.approx(0.5 + 0.04 + 1.5, abs=0.01)
     assert np.isnan(found.at("vaslat", np.array([0.5, 4.6]))).all()
-    given = load_envelopes(in_si(table(path, normalised_by={"VL": 3e-4})), TIME)
+    given = load_envelopes(table(path, normalised_by={"VL": 3e-4}), TIME)
     assert given.values["VL"].max() < 2 / np.pi
 
 
@@ -106,14 +105,14 @@ def test_a_table_serves_as_well(tmp_path):
     path = tmp_path / "emg.csv"
     rows = [f"{t:.6f},{v:.9f}," for t, v in zip(TIME, burst(2.0), strict=True)]
     path.write_text("\n".join(["clock,VL,", *rows]).replace("VL,", "VL"), encoding="utf-8")
-    found = load_envelopes(in_si(table(path, time="clock")), TIME)
+    found = load_envelopes(table(path, time="clock"), TIME)
     assert found.time[found.values["VL"].argmax()] == pytest.approx(2.0, abs=0.01)
     with pytest.raises(
         InputError, match=r"from 9 to 12.9992 s, the motion lasts from 0 to .*offset_s"
     ):
-        load_envelopes(in_si(table(path, time="clock", offset_s=9.0)), TIME)
+        load_envelopes(table(path, time="clock", offset_s=9.0), TIME)
     with pytest.raises(InputError, match="no column 'VM'"):
-        load_envelopes(in_si(table(path, time="clock", channels={"VM": ("vasmed",)})), TIME)
+        load_envelopes(table(path, time="clock", channels={"VM": ("vasmed",)}), TIME)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.3, -1e-4])
@@ -123,7 +122,7 @@ def test_an_electrode_that_gave_one_value_throughout_is_no_signal(tmp_path, leve
     path = tmp_path / "flat.csv"
     path.write_text("\n".join(["time,VL", *(f"{t:.6f},{level}" for t in TIME)]), encoding="utf-8")
     with pytest.raises(InputError, match="'VL' holds no signal"):
-        load_envelopes(in_si(table(path, high_pass_Hz=high_pass)), TIME)
+        load_envelopes(table(path, high_pass_Hz=high_pass), TIME)
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ import pytest
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
-from tkamb.io.scene.recording_tables import GroundReactionTable
-from tkamb.io.scene.si import in_si
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 
 STAMPS = np.arange(2401) / 1200
 AT = np.linspace(0.2, 1.8, 33)
@@ -31,9 +30,7 @@ def write(path, force, point, moment, stamps=STAMPS):
 
 
 def plate(file, **changes):
-    return in_si(
-        GroundReactionTable(**({"file": file, "length_unit": "m", "cutoff_Hz": 50.0} | changes))
-    )
+    return GroundReactionTable(**({"file": file, "length_unit": "m", "cutoff_Hz": 50.0} | changes))
 
 
 def about_origin(reaction):

@@ -18,7 +18,6 @@ from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.scene import lines
 from tkamb.io.scene.case import Case, load_case
 from tkamb.io.scene.scene import Scene, load_scene
-from tkamb.io.scene.si import in_si
 from tkamb.knee import contact_points, patellofemoral
 from tkamb.knee import equations as knee
 from tkamb.knee.chain import Chain
@@ -182,7 +181,7 @@ def scaled_scene(scene: Scene) -> Scene:
 
 def scaled_chain(case: Case) -> Chain:
     """Return the chain with placements, inertias and gravity in the new units."""
-    chain = Chain(load_urdf(in_si(case.scene.patient), True), True)
+    chain = Chain(load_urdf(case.scene.patient, True), True)
     model = chain.model
     for joint in range(model.njoints):
         place, inertia = model.jointPlacements[joint], model.inertias[joint]

@@ -4,7 +4,7 @@ import numpy as np
 
 from tkamb.contact.lattice.meshing.contact_map import contact_map
 from tkamb.contact.lattice.meshing.grid import build_grid
-from tkamb.studies.bodies import block, dishes, flat
+from tkamb.studies.cases import block, dishes, flat
 
 RADIUS, THICK = 34e-3, 8e-3
 

@@ -15,7 +15,8 @@ from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.io.recordings.urdf_check import _check_attributes
 from tkamb.io.toml_text import parse_toml
 from tkamb.run.guard import guarded
-from tkamb.studies.wear.kept import STATE_NAME, kept_state
+from tkamb.studies.wear.report import STATE_NAME
+from tkamb.studies.wear.run import kept_state
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ from pydantic import ValidationError
 from synthetic_run import make_run
 from tkamb.errors import InputError
 from tkamb.io.recordings.measured import load_measured_force
-from tkamb.io.scene.measured import MeasuredTable
-from tkamb.io.scene.si import in_si
+from tkamb.io.recordings.recording_tables import MeasuredTable
 from tkamb.run.recorded import compare_measured, comparison_words, measured_column
 from tkamb.run.results import Results
 from tkamb.show.axis import horizontal_axis
@@ -22,7 +21,7 @@ def read(path, at, content="time,a,b\n0,10,1\n1,20,2\n2,30,3\n3,40,4\n4,50,5\n",
     path.write_text(content, encoding="utf-8")
     table = {"file": path, "unit": "N", "offset_s": 0.0, "columns": {"total": "a"}} | changes
     at = np.asarray(at, float)
-    return load_measured_force(in_si(MeasuredTable(**table)), at).at(at)
+    return load_measured_force(MeasuredTable(**table), at).at(at)
 
 
 def test_forces_are_sums_in_newton_on_the_motions_clock(tmp_path):

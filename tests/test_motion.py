@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, mirrored_pose, pose
 from tkamb.io.recordings.motion import load_motion
-from tkamb.io.scene.recording_tables import MotionTable
-from tkamb.io.scene.si import in_si
+from tkamb.io.recordings.recording_tables import MotionTable
 
 TIME = np.linspace(0, 3, 101)
 EYE = np.eye(4)
@@ -64,7 +63,7 @@ def pose_columns(poses, sequence, time=TIME):
 
 def coordinates_table(file, **changes):
     keys = {"file": file, "angle_unit": "deg", "length_unit": "mm", "cutoff_Hz": "none"}
-    return in_si(MotionTable(**(keys | changes)))
+    return MotionTable(**(keys | changes))
 
 
 def pose_table(file, sequence="XYZ", **changes):

@@ -10,8 +10,7 @@ from knees import INERTIA, leg_urdf, random_motion
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose
 from tkamb.io.recordings.patient import load_urdf, segment_inertia
-from tkamb.io.scene.si import in_si
-from tkamb.io.scene.tables import PatientTable
+from tkamb.io.recordings.recording_tables import PatientTable
 from tkamb.knee.chain import Chain, ChainMotion
 
 LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia"/></joint>'
@@ -20,7 +19,7 @@ LOOP = '<joint name="loop" type="fixed"><parent link="femur"/><child link="tibia
 def table(tmp_path, text, side="right", **more):
     path = tmp_path / "leg.urdf"
     path.write_text(text)
-    return in_si(PatientTable(urdf=path, side=side, mass_kg=75.0, **more))
+    return PatientTable(urdf=path, side=side, mass_kg=75.0, **more)
 
 
 def left(text):
@@ -130,6 +129,6 @@ def test_missing_sex_is_asked_for(tmp_path):
 
 
 def test_missing_file_is_named(tmp_path):
-    nowhere = in_si(PatientTable(urdf=tmp_path / "none.urdf", side="right", mass_kg=75.0))
+    nowhere = PatientTable(urdf=tmp_path / "none.urdf", side="right", mass_kg=75.0)
     with pytest.raises(InputError, match=r"none\.urdf: no such URDF"):
         load_urdf(nowhere, True)

@@ -18,11 +18,9 @@ from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
 from tkamb.run.decks.calculix import Deck
 from tkamb.run.decks.problem import press_problem
-from tkamb.studies import peer
-from tkamb.studies.bodies import balls, block, dishes
-from tkamb.studies.calculix import PeerRun, run_calculix
-from tkamb.studies.cases import study_case
-from tkamb.studies.peer import measure_by_calculix, press_by_calculix
+from tkamb.studies import calculix as peer
+from tkamb.studies.calculix import PeerRun, measure_by_calculix, press_by_calculix, run_calculix
+from tkamb.studies.cases import balls, block, dishes, study_case
 from tkamb.studies.references import read_references
 from tkamb.studies.tradeoff import run_peer
 

@@ -8,9 +8,8 @@ from test_c3d import COUNT, RATIO, plate_signals, pushes
 from tkamb.errors import InputError
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.io.recordings.unit_words import GivenUnits, metres, newton_metres, newtons
-from tkamb.io.scene.recording_tables import GroundReactionTable
-from tkamb.io.scene.si import in_si
 from tkamb.run.plausibility.movement import drift_questions
 
 ORIGIN = np.array([0.003, -0.002, -0.03])
@@ -205,8 +204,8 @@ def test_an_unloaded_plate_does_not_enter_the_sum_and_drift_is_told(tmp_path, le
         cutoff_Hz="none",
     )
     time = read_c3d(table.file).analog_time
-    ground = load_ground_reaction(in_si(table), time, "right")
-    own = load_ground_reaction(in_si(table.model_copy(update={"plates": (1,)})), time, "right")
+    ground = load_ground_reaction(table, time, "right")
+    own = load_ground_reaction(table.model_copy(update={"plates": (1,)}), time, "right")
     np.testing.assert_allclose(ground.force, own.force, atol=1e-6)
     np.testing.assert_allclose(ground.moment, own.moment, atol=1e-6)
     assert np.abs(ground.force[:5]).max() < 1e-9  # nobody stands on either
@@ -225,7 +224,7 @@ def test_light_loads_all_along_are_no_drift(tmp_path):
     table = GroundReactionTable(
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
     )
-    ground = load_ground_reaction(in_si(table), read_c3d(path).analog_time, "right")
+    ground = load_ground_reaction(table, read_c3d(path).analog_time, "right")
     np.testing.assert_allclose(ground.force[:, 1], signals[2], atol=1e-3)
     assert ground.drift == {}
 
@@ -244,9 +243,9 @@ def test_samples_that_are_no_numbers_matter_only_among_the_frames(tmp_path, wher
     frames = np.linspace(0.04, 0.15, 30)
     if where == "middle":
         with pytest.raises(InputError, match=r"not a number at 0\.09"):
-            load_ground_reaction(in_si(table), frames, "right")
+            load_ground_reaction(table, frames, "right")
         return
-    ground = load_ground_reaction(in_si(table), frames, "right")
+    ground = load_ground_reaction(table, frames, "right")
     time = np.arange(COUNT * RATIO) / 1000.0
     np.testing.assert_allclose(
         ground.force[:, 1], np.interp(frames, time, pushes()[0][:, 2]), atol=0.05

@@ -1,24 +1,27 @@
 """The scene: overrides, what belongs together, and the page that documents it."""
 
+import ast
 import json
 import runpy
-from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydantic import Field
 
 from scenes import MODEL, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, transform
+from tkamb.io.recordings import recording_tables
 from tkamb.io.recordings.meshes import load_surface
-from tkamb.io.scene import lines
+from tkamb.io.recordings.scene_table import SceneTable
+from tkamb.io.recordings.tibia import load_tibia
+from tkamb.io.scene import lines, tables
+from tkamb.io.scene import scene as scene_module
 from tkamb.io.scene.case import load_case
-from tkamb.io.scene.recording_tables import TibiaTable
 from tkamb.io.scene.scene import load_scene
-from tkamb.io.scene.si import CLASSES, in_si, si_names
 
 ROOT = Path(__file__).parents[1]
 
@@ -147,20 +150,48 @@ def test_the_case_leaves_the_scene_as_its_file_has_it(tmp_path):
     assert left.patellar_ligament == scene.patellar_ligament
 
 
-@pytest.mark.parametrize("table", CLASSES)
-def test_every_key_of_a_recording_has_a_field_that_its_reader_sees(table):
-    assert {name for name, _ in si_names(table).values()} == {
-        one.name for one in fields(CLASSES[table])
-    }
+DECLARING = (recording_tables, tables)
+"""Modules that declare the tables whose keys are read one by one."""
 
 
-def test_a_key_that_no_reader_would_see_is_an_error(monkeypatch):
-    """A key that is declared in the table alone used to be read and passed over."""
+def table_classes():
+    """Return the tables of the scene, without those that are handed on whole."""
+    for module in DECLARING:
+        for table in vars(module).values():
+            own = isinstance(table, type) and table.__module__ == module.__name__
+            if own and issubclass(table, SceneTable) and table is not tables.MaterialTable:
+                yield table
 
-    class MoreTable(TibiaTable):
-        tilt_deg: float = 0.0
 
-    monkeypatch.setitem(CLASSES, MoreTable, CLASSES[TibiaTable])
-    table = MoreTable(kind="sagittal", file="lean.csv", tilt_deg=3.0)
-    with pytest.raises(TypeError, match=r"MoreTable.tilt_deg: no field ShankRecording.tilt"):
-        in_si(table)
+def test_every_key_is_read_somewhere():
+    """A key that is declared but not read would be ignored without a word."""
+    read = set()
+    for path in (ROOT / "tkamb").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) != "self":
+                read.add(node.attr)
+    for table in table_classes():
+        assert not table.model_fields.keys() - read, table
+
+
+def test_a_key_is_declared_in_one_place(tmp_path, monkeypatch):
+    """The reader gets a new key of its table, and the page of the scene names it."""
+
+    class LongerTable(recording_tables.TibiaTable):
+        tilt_deg: float = Field(0.0, description="tilt of the floor")
+
+    class LongerScene(scene_module.Scene):
+        tibia: LongerTable | None = None
+
+    given = []
+
+    def reader(table, *rest):
+        given.append(table)
+        return load_tibia(table, *rest)
+
+    monkeypatch.setattr(scene_module, "Scene", LongerScene)
+    monkeypatch.setattr("tkamb.io.recordings.tibia.load_tibia", reader)
+    load_case(load_scene(write_scene(tmp_path), {"tibia.tilt_deg": 3.0, "motion.frames": 3}))
+    assert [table.tilt_deg for table in given] == [3.0]
+    page = runpy.run_path(str(ROOT / "scripts" / "make_scene_page"))["page"]()
+    assert "| `tilt_deg` | number | `0.0` | tilt of the floor |" in page

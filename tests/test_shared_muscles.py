@@ -162,7 +162,6 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
         "tkamb.run.muscles",
         "tkamb.io.opensim",
         "tkamb.io.recordings.measured",
-        "tkamb.io.recordings.measured",
         "tkamb.run.recorded",
     )
     code = (

@@ -13,10 +13,10 @@ from tkamb.contact.lattice import model, report, solver
 from tkamb.contact.lattice.active_set import _forces_of, solve_contact
 from tkamb.contact.lattice.linear import cache
 from tkamb.contact.materials import RambergOsgood
-from tkamb.studies.audit import PEER_BOUNDS, complaints, peer_distances
 from tkamb.studies.closed_forms import CLOSED_FORM, ClosedForm, closed_forms, press_closed_form
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.stability import judge_safely, stored_verdicts
+from tkamb.studies.verdict import PEER_BOUNDS, complaints, peer_distances
 
 PLATES = [
     ClosedForm("plate", name) for name in ("lattice", "lattice-linear", "fe", "lattice-source")
@@ -108,7 +108,7 @@ def test_calculix_s_answers_hold_the_lattice_and_notice_a_changed_case():
 
 
 def test_a_stored_answer_to_another_case_is_no_reference(monkeypatch):
-    monkeypatch.setattr("tkamb.studies.audit.body_hash", lambda extreme: "another")
+    monkeypatch.setattr("tkamb.studies.verdict.body_hash", lambda extreme: "another")
     verdict = judge_safely(PEERED)
     assert verdict.kind == "unverified" and "make_stability_answers" in verdict.reason
 

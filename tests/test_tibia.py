@@ -7,9 +7,8 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose, pose, transform
 from tkamb.io.recordings.markers import fit_rigid
+from tkamb.io.recordings.recording_tables import JointCentreTable, TibiaTable
 from tkamb.io.recordings.tibia import load_tibia
-from tkamb.io.scene.recording_tables import JointCentreTable, TibiaTable
-from tkamb.io.scene.si import in_si
 
 STAMPS = np.arange(241) / 120
 AT = np.linspace(0.5, 1.5, 21)
@@ -52,7 +51,7 @@ def marker_file(path, poses, markers=MARKERS):
 
 
 def marker_table(file, **changes):
-    return in_si(TibiaTable(**({"kind": "markers", "file": file, "markers_mm": MARKERS} | changes)))
+    return TibiaTable(**({"kind": "markers", "file": file, "markers_mm": MARKERS} | changes))
 
 
 def test_markers_give_pose_and_rates(tmp_path):
@@ -128,7 +127,7 @@ def test_columns_of_poses(tmp_path):
     lines = [",".join(names), *(",".join(f"{v:.15g}" for v in row) for row in rows)]
     file = tmp_path / "p.csv"
     file.write_text("\n".join(lines), encoding="utf-8")
-    table = in_si(TibiaTable(kind="pose", file=file, sequence="ZXY", length_unit="mm"))
+    table = TibiaTable(kind="pose", file=file, sequence="ZXY", length_unit="mm")
     tibia = load_tibia(table, AT, "right", "none")
     np.testing.assert_allclose(tibia.pose, shank(AT), atol=1e-8)
     assert tibia.residual is None
@@ -141,9 +140,7 @@ def lean_file(path):
 
 
 def test_sagittal_lean_is_forward_about_a_fixed_ankle(tmp_path):
-    table = in_si(
-        TibiaTable(kind="sagittal", file=lean_file(tmp_path / "l.csv"), ankle_mm=(10, 80, 90))
-    )
+    table = TibiaTable(kind="sagittal", file=lean_file(tmp_path / "l.csv"), ankle_mm=(10, 80, 90))
     tibia = load_tibia(table, AT, "right", "none")
     lean = 0.5 * np.sin(2 * AT)
     knee = transform(tibia.pose, np.array([0, 0.4, 0]))
@@ -166,7 +163,7 @@ def test_left_shank_is_mirrored_to_the_same_arrays(tmp_path):
     sagittal = TibiaTable(
         kind="sagittal", file=lean_file(tmp_path / "s.csv"), ankle_mm=(10, 80, -90)
     )
-    leaning = load_tibia(in_si(sagittal), AT, "left", "none")
+    leaning = load_tibia(sagittal, AT, "left", "none")
     np.testing.assert_allclose(leaning.pose[:, :3, 3], np.tile([0.01, 0.08, 0.09], (21, 1)))
 
 

@@ -19,19 +19,26 @@ from tkamb.io.scene.case import load_case
 from tkamb.studies import tradeoff
 from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, copied_scene, study_case, thin_out
-from tkamb.studies.elastic_layer import sphere_on_layer
 from tkamb.studies.kept_rows import KeptRows
-from tkamb.studies.measures import Job, measure, measure_apart
-from tkamb.studies.quantities import errors, map_error, quantities, raster_map
+from tkamb.studies.measures import (
+    Job,
+    errors,
+    map_error,
+    measure,
+    measure_apart,
+    quantities,
+    raster_map,
+)
 from tkamb.studies.references import (
     common_limit,
     compute_reference,
     limits,
     read_references,
     reference_of,
+    sphere_on_layer,
     write_references,
 )
-from tkamb.studies.row import TIMING, on_front
+from tkamb.studies.tradeoff import TIMING, on_front
 from tradeoff_blocks import moved
 
 ROOT = Path(__file__).parents[1]

@@ -24,7 +24,7 @@ from tkamb.show.tradeoff_report import comparison, picture, recommendations, tab
 from tkamb.studies.body_trade import read_body_rows
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.references import read_references
-from tkamb.studies.row import KEYS, TIMES, Row, as_json, read_rows, with_fronts
+from tkamb.studies.tradeoff import KEYS, TIMES, Row, as_json, read_rows, with_fronts
 from tradeoff_blocks import (
     MARKERS,
     block,

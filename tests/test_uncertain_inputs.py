@@ -12,19 +12,27 @@ from test_uncertainty import SCENE, bodies_alone, knee
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, knee_pose, transform
+from tkamb.io.recordings.recording_tables import MarkersTable
 from tkamb.io.scene.case import load_case
-from tkamb.io.scene.recording_tables import MarkersTable
 from tkamb.io.scene.uncertainty import CorrelationTable
 from tkamb.knee.load import PointForces
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import mechanics_of
 from tkamb.studies.uncertainty.bands import influences
-from tkamb.studies.uncertainty.correlation import correlation_root
 from tkamb.studies.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
 from tkamb.studies.uncertainty.run import estimate_uncertainty
-from tkamb.studies.uncertainty.sample import Sampler
-from tkamb.studies.uncertainty.sampling import Point, normal_samples, one_at_a_time
-from tkamb.studies.uncertainty.varied_case import displaced_by_markers, varied_case, varied_muscles
+from tkamb.studies.uncertainty.sample import (
+    Sampler,
+    displaced_by_markers,
+    varied_case,
+    varied_muscles,
+)
+from tkamb.studies.uncertainty.sampling import (
+    Point,
+    correlation_root,
+    normal_samples,
+    one_at_a_time,
+)
 
 NAMES = ["a", "b", "c"]
 

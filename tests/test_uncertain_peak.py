@@ -17,7 +17,7 @@ from tkamb.show.headline import cards
 from tkamb.studies.uncertainty.bands import band_columns, peak_band
 from tkamb.studies.uncertainty.inputs import Draw, VariedInput, varied_inputs
 from tkamb.studies.uncertainty.run import estimate_uncertainty
-from tkamb.studies.uncertainty.varied_case import varied_case
+from tkamb.studies.uncertainty.sample import varied_case
 
 NOMINAL = np.array([1.0, 3.39, 2.0])
 

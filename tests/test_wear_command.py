@@ -17,12 +17,12 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates
 from tkamb.studies.wear import run as wear_run
-from tkamb.studies.wear.kept import STATE_NAME
 from tkamb.studies.wear.laws import Archard, ContactArea, law_names, wear_law
 from tkamb.studies.wear.materials import material_names, wear_material
-from tkamb.studies.wear.profile import read_profile
+from tkamb.studies.wear.report import STATE_NAME
 from tkamb.studies.wear.setup import wear_setup
 from tkamb.studies.wear.simulation import first_cycle
+from tkamb.studies.wear.simulator import read_profile
 from wear_bodies import balls_scene, swing, swinging_case
 
 CYCLE = """cycle_percent,axial_force_N,flexion_deg,ap_mm,axial_rotation_deg

@@ -16,12 +16,18 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates, knee_pose
 from tkamb.studies.wear import run as wear_run
 from tkamb.studies.wear.engine import ContactEngine
-from tkamb.studies.wear.force_control import ForceDrive, RestingPoses
 from tkamb.studies.wear.laws import Archard
 from tkamb.studies.wear.motion import CycleMotion
-from tkamb.studies.wear.profile import read_profile, zero_at
 from tkamb.studies.wear.simulation import WearCase, simulate_wear
-from tkamb.studies.wear.springs import Spring, Springs, read_springs
+from tkamb.studies.wear.simulator import (
+    ForceDrive,
+    RestingPoses,
+    Spring,
+    Springs,
+    read_profile,
+    read_springs,
+    zero_at,
+)
 from tkamb.studies.wear.worn_surface import ArticularSurface
 from wear_bodies import DENSITY, MM, balls, balls_scene
 

@@ -14,8 +14,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.samples import gaps_along_normals, sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import pose
-from tkamb.studies.wear.viscoelastic import PronySeries
-from tkamb.studies.wear.viscoelastic_lattice import ViscoelasticLattice
+from tkamb.studies.wear.viscoelastic import PronySeries, ViscoelasticLattice
 
 
 class ViscoelasticBed:

@@ -19,7 +19,7 @@ from tkamb.geometry.frames import inverse, knee_pose, transform
 from tkamb.geometry.polygons import sagittal_outline
 from tkamb.geometry.surface import Surface
 from tkamb.knee.wrapping import taut_path
-from tkamb.studies.designs.sagittal import normal as normal_at
+from tkamb.studies.designs.femoral import normal as normal_at
 
 STEP = 1e-6
 BETA_RANGE = (-0.3, 0.4)

@@ -17,9 +17,9 @@ from tkamb.contact.registry import contact_model
 from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, knee_pose
-from tkamb.studies.bodies import balls, block, dishes, flat
+from tkamb.studies.cases import balls, block, dishes, flat
 from tkamb.studies.designs.design import Design, load_design
-from tkamb.studies.elastic_layer import sphere_on_layer
+from tkamb.studies.references import sphere_on_layer
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 from validation.design_cells import PressedDesign
 from validation.design_tables import FOLDERS

@@ -65,9 +65,8 @@ def _cohort(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from tkamb.run.workers import PoolOptions
-    from tkamb.studies.cohort.folder import REPORT_NAME
     from tkamb.studies.cohort.plan import load_cohort
-    from tkamb.studies.cohort.run import Part, run_cohort
+    from tkamb.studies.cohort.run import REPORT_NAME, Part, run_cohort
 
     part = None if options.shard is None else Part(*options.shard)
     crew = PoolOptions(options.workers, options.dask)
@@ -157,7 +156,7 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     from tkamb.studies import tradeoff as study
     from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
     from tkamb.studies.kept_rows import KeptRows
-    from tkamb.studies.row import as_json, with_fronts
+    from tkamb.studies.tradeoff import as_json, with_fronts
 
     jobs = study.jobs(options.quick, options.scene, options.full)
     cases = study.cases_of(jobs)

@@ -97,7 +97,7 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     from tkamb.io.scene import load_scene
     from tkamb.io.scene.case import load_case
     from tkamb.run.workers import PoolOptions
-    from tkamb.studies.uncertainty.screening import screen, screen_lines
+    from tkamb.studies.uncertainty.sensitivity import screen, screen_lines
 
     scene, text = load_scene(options.scene, overrides), []
     if scene.contact and not {"contact.model", "contact.resolution_mm"} & set(overrides):

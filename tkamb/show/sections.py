@@ -410,7 +410,7 @@ def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
 
 def _wear_range(wear: dict[str, Any], key: str) -> str:
     """Return the range that the wear factor alone gives a number."""
-    limits = wear.get(f"{key}_wear_range")
+    limits = wear.get(f"{key}_range")
     return "–" if limits is None else f"{_significant(limits[0])} to {_significant(limits[1])}"
 
 

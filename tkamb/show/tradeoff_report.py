@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from tkamb.geometry.frames import SIDES
 from tkamb.show.style import CYCLE, GREY, new_figure, settings
-from tkamb.studies.quantities import SIDES
 from tkamb.studies.references import Reference
-from tkamb.studies.row import FRONT_ERRORS, KEYS, TIMING, Row
+from tkamb.studies.tradeoff import FRONT_ERRORS, KEYS, TIMING, Row
 
 MARKERS = "osD^vPX*<>"
 

@@ -36,9 +36,9 @@ from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Mask
 from tkamb.geometry.surface import Surface
-from tkamb.studies.bodies import balls, block, flat
-from tkamb.studies.elastic_layer import sphere_on_layer
+from tkamb.studies.cases import balls, block, flat
 from tkamb.studies.measures import environment
+from tkamb.studies.references import sphere_on_layer
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4.5485}

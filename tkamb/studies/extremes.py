@@ -13,7 +13,7 @@ from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.studies.bodies import Height, balls, block, dishes, flat
+from tkamb.studies.cases import Height, balls, block, dishes, flat
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 

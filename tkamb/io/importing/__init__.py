@@ -1,1 +1,1 @@
-"""A patient from an OpenSim model, a recording and meshes: what `tkamb import` does."""
+"""`tkamb import`: a patient and a scene from an OpenSim model, a recording and meshes."""

@@ -1,12 +1,4 @@
-"""One leg found in an OpenSim model: its joints, the bodies that move together, its links.
-
-Links are those of docs/patient.md. Each stands in a body of the model:
-
-- femur: the femoral component's mesh frame, turned to x anterior, y superior, z right; without
-  an implant the knee joint's centre in the femur with the femur's axes.
-- tibia: the ankle joint's centre, with the tibia's axes.
-- patella: the patella's origin, its axes turned to those of the femur, quarter turns only.
-"""
+"""One leg found in an OpenSim model: its joints, and the bodies that move together."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,8 +12,8 @@ from tkamb.io.opensim.model import Coordinate, Joint, OpenSimModel
 
 OTHER = {"right": "left", "left": "right"}
 SEGMENT_LENGTH = (0.15, 0.75)
-"""m: range of thigh and shank lengths that are accepted, from a child of six (about 0.25) to the
-tallest adult (about 0.6), with a margin."""
+"""m: accepted lengths of thigh and shank. Chosen: from a child of six (about 0.25) to the tallest
+adult (about 0.6), with a margin."""
 SUFFIX = {"right": ("_r", "_R", ".r"), "left": ("_l", "_L", ".l")}
 
 
@@ -33,7 +25,7 @@ class Leg:
         model: the model.
         side: "right" or "left".
         knee: the femorotibial joint.
-        flexion: its coordinate of flexion; None if the knee is locked throughout.
+        flexion: name of its flexion coordinate; None if the knee has no coordinate that rotates it.
         ankle: the joint below the tibia.
         hip: the joint above the femur.
         femur: bodies that move with the femur, the femur first.
@@ -41,7 +33,8 @@ class Leg:
         foot: bodies below the ankle.
         patella: the patella's body; None if the model has none.
         pelvis: the body above the hip.
-        neutral: body -> (4, 4) pose in ground at the defaults with the knee straight.
+        neutral: body -> (4, 4) pose in ground in the neutral position: all coordinates at their
+            defaults, the knee straight.
     """
 
     model: OpenSimModel
@@ -58,15 +51,15 @@ class Leg:
     neutral: dict[str, Array]
 
     def in_body(self, body: str, other: str) -> Array:
-        """Return pose_body_in_other (4, 4) at the neutral pose."""
+        """Return pose_body_in_other (4, 4) in the neutral position."""
         return inverse(self.neutral[other]) @ self.neutral[body]
 
     @property
     def knee_centre(self) -> Array:
-        """(3,) m, the knee's centre in ground at the neutral pose.
+        """(3,) m, the knee's centre in ground in the neutral position.
 
-        The joint's end on the femur; where that is the hip, because the joint's translation
-        carries the thigh's length (Delp's models), its end on the tibia.
+        It is the joint's frame on the femur. In Delp's models that frame is at the hip, because the
+        joint's translation includes the thigh's length. There it is the frame on the tibia.
         """
         hip = transform(self.neutral[self.hip_centre[0]], self.hip_centre[1])
         for group in (self.femur, self.tibia):
@@ -78,25 +71,26 @@ class Leg:
 
     @property
     def hip_centre(self) -> tuple[str, Array]:
-        """Body and point (3,) m of the hip joint's centre in the femur."""
+        """Hip centre: name of the femoral body, and the point (3,) m in it."""
         return _end(self.hip, self.femur)
 
     @property
     def ankle_centre(self) -> tuple[str, Array]:
-        """Body and point (3,) m of the ankle joint's centre in the tibia."""
+        """Ankle centre: name of the tibial body, and the point (3,) m in it."""
         return _end(self.ankle, self.tibia)
 
 
 def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
-    """Return the leg of a side.
+    """Return the left or right leg of a model.
 
     Args:
         model: the model.
         side: "right" or "left".
-        knee: the femorotibial joint, if it is not to be found by its name.
+        knee: name of the femorotibial joint; None: find it by its name.
 
     Raises:
-        InputError: no such joint, or no hip, ankle or patella where the knee wants one.
+        InputError: no such joint; or no single joint above the femur or below the tibia; or a
+            thigh or shank of impossible length.
     """
     try:
         joint, hip, ankle, femur, tibia = _joints(model, side, knee)
@@ -136,7 +130,7 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
 def _joints(
     model: OpenSimModel, side: str, name: str | None
 ) -> tuple[Joint, Joint, Joint, tuple[str, ...], tuple[str, ...]]:
-    """Return knee, hip and ankle, and the bodies of femur and tibia."""
+    """Return the joints knee, hip and ankle, and the bodies of femur and tibia."""
     knee = _knee(model, side, name)
     groups = _rigid_groups(model)
     femur = _ordered(model, groups[knee.inboard], "fem")
@@ -151,11 +145,11 @@ def _joints(
 
 
 def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError | None:
-    """Return the refusal of the first joint that could not be read at all, if there is one.
+    """Return the error of the first joint that could not be read at all; None without one.
 
     Args:
         model: the model.
-        bodies: of the joint; none: of any joint.
+        bodies: names of bodies that the joint must connect; empty: any joint counts.
     """
     names = {joint.name for joint in model.joints}
     for one in model.unread:
@@ -166,10 +160,10 @@ def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError
 
 
 def _refuse_unread(model: OpenSimModel, joints: Iterable[Joint], bodies: set[str]) -> None:
-    """Raise if a joint or constraint that was not read holds the bodies of a leg.
+    """Raise if a joint or constraint of the leg's bodies could not be read.
 
     Raises:
-        InputError: which, and why it was not read.
+        InputError: the joint or constraint, and why it could not be read.
     """
     for joint in model.joints:
         if joint.unread and (joint in joints or {*_ends(joint)} <= bodies):
@@ -183,7 +177,7 @@ def _refuse_unread(model: OpenSimModel, joints: Iterable[Joint], bodies: set[str
 
 
 def way_to_pelvis(leg: Leg) -> list[Joint]:
-    """Return the joints between ground and the body above the hip."""
+    """Return the joints from the body above the hip down to ground."""
     carrier = {joint.outboard: joint for joint in leg.model.joints}
     way, body = [], leg.pelvis
     while body in carrier:
@@ -193,7 +187,7 @@ def way_to_pelvis(leg: Leg) -> list[Joint]:
 
 
 def _check_lengths(leg: Leg) -> None:
-    """Raise unless thigh and shank are as long as a person's: else the knee is another joint."""
+    """Raise if thigh or shank has no human length: the joint is then not the knee."""
     centre = leg.knee_centre
     for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
         length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))
@@ -215,7 +209,7 @@ def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
         j for j in _moving(model) if "knee" in j.name.lower() or "femorotibial" in j.name.lower()
     ]
     own = [j for j in named if j.name.endswith(SUFFIX[side])]
-    if not own:  # a model of one side may leave its joints without a suffix
+    if not own:  # in a model of one leg the names may have no suffix
         own = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
     if len(own) != 1:
         result = f"{len(own)} joints" if own else "no joint"
@@ -243,7 +237,7 @@ def _moving(model: OpenSimModel) -> list[Joint]:
 
 
 def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
-    """Return body -> bodies welded to it, itself among them."""
+    """Return body -> set of the bodies welded to it, including itself."""
     groups = {body: {body} for body in ("ground", *model.bodies)}
     moving = _moving(model)
     for joint in model.joints:
@@ -260,7 +254,7 @@ def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]
 
 
 def _carried(model: OpenSimModel, body: str) -> list[str]:
-    """Return a body and all bodies that it carries."""
+    """Return a body and all bodies beyond it, seen from ground."""
     result = [body]
     for joint in model.joints:  # from ground outwards
         if joint.inboard in result:
@@ -281,7 +275,7 @@ def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[
     if len(joints) != 1:
         result = ", ".join(j.name for j in joints) or "none"
         raise InputError(
-            f"has not one joint {where} ({', '.join(bodies)}), but {result}",
+            f"must have one joint {where} ({', '.join(bodies)}), but has {result}",
             model.name,
             "give the femorotibial joint with --knee",
         )
@@ -289,7 +283,7 @@ def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[
 
 
 def _end(joint: Joint, group: tuple[str, ...]) -> tuple[str, Array]:
-    """Return the end of a joint that lies in a group of bodies: body and point (3,)."""
+    """Return a joint's frame on a group of bodies: the body, and the origin (3,) m in it."""
     if joint.parent in group:
         return joint.parent, joint.pose_parent_frame[:3, 3]
     return joint.child, joint.pose_child_frame[:3, 3]

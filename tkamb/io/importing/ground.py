@@ -1,4 +1,4 @@
-"""The ground reaction of an import: a recording's plates, or forces of a table."""
+"""The ground reaction of an imported trial, from force plates or from a table of forces."""
 
 import re
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from tkamb.io.recordings.ground_reaction import (
     recorded_wrench,
     summed_reaction,
 )
-from tkamb.io.recordings.recordings import ForceRecording
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.io.recordings.tables import Table, read_table
 
 
@@ -38,45 +38,47 @@ class ImportedForceSettings:
     """Settings of the ground reaction in an imported scene."""
 
     hold_below: float = 40.0
-    """N; vertical force below which the imported scene holds the centre of pressure. Chosen: the
-    shipped imports use it: below 40 N the quotient of moment and force is noise."""
+    """N; below this vertical force the centre of pressure is interpolated in time. Chosen: below 40
+    N the quotient of moment and force is noise."""
 
 
 IMPORTED_FORCE = ImportedForceSettings()
 
 COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
-"""Columns of a table of summed forces: s, N, m, N·m about the point; x forward, y up, z right."""
+"""Columns of a table of summed forces: time (s), force (N), point (m) and moment (N·m) about the
+point; x forward, y up, z right."""
 Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class FoundGround:
-    """A foot's ground reaction.
+    """The ground reaction of one foot.
 
     Args:
-        ground: file and columns; None: no ground reaction is modelled.
-        interval: s, in which every surface under the foot was measured; None: unknown.
-        span: s, first and last sample of a table; None: the recording's own.
-        said: lines for the report.
+        ground: its file and plates or columns; None: no ground reaction is modelled.
+        interval: start and end (s) of the part in which every surface under the foot was measured;
+            None: unknown.
+        span: times (s) of a table's first and last sample; None: plates of the recording itself.
+        remarks: lines for the report.
     """
 
     ground: GroundFile | None
     interval: Interval | None
     span: Interval | None
-    said: list[str]
+    remarks: list[str]
 
 
 def find_ground(request: ImportRequest, side: str, axes: str, feet: Feet | None) -> FoundGround:
-    """Return the ground reaction under a foot.
+    """Return the ground reaction of one foot.
 
     Args:
-        request: recording, table, plates and interval.
-        side: of the knee.
-        axes: the recording's and the table's that point forward, up and right.
-        feet: where the feet are; None: unknown.
+        request: names the recording, table, plates and interval.
+        side: "left" or "right".
+        axes: axes of recording and table that point forward, up and right.
+        feet: positions of the feet; None: unknown.
 
     Raises:
-        InputError: plates or columns that cannot be used, or that carry both feet.
+        InputError: plates or columns cannot be used, or both feet stood on a plate.
     """
     if request.grf is not None:
         return _from_table(request, request.grf, side, axes, feet)
@@ -121,7 +123,7 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
 def _from_table(
     request: ImportRequest, path: Path, side: str, axes: str, feet: Feet | None
 ) -> FoundGround:
-    """Return a foot's forces in a table: as given, by their names, or by where they act."""
+    """Return a foot's forces in a table, chosen by option, by name, or by where they act."""
     table = read_table(path)
     forces = table_forces(table)
     time = table.time()
@@ -156,9 +158,11 @@ def _from_table(
 
 
 def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
-    """Return the axes of a table whose y points up beside a recording whose z does.
+    """Return the table's axes that point forward, up and right.
 
-    OpenSim turns recordings about x: its x, y, z are the recording's x, z, -y.
+    They are the recording's, except where the recording's z points up and the largest force of the
+    table is along y. Such a table was turned about x, as OpenSim does: its x, y, z are the
+    recording's x, z, -y.
     """
     if not forces or axes.split(",")[1][-1] != "z":
         return axes
@@ -177,7 +181,7 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
 def _named(
     forces: list[TableForce], side: str, source_name: str | None, table: Table
 ) -> list[TableForce]:
-    """Return the forces that are given, or the one that is named after the foot; else none."""
+    """Return the forces that --grf-force names, or the force named after the foot; else none."""
     names = ", ".join(force.name for force in forces) or "none"
     if source_name is not None:
         chosen = []
@@ -204,19 +208,15 @@ def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError
 
 
 def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
-    """Return a table's force with its wrench in the laboratory."""
+    """Return a force of a table as a recorded force in the laboratory."""
     columns = {"time": "time", **force.columns}
-    source = ForceRecording(
-        table.path,
-        "none",
-        None,
-        (),
-        columns,
-        "m",
-        axes,
-        "on the foot",
-        IMPORTED_FORCE.hold_below,
-        0.0,
+    source = GroundReactionTable(
+        file=table.path,
+        columns=columns,
+        length_unit="m",
+        laboratory_axes=axes,
+        cutoff_Hz="none",
+        unloaded_N=IMPORTED_FORCE.hold_below,
     )
     time, wrench, level = recorded_wrench(source)
     on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
@@ -227,7 +227,7 @@ def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
 def _table_file(
     path: Path, axes: str, chosen: list[TableForce], recorded: list[RecordedForce]
 ) -> GroundFile:
-    """Return where the scene finds the forces: their own columns, or a table of their sum."""
+    """Return the source of the scene's ground reaction: columns of one force, or a summed table."""
     if len(chosen) == 1:
         own = chosen[0].columns
         columns = (("time", "time"), *((role, own[role]) for role in COLUMNS[1:] if role in own))
@@ -236,7 +236,7 @@ def _table_file(
 
 
 def _summed(recorded: list[RecordedForce], path: Path) -> str:
-    """Return the table of the sum of forces, each while it is loaded, as CSV."""
+    """Return a table of the summed forces as CSV; a force counts only while it is loaded."""
     time = recorded[0].time
     levels = [one.level for one in recorded]
     wrenches = []
@@ -253,15 +253,16 @@ def _summed(recorded: list[RecordedForce], path: Path) -> str:
 def common_interval(
     time: Array, interval: Interval | None, span: Interval | None
 ) -> tuple[Interval | None, list[str]]:
-    """Return the part of an interval in which both clocks run, and a line where that is shorter.
+    """Return the part of an interval that both recordings cover, and a remark if that is shorter.
 
     Args:
-        time: (n,) s, of the motion.
-        interval: s, wanted; None: all of the motion.
-        span: s, first and last sample of the ground reaction; None: of the same recording.
+        time: (n,) s, times of the motion.
+        interval: requested start and end (s); None: all of the motion.
+        span: times (s) of the ground reaction's first and last sample; None: the ground reaction
+            is from the recording of the motion.
 
     Raises:
-        InputError: the two share less than two frames.
+        InputError: they share less than two frames.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
     if span is None or (span[0] <= start + 1e-9 and span[1] >= end - 1e-9):
@@ -313,14 +314,14 @@ def _unmeasured_line(
         return []
     return [
         f"ATTENTION: off its plates the foot is nearly still in {len(times)} frames, first at "
-        f"{times[0]:.3f} s: it may stand on something that was not measured"
+        f"{times[0]:.3f} s: it may stand on an unmeasured surface"
     ]
 
 
 def _drift_lines(forces: list[RecordedForce], plates: tuple[int | str, ...]) -> list[str]:
     return [
         f"ATTENTION: {one.title} reads {one.drift:.1f} N while nobody stands on it: it drifts, and "
-        "its force under the foot is too large by as much"
+        "its force under the foot is too large by that amount"
         for one in forces
         if one.key in plates and abs(one.drift) > PLATE_LOAD.drift_N
     ]

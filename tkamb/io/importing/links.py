@@ -1,4 +1,12 @@
-"""The links of docs/patient.md in the bodies of an OpenSim model, and the URDF of these links."""
+"""The links of docs/patient.md in the bodies of an OpenSim model, and the URDF of these links.
+
+Each link is fixed to a body of the model:
+
+- femur: the frame of the femoral component's mesh, turned to x anterior, y superior, z right.
+  Without an implant: the femur's axes at the knee's centre.
+- tibia: the tibia's axes at the ankle joint's centre.
+- patella: the patella's origin; its axes are turned by quarter turns to be nearest the femur's.
+"""
 
 from dataclasses import dataclass
 from functools import reduce
@@ -18,11 +26,11 @@ from tkamb.units import DEGREE
 
 @dataclass(frozen=True)
 class LinkFitSettings:
-    """How the links of the URDF are placed in the bodies of an OpenSim model."""
+    """Limits on where the implant sits on the bones of an OpenSim model."""
 
     max_implant_rotation: float = 35.0 * DEGREE
-    """rad; largest rotation between the implant's axes and the bone's. Chosen: a wrong axis is off
-    by 90 deg, a real implantation by a few degrees."""
+    """rad; largest rotation between the axes of implant and bone. Chosen: with wrong axes it is 90
+    deg, in a real implantation a few degrees."""
 
 
 LINK_FIT = LinkFitSettings()
@@ -30,12 +38,12 @@ LINK_FIT = LinkFitSettings()
 
 @dataclass(frozen=True, eq=False)
 class MeshFrame:
-    """Where a mesh's own frame stands in a body of the model.
+    """The frame of a mesh in a body of the model.
 
     Args:
-        body: the body.
-        pose: (4, 4) in it; None: at its origin, with anatomical axes.
-        why: how it was found, for the report.
+        body: name of the body.
+        pose: (4, 4) pose_mesh_in_body; None: at the body's origin, with anatomical axes.
+        why: how the frame was found, for the report.
     """
 
     body: str
@@ -51,15 +59,15 @@ _STEMS = {
 
 
 def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
-    """Return where a part's mesh frame stands: as given, or by the name of a frame or body.
+    """Return the frame of a part's mesh: an offset frame or body of the model.
 
     Args:
         leg: the leg.
         part: "femoral component", "insert" or "patellar button".
-        wished_name: name of an offset frame or body; None: look for one.
+        wished_name: name of the offset frame or body; None: find one with the part in its name.
 
     Raises:
-        InputError: no such frame, or none that is named after the part.
+        InputError: no such frame, or no frame with the part in its name.
     """
     model = leg.model
     group = {
@@ -103,18 +111,19 @@ def quarter_turn(rotation: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """The links in the model's bodies, m.
+    """The links of a leg as poses (4, 4), m, in the bodies of the model.
 
     Args:
         leg: the leg.
-        femur: (4, 4) femur link in the femur's body.
-        tibia: (4, 4) tibia link in the tibia's body.
-        patella: (4, 4) patella link in the patella's body; None without a patella.
-        insert_in_tibia: (4, 4) insert frame in the tibia link.
-        button_in_patella: (4, 4) the button's anatomical axes in the patella link; None
+        femur: pose of the femur link in the femur's body.
+        tibia: pose of the tibia link in the tibia's body.
+        patella: pose of the patella link in the patella's body; None without a patella.
+        insert_in_tibia: pose of the insert frame in the tibia link.
+        button_in_patella: pose of the button, in anatomical axes, in the patella link; None
             without a button.
-        patella_error: rad, between the patella's axes by quarter turns and the femur's.
-        said: lines on where the implant sits.
+        patella_error: angle (rad) between the axes of patella link and femur link in the neutral
+            position.
+        remarks: lines on where the implant sits, for the report.
     """
 
     leg: Leg
@@ -124,13 +133,13 @@ class Links:
     insert_in_tibia: Array
     button_in_patella: Array | None
     patella_error: float
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
 
     def body_in_link(self, body: str) -> tuple[str, Array]:
-        """Return the link that a body moves with, and the body's pose (4, 4) in it.
+        """Return the link that moves with a body, and the body's pose (4, 4) in it.
 
         Raises:
-            InputError: a body of no link.
+            InputError: no link moves with the body.
         """
         leg = self.leg
         for link, bodies, own in (
@@ -143,13 +152,13 @@ class Links:
         raise InputError(f"body '{body}' is not part of any link of the leg", leg.model.name)
 
     def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
-        """Return the link that a body moves with, and a point (3,) of the body in it."""
+        """Return the link that moves with a body, and a point (3,) m of the body in that link."""
         link, offset = self.body_in_link(body)
         return link, transform(offset, point)
 
     @property
     def neutral(self) -> Array:
-        """(6,) knee coordinates at the model's defaults with the knee straight."""
+        """(6,) knee coordinates (m, rad) in the neutral position."""
         leg = self.leg
         tibia = leg.neutral[leg.tibia[0]] @ self.tibia @ self.insert_in_tibia
         femur = leg.neutral[leg.femur[0]] @ self.femur
@@ -157,13 +166,13 @@ class Links:
 
     @property
     def hip(self) -> Array:
-        """(3,) m, hip centre in the femur link."""
+        """(3,) m, the hip's centre in the femur link."""
         body, point = self.leg.hip_centre
         return self.point_in_link(body, point)[1]
 
     @property
     def patella_in_femur(self) -> Array | None:
-        """(4, 4) patella link in the femur link at the neutral pose."""
+        """(4, 4) pose of the patella link in the femur link, neutral position; None without it."""
         leg = self.leg
         if leg.patella is None or self.patella is None:
             return None
@@ -182,14 +191,14 @@ def find_links(
 
     Args:
         leg: the leg.
-        placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin, in the
-            insert frame; None without implant.
-        axes: the meshes' axes that point anterior, superior and right.
-        frames: part -> frame of its mesh, where that is given.
-        with_button: whether there is a patellar button.
+        placement: (4, 4) pose of the insert's mesh, in anatomical axes about its own origin, in
+            the insert frame; None without an implant.
+        axes: axes of the meshes that point anterior, superior and right.
+        frames: part -> name of its mesh's frame; None: find it by its name.
+        with_button: whether the implant has a patellar button.
 
     Raises:
-        InputError: no frame for a mesh, or axes that do not agree with the bone's.
+        InputError: a mesh has no frame, or its axes do not agree with the bone's.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     text: list[str] = []
@@ -215,7 +224,11 @@ def find_links(
 def _anatomical(
     leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, remarks: list[str]
 ) -> Array:
-    """Return the part's frame (4, 4) in a body, turned to anatomical axes, checked against it."""
+    """Return the pose (4, 4) in a body of a part's frame, turned to anatomical axes.
+
+    Raises:
+        InputError: the part is rotated too far from the bone's axes.
+    """
     assert frame.pose is not None
     pose = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(pose[:3, :3])
@@ -242,7 +255,7 @@ def _patella(
     with_button: bool,
     remarks: list[str],
 ) -> tuple[Array | None, Array | None, float]:
-    """Return the patella link in its body, the button in the link, and the axes' error (rad)."""
+    """Return `patella`, `button_in_patella` and `patella_error` of `Links`."""
     if leg.patella is None:
         return None, None, 0.0
     anatomical = leg.neutral[leg.patella][:3, :3].T @ (leg.neutral[leg.femur[0]] @ femur)[:3, :3]
@@ -259,22 +272,24 @@ def _patella(
 
 
 RESERVED = ("ground", "tibia", "femur", "patella", "hip")
-"""Links that docs/patient.md names; a body of one of these names gets `_bone` behind it."""
+"""Names of links in docs/patient.md; a body with one of these names gets the suffix `_bone`."""
 
 _LIMIT = '<limit lower="-10" upper="10" effort="1e6" velocity="1e3"/>'
 
 
 def body_link(body: str) -> str:
-    """Return the name of the link that stands for a body of the model."""
+    """Return the name of the URDF's link for a body of the model."""
     return f"{body}_bone" if body in RESERVED else body
 
 
 def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
-    """Return link -> inertia in the link: tibia with the foot at its neutral angles, and femur.
+    """Return link -> its inertia in its own frame.
+
+    The tibia link includes the foot with the ankle at its neutral angle.
 
     Args:
-        links: of the leg.
-        scale: factor on masses and inertias.
+        links: the links of the leg.
+        scale: factor (1) on masses and inertias.
     """
     leg = links.leg
     groups = {
@@ -288,7 +303,7 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
 
 
 def _seen_from(links: Links, body: str, base: str, own: Array, scale: float) -> RigidInertia:
-    """Return the inertia of a body in a link that stands at `own` in the body `base`."""
+    """Return a body's inertia in a link, where `own` is the link's pose in the body `base`."""
     pose = np.linalg.inv(own) @ links.leg.in_body(body, base)
     inertia, turn = links.leg.model.bodies[body], pose[:3, :3]
     tensor = scale * turn @ inertia.inertia @ turn.T
@@ -299,9 +314,9 @@ def patient_urdf(links: Links, scale: float, comment: str) -> str:
     """Return the text of the URDF.
 
     Args:
-        links: of the leg.
-        scale: factor on the model's masses.
-        comment: what stands at the top.
+        links: the links of the leg.
+        scale: factor (1) on the model's masses.
+        comment: comment at the top of the file.
     """
     leg = links.leg
     inertias = link_inertias(links, scale)
@@ -333,10 +348,10 @@ def _chain(
     first: Array,
     side: str,
 ) -> list[str]:
-    """Return single-axis joints in a row with massless links between them."""
+    """Return the lines of joints in series, each with one axis, and massless links between them."""
     lines, parent = [], start
     for number, (name, (kind, axis)) in enumerate(joints.items(), 1):
-        # a left knee turns the other way about y and x: docs/patient.md
+        # docs/patient.md: in a left knee the axes x and y of rotation have the other sign
         reversed_axis = side == "left" and kind == "revolute" and axis[2] == 0
         own = tuple(-v for v in axis) if reversed_axis else axis
         child = end if number == len(joints) else f"{name}_link"

@@ -1,5 +1,4 @@
-"""The leg's markers in a recording: matched to the model's, and used to find the laboratory
-axes."""
+"""Markers of the leg: matched between model and recording, and used to find the laboratory axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,15 +16,16 @@ from tkamb.units import DEGREE
 
 @dataclass(frozen=True, eq=False)
 class ModelSegment:
-    """A segment's markers that the recording holds.
+    """The markers of a segment that the recording contains.
 
     Args:
         name: "shank", "thigh", "foot" or "pelvis".
-        points: label in the recording -> (3,) m in the segment's link (shank, thigh) or body.
-        missing: markers of the model that the recording does not show.
-        joined_to: "shank" or "thigh" for a neighbour.
-        joint: (3,) m, the ball joint in that segment's link.
-        centre: (3,) m, the same in the neighbour's body.
+        points: label in the recording -> its place (3,) m in the link of shank or thigh, or in the
+            body of foot or pelvis.
+        missing: names of the model's markers that the recording does not show.
+        joined_to: "shank" for the foot, "thigh" for the pelvis, else "".
+        joint: (3,) m, the ball joint between them, in the link of `joined_to`.
+        centre: (3,) m, the same point in the body of foot or pelvis.
     """
 
     name: str
@@ -39,15 +39,15 @@ class ModelSegment:
 def model_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> list[ModelSegment]:
-    """Return shank, thigh, and of foot and pelvis those with three markers or more.
+    """Return the segments with three markers or more: shank and thigh, and possibly foot, pelvis.
 
     Args:
-        links: of the leg.
+        links: the links of the leg.
         recorded: table of markers.
-        without: labels that are not to be used.
+        without: labels of markers that are left out.
 
     Raises:
-        InputError: shank or thigh with fewer than three markers in the recording.
+        InputError: shank or thigh has fewer than three markers in the recording.
     """
     result = seen_segments(links, recorded, without)
     for name in ("shank", "thigh"):
@@ -74,15 +74,15 @@ def model_segments(
 def seen_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> dict[str, ModelSegment]:
-    """Return shank, thigh, foot and pelvis with those of their markers that were ever seen.
+    """Return the segments shank, thigh, foot and pelvis with their markers that are ever visible.
 
     Args:
-        links: of the leg.
+        links: the links of the leg.
         recorded: table of markers.
-        without: labels that are not to be used.
+        without: labels of markers that are left out.
 
     Raises:
-        InputError: a label of `without` that the recording does not hold.
+        InputError: the recording has no marker of a label in `without`.
     """
     leg = links.leg
     foot = _with_most_markers(leg, leg.foot)
@@ -115,12 +115,12 @@ def seen_segments(
 
 
 def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the labels of the markers that were ever seen, and those that are left out."""
+    """Return the labels of the markers that are ever visible, and the labels that are left out."""
     labels = recorded_labels(recorded)
     dropped = matched_labels(without, labels)
     if unknown := [name for name in without if name not in dropped]:
         raise InputError(
-            f"holds no marker '{unknown[0]}', which is to be left out",
+            f"has no marker '{unknown[0]}' to leave out",
             recorded.path,
             f"it has {', '.join(labels[:12])}, …",
         )
@@ -130,7 +130,7 @@ def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], li
 
 
 def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
-    """Return the segments with the labels of another recording, those that it holds."""
+    """Return the segments with the labels of another recording and only the markers it has."""
     labels = recorded_labels(recorded)
     result = []
     for segment in segments:
@@ -141,13 +141,13 @@ def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegm
 
 
 def _equal_line(recorded: Table) -> str:
-    """Return which labels stand twice, and are not used; empty without any."""
+    """Return words on the labels that occur twice and are not used; "" without any."""
     names = list(dict.fromkeys(column[:-2] for column in recorded.equal))
     return f"; it has two markers {', '.join(names)}: rename one of each" if names else ""
 
 
 def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
-    """Return the prefixes under which a wanted marker stands more than once."""
+    """Return the prefixes of a needed marker that occurs under several prefixes."""
     plain = {plain_label(name) for name in needed}
     result: dict[str, list[str]] = {}
     for label in labels:
@@ -158,10 +158,10 @@ def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
 
 
 def with_prefix(recorded: Table, prefix: str) -> Table:
-    """Return a table of markers with those of one prefix alone, like "JW" in "JW:RHeel".
+    """Return the table with only the markers of one prefix, like "JW" in "JW:RHeel".
 
     Raises:
-        InputError: no label begins with it.
+        InputError: no label begins with the prefix.
     """
     wished_prefix = prefix.rstrip(":")
     labels = recorded_labels(recorded)
@@ -188,12 +188,13 @@ def _with_most_markers(leg: Leg, bodies: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Facing:
-    """Which of a recording's axes point where, and how far the subject is from them.
+    """Directions of a recording's axes, found from how the subject stands.
 
     Args:
-        axes: axes of the file that point forward, up and to the right, like "-x,+z,+y".
-        up_deg: angle between the mean upward axis of shank, thigh and pelvis and the file's axis.
-        forward_deg: angle between the mean forward axis and the file's, in the horizontal plane.
+        axes: axes of the file that point forward, up and right, like "-x,+z,+y".
+        up_deg: angle between the file's upward axis and the mean upward axis of shank, thigh and
+            pelvis; NaN where `axes` was given.
+        forward_deg: angle between the forward axes in the horizontal plane; NaN likewise.
     """
 
     axes: str
@@ -202,13 +203,13 @@ class Facing:
 
 
 def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
-    """Return the laboratory's axes from how thigh, shank and pelvis stand in the recording.
+    """Return the directions of the recording's axes, from the poses of thigh, shank and pelvis.
 
-    The segments' own y axes point up, their x axes forward; both are averaged over frames and
-    taken to the nearest axis of the file.
+    The segments' own y axes point up, their x axes forward. Both are averaged over all frames, and
+    the nearest axis of the file is taken.
 
     Raises:
-        InputError: the segments do not stand, or face no direction.
+        InputError: on average the segments are not upright, or face no direction.
     """
     upright = [s for s in segments if s.name in ("shank", "thigh", "pelvis")]
     turns = []
@@ -250,7 +251,13 @@ def _axis_name(axis: Array) -> str:
 
 
 def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
-    """Return side -> labels of the recording on that side's foot; the other side if there."""
+    """Return side -> labels of the markers on that foot; none for a foot that the model lacks.
+
+    Args:
+        leg: the leg of one side.
+        recorded: table of markers.
+        other: the other side, "left" or "right".
+    """
     labels = recorded_labels(recorded)
     result = {leg.side: _foot_labels(leg, labels)}
     try:

@@ -1,8 +1,8 @@
-"""An OpenSim model's own chain fitted to markers: what OpenSim's InverseKinematicsTool does.
+"""An OpenSim model fitted to markers by least squares, as by OpenSim's InverseKinematicsTool.
 
-All coordinates are free, except locked ones and those that follow others by an enforced coupler.
-Ranges are not imposed. The least squares are the same as for a leg
-(`tkamb.io.recordings.inverse_kinematics`), with the model's joints.
+All coordinates are free, except locked ones and the dependent ones of couplers. Their ranges are
+not imposed. `tkamb.io.recordings.inverse_kinematics` solves the least squares; here are the
+residuals and derivatives of the model's joints.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,11 +27,11 @@ class ModelFitSettings:
     """How the poses of a model are fitted to markers."""
 
     block_frames: int = 128
-    """Frames that are fitted in one call. Chosen: their arrays fit into the processor's cache. It
-    changes no result."""
+    """Number of frames that are fitted in one call. Chosen: their arrays fit into the processor's
+    cache. It changes no result."""
     coarse_stride: int = 8
-    """Frames between those that are fitted first; the others begin from their poses. Chosen: it
-    changes the initial guesses only."""
+    """Every so many frames one is fitted first; the others begin from poses interpolated between
+    these. Chosen: it changes the initial guesses only."""
 
 
 MODEL_FIT = ModelFitSettings()
@@ -77,11 +77,11 @@ class ModelChain:
         )
 
     def default(self, frames: int) -> Array:
-        """Return the coordinates (f, n) at their defaults."""
+        """Return coordinates (f, n) at their defaults, for f frames."""
         return np.tile(self.kinematics.coupled({}), (frames, 1))
 
     def places(self, state: Array) -> Array:
-        """Return the markers (f, m, 3) m."""
+        """Return the positions (f, m, 3) m of the markers in ground."""
         return self._markers_at(self.kinematics.poses(state))
 
     def _markers_at(self, poses: Array) -> Array:
@@ -91,18 +91,23 @@ class ModelChain:
         )
 
     def normal(self, state: Array, target: Array, weights: Array) -> NormalEquations:
-        """Return the least squares to markers (f, m, 3) m with weights (f, m).
+        """Return the normal equations of a fit to measured markers.
 
-        With s = (a, b) a coordinate's twist in ground (rotation a, velocity b of ground's
-        origin), a marker at x that is carried by its joint moves by u = b + a × x. For i above j
-        in the chain, with sums over the markers that j carries,
+        Let s = (a, b) be a coordinate's twist in ground: rotation a, and velocity b of ground's
+        origin. A marker at x beyond its joint has the velocity u = b + a × x. For a coordinate i
+        before j in the chain, with sums over the markers beyond j,
 
             (Jᵀ W J)_ij = s_i · Σ w (x × u_j, u_j)
             residuals' curvature_ij = -Σ w r · (a_i × u_j) = -a_i · Σ w u_j × r,   r = p - x
 
-        so that a coordinate needs the sums Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ over the
-        markers that it carries, and no marker needs its own Jacobian. The curvature of a joint's
-        splines is neglected.
+        A coordinate therefore needs only the sums Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ over
+        the markers beyond it, and no marker's Jacobian. The curvature of a joint's splines is
+        neglected.
+
+        Args:
+            state: (f, n) coordinates, rad and m.
+            target: (f, m, 3) m, measured positions p of the markers.
+            weights: (f, m) weights w of their squared distances.
         """
         poses, twists = self.kinematics.joint_twists(state)
         twists = twists[:, self._moving]
@@ -128,7 +133,14 @@ class ModelChain:
     def _assembled(
         self, state: Array, twists: Array, carried: Array, cost: Array
     ) -> NormalEquations:
-        """Return the equations of the free coordinates from what each coordinate carries."""
+        """Return the normal equations of the free coordinates.
+
+        Args:
+            state: (f, n) coordinates.
+            twists: (f, k, 6) twist of each moving coordinate.
+            carried: (f, k, 25) the sums over the markers beyond each of them.
+            cost: (f,) m², weighted sum of squares.
+        """
         a, b = twists[..., :3], twists[..., 3:]
         weight, first, pull = carried[..., :1], carried[..., 1:4], carried[..., 4:7]
         second = carried[..., 7:16].reshape(*weight.shape[:2], 3, 3)
@@ -147,16 +159,16 @@ class ModelChain:
         return NormalEquations(cost, matrix, self._free_part(right[..., None], state)[..., 0], bent)
 
     def _symmetric(self, matrix: Array) -> Array:
-        """Return the matrix (f, n, n) whose rows i are right where i is above column j."""
+        """Return the symmetric matrix (f, n, n) from its entries with i before j in the chain."""
         upper = matrix * self._above
         return np.asarray(upper + upper.swapaxes(1, 2))
 
     def _free_part(self, values: Array, state: Array) -> Array:
-        """Return rows, and columns of a square matrix, by the free coordinates.
+        """Return the rows, and for a square matrix also the columns, of the free coordinates.
 
-        By the chain rule, the rows (and columns) of a follower, times the slope of its coupler,
-        are added to those of the coordinate that it follows. The end of a chain of followers is
-        added first.
+        By the chain rule, the row (and column) of a dependent coordinate, times the slope of its
+        coupler, is added to that of its independent one. In a chain of couplers the last is added
+        first.
         """
         square, free = values.shape[1] == values.shape[2], len(self.free)
         for dependent, independent, coordinate, function in reversed(self._after):
@@ -167,28 +179,32 @@ class ModelChain:
         return values[:, :free, :free] if square else values[:, :free]
 
     def moved(self, state: Array, step: Array) -> Array:
-        """Return the coordinates (f, n) after a step (f, free) of the free ones."""
+        """Return the coordinates (f, n) after a step (f, k) of the k free ones."""
         shifted = state.copy()
         shifted[:, self.free] += step
         return self.kinematics.coupled(shifted) if self._couplers else shifted
 
     def chosen(self, state: Array, frames: Index) -> Array:
-        """Return the coordinates of some frames."""
+        """Return the coordinates of the chosen frames."""
         return np.asarray(state[frames])
 
     def replaced(self, state: Array, frames: Index, part: Array) -> Array:
-        """Return the coordinates with some frames as in `part`."""
+        """Return the coordinates where those of the chosen frames are replaced by `part`."""
         return put(state, frames, part)
 
 
 def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
-    """Return which markers each coordinate moves, and which coordinates each one moves.
+    """Return which markers and which other coordinates' axes each coordinate moves.
+
+    Args:
+        kinematics: of the model.
+        at: index of each marker's body.
 
     Returns:
-        (n, m), 1 where the joint of coordinate i carries marker j, else 0; and (n, n), 1 where
-        coordinate i moves the axis of coordinate j, 1/2 on the diagonal, else 0. Within a joint
-        the translations come before the rotations, because they are along axes of its parent
-        frame; a joint that the chain passes backwards has the reverse order.
+        (n, m): 1 where coordinate i moves marker j, else 0. (n, n): 1 where coordinate i moves the
+        axis of coordinate j, 1/2 on the diagonal, else 0. Within a joint the translations come
+        before the rotations, because they are along axes of the parent frame. The order is
+        reversed in a joint that the chain passes backwards.
     """
     model, bodies = kinematics.model, kinematics.bodies
     hanging: dict[Joint, set[int]] = {}  # bodies outboard of each joint
@@ -224,12 +240,12 @@ def fit_model(
     weights: Mapping[str, float] | None = None,
     laboratory_axes: str = "+x,+y,+z",
 ) -> tuple[ModelChain, ChainFit[Array]]:
-    """Return a model's chain fitted to a recording, all frames at once.
+    """Return a model's chain and its fit to all frames of a recording.
 
     Args:
         model: the model.
         recorded: table of markers.
-        weights: marker -> weight of its squared distance, where not 1.
+        weights: name of a marker -> weight (1) of its squared distance; default 1.
         laboratory_axes: axes of the file that are the model's ground x, y and z (forward, up
             and right), as "-x,+z,+y".
 
@@ -264,7 +280,7 @@ def fit_model(
 def fit_in_blocks(
     chain: ModelChain, measured: Array, weights: Array, start: Array
 ) -> ChainFit[Array]:
-    """Return `fit_chain` of many frames, computed in blocks of `block_frames`."""
+    """Return the fit of many frames, computed in blocks of `block_frames`."""
     parts = [
         slice(k, k + MODEL_FIT.block_frames)
         for k in range(0, len(measured), MODEL_FIT.block_frames)

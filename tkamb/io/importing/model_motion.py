@@ -1,4 +1,4 @@
-"""A motion in a model's coordinates (`.mot`, `.sto`) as the scene's knee and shank."""
+"""A motion in an OpenSim model's coordinates (`.mot`, `.sto`), turned into knee and shank poses."""
 
 from dataclasses import dataclass, replace
 
@@ -27,31 +27,31 @@ COLUMNS = (
     *(f"tibia_rotation_{k}_deg" for k in (1, 2, 3)),
     *(f"tibia_translation_{k}_mm" for k in (1, 2, 3)),
 )
-"""Of `motion.csv`, after time_s: the knee's coordinates and the tibia link in the model's ground,
-rotations intrinsic x-y-z."""
+"""Columns of `motion.csv` after time_s: the knee's coordinates, and the pose of the tibia link in
+the model's ground (intrinsic rotations x, y, z)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModelMotion:
-    """Knee and shank of a motion.
+    """Motion of knee and shank.
 
     Args:
         time: (n,) s.
-        values: (n, 12) of `COLUMNS`.
-        missing: coordinates of the model that the file does not hold: at their defaults.
-        said: lines on how the file was read.
+        values: (n, 12) values of `COLUMNS`, mm and deg.
+        missing: coordinates of the model that the file lacks; they stay at their defaults.
+        remarks: lines on how the file was read, for the report.
     """
 
     time: Array
     values: Array
     missing: tuple[str, ...]
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def part(self, start: float, end: float) -> "ModelMotion":
-        """Return the rows from one time to another.
+        """Return the rows between two times (s).
 
         Raises:
-            InputError: fewer than two.
+            InputError: there are fewer than two.
         """
         inside = (self.time >= start - 1e-9) & (self.time <= end + 1e-9)
         if inside.sum() < 2:
@@ -71,14 +71,14 @@ class ModelMotion:
 
 
 def model_motion(links: Links, recorded: Table) -> ModelMotion:
-    """Return the knee and the shank of a motion in the model's coordinates.
+    """Return the motion of knee and shank from a motion in the model's coordinates.
 
     Args:
-        links: of the leg.
-        recorded: with a column per coordinate, named as in the model or by its path.
+        links: the links of the leg.
+        recorded: table with a column for each coordinate, named as in the model or by its path.
 
     Raises:
-        InputError: no coordinate of the knee, or angles of unknown unit.
+        InputError: the knee's flexion is missing, or the unit of angles is unknown.
     """
     leg = links.leg
     kinematics = Kinematics(leg.model)
@@ -107,7 +107,7 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
 
 
 def model_feet(links: Links, recorded: Table) -> Feet:
-    """Return where the feet are in a motion: the mean origin of each foot's bodies, m."""
+    """Return the positions of the feet in a motion: the mean origin of each foot's bodies."""
     leg = links.leg
     kinematics = Kinematics(leg.model)
     q, _ = read_coordinates(kinematics, recorded)
@@ -127,7 +127,11 @@ def model_feet(links: Links, recorded: Table) -> Feet:
 
 
 def motion_tables(flexion_alone: bool) -> list[str]:
-    """Return the scene's [motion] columns, of flexion or all six, and [tibia] for `motion.csv`."""
+    """Return the scene's tables [motion.columns] and [tibia] for `motion.csv`.
+
+    Args:
+        flexion_alone: whether the scene reads only flexion, instead of all six coordinates.
+    """
     columns = dict(zip(KNEE_COORDINATES, COLUMNS, strict=False))
     names = ("flexion",) if flexion_alone else KNEE_COORDINATES
     lines = ["[motion.columns]", 'time = "time_s"']

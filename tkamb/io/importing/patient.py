@@ -1,4 +1,4 @@
-"""Import of a patient: from model, recording and meshes to a URDF and a scene that runs."""
+"""Import of a patient: a URDF and a scene from an OpenSim model, a recording and meshes."""
 
 import os
 from contextlib import suppress
@@ -40,36 +40,36 @@ class ModelMassSettings:
     """How the mass of an OpenSim model becomes the mass of a patient."""
 
     one_leg_share: float = 0.6
-    """1: a model whose thigh, shank and foot have at least this share of its mass is a model of one
-    leg. Chosen: of a whole body, one leg has less than a fifth."""
+    """Share (1) of a model's mass: a model with more than this in thigh, shank and foot is a model
+    of one leg. Chosen: in a whole body, one leg has less than a fifth."""
     leg_mass_share: float = 0.161
-    """Share of the body's mass in one leg: thigh 0.100, shank 0.0465, foot 0.0145 (Winter,
+    """Share (1) of the body's mass in one leg: thigh 0.100, shank 0.0465, foot 0.0145 (Winter,
     Biomechanics, 2009)."""
     max_reasons: int = 3
-    """Largest number of parts that could not be read whose reasons the report of an import gives.
-    Chosen: a report stays short."""
+    """Number of unreadable parts for which the report of an import gives the reason. Chosen: the
+    report stays short."""
     same_mass_share: float = 0.01
-    """Share of the subject's mass: a model whose mass differs by less is not scaled. Chosen:
-    clothes and rounding differ by less."""
+    """Share (1) of the subject's mass: if the model's mass differs by less, it is not scaled.
+    Chosen: clothes and rounding make less."""
 
 
 MODEL_MASS = ModelMassSettings()
 
 LEG_SHARES = (0.10, 0.25)
-"""Accepted share of one leg in the body's mass: Winter (2009) gives 0.161, de Leva (1996) 0.20; the
-margin is for individual differences."""
+"""Accepted shares (1) of one leg in the body's mass. Winter (2009) gives 0.161, de Leva (1996)
+0.20; the margin is for individual differences."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedPatient:
-    """What an import gives.
+    """The result of an import.
 
     Args:
         urdf: text of patient.urdf.
-        scene: the scene, to be written as text.
-        motion: text of motion.csv; None where markers are read from the recording.
-        ground: text of ground_reaction.csv; None where the ground reaction has one file.
+        scene: content of the scene file.
+        motion: text of motion.csv; None: the scene reads the recording.
         report: lines on what was read and what was assumed.
+        ground: text of ground_reaction.csv; None: the scene reads the recorded forces.
     """
 
     urdf: str
@@ -83,11 +83,11 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     """Return a patient's URDF and scene.
 
     Args:
-        request: files and what is known.
-        folder: where the scene will stand.
+        request: the files and options of the import.
+        folder: the scene's future folder.
 
     Raises:
-        InputError: a file or value that cannot be used, in one line.
+        InputError: a file or value cannot be used.
     """
     model = read_osim(request.model, partial=True)
     leg = find_leg(model, request.side, request.knee)
@@ -131,8 +131,14 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         request.recording if result.motion else None,
         request.cycle,
     )
-    report = [*_model_lines(model), *_leg_lines(leg), weighed, *links.said, *_patella_line(links)]
-    report += [*result.said, *tissue.said]
+    report = [
+        *_model_lines(model),
+        *_leg_lines(leg),
+        weighed,
+        *links.remarks,
+        *_patella_line(links),
+    ]
+    report += [*result.remarks, *tissue.remarks]
     if request.static is not None:
         if result.markers is None:
             raise InputError(
@@ -151,7 +157,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
 
 
 def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | None) -> Trial:
-    """Return the recording: markers, poses with markers, or the model's coordinates."""
+    """Return the trial, from recorded poses, from markers or from the model's coordinates."""
     recorded = with_unit(read_table(request.recording), request.units.length)
     if request.prefix is not None:
         recorded = with_prefix(recorded, request.prefix)
@@ -170,19 +176,24 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
     if labels:
         return from_markers(request, leg, links, recorded)
     if request.without:
-        raise InputError("holds no markers to be left out", recorded.path, "drop --without")
+        raise InputError("has no markers to leave out", recorded.path, "drop --without")
     return from_coordinates(request, leg, links, recorded)
 
 
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
-    """Write URDF and scene, load them as a run would, and return what the markers say.
+    """Write URDF and scene, load them as a run does, and return remarks on markers and gait.
 
-    Existing files are not changed: a file of the same content may be shared with another scene. If
-    anything fails, no new file remains.
+    Existing files do not change: scenes may share a file of the same content. If anything fails, no
+    new file remains.
+
+    Args:
+        patient: the result of the import.
+        folder: the scene's folder.
+        name: the scene's file name.
 
     Raises:
-        InputError: the folder cannot be written, holds a file of one of these names with another
-            content, or the scene does not load.
+        InputError: the folder cannot be written, a file of the same name has another content, or
+            the scene cannot be loaded.
     """
     scene = folder / name
     if os.path.lexists(scene):
@@ -202,7 +213,7 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
             written.append(path)
         case = load_case(load_scene(scene))
         return (*marker_lines(case), *_gait_lines(case, patient.scene.cycle == "plates"))
-    except BaseException:  # an interrupt too: nothing may stay
+    except BaseException:  # also an interrupt: no new file may remain
         for path in written:
             path.unlink(missing_ok=True)
         with suppress(OSError):  # not empty, or never made
@@ -212,10 +223,10 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
 
 
 def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
-    """Return what the force plates show of gait, in a line.
+    """Return a line on the gait events on the force plates; nothing without any.
 
     Raises:
-        InputError: a gait cycle is requested from the plates, and they show none.
+        InputError: `asks_gait`, and the plates show no gait cycle.
     """
     gait = None if case.ground is None else case.ground.gait
     if asks_gait and case.gait_cycle_s is None:
@@ -237,10 +248,10 @@ def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
 
 
 def _same_there(path: Path, text: str) -> bool:
-    """Say whether a file of that content is there.
+    """Return whether a file with this content exists.
 
     Raises:
-        InputError: there is a file of another content, or something that is not a file.
+        InputError: the path holds other content, or is not a file.
     """
     if not os.path.lexists(path):
         return False
@@ -252,7 +263,7 @@ def _same_there(path: Path, text: str) -> bool:
 
 
 def marker_lines(case: Case) -> tuple[str, ...]:
-    """Return how well the markers fit, by both readings, and how far the knee centres are apart."""
+    """Return lines on the fit of the markers by both methods, and on the knee centres' distance."""
     result = case.motion.markers
     if result is None:
         rms = case.tibia.residual if case.tibia else None
@@ -283,10 +294,10 @@ def marker_lines(case: Case) -> tuple[str, ...]:
 
 
 def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
-    """Return the factor on the model's masses, and a line on it.
+    """Return the factor on the model's masses, and a remark on it.
 
     Raises:
-        InputError: masses that cannot be the subject's.
+        InputError: the masses cannot be the subject's.
     """
     model, subject = leg.model.mass_kg, request.mass_kg
     own = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
@@ -313,13 +324,17 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
 
 
 def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
-    """Return the factor on the masses of a model that is little more than one leg, and a line.
+    """Return the factor on the masses of a model of one leg, and a remark on it.
 
-    Such a model has the mass of the leg or, if a scaling tool used the subject's mass, that of the
+    Such a model has the mass of a leg or, if a scaling tool used the subject's mass, that of the
     whole body. The leg's mass is `MODEL_MASS.leg_mass_share` of the subject's.
 
+    Args:
+        request: states the subject's mass.
+        own: mass (kg) of thigh, shank and foot in the model.
+
     Raises:
-        InputError: neither of the two.
+        InputError: the model has neither mass.
     """
     subject = request.mass_kg
     share, target = own / subject, MODEL_MASS.leg_mass_share * subject
@@ -376,7 +391,7 @@ def _patella_line(links: Links) -> list[str]:
         axes.append(f"{axis} {'' if turn[k, j] > 0 else '-'}{names[j]}")
     return [
         f"patella's axes: {', '.join(axes)} (within {links.patella_error / DEGREE:.0f} deg at the "
-        "neutral pose); its mass is 0.1 kg, not the model's"
+        "neutral position); its mass is 0.1 kg, not the model's"
     ]
 
 
@@ -384,8 +399,8 @@ def _title(request: ImportRequest) -> tuple[str, ...]:
     poses = f", poses of {request.poses.file.name}" if request.poses else ""
     return (
         f"The {request.side} knee of {request.model.name}, {request.recording.name}{poses}.",
-        "Written by `tkamb import`; what it inferred stands here as given. The recording and the",
-        "meshes are read where they lie.",
+        "Written by `tkamb import`, with all that it inferred. The recording and the meshes stay",
+        "where they are.",
     )
 
 
@@ -434,7 +449,7 @@ def _motion_notes(request: ImportRequest, trial: Trial) -> list[str]:
             "phase is "
             "mapped to one of their strides: an assumption."
         )
-    if centres := [centre.name.replace("_", " ") for centre in trial.shank.centres]:
+    if centres := [name.replace("_", " ") for name in trial.shank.centres]:
         notes.append(
             f"The shank shows {len(trial.shank.points)} markers. They are completed by "
             f"{' and '.join(centres)} from the markers of its neighbours, so its lean is less "

@@ -36,29 +36,29 @@ _NAMED = re.compile(r"(.*?)([_. ]?)([vpfmt]?)([xyz])")
 
 @dataclass(frozen=True)
 class TableForce:
-    """A force of a table.
+    """The columns of one force in a table.
 
     Args:
         name: common beginning of its column names.
-        columns: role of a scene, like "force_1" or "moment_2" -> column.
+        columns: role of the column in a scene, like "force_1" or "moment_2" -> its name.
     """
 
     name: str
     columns: dict[str, str] = field(default_factory=dict)
 
     def has(self, kind: str) -> bool:
-        """Return whether all three columns of a kind are there."""
+        """Return whether the force has all three columns of a kind: force, point or moment."""
         return all(f"{kind}_{k}" in self.columns for k in (1, 2, 3))
 
     @property
     def moments(self) -> tuple[str, ...]:
-        """The columns of the moment."""
+        """Names of the columns of its moment."""
         return tuple(v for k, v in self.columns.items() if k.startswith("moment"))
 
 
 @dataclass(frozen=True)
 class _Column:
-    """A column's name, taken apart; `owner` is the plain name of its force."""
+    """The parts of a column's name; `owner` is the name of its force without the usual words."""
 
     name: str
     kind: str
@@ -71,7 +71,7 @@ def table_forces(table: Table) -> list[TableForce]:
     """Return the forces of a table, in its order.
 
     Raises:
-        InputError: a column of moments that belongs to no force, or two for one axis.
+        InputError: a column of moments that belongs to no force, or two columns for one axis.
     """
     columns = [c for name in table.columns if (c := _taken_apart(name)) is not None]
     result: dict[str, TableForce] = {}
@@ -123,7 +123,7 @@ def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[Table
 
 
 def _taken_apart(name: str) -> _Column | None:
-    """Return the parts of a column's name; None if it is not a force, point or moment."""
+    """Return the parts of a column's name; None if it is none of force, point and moment."""
     plain = name.lower().rstrip()
     if match := _NUMBERED.fullmatch(plain):
         kind, owner, axis = match.groups()
@@ -160,27 +160,28 @@ def _kind_of_words(stem: str) -> str | None:
 
 @dataclass(frozen=True)
 class FootContactSettings:
-    """Which force plate carries which foot, from forces and markers."""
+    """Which foot stands on which force plate, from forces and markers."""
 
     min_force: float = 40.0
-    """N: vertical force from which a plate counts as loaded. Chosen: the noise of a plate is a few
+    """N; a plate counts as loaded above this vertical force. Chosen: the noise of a plate is a few
     newtons."""
     min_duration: float = 0.1
-    """s: a shorter load is no step. Chosen: it is a knock."""
+    """s; a shorter load is not taken as a step. Chosen: shorter loads are knocks."""
     max_foot_distance: float = 0.25
     """m; horizontal distance from the centre of pressure to the middle of the foot's markers.
     Chosen: about the length of a foot."""
     min_step_height: float = 0.15
-    """m; a foot whose markers are this far above the plate stands on something else. Chosen: the
+    """m; above this height of its markers over the plate, a foot stands on a step. Chosen: the
     lowest stair of the data sets is 0.17 m high."""
     marker_height: float = 0.055
-    """m; height of the middle of a foot's markers above the ground on which it stands. Chosen: a
-    usual foot's markers have it on level ground."""
+    """m; mean height of a foot's markers above the surface on which it stands. Chosen: a usual
+    value on level ground."""
     same_height: float = 0.05
-    """m; heights that differ by less belong to one step. Chosen: the steps of stairs differ by
+    """m; two heights that differ by less belong to one step. Chosen: the steps of stairs differ by
     more."""
     max_standing_speed: float = 0.15
-    """m/s; a foot off the plates that moves less stands on something that was not measured."""
+    """m/s; a foot that is off the plates and slower than this may stand on an unmeasured surface.
+    Chosen: a swinging foot is faster."""
 
 
 FOOT_CONTACT = FootContactSettings()
@@ -188,15 +189,15 @@ FOOT_CONTACT = FootContactSettings()
 
 @dataclass(frozen=True, eq=False)
 class RecordedForce:
-    """A force that was recorded, in the laboratory.
+    """A recorded force in the laboratory's frame (x forward, y up, z right).
 
     Args:
         key: number of the plate, or name of the table's force.
         title: name in messages.
         time: (k,) s.
-        wrench: (k, 6) N and N·m about the laboratory's origin.
-        level: m, height of the surface.
-        drift: N, reading while nobody stands on it.
+        wrench: (k, 6) force (N) above moment (N·m) about the laboratory's origin.
+        level: height (m) of the surface.
+        drift: vertical force (N) that it reads while nobody stands on it.
     """
 
     key: int | str
@@ -208,7 +209,7 @@ class RecordedForce:
 
     @property
     def point(self) -> Array:
-        """(k, 3) m, centre of pressure on the level; NaN where it is not loaded."""
+        """(k, 3) m, centre of pressure on the surface; NaN while nobody stands on it."""
         force, moment = self.wrench[:, :3], self.wrench[:, 3:]
         vertical = np.where(self.loaded, force[:, 1], np.nan)
         x = (moment[:, 2] + self.level * force[:, 0]) / vertical
@@ -217,23 +218,23 @@ class RecordedForce:
 
     @property
     def loaded(self) -> np.ndarray:
-        """(k,) whether somebody stands on it."""
+        """(k,) whether somebody stands on the surface."""
         return np.asarray(self.wrench[:, 1] - self.drift > FOOT_CONTACT.min_force)
 
 
 @dataclass(frozen=True)
 class Load:
-    """A force under a foot.
+    """One uninterrupted load of a plate.
 
     Args:
         plate: number of the plate, or name of the table's force.
         title: name in messages.
-        side: side of the foot; empty: a foot without known markers.
-        start: s.
-        end: s.
-        distance: m, median, between the centre of pressure and that foot's markers.
-        other: m, median distance to the other foot's markers; NaN if that has none.
-        surface: m, approximate height of that foot above the plate: zero, or a step.
+        side: "left" or "right" foot; "": no foot's markers are near.
+        start: time (s) of its first sample.
+        end: time (s) of its last sample.
+        distance: median distance (m) between the centre of pressure and the nearest foot's markers.
+        other: median distance (m) to the other foot's markers; NaN without any.
+        surface: approximate height (m) of the step under the foot above the plate; 0: no step.
     """
 
     plate: int | str
@@ -248,12 +249,13 @@ class Load:
 
 @dataclass(frozen=True, eq=False)
 class Feet:
-    """Where the feet are.
+    """Positions of the feet.
 
     Args:
         path: the recording, for messages.
         time: (n,) s.
-        middles: side -> (n, 3) m, laboratory, the middle of the foot's markers; NaN unseen.
+        middles: side -> (n, 3) m, mean of the foot's markers in the laboratory; NaN where no
+            marker is visible.
     """
 
     path: Path
@@ -266,7 +268,7 @@ def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Fee
 
     Args:
         recorded: the markers.
-        axes: the file's that point forward, up and right.
+        axes: axes of the file that point forward, up and right, like "-x,+z,+y".
         labels: side -> labels of the foot's markers.
     """
     rotation = laboratory_rotation(axes, recorded.path)
@@ -275,7 +277,7 @@ def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Fee
 
 
 def plate_forces(recording: Recording, axes: str) -> list[RecordedForce]:
-    """Return the forces of a recording's plates."""
+    """Return the force of each of a recording's plates, in the laboratory of `axes`."""
     rotation = laboratory_rotation(axes, recording.path)
     time = recording.analog_time
     forces = []
@@ -290,7 +292,7 @@ def plate_forces(recording: Recording, axes: str) -> list[RecordedForce]:
 
 
 def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
-    """Return every load of every force, with the foot that is nearest to it."""
+    """Return all loads of all forces, each with the foot nearest to it, in order of time."""
     loads = []
     for one in forces:
         middles = {s: _interpolated(m, feet.time, one.time) for s, m in feet.middles.items()}
@@ -307,7 +309,7 @@ def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
 def _load(
     one: RecordedForce, time: Array, point: Array, force: Array, middles: dict[str, Array]
 ) -> Load:
-    """Return a load; a foot on a step is compared with the force's line on the step's level."""
+    """Return a load; for a foot on a step, the force's line is cut at the step's level."""
     away, surface = {}, {}
     for side, middle in middles.items():
         above = middle[:, 1] - point[:, 1]
@@ -328,10 +330,16 @@ def _load(
 def own_plates(
     loads: list[Load], side: str, path: Path, hint: str = "give --plates and --interval"
 ) -> tuple[int | str, ...]:
-    """Return the plates that only this foot stood on.
+    """Return the plates on which only this foot stood.
+
+    Args:
+        loads: all loads of the recording.
+        side: "left" or "right".
+        path: the recording, for messages.
+        hint: advice in messages.
 
     Raises:
-        InputError: none, or a plate that both feet stood on.
+        InputError: there is none, or both feet stood on one of them.
     """
     own = list(dict.fromkeys(load.plate for load in loads if load.side == side))
     others = {load.plate for load in loads if load.side != side}
@@ -356,7 +364,7 @@ def own_plates(
 
 
 def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
-    """Return how high (m) the foot stands above its plates; zero where that differs."""
+    """Return the mean height (m) of the step under the foot; 0 where the plates' heights differ."""
     heights = [load.surface for load in loads if load.plate in plates]
     return float(np.mean(heights)) if np.ptp(heights) < FOOT_CONTACT.same_height else 0.0
 
@@ -364,10 +372,10 @@ def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
 def known_interval(
     loads: list[Load], plates: tuple[int | str, ...], feet: Feet
 ) -> tuple[float, float]:
-    """Return the frames' times (s) from the first to the last load of the foot's plates.
+    """Return the times (s) of the first and the last frame in which the foot's plates are loaded.
 
     Raises:
-        InputError: fewer than two frames between them.
+        InputError: fewer than two frames lie between the first and the last load.
     """
     own = [load for load in loads if load.plate in plates]
     start, end = min(load.start for load in own), max(load.end for load in own)
@@ -388,7 +396,7 @@ def unmeasured(
     side: str,
     interval: tuple[float, float],
 ) -> Array:
-    """Return the times (s) in an interval at which the foot is still but on none of the plates."""
+    """Return the times (s) of an interval at which the foot is nearly still but on no plate."""
     time = feet.time
     speed = np.linalg.norm(np.gradient(feet.middles[side], time, axis=0), axis=1)
     on = np.zeros(len(time), bool)
@@ -400,7 +408,7 @@ def unmeasured(
 
 
 def _middle(table: Table, labels: list[str]) -> Array:
-    """Return the mean (n, 3) m of the markers that are seen; NaN without any."""
+    """Return the mean position (n, 3) m of the visible markers; NaN without any."""
     rows = table.rows
     if not labels:
         return np.full((rows, 3), np.nan)

@@ -19,40 +19,36 @@ from tkamb.io.importing.links import Links
 from tkamb.io.importing.markers import ModelSegment
 from tkamb.io.recordings.meshes import axes_rotation
 from tkamb.io.recordings.motion import KneeMotion, load_motion
-from tkamb.io.recordings.recordings import JointCentre
-from tkamb.io.scene.recording_tables import MotionTable
-from tkamb.io.scene.si import in_si
+from tkamb.io.recordings.recording_tables import MotionTable
 from tkamb.io.toml_text import toml_markers, toml_mm, toml_text
 from tkamb.units import DEGREE, MILLIMETRE
 
 
 @dataclass(frozen=True, eq=False)
 class ShankMarkers:
-    """Markers by which the tibia link stands in the laboratory.
+    """Markers that give the pose of the tibia link in the laboratory.
 
     Args:
-        path: of the recording.
-        axes: the file's that point forward, up and right.
-        points: label -> (3,) m in the tibia link.
-        centres: joint centres that complete them.
-        said: lines on them.
+        path: the recording.
+        axes: axes of the file that point forward, up and right.
+        points: label of a marker -> its place (3,) m in the tibia link.
+        centres: name of a joint centre that is used as a further marker -> the lines of its table
+            [[tibia.joint_centre]].
+        remarks: lines on the joint centres, for the report.
     """
 
     path: Path
     axes: str
     points: dict[str, Array]
-    centres: tuple[JointCentre, ...]
-    said: tuple[str, ...]
+    centres: dict[str, list[str]]
+    remarks: tuple[str, ...]
 
     def lines(self, path: str) -> list[str]:
-        """Return the scene's [tibia]; `path` is the recording's, as TOML."""
+        """Return the scene's table [tibia]; `path` is the recording's path as TOML."""
         lines = ["[tibia]", 'kind = "markers"', f"file = {path}"]
         lines += [f'laboratory_axes = "{self.axes}"', f"markers_mm = {toml_markers(self.points)}"]
-        for centre in self.centres:
-            lines += ["", "[[tibia.joint_centre]]", f"name = {toml_text(centre.name)}"]
-            lines.append(f"markers_mm = {toml_markers(centre.markers)}")
-            lines.append(f"centre_mm = {toml_mm(centre.centre)}")
-            lines.append(f"tibia_mm = {toml_mm(centre.tibia)}")
+        for centre in self.centres.values():
+            lines += ["", *centre]
         return lines
 
 
@@ -63,23 +59,24 @@ def shank_markers(
     recording: Path,
     axes: str,
 ) -> ShankMarkers:
-    """Return the points that place the shank: its markers and, if fewer than three, joint centres.
+    """Return the points that give the shank's pose.
 
-    The ankle's centre is carried by three or more markers of the foot, the knee's by those of
-    the thigh. Where the knee's centre lies in the shank is the mean over the poses given.
+    They are the shank's markers. If these are fewer than three, joint centres are added: the
+    ankle's centre moves with three or more markers of the foot, the knee's centre with those of the
+    thigh. The knee's centre in the shank is the mean over the recorded poses.
 
     Args:
-        links: of the leg.
-        segments: name -> the markers that were seen.
-        femur: (n, 4, 4) m, the femur's body in the tibia link.
-        recording: the file.
-        axes: the file's that point forward, up and right.
+        links: the links of the leg.
+        segments: name of a segment -> its visible markers.
+        femur: (n, 4, 4) poses, m, of the femur's body in the tibia link.
+        recording: the file of the markers.
+        axes: axes of the file that point forward, up and right.
 
     Raises:
-        InputError: fewer than three points.
+        InputError: there are fewer than three points.
     """
     points = segments["shank"].points
-    centres: list[JointCentre] = []
+    centres: dict[str, list[str]] = {}
     text: list[str] = []
     if len(points) < 3:
         centres, text = _carried(links, segments, femur)
@@ -88,52 +85,77 @@ def shank_markers(
             f"shows {len(points)} markers of the shank and joint centres for {len(centres)} more; "
             "three are needed",
             recording,
-            "three markers of the foot carry the ankle's centre, three of the thigh the knee's",
+            "three markers of the foot give the ankle's centre, three of the thigh the knee's",
         )
-    return ShankMarkers(recording, axes, points, tuple(centres), tuple(text))
+    return ShankMarkers(recording, axes, points, centres, tuple(text))
 
 
 def _carried(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
-) -> tuple[list[JointCentre], list[str]]:
-    """Return the joint centres that foot and thigh carry, and lines on them."""
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Return the joint centres that move with markers of foot and thigh, and remarks on them."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
-    centres, text = [], []
+    centres: dict[str, list[str]] = {}
+    text = []
     if len(foot.points) >= 3 and foot.centre is not None:
-        centres.append(JointCentre("ankle_centre", foot.points, foot.centre, np.zeros(3)))
-        text.append(f"shank: its ankle centre is carried by the foot's {len(foot.points)} markers")
+        centres["ankle_centre"] = _centre_lines(
+            "ankle_centre", foot.points, foot.centre, np.zeros(3)
+        )
+        text.append(f"shank: the foot's {len(foot.points)} markers give its ankle centre")
     if len(thigh.points) >= 3:
         own = {name: transform(links.femur, point) for name, point in thigh.points.items()}
         centre = transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre)
         places = transform(femur, centre)
         mean = places.mean(axis=0)
         apart = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
-        centres.append(JointCentre("knee_centre", own, centre, mean))
+        centres["knee_centre"] = _centre_lines("knee_centre", own, centre, mean)
         text.append(
-            f"shank: its knee centre is carried by the thigh's {len(own)} markers, at the mean of "
+            f"shank: the thigh's {len(own)} markers give its knee centre, at the mean of "
             f"{len(places)} recorded poses ({apart:.1f} mm rms about it)"
         )
     return centres, text
 
 
+def _centre_lines(
+    name: str, markers: Mapping[str, Array], centre: Array, tibia: Array
+) -> list[str]:
+    """Return the lines of a table [[tibia.joint_centre]].
+
+    Args:
+        name: name of the joint centre.
+        markers: label of a marker of the neighbouring segment -> its place (3,) m in that frame.
+        centre: (3,) m, the joint centre in the same frame.
+        tibia: (3,) m, the joint centre in the tibia link.
+    """
+    return [
+        "[[tibia.joint_centre]]",
+        f"name = {toml_text(name)}",
+        f"markers_mm = {toml_markers(markers)}",
+        f"centre_mm = {toml_mm(centre)}",
+        f"tibia_mm = {toml_mm(tibia)}",
+    ]
+
+
 ROLES = tuple(f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3))
-"""Of the columns, in their order."""
+"""Roles of the columns of a table of poses, in their order."""
 
 
 @dataclass(frozen=True)
 class PoseRecording:
-    """Poses of the femoral mesh in the insert mesh's own axes, and what is known of them.
+    """A table of poses of the femoral mesh in the insert mesh's own axes, and how to read it.
 
     Args:
         file: the table.
-        columns: of `ROLES`: three angles in the order of the sequence, then x, y, z.
-        sequence: of the rotations, as in scipy: "XYZ" is Rx Ry Rz.
+        columns: names of the columns of `ROLES`: three angles in the order of the sequence, then
+            x, y, z.
+        sequence: axes of the rotations, as in scipy: "XYZ" is Rx Ry Rz.
         angle_unit: "deg" or "rad".
         length_unit: "m", "cm" or "mm".
-        turned: roles that are read with the other sign.
-        stride: s, where 0 and 100 % of the file's time column lie on the recording's clock;
-            None: the file has that clock itself.
-        stance: part of the file's time column, in which the foot is loaded; None: all of it.
+        turned: roles whose columns are read with the other sign.
+        stride: times (s) of the recording at 0 and 100 % of the file's time column; None: the
+            file's times are those of the recording.
+        stance: start and end, in the file's time column, of the part in which the foot is loaded;
+            None: all of it.
     """
 
     file: Path
@@ -146,7 +168,7 @@ class PoseRecording:
     stance: tuple[float, float] | None = None
 
     def keys(self) -> dict[str, Any]:
-        """Return the keys of the scene's [motion] but its file, cut-off and columns."""
+        """Return the keys of the scene's [motion], without file, cut-off frequency and columns."""
         result: dict[str, Any] = {
             "interpretation": "pose",
             "sequence": self.sequence,
@@ -162,15 +184,15 @@ class PoseRecording:
 
 @dataclass(frozen=True, eq=False)
 class RecordedPoses:
-    """Poses after reading.
+    """Recorded poses after reading.
 
     Args:
-        given: the table of poses and its units.
-        interval: s, the part that is computed; None: all of it.
-        time: (n,) s, on the recording's clock.
-        femur: (n, 4, 4) m, the femur's body in the tibia link.
+        given: the table of poses.
+        interval: start and end (s) of the part that is computed; None: all of it.
+        time: (n,) s, times of the recording of markers.
+        femur: (n, 4, 4) poses, m, of the femur's body in the tibia link.
         in_stance: (n,) whether the foot is loaded.
-        said: lines for the report.
+        remarks: lines for the report.
     """
 
     given: PoseRecording
@@ -178,14 +200,14 @@ class RecordedPoses:
     time: Array
     femur: Array
     in_stance: Array
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
 
     def motion_lines(self, path: str, cutoff_Hz: float) -> list[str]:
-        """Return the scene's [motion]; `path` is the file's, as TOML."""
+        """Return the scene's table [motion]; `path` is the file's path as TOML."""
         lines = ["[motion]", f"file = {path}", f"cutoff_Hz = {cutoff_Hz:g}"]
         for key, value in self.given.keys().items():
             if key == "cycle_s":
-                lines.append("# 0 and 100 % on the recording's clock: an assumption, as given")
+                lines.append("# times of the recording at 0 and 100 %: given, an assumption")
             lines.append(f"{key} = {_toml(value)}")
         if self.interval:
             lines.append(f"interval_s = {_toml(list(self.interval))}")
@@ -202,18 +224,18 @@ def read_poses(
     cutoff_Hz: float,
     interval: tuple[float, float] | None,
 ) -> RecordedPoses:
-    """Return recorded poses as those of the femur's body in the tibia link.
+    """Return recorded poses, converted to poses of the femur's body in the tibia link.
 
-    With P the recorded pose of the femoral mesh in the insert mesh,
+    With the recorded pose P of the femoral mesh in the insert mesh,
     T_femur_in_tibia = T_insert_in_tibia T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
 
     Args:
-        recording: the table of poses and its units.
-        links: of the leg.
-        insert: its mesh about its own origin, in anatomical axes.
-        axes: the meshes' axes that point anterior, superior and right.
-        cutoff_Hz: low-pass of the scene.
-        interval: s, the part that is computed; None: all of it.
+        recording: the table of poses.
+        links: the links of the leg.
+        insert: mesh of the insert about its own origin, in anatomical axes.
+        axes: axes of the meshes that point anterior, superior and right.
+        cutoff_Hz: cut-off frequency (Hz) of the scene's low-pass filter.
+        interval: start and end (s) of the part that is computed; None: all of it.
 
     Raises:
         InputError: file, columns, units or times cannot be used.
@@ -226,19 +248,21 @@ def read_poses(
     own_side = mirrored_pose(knee) if side == "left" else knee  # the motion is a right knee's
     femur = links.insert_in_tibia @ own_side @ inverse(links.femur)
     stance = _in_stance(recording, motion)
-    return RecordedPoses(recording, interval, motion.time, femur, stance, _said(recording, motion))
+    return RecordedPoses(
+        recording, interval, motion.time, femur, stance, _remarks(recording, motion)
+    )
 
 
 def _motion_table(
     recording: PoseRecording, cutoff_Hz: float, interval: tuple[float, float] | None
-) -> Any:
+) -> MotionTable:
     keys = recording.keys() | {
         "file": recording.file,
         "cutoff_Hz": cutoff_Hz,
         "interval_s": interval,
     }
     keys["columns"] = dict(zip(ROLES, recording.columns, strict=True))
-    return in_si(MotionTable.model_validate(keys))
+    return MotionTable.model_validate(keys)
 
 
 def _in_stance(recording: PoseRecording, motion: KneeMotion) -> Array:
@@ -256,7 +280,7 @@ def _in_stance(recording: PoseRecording, motion: KneeMotion) -> Array:
     return np.asarray(inside)
 
 
-def _said(recording: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
+def _remarks(recording: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
     flexion = motion.raw_coordinates[:, 5] / DEGREE
     angles, places = ", ".join(recording.columns[:3]), ", ".join(recording.columns[3:])
     text = [

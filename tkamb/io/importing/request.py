@@ -1,4 +1,4 @@
-"""The request of an import."""
+"""The files and options of an import."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,35 +11,36 @@ from tkamb.io.recordings.unit_words import GivenUnits
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """Files and options of an import; None: inferred, or absent.
+    """The files and options of an import. None: the import infers it, or it is absent.
 
     Args:
         model: the .osim file.
-        side: of the knee.
-        mass_kg: of the subject.
-        recording: .c3d or .trc; .mot or .sto of the model's coordinates.
+        side: side of the knee, "left" or "right".
+        mass_kg: mass of the subject.
+        recording: .c3d or .trc file of markers, or .mot or .sto file of the model's coordinates.
         grf: table of ground reactions, instead of a C3D file's plates.
-        grf_force: how the columns of the foot's forces begin in it, separated by commas.
-        poses: of the femoral component in the insert; then the recording's markers place the
-            shank alone.
-        without: labels of markers that are not to be used.
-        static: recording of a standing trial, from which the markers' places are calibrated.
-        meshes: the implant's.
-        knee: the femorotibial joint's name.
-        frames: part -> frame of its mesh.
-        plates: under the foot.
-        interval: s, the part of the recording.
-        laboratory_axes: the file's that point forward, up and right.
+        grf_force: common beginnings of the names of that table's columns for the foot, separated
+            by commas.
+        poses: recorded poses of the femoral component in the insert. The markers then give only
+            the shank's pose.
+        without: labels of markers that are left out.
+        static: recording of a standing trial, which calibrates the markers' places.
+        meshes: meshes of the implant.
+        knee: name of the femorotibial joint.
+        frames: part of the implant -> name of its mesh's frame in the model.
+        plates: numbers of the plates under the foot; (): no ground reaction.
+        interval: start and end (s) of the part of the recording.
+        laboratory_axes: axes of the file that point forward, up and right.
         scale_mass: whether the model's masses are scaled to the subject's.
-        method: how the markers are fitted, "segments" or "chain".
-        cutoff_Hz: of markers and plates.
-        contact: the scene's contact model.
-        activity: what the report compares with; None: with nothing.
-        notes: of the user, for the report.
-        prefix: of the markers' labels that are used, where several prefixes share a label.
-        muscles: whether the scene has all muscles of the model, which share the load.
-        cycle: s, 0 and 100 % of the gait cycle; "plates": two foot strikes of the plates.
-        units: the recording's units, where it does not state them.
+        method: fit of the markers, "segments" or "chain".
+        cutoff_Hz: cut-off frequency for markers and plates.
+        contact: name of the scene's contact model.
+        activity: activity whose published peaks the report shows; None: no peaks.
+        notes: the user's notes for the report.
+        prefix: prefix of the markers that are used, if a label occurs under several prefixes.
+        muscles: whether all muscles of the model share the load.
+        cycle: times (s) of 0 and 100 % of the gait cycle; "plates": two foot strikes on the plates.
+        units: units of the recording that its file does not state.
     """
 
     model: Path

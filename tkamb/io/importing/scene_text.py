@@ -1,4 +1,4 @@
-"""The scene file that an import writes: TOML with what was inferred, as given."""
+"""The scene file that an import writes: TOML that states everything the import has inferred."""
 
 import json
 import os
@@ -17,13 +17,21 @@ from tkamb.io.toml_text import toml_markers, toml_mm, toml_numbers, toml_text
 from tkamb.units import DEGREE
 
 GROUND_FILE = "ground_reaction.csv"
-"""File beside the scene: a foot's ground reaction, if it is the sum of several forces of a
-table."""
+"""File beside the scene with the ground reaction, where that is a sum of forces in a table."""
 
 
 @dataclass(frozen=True)
 class Meshes:
-    """The implant's files, their unit and axes; the femur's bone, in its body's own axes."""
+    """Files of the implant's meshes, with their unit and their axes.
+
+    Args:
+        femoral: mesh of the femoral component.
+        insert: mesh of the insert.
+        patella: mesh of the patellar button; None without.
+        unit: "m", "cm", "mm" or "inch".
+        axes: axes of the meshes that point anterior, superior and right, like "+x,+y,+z".
+        femur_bone: mesh of the femur in its own body's axes, for wrapping; None without.
+    """
 
     femoral: Path
     insert: Path
@@ -37,8 +45,15 @@ class Meshes:
 class GroundFile:
     """Source of the ground reaction: plates of a C3D file, or columns of a table.
 
-    A foot on a step stands `surface` (m) above its plates. `made` is the text of a table that the
-    import writes: forces in turn, summed.
+    Args:
+        path: the file.
+        axes: axes of the file that point forward, up and right.
+        plates: numbers of the plates under the foot.
+        columns: (role, name) of the columns of a table.
+        length_unit: unit of lengths in the table; None: as the file states.
+        surface: height (m) of the step under the foot above its plates; 0: no step.
+        units: units that a C3D file does not state.
+        made: text of a table of summed forces that the import writes; None: `path` is read.
     """
 
     path: Path
@@ -53,9 +68,18 @@ class GroundFile:
 
 @dataclass(frozen=True, eq=False)
 class MarkerFile:
-    """A recording of markers and how they are read.
+    """A recording of markers, and how the scene reads it.
 
-    `whole_labels`: the scene names markers with their prefix, since the recording has several.
+    Args:
+        path: the file.
+        axes: axes of the file that point forward, up and right.
+        segments: segments with their markers.
+        method: fit of the markers, "segments" or "chain".
+        knee: joint of the chain, "hinge" or "free".
+        interval: start and end (s); None: all of it.
+        frames: number of frames, at equal intervals; None: all frames of the recording.
+        length_unit: unit of lengths that the user states; None: as the file states.
+        whole_labels: whether the scene names markers with their prefix.
     """
 
     path: Path
@@ -73,27 +97,29 @@ class MarkerFile:
 class SceneText:
     """Content of the scene.
 
+    The motion comes from `markers`, from `poses` or, without both, from `motion.csv`.
+
     Args:
         title: comment lines at the top.
-        folder: where the scene will stand; paths are relative to it.
-        side: of the knee.
-        mass_kg: of the subject.
-        urdf: name of the URDF beside the scene.
-        cutoff_Hz: of markers and plates.
-        links: of the leg.
-        markers: the recording of the knee's markers, if they are the motion.
-        poses: of the femoral component, if they are; the model's own coordinates, in
-            `motion.csv`, if neither is.
-        shank: markers that place the shank, with poses.
-        ground: the ground reaction; None without.
-        meshes: the implant; None without.
+        folder: the scene's future folder; paths in the scene are relative to it.
+        side: side of the knee, "left" or "right".
+        mass_kg: mass of the subject.
+        urdf: name of the URDF file, in the same folder.
+        cutoff_Hz: cut-off frequency for markers and plates.
+        links: the links of the leg.
+        markers: recording of markers for knee and shank; None: without.
+        poses: recorded poses of the femoral component; None: without.
+        shank: markers that give the shank's pose, with `poses`; None: without.
+        ground: the ground reaction; None: without.
+        meshes: the implant; None: without.
         tissue: muscles and ligaments.
-        contact: the contact model.
-        activity: what the report compares with; None: with nothing.
-        notes: for the report.
-        model: the .osim file whose muscles all act; None: the quadriceps alone.
-        coordinates: of that model, where the recording holds them and not markers.
-        cycle: s, 0 and 100 % of the gait cycle; "plates": as they show it; None: against time.
+        contact: name of the contact model.
+        activity: activity whose published peaks the report shows; None: no peaks.
+        notes: notes for the report.
+        model: the .osim file, if all its muscles act; None: only the quadriceps.
+        coordinates: file of that model's coordinates; None: they are fitted to the markers.
+        cycle: times (s) of 0 and 100 % of the gait cycle; "plates": from foot strikes on the
+            plates; None: results are shown over time.
     """
 
     title: tuple[str, ...]
@@ -157,10 +183,14 @@ class SceneText:
         lines += [f'length_unit = "{m.length_unit}"'] if m.length_unit else []
         lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
         if m.interval:
-            lines.append("# s on the file's clock, while every surface under the foot was measured")
+            lines.append(
+                "# s, times of the file at which every surface under the foot was measured"
+            )
             lines.append(f"interval_s = [{m.interval[0]:.9f}, {m.interval[1]:.9f}]")
         if m.frames:
-            lines.append("# every k-th frame of the recording: five times the cut-off is enough")
+            lines.append(
+                "# every k-th frame: five frames per period of the cut-off frequency are enough"
+            )
             lines.append(f"frames = {m.frames}")
         coordinates = ["flexion"] if self.meshes else _ALL
         lines += [
@@ -169,7 +199,7 @@ class SceneText:
             f'method = "{m.method}"  # "segments": shank and thigh separately; or "chain"',
             f'knee = "{m.knee}"',
             f"coordinates = {json.dumps(coordinates)}",
-            "# where the model keeps the straight knee",
+            "# position and rotation of the straight knee in the model",
             f"neutral_mm = {toml_mm(neutral[:3])}",
             f"neutral_deg = {toml_numbers(neutral[3:5] / DEGREE)}",
             f'laboratory_axes = "{m.axes}"',
@@ -197,7 +227,7 @@ class SceneText:
             "unloaded_N = 40.0",
         ]
         if g.surface:
-            lines.append("# the foot stands on a step, about as high above the plate")
+            lines.append("# the foot stands on a step of about this height above the plate")
             lines.append(f"surface_mm = {round(g.surface * 1e3, -1):.0f}")
         if g.columns:
             lines += ["", "[ground_reaction.columns]"]
@@ -260,7 +290,7 @@ class SceneText:
         link = toml_text(body_link(self.links.leg.femur[0]))
         mesh = f'mesh = {self._path(m.femur_bone)}, unit = "{m.unit}"'
         return [
-            "# what the line may wrap besides the component",
+            "# bone that the line may wrap, beside the component",
             f"bone = {{ {mesh}, link = {link} }}",
         ]
 
@@ -304,8 +334,7 @@ class SceneText:
             return lines
         return [
             *lines,
-            "# not recorded: they follow from the equilibrium of contact, ligaments and muscle "
-            "line",
+            "# not recorded: the equilibrium of contact, ligaments and muscle line gives them",
             'released = ["adduction", "axial_rotation", "ap", "ml"]',
         ]
 
@@ -325,7 +354,7 @@ _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
 
 
 def _end(key: str, end: End) -> str:
-    """Return the line of a strand's end."""
+    """Return the line for one end of a muscle or ligament."""
     return f"{key} = {{ link = {toml_text(end.link)}, point_mm = {toml_mm(end.point)} }}"
 
 

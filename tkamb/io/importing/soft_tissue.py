@@ -1,4 +1,4 @@
-"""The muscles and ligaments of a model that a scene can hold, and why others are left out."""
+"""Muscles and ligaments of an OpenSim model that a scene can describe; the rest with a reason."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,8 @@ class ImportedLigamentSettings:
     """Properties of imported ligaments that an OpenSim model does not state."""
 
     toe_strain: float = 0.06
-    """Strain at which the toe of law \"quadratic-toe\" ends: twice eps1 = 0.03 (Blankevoort
-    1991)."""
+    """Strain (1) at which the toe region of the law \"quadratic-toe\" ends: twice eps1 = 0.03
+    (Blankevoort 1991)."""
 
 
 IMPORTED_LIGAMENT = ImportedLigamentSettings()
@@ -23,7 +23,7 @@ IMPORTED_LIGAMENT = ImportedLigamentSettings()
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """A point (3,) m of a link of the URDF."""
+    """An attachment: a point (3,) m of a link of the URDF."""
 
     link: str
     point: Array
@@ -31,7 +31,7 @@ class End:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A ligament of the model that the scene's law describes exactly."""
+    """A strand of a ligament whose law the scene has too."""
 
     name: str
     proximal: End
@@ -42,25 +42,25 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class SoftTissue:
-    """Muscles and ligaments that are imported.
+    """The imported muscles and ligaments.
 
     Args:
         quadriceps: origin and insertion; None without a patella or a vastus intermedius.
-        patellar_ligament: ends on patella and tibia; None without.
-        ligament_length: m, of the patellar ligament.
-        bundles: femorotibial ligaments.
-        said: lines on what is imported, what is left out, and why.
+        patellar_ligament: ends on patella and tibia; None without a patellar ligament.
+        ligament_length: length (m) of the patellar ligament.
+        bundles: strands of the femorotibial ligaments.
+        remarks: lines on what is imported, what is left out, and why.
     """
 
     quadriceps: tuple[End, End] | None
     patellar_ligament: tuple[End, End] | None
     ligament_length: float
     bundles: tuple[Bundle, ...]
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
 
 
 def soft_tissue(links: Links) -> SoftTissue:
-    """Return the soft tissue of a leg's knee that the scene can hold."""
+    """Return the muscles and ligaments of a leg that the scene can describe."""
     text: list[str] = []
     quadriceps = _quadriceps(links, text)
     ligament, length = _patellar_ligament(links, text)
@@ -74,7 +74,7 @@ def _end(point: PathPoint) -> End:
 
 
 def _fixed(path: Path, bodies: tuple[str, ...]) -> list[PathPoint]:
-    """Return the path's plain points on some bodies."""
+    """Return the fixed points of a path on some bodies."""
     return [p for p in path.points if type(p) is PathPoint and p.body in bodies]
 
 
@@ -181,7 +181,7 @@ def _reason_against(ligament: OpenSimLigament, fixed: int) -> str:
 
 
 def _name_muscles(links: Links, remarks: list[str]) -> None:
-    """Say which muscles cross the knee and do not act without [muscles]."""
+    """Add a remark on the muscles that cross the knee but act only with [muscles]."""
     leg = links.leg
     across = [
         muscle.name
@@ -191,8 +191,8 @@ def _name_muscles(links: Links, remarks: list[str]) -> None:
     ]
     if across:
         remarks.append(
-            f"{len(across)} muscles run from thigh or pelvis to the shank; they act with "
-            f"--muscles, without it the quadriceps line alone: {some_names(across)}"
+            f"{len(across)} muscles cross the knee and act only with --muscles; without it only "
+            f"the quadriceps line acts: {some_names(across)}"
         )
 
 

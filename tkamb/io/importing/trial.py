@@ -1,4 +1,4 @@
-"""A trial: markers or coordinates, the direction the subject faces, the plates under the foot.
+"""A recorded trial: markers or coordinates, the laboratory's axes, the ground reaction of the foot.
 
 A standing trial of the same subject can calibrate the positions of the markers.
 """
@@ -34,18 +34,21 @@ from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.inverse_kinematics import LegChain
 from tkamb.io.recordings.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.io.recordings.markers import matched_labels, plain_label
+from tkamb.io.recordings.recording_tables import MarkersTable
 from tkamb.io.recordings.tables import Table, read_table, with_unit
 from tkamb.io.scene import Scene
-from tkamb.io.scene.recording_tables import MarkersTable
-from tkamb.io.scene.si import in_si
 
 
 def with_static_markers(
     scene: SceneText, static: Path, segments: list[ModelSegment], length_unit: str | None = None
 ) -> tuple[SceneText, list[str]]:
-    """Return the scene with its markers where they sit in a standing trial, and lines on it.
+    """Return the scene with markers' places calibrated by a standing trial, and remarks on them.
 
-    `length_unit` is the trial's, where its own word is not understood.
+    Args:
+        scene: content of the scene, with markers.
+        static: recording of the standing trial.
+        segments: segments with their markers.
+        length_unit: unit of lengths in the trial; None: as the file states.
     """
     assert scene.markers is not None
     stated = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
@@ -80,17 +83,17 @@ def calibrated_markers(
     side: Literal["right", "left"],
     pose_insert_in_tibia: Array,
 ) -> dict[str, dict[str, Array]]:
-    """Return where the markers sit on a subject who stands: segment -> marker -> (3,) m.
+    """Return the calibrated places of the markers: segment -> marker -> (3,) m in the segment.
 
-    The chain is fitted to the standing trial with the markers as the table has them; each
-    marker's mean position in its fitted segment is its calibrated one. So the chain decides the
-    pose of the bones, and the markers follow.
+    The chain of the leg is fitted to the standing trial, with the markers' places of the table. The
+    mean position of each marker in its fitted segment is its calibrated place. The chain thus gives
+    the pose of the bones, and the markers' places follow from it.
 
     Args:
-        table: markers and joints; those that the trial does not hold are left as they are.
+        table: markers and joints of the scene. Markers that the trial lacks are left out.
         recorded: the standing trial.
-        side: of the leg.
-        pose_insert_in_tibia: (4, 4), of the (mirrored) patient.
+        side: side of the leg.
+        pose_insert_in_tibia: (4, 4), mirrored for a left leg.
 
     Raises:
         InputError: the trial cannot be read, or its markers do not fit.
@@ -106,7 +109,7 @@ def calibrated_markers(
         )
         for own in table.segment
     ]
-    markers = in_si(table.model_copy(update={"segment": tuple(points)}))
+    markers = table.model_copy(update={"segment": tuple(points)})
     segments, measured = leg_segments(markers, recorded, None, side)
     chain = LegChain(segments, pose_insert_in_tibia, markers.knee == "free")
     neutral = neutral_coordinates(markers, side)
@@ -124,8 +127,8 @@ class TrialFrameSettings:
     """How many frames of a trial an imported scene holds."""
 
     frames_per_period: float = 5.0
-    """Frames per period of the cut-off frequency. Chosen: a low-pass-filtered motion has no content
-    between them."""
+    """Number of frames per period of the cut-off frequency. Chosen: a low-pass-filtered motion has
+    no content between them."""
 
 
 TRIAL_FRAMES = TrialFrameSettings()
@@ -133,10 +136,19 @@ TRIAL_FRAMES = TrialFrameSettings()
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What a recording gives: markers or coordinates, ground reaction, and lines on them."""
+    """Motion and ground reaction of a recorded trial.
+
+    Args:
+        ground: the ground reaction; None: none is modelled.
+        remarks: lines for the report.
+        markers: recording of markers; None: the motion is not from markers.
+        motion: motion in the model's coordinates; None: not from coordinates.
+        poses: recorded poses of the knee; None: not from poses.
+        shank: markers that give the shank's pose, with `poses`.
+    """
 
     ground: GroundFile | None
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
     markers: MarkerFile | None = None
     motion: ModelMotion | None = None
     poses: RecordedPoses | None = None
@@ -144,10 +156,10 @@ class Trial:
 
 
 def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
-    """Return a recording of markers: C3D with its plates, or markers and a table of forces.
+    """Return a trial of markers, with plates of a C3D file or with a table of forces.
 
     Raises:
-        InputError: markers, plates or interval that cannot be used.
+        InputError: markers, plates or interval cannot be used.
     """
     segments = model_segments(links, recorded, request.without)
     facing = _facing(request, segments, recorded)
@@ -170,17 +182,17 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
         request.prefix is not None,
     )
     matched = [*_notices(request, recorded), *_segment_lines(segments, request.without)]
-    text = (*matched, _facing_line(request, facing), *result.said, *joined, thinned)
+    text = (*matched, _facing_line(request, facing), *result.remarks, *joined, thinned)
     return Trial(result.ground, text, markers)
 
 
 def from_poses(
     request: ImportRequest, leg: Leg, links: Links, recorded: Table, poses: RecordedPoses
 ) -> Trial:
-    """Return recorded poses of the knee, with a recording of markers that place the shank.
+    """Return a trial of recorded knee poses, with markers that give the shank's pose.
 
     Raises:
-        InputError: markers or plates that cannot be used.
+        InputError: markers or plates cannot be used.
     """
     segments = seen_segments(links, recorded, request.without)
     facing = _facing(request, [s for s in segments.values() if len(s.points) >= 3], recorded)
@@ -190,15 +202,21 @@ def from_poses(
     feet_there = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
     result = find_ground(covered, leg.side, facing.axes, feet_there)
     matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
-    text = (*poses.said, *matched, _facing_line(request, facing), *shank.said, *result.said)
+    text = (
+        *poses.remarks,
+        *matched,
+        _facing_line(request, facing),
+        *shank.remarks,
+        *result.remarks,
+    )
     return Trial(result.ground, text, poses=poses, shank=shank)
 
 
 def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
-    """Return a motion in the model's own coordinates.
+    """Return a trial in the model's own coordinates.
 
     Raises:
-        InputError: no flexion of the knee in it, or a ground reaction of no foot.
+        InputError: it has no flexion of the knee, or no force is the foot's.
     """
     for joint in way_to_pelvis(leg):
         if joint.unread:
@@ -207,10 +225,10 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     text = [f"motion: the model's coordinates in {recorded.path.name}, into {MOTION_FILE}"]
     if motion.missing:
         text.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
-    text += [*_notices(request, recorded), *motion.said]
+    text += [*_notices(request, recorded), *motion.remarks]
     feet = model_feet(links, recorded) if request.grf is not None else None
     result = find_ground(request, leg.side, "+x,+y,+z", feet)
-    text += result.said
+    text += result.remarks
     if result.ground is not None:
         text.append("laboratory: the model's ground, x forward, y up")
     if request.interval is not None:
@@ -222,7 +240,7 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
 
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
-    """Return lines on parts of the recording that are not used, or not read as stated."""
+    """Return remarks on parts of the recording that are not used, or not read as stated."""
     notices = recorded.notices
     if recorded.path.suffix.lower() == ".c3d":
         notices = read_c3d(recorded.path, request.units).all_notices
@@ -257,9 +275,10 @@ def _segment_lines(segments: Iterable[ModelSegment], without: tuple[str, ...]) -
 def _thinned(
     time: Array, interval: tuple[float, float] | None, cutoff_Hz: float
 ) -> tuple[tuple[float, float], int | None, str]:
-    """Return interval and number of frames at about five times the cut-off, and a line on it.
+    """Return the interval, the number of frames in it (None: all), and a remark on them.
 
-    The frames are every k-th of the recording, at its own times.
+    The frames are every k-th frame of the recording, at about `frames_per_period` times the cut-off
+    frequency.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
@@ -279,12 +298,12 @@ def _thinned(
 
 
 def _check_within(time: Array, start: float, end: float) -> None:
-    """Raise unless an interval lies within a recording, but for a frame at either end."""
+    """Raise if an interval reaches beyond the recording by more than one frame at either end."""
     frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if start < time[0] - frame or end > time[-1] + frame:
         raise InputError(
             f"{start:g} to {end:g} s is not within the recording, "
             f"{time[0]:.4f} to {time[-1]:.4f} s",
             "--interval",
-            "give it on the recording's own clock",
+            "give times of the recording",
         )

@@ -24,7 +24,7 @@ from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates
 from tkamb.io.recordings.force_plates import PLATE_LOAD, around_load, unloaded_level
 from tkamb.io.recordings.gait_cycle import Gait, find_gait
 from tkamb.io.recordings.laboratory import check_roles, laboratory_rotation
-from tkamb.io.recordings.recordings import ForceRecording, Side
+from tkamb.io.recordings.recording_tables import GroundReactionTable, Side
 from tkamb.io.recordings.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.io.recordings.unit_words import GivenUnits
@@ -120,7 +120,7 @@ class RecordedReaction:
         return replace(self, **own)
 
 
-def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> GroundReaction:
+def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -> GroundReaction:
     """Return the ground reaction at the frames of the knee's motion.
 
     Args:
@@ -139,14 +139,14 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     path = source.file
     check_spacing(path, stamps)
     _check_upward(force, source)
-    loaded = force[:, 1] >= source.unloaded
+    loaded = force[:, 1] >= source.unloaded_N
     held, point = _own_points(recorded, loaded, path)
     near = (stamps >= time[0] - GROUND_REACTION.window) & (
         stamps <= time[-1] + GROUND_REACTION.window
     )
     # Plates record the wrench. Their centre of pressure is a quotient and noisy at small forces.
     points = None if from_plates else point[near]
-    odd = _odd_samples(path, stamps[near], force[near], points, loaded[near], source.cutoff)
+    odd = _odd_samples(path, stamps[near], force[near], points, loaded[near], source.cutoff_Hz)
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
     if loaded.any() and np.abs(point[loaded, 1] - level).max() > GROUND_REACTION.level_tolerance:
         raise InputError(
@@ -158,8 +158,10 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
         force, point, moment = force @ MIRROR, point @ MIRROR, -moment @ MIRROR
         held = held @ MIRROR
     wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
-    filtered, _, _ = differentiate_coordinates(stamps, wrench, source.cutoff, time, name=str(path))
-    reaction = _at_centre_of_pressure(filtered, level, source.unloaded, time, stamps, held)
+    filtered, _, _ = differentiate_coordinates(
+        stamps, wrench, source.cutoff_Hz, time, name=str(path)
+    )
+    reaction = _at_centre_of_pressure(filtered, level, source.unloaded_N, time, stamps, held)
     return replace(
         reaction,
         odd=odd,
@@ -170,7 +172,7 @@ def load_ground_reaction(source: ForceRecording, time: Array, side: Side) -> Gro
     )
 
 
-def recorded_wrench(source: ForceRecording) -> tuple[Array, Array, float]:
+def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
     """Return times (k,) s, wrench (k, 6) N and N·m, and level (m) of a table's force.
 
     The wrench is that on the foot, in the laboratory and about its origin.
@@ -180,7 +182,7 @@ def recorded_wrench(source: ForceRecording) -> tuple[Array, Array, float]:
     """
     recorded = _read_table(source)
     _check_upward(recorded.force, source)
-    loaded = recorded.force[:, 1] >= source.unloaded
+    loaded = recorded.force[:, 1] >= source.unloaded_N
     _, point = _own_points(recorded, loaded, source.file)
     about = np.cross(point, recorded.force) + recorded.moment
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
@@ -198,7 +200,7 @@ def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> t
     return held, np.where(own[:, None], recorded.point, held)
 
 
-def recorded_span(source: ForceRecording) -> tuple[float, float]:
+def recorded_span(source: GroundReactionTable) -> tuple[float, float]:
     """Return first and last time (s) of a file's ground reaction."""
     if _is_c3d(source):
         time = read_c3d(source.file, _units(source)).analog_time
@@ -207,16 +209,16 @@ def recorded_span(source: ForceRecording) -> tuple[float, float]:
     return float(time[0]), float(time[-1])
 
 
-def _is_c3d(source: ForceRecording) -> bool:
+def _is_c3d(source: GroundReactionTable) -> bool:
     return (source.format or source.file.suffix.lower().lstrip(".")) == "c3d"
 
 
-def _units(source: ForceRecording) -> GivenUnits:
+def _units(source: GroundReactionTable) -> GivenUnits:
     return GivenUnits(source.length_unit, source.force_unit, source.moment_unit)
 
 
 def _complete_part(
-    recorded: RecordedReaction, time: Array, source: ForceRecording
+    recorded: RecordedReaction, time: Array, source: GroundReactionTable
 ) -> RecordedReaction:
     """Return the samples around the frames up to the next that is not a number.
 
@@ -245,9 +247,9 @@ def _complete_part(
     return replace(part, notices=(*part.notices, line + "not numbers"))
 
 
-def _read_table(source: ForceRecording) -> RecordedReaction:
+def _read_table(source: GroundReactionTable) -> RecordedReaction:
     """Return what a table holds; one without the points' heights has them at zero."""
-    if source.surface:
+    if source.surface_mm:
         raise InputError(
             "is for plates of a .c3d: a table states its points itself",
             "[ground_reaction] surface_mm",
@@ -320,12 +322,12 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
         )
 
 
-def _upright_point(source: ForceRecording) -> str:
+def _upright_point(source: GroundReactionTable) -> str:
     """Return the role of the centre of pressure's height: a plate need not record its own."""
     return f"point_{'xyz'.index(source.laboratory_axes.split(',')[1][-1]) + 1}"
 
 
-def _read_columns(source: ForceRecording, recorded: Table) -> tuple[Array, Array, Array]:
+def _read_columns(source: GroundReactionTable, recorded: Table) -> tuple[Array, Array, Array]:
     """Return force (N), point (m) and free moment (N·m), each (n, 3), in the laboratory."""
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
     check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
@@ -362,7 +364,7 @@ def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
     check_range(path, f"foot: column '{column}'", filled, (-largest, largest), unit, question)
 
 
-def _read_plates(source: ForceRecording) -> RecordedReaction:
+def _read_plates(source: GroundReactionTable) -> RecordedReaction:
     """Return the ground reaction of a recording's plates.
 
     The wrenches are summed about the laboratory's origin and kept, each while its plate is
@@ -395,7 +397,11 @@ def _read_plates(source: ForceRecording) -> RecordedReaction:
         if abs(level) > PLATE_LOAD.drift_N:
             drift[plate.number] = level
     point, moment, force = summed_reaction(
-        recording.analog_time, wrenches, levels[0] + source.surface, source.unloaded, source.file
+        recording.analog_time,
+        wrenches,
+        levels[0] + source.surface_mm * MILLIMETRE,
+        source.unloaded_N,
+        source.file,
     )
     notices = tuple(notice for plate in plates for notice in plate.notices)
     return RecordedReaction(
@@ -432,11 +438,11 @@ def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Arra
     return np.stack([x, np.full_like(x, level), z], axis=1)
 
 
-def _check_upward(force: Array, source: ForceRecording) -> None:
+def _check_upward(force: Array, source: GroundReactionTable) -> None:
     """Raise where the largest force on the foot points down or sideways."""
     up, down = float(force[:, 1].max()), float(-force[:, 1].min())
     aside = float(np.hypot(force[:, 0], force[:, 2]).max())
-    if max(down, aside) > max(up, source.unloaded):
+    if max(down, aside) > max(up, source.unloaded_N):
         word, size = ("down", down) if down > aside else ("sideways", aside)
         raise InputError(
             f"the ground pushes the foot up with {max(up, 0.0):.4g} N at most, but {word} with "

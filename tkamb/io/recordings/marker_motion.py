@@ -35,10 +35,10 @@ from tkamb.io.recordings.inverse_kinematics import (
 )
 from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import MARKER_FIT, fit_seen, marker_trajectories
-from tkamb.io.recordings.recordings import MarkerSet, MotionRecording, Side
+from tkamb.io.recordings.recording_tables import MarkersTable, MotionTable, Side
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.io.recordings.tibia import BodyMotion
-from tkamb.units import MILLIMETRE
+from tkamb.units import DEGREE, MILLIMETRE
 
 Method = Literal["segments", "chain"]
 KNEE_SEGMENTS = ("shank", "thigh")
@@ -95,7 +95,7 @@ class MarkerKinematics:
 
 
 def load_marker_motion(
-    source: MotionRecording, side: Side, pose_insert_in_tibia: Array
+    source: MotionTable, side: Side, pose_insert_in_tibia: Array
 ) -> MarkerKinematics:
     """Return knee and shank of a recording's markers.
 
@@ -152,7 +152,7 @@ def both_fits(
 
 
 def leg_segments(
-    markers: MarkerSet, recorded: Table, length_unit: str | None, side: str
+    markers: MarkersTable, recorded: Table, length_unit: str | None, side: str
 ) -> tuple[list[Segment], dict[str, Array]]:
     """Return the segments, and segment -> its markers (n, m, 3) m, laboratory, gaps NaN.
 
@@ -164,15 +164,18 @@ def leg_segments(
     mirror = MIRROR if side == "left" else np.eye(3)
     segments, measured = [], {}
     for own in markers.segment:
-        labels = tuple(own.markers)
+        labels = tuple(own.markers_mm)
         points = marker_trajectories(recorded, list(labels), scale) @ rotation.T
         measured[own.name] = points @ mirror
-        ends = [None if end is None else mirror @ end for end in (own.joint, own.centre)]
+        ends = [
+            None if end is None else mirror @ (np.array(end) * MILLIMETRE)
+            for end in (own.joint_mm, own.centre_mm)
+        ]
         segments.append(
             Segment(
                 own.name,
                 labels,
-                np.array(list(own.markers.values())) @ mirror,
+                np.array(list(own.markers_mm.values())) * MILLIMETRE @ mirror,
                 np.array([own.weights.get(label, 1.0) for label in labels]),
                 own.joined_to or "",
                 *ends,
@@ -181,10 +184,10 @@ def leg_segments(
     return segments, measured
 
 
-def neutral_coordinates(markers: MarkerSet, side: str) -> Array:
+def neutral_coordinates(markers: MarkersTable, side: str) -> Array:
     """Return the knee coordinates (6,), m and rad, that a hinge keeps; flexion is zero."""
-    ap, si, ml = markers.neutral_translation
-    axial, adduction = markers.neutral_rotation
+    ap, si, ml = np.array(markers.neutral_mm) * MILLIMETRE
+    axial, adduction = np.array(markers.neutral_deg) * DEGREE
     return np.array([ap, si, -ml if side == "left" else ml, axial, adduction, 0.0])
 
 
@@ -222,7 +225,7 @@ def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Ta
 
 
 def _compare_readings(
-    source: MotionRecording,
+    source: MotionTable,
     recorded: Table,
     time: Array,
     readings: dict[Method, tuple[Array, Array]],
@@ -238,7 +241,7 @@ def _compare_readings(
     missing = np.concatenate(
         [np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1
     )
-    run = _run(time, np.isnan(knees[used][:, 0]), source.interval, recorded)
+    run = _run(time, np.isnan(knees[used][:, 0]), source.interval_s, recorded)
     return MarkerKinematics(
         time[run],
         used,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
-from tkamb.io.recordings.recordings import ShankRecording
+from tkamb.io.recordings.recording_tables import TibiaTable
 from tkamb.io.recordings.tables import Table
 from tkamb.units import MILLIMETRE
 
@@ -69,7 +69,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
     return np.moveaxis(np.array(columns), 2, 0) * metres_per_unit
 
 
-def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]:
+def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, measured and in the tibia link.
 
     A joint centre comes from a rigid fit of the neighbouring segment's markers.
@@ -81,16 +81,16 @@ def shank_points(source: ShankRecording, recorded: Table) -> tuple[Array, Array]
         InputError: no unit, unknown markers, or a neighbour's markers that do not fit.
     """
     scale = recorded.unit_scale(source.length_unit, "length_unit")
-    points = [marker_trajectories(recorded, [name], scale) for name in source.markers]
-    reference = list(source.markers.values())
+    points = [marker_trajectories(recorded, [name], scale) for name in source.markers_mm]
+    reference = list(source.markers_mm.values())
     for joint in source.joint_centre:
-        measured = marker_trajectories(recorded, list(joint.markers), scale)
-        own = np.array(list(joint.markers.values()))
+        measured = marker_trajectories(recorded, list(joint.markers_mm), scale)
+        own = np.array(list(joint.markers_mm.values())) * MILLIMETRE
         poses, residual = fit_rigid(measured, own, joint.name)
         check_fit(residual, f"the markers of joint centre '{joint.name}'", recorded)
-        points.append(transform(poses, joint.centre)[:, None])
-        reference.append(joint.tibia)
-    return np.concatenate(points, axis=1), np.array(reference)
+        points.append(transform(poses, np.array(joint.centre_mm) * MILLIMETRE)[:, None])
+        reference.append(joint.tibia_mm)
+    return np.concatenate(points, axis=1), np.array(reference) * MILLIMETRE
 
 
 def check_fit(residual: Array, what: str, recorded: Table) -> None:

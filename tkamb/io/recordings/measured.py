@@ -21,7 +21,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.io.recordings.recordings import EmgRecording, ForceMeasurement
+from tkamb.io.recordings.recording_tables import EmgTable, MeasuredTable
 from tkamb.io.recordings.samples import check_overlap
 from tkamb.io.recordings.tables import Table, read_table
 
@@ -72,7 +72,7 @@ class MeasuredForce:
         }
 
 
-def load_measured_force(source: ForceMeasurement, time: Array) -> MeasuredForce:
+def load_measured_force(source: MeasuredTable, time: Array) -> MeasuredForce:
     """Read what was measured.
 
     Args:
@@ -85,10 +85,10 @@ def load_measured_force(source: ForceMeasurement, time: Array) -> MeasuredForce:
     table = read_table(source.file, source.format)
     name = source.columns.get("time", "time")
     assert isinstance(name, str)
-    clock = table.time(name) + source.offset
+    clock = table.time(name) + source.offset_s
     if len(clock) < 2:
         raise InputError("holds fewer than two samples", source.file)
-    force = {
+    force: dict[str, Array] = {
         role: _sum(table, column) * FORCE[source.unit]
         for role, column in source.columns.items()
         if role != "time"
@@ -154,7 +154,7 @@ class Envelopes:
         return np.interp(time, self.time, values, left=np.nan, right=np.nan)
 
 
-def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
+def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
     """Read EMG and return its envelopes.
 
     Args:
@@ -170,12 +170,12 @@ def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
     step = np.diff(time)
     if len(step) < 2 or np.abs(step - np.median(step)).max() > EMG.step_tolerance * np.median(step):
         raise InputError("has EMG that is not sampled evenly", source.file, "resample it")
-    check_overlap(source.file, time + source.offset, motion, "[muscles.emg]")
+    check_overlap(source.file, time + source.offset_s, motion, "[muscles.emg]")
     rate = len(step) / (time[-1] - time[0])
     values, normalised_by = {}, {}
     for channel, signal in signals.items():
         try:
-            result = envelope(signal, rate, source.cutoff, source.high_pass)
+            result = envelope(signal, rate, source.cutoff_Hz, source.high_pass_Hz)
         except InputError as error:
             raise InputError(
                 error.what, f"{source.file}: channel '{channel}'", error.hint
@@ -186,7 +186,7 @@ def load_envelopes(source: EmgRecording, motion: Array) -> Envelopes:
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
         values[channel] = result / normalised_by[channel]
     muscles = {muscle: channel for channel, own in source.channels.items() for muscle in own}
-    return Envelopes(source.file, time + source.offset, values, muscles, normalised_by)
+    return Envelopes(source.file, time + source.offset_s, values, muscles, normalised_by)
 
 
 def envelope(
@@ -233,7 +233,7 @@ def _low_passed(signal: Array, cutoff: float) -> Array:
     return np.fft.irfft(spectrum, len(mirrored))[: len(signal)]
 
 
-def _signals(source: EmgRecording) -> tuple[Array, dict[str, Array]]:
+def _signals(source: EmgTable) -> tuple[Array, dict[str, Array]]:
     """Return times (n,) s on the file's clock and channel -> (n,)."""
     if source.file.suffix.lower() != ".c3d":
         table = read_table(source.file)

@@ -26,7 +26,7 @@ from tkamb.geometry.frames import (
 from tkamb.io.recordings.filtering import differentiate_coordinates
 from tkamb.io.recordings.gait_cycle import Cycle
 from tkamb.io.recordings.laboratory import angle_scale, check_roles, poses_of_columns
-from tkamb.io.recordings.recordings import MotionRecording, Side
+from tkamb.io.recordings.recording_tables import MotionTable, Side
 from tkamb.io.recordings.samples import (
     OddSample,
     check_range,
@@ -106,7 +106,7 @@ class KneeMotion:
 
 
 def load_motion(
-    source: MotionRecording,
+    source: MotionTable,
     side: Side,
     pose_insert_mesh_in_insert: Array,
     pose_femoral_mesh_in_femur: Array,
@@ -160,7 +160,7 @@ def load_motion(
 
 
 def _from_markers(
-    source: MotionRecording, side: Side, insert: Array, released: Sequence[str]
+    source: MotionTable, side: Side, insert: Array, released: Sequence[str]
 ) -> KneeMotion:
     """Return the motion that skin markers give: the coordinates that are taken from them."""
     from tkamb.io.recordings.marker_motion import load_marker_motion
@@ -184,7 +184,7 @@ def _from_markers(
 
 
 def _find_unrecorded(
-    recorded: Table, source: MotionRecording, released: Sequence[str]
+    recorded: Table, source: MotionTable, released: Sequence[str]
 ) -> tuple[str, ...]:
     """Return the coordinates without a column, all of which must be released."""
     missing = [
@@ -205,7 +205,7 @@ def _find_unrecorded(
 
 def _read_coordinates(
     recorded: Table,
-    source: MotionRecording,
+    source: MotionTable,
     roles: tuple[str, ...],
     unrecorded: tuple[str, ...] = (),
 ) -> Array:
@@ -222,7 +222,7 @@ def _read_coordinates(
     return values
 
 
-def _check_roles(source: MotionRecording, recorded: Table) -> None:
+def _check_roles(source: MotionTable, recorded: Table) -> None:
     if source.interpretation == "pose":
         kinds = ("rotation", "translation")
         own = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
@@ -238,14 +238,14 @@ def _check_roles(source: MotionRecording, recorded: Table) -> None:
             )
 
 
-def _turn_signs(recorded: Table, source: MotionRecording) -> Table:
+def _turn_signs(recorded: Table, source: MotionTable) -> Table:
     """Return the recording with the columns of the roles in `signs_turned` negated."""
     names = {source.columns.get(role, role) for role in source.signs_turned}
     negated = {name: -recorded.column(name) for name in names}
     return replace(recorded, columns=recorded.columns | negated)
 
 
-def _bending_role(recorded: Table, source: MotionRecording) -> str:
+def _bending_role(recorded: Table, source: MotionTable) -> str:
     """Return the role whose sign is that of flexion: of a pose, the rotation of widest range."""
     if source.interpretation != "pose":
         return "flexion"
@@ -305,13 +305,13 @@ def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, 
 
 
 def _differentiate(
-    time: Array, knee: Array, patella: Array | None, source: MotionRecording, path: Path
+    time: Array, knee: Array, patella: Array | None, source: MotionTable, path: Path
 ) -> KneeMotion:
     """Return the filtered motion at the scene's frames."""
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
     cycle = None
-    if source.cycle:
-        cycle = Cycle.of(time, knee, source.cycle, source.cycle_offset_percent, path)
+    if source.cycle_s:
+        cycle = Cycle.of(time, knee, source.cycle_s, source.cycle_offset_percent, path)
     sampled = cycle.seconds(time) if cycle else time
     check_spacing(path, sampled)
     odd = _find_odd_steps(sampled, values, path)
@@ -319,7 +319,7 @@ def _differentiate(
     inside = cycle.wrapped(at, sampled) if cycle else at
     closed = cycle is not None and cycle.closed
     name = str(path)
-    x, v, a = differentiate_coordinates(sampled, values, source.cutoff, inside, closed, name)
+    x, v, a = differentiate_coordinates(sampled, values, source.cutoff_Hz, inside, closed, name)
     raw, _, _ = differentiate_coordinates(sampled, knee, "none", inside, name=name)
     filtered_pose, raw_pose = knee_pose(x[:, :6]), knee_pose(raw)
     turn = inverse(raw_pose)[:, :3, :3] @ filtered_pose[:, :3, :3]
@@ -341,10 +341,10 @@ def _differentiate(
     )
 
 
-def _frames(sampled: Array, source: MotionRecording, cycle: Cycle | None) -> Array:
+def _frames(sampled: Array, source: MotionTable, cycle: Cycle | None) -> Array:
     if cycle:
         return cycle.frames(sampled, source.frames)
-    start, end = source.interval or (sampled[0], sampled[-1])
+    start, end = source.interval_s or (sampled[0], sampled[-1])
     inside = sampled[(sampled >= start - 1e-9) & (sampled <= end + 1e-9)]
     if len(inside) < 2 or start < sampled[0] - 1e-9 or end > sampled[-1] + 1e-9:
         raise InputError(

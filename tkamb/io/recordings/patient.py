@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.files import read_xml
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
-from tkamb.io.recordings.recordings import Patient
+from tkamb.io.recordings.recording_tables import PatientTable
 from tkamb.io.recordings.urdf_check import (
     check_chain,
     check_elements,
@@ -137,11 +137,11 @@ MOST_TURNED = np.radians(40.0)
 deformed leg."""
 
 
-def load_urdf(patient: Patient, with_patella: bool) -> str:
+def load_urdf(patient: PatientTable, with_patella: bool) -> str:
     """Return the URDF text of a right knee (a left one mirrored), complete and checked.
 
     Args:
-        patient: who it is.
+        patient: the scene's [patient].
         with_patella: whether the patella and its joints are needed.
 
     Raises:
@@ -236,7 +236,9 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
         )
 
 
-def _complete_inertias(robot: ElementTree.Element, patient: Patient, with_patella: bool) -> None:
+def _complete_inertias(
+    robot: ElementTree.Element, patient: PatientTable, with_patella: bool
+) -> None:
     links = {link.get("name"): link for link in robot.findall("link")}
     missing = [n for n in ("tibia", "femur") if links[n].find("inertial") is None]
     if missing and patient.sex is None:
@@ -253,15 +255,17 @@ def _complete_inertias(robot: ElementTree.Element, patient: Patient, with_patell
         _write_inertia(links["patella"], RigidInertia(PATELLA_LINK.mass, np.zeros(3), tensor))
 
 
-def _segment(robot: ElementTree.Element, name: str, sex: Sex, patient: Patient) -> RigidInertia:
+def _segment(
+    robot: ElementTree.Element, name: str, sex: Sex, patient: PatientTable
+) -> RigidInertia:
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     if name == "femur":
         hip = _fixed_pose(robot, "hip", "femur", patient.urdf)[:3, 3]
-        return segment_inertia("thigh", sex, patient.mass, hip, np.zeros(3))
+        return segment_inertia("thigh", sex, patient.mass_kg, hip, np.zeros(3))
     ankle = np.zeros(3)
     knee = _origin(joints["knee_ap"])[:3, 3]
-    shank = segment_inertia("shank", sex, patient.mass, knee, ankle)
-    foot = segment_inertia("foot", sex, patient.mass, ankle, ankle + np.array([0, -1.0, 0]))
+    shank = segment_inertia("shank", sex, patient.mass_kg, knee, ankle)
+    foot = segment_inertia("foot", sex, patient.mass_kg, ankle, ankle + np.array([0, -1.0, 0]))
     return combined(shank, foot)
 
 

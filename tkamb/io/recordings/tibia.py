@@ -18,7 +18,7 @@ from tkamb.io.recordings.laboratory import (
     poses_of_columns,
 )
 from tkamb.io.recordings.markers import check_fit, complete_run, fit_rigid, shank_points
-from tkamb.io.recordings.recordings import ShankRecording, Side
+from tkamb.io.recordings.recording_tables import Side, TibiaTable
 from tkamb.io.recordings.samples import (
     OddSample,
     check_range,
@@ -79,7 +79,7 @@ class BodyMotion:
     odd: tuple[OddSample, ...] = ()
 
 
-def load_tibia(source: ShankRecording, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
+def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
     """Return the tibia's motion at the frames of the knee's motion.
 
     The whole record is filtered and then evaluated, so that a record longer than the
@@ -94,7 +94,7 @@ def load_tibia(source: ShankRecording, time: Array, side: Side, cutoff_Hz: Cutof
     Raises:
         InputError: file, columns or markers cannot be used, or do not cover `time`.
     """
-    cutoff: Cutoff = cutoff_Hz if source.cutoff is None else source.cutoff
+    cutoff: Cutoff = cutoff_Hz if source.cutoff_Hz is None else source.cutoff_Hz
     recorded = read_table(source.file)
     if source.kind == "sagittal":
         return _sagittal(source, recorded, time, side, cutoff)
@@ -140,7 +140,7 @@ def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tup
 
 
 def _sagittal(
-    source: ShankRecording, recorded: Table, time: Array, side: str, cutoff: Cutoff
+    source: TibiaTable, recorded: Table, time: Array, side: str, cutoff: Cutoff
 ) -> BodyMotion:
     """Return the lean about the laboratory's z over a fixed ankle."""
     check_roles(source.columns, ("time", "angle"), recorded.path, "tibia")
@@ -157,7 +157,7 @@ def _sagittal(
     angle, rate, rate_of_rate = differentiate_coordinates(
         stamps, -lean, cutoff, time, name=str(recorded.path)
     )
-    ankle = source.ankle
+    ankle = np.array(source.ankle_mm) * MILLIMETRE
     if side == "left":
         ankle = MIRROR @ ankle
     velocity, acceleration = np.zeros((len(time), 6)), np.zeros((len(time), 6))
@@ -166,7 +166,7 @@ def _sagittal(
     return BodyMotion(time, pose(rotation, ankle), velocity, acceleration, odd=odd)
 
 
-def _read_poses(source: ShankRecording, recorded: Table) -> Array:
+def _read_poses(source: TibiaTable, recorded: Table) -> Array:
     assert source.sequence is not None
     kinds = ("rotation", "translation")
     roles = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
@@ -177,12 +177,12 @@ def _read_poses(source: ShankRecording, recorded: Table) -> Array:
 
 
 def _fit_markers(
-    source: ShankRecording, recorded: Table, stamps: Array, time: Array
+    source: TibiaTable, recorded: Table, stamps: Array, time: Array
 ) -> tuple[Array, Array, Array]:
     """Return times, poses and residuals of the marker fit, around the frames."""
     check_roles(source.columns, ("time",), recorded.path, "tibia")
     points, reference = shank_points(source, recorded)
-    names = [*source.markers, *(joint.name for joint in source.joint_centre)]
+    names = [*source.markers_mm, *(joint.name for joint in source.joint_centre)]
     run = complete_run(points, names, stamps, time[0], time[-1], recorded)
     poses, residual = fit_rigid(points[run], reference)
     check_fit(residual, "shank markers", recorded)

@@ -1,4 +1,4 @@
-"""The scene file: the only place that knows its tables. Below it everything is in SI."""
+"""The scene file, and the case that is read from it."""
 
 from tkamb.io.scene.scene import Scene, load_scene, scene_schema, with_overrides, with_preset
 

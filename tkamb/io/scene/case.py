@@ -13,8 +13,8 @@ from tkamb.geometry.frames import Array, pose
 from tkamb.io.recordings.filtering import check_frames, differentiate_coordinates
 from tkamb.io.recordings.motion import KneeMotion, load_motion
 from tkamb.io.recordings.patient import load_urdf
+from tkamb.io.recordings.recording_tables import MotionTable
 from tkamb.io.scene.scene import Scene
-from tkamb.io.scene.si import in_si
 from tkamb.io.scene.tables import FemoralImplantTable, PatellarImplantTable
 from tkamb.knee.chain import Chain
 from tkamb.units import MILLIMETRE
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
     from tkamb.io.recordings.ground_reaction import GroundReaction
     from tkamb.io.recordings.measured import Envelopes, MeasuredForce
-    from tkamb.io.recordings.recordings import MotionRecording
     from tkamb.io.recordings.tibia import BodyMotion
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.muscles import Muscle, PatellarLigament
@@ -121,7 +120,7 @@ class Case:
 
 
 def _recordings(
-    scene: Scene, source: "MotionRecording", chain: Chain, parts: "_Parts | None"
+    scene: Scene, source: MotionTable, chain: Chain, parts: "_Parts | None"
 ) -> "tuple[KneeMotion, BodyMotion | None, GroundReaction | None]":
     """Return knee, shank and ground reaction at the frames of the motion."""
     released = scene.contact.released if scene.contact else ()
@@ -137,16 +136,14 @@ def _recordings(
     if scene.tibia:
         from tkamb.io.recordings.tibia import load_tibia
 
-        tibia = load_tibia(
-            in_si(scene.tibia), motion.time, scene.patient.side, scene.motion.cutoff_Hz
-        )
+        tibia = load_tibia(scene.tibia, motion.time, scene.patient.side, scene.motion.cutoff_Hz)
     elif motion.markers:
         cutoff = scene.motion.cutoff_Hz
         tibia = motion.markers.shank_motion(cutoff, motion.time, str(scene.motion.file))
     if scene.ground_reaction:
         from tkamb.io.recordings.ground_reaction import check_under_foot, load_ground_reaction
 
-        ground = load_ground_reaction(in_si(scene.ground_reaction), motion.time, scene.patient.side)
+        ground = load_ground_reaction(scene.ground_reaction, motion.time, scene.patient.side)
         for notice in ground.notices:
             logger.warning("%s: %s", scene.ground_reaction.file, notice)
         if tibia and scene.ground_reaction.applied == "cop":
@@ -154,7 +151,7 @@ def _recordings(
     return motion, tibia, ground
 
 
-def _common_part(scene: Scene) -> "MotionRecording | None":
+def _common_part(scene: Scene) -> MotionTable | None:
     """Return the part of the motion that the ground reaction covers; None if there is none.
 
     A scene without an interval asks for the whole recording, but the clocks of two files may
@@ -165,10 +162,10 @@ def _common_part(scene: Scene) -> "MotionRecording | None":
     from tkamb.io.recordings.ground_reaction import recorded_span
     from tkamb.io.recordings.tables import read_table
 
-    source: MotionRecording = in_si(scene.motion)
+    source = scene.motion
     recorded = read_table(source.file, source.format)
     time = recorded.time(source.columns.get("time", "time"))
-    start, end = recorded_span(in_si(scene.ground_reaction))
+    start, end = recorded_span(scene.ground_reaction)
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
     if len(inside) < 2 or len(inside) == len(time):
         return None
@@ -178,7 +175,7 @@ def _common_part(scene: Scene) -> "MotionRecording | None":
         scene.ground_reaction.file,
         *(start, end, time[0], time[-1], *common),
     )
-    return replace(source, interval=common)
+    return source.model_copy(update={"interval_s": common})
 
 
 def load_case(scene: Scene) -> Case:
@@ -188,11 +185,11 @@ def load_case(scene: Scene) -> Case:
         InputError: whatever is wrong with them, in one line.
     """
     with_patella = scene.patella is not None
-    chain = Chain(load_urdf(in_si(scene.patient), with_patella), with_patella)
+    chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
     # Tables before meshes, which take longer: a mistake in a table is reported at once.
     parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
     try:
-        motion, tibia, ground = _recordings(scene, in_si(scene.motion), chain, parts)
+        motion, tibia, ground = _recordings(scene, scene.motion, chain, parts)
     except InputError:
         source = _common_part(scene)
         if source is None:
@@ -276,7 +273,7 @@ def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
         return None
     from tkamb.io.recordings.measured import load_measured_force
 
-    return load_measured_force(in_si(scene.measured), motion.time)
+    return load_measured_force(scene.measured, motion.time)
 
 
 def _emg(scene: Scene, motion: KneeMotion) -> "Envelopes | None":
@@ -284,7 +281,7 @@ def _emg(scene: Scene, motion: KneeMotion) -> "Envelopes | None":
         return None
     from tkamb.io.recordings.measured import load_envelopes
 
-    return load_envelopes(in_si(scene.muscles.emg), motion.time)
+    return load_envelopes(scene.muscles.emg, motion.time)
 
 
 def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":

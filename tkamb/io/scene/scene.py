@@ -14,9 +14,14 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_valid
 from pydantic_core import ErrorDetails
 
 from tkamb.errors import InputError, names_near
-from tkamb.io.scene.measured import MeasuredTable
-from tkamb.io.scene.recording_tables import GroundReactionTable, MotionTable, TibiaTable
-from tkamb.io.scene.table import SceneTable
+from tkamb.io.recordings.recording_tables import (
+    GroundReactionTable,
+    MeasuredTable,
+    MotionTable,
+    PatientTable,
+    TibiaTable,
+)
+from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.tables import (
     ContactTable,
     GenericLigamentsTable,
@@ -28,7 +33,6 @@ from tkamb.io.scene.tables import (
     OutputTable,
     PatellarLigamentTable,
     PatellaTable,
-    PatientTable,
     QuadricepsTable,
     WearTable,
 )

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 
 from tkamb.io import CONTACT_MODEL
 from tkamb.io.activities import Activity
-from tkamb.io.scene.measured import EmgTable
-from tkamb.io.scene.table import (
+from tkamb.io.recordings.recording_tables import EmgTable
+from tkamb.io.recordings.scene_table import (
     DEFAULT_CLOSING,
     Axes,
     Band,
@@ -28,32 +28,6 @@ from tkamb.io.scene.table import (
     Turn,
     within,
 )
-
-
-class PatientTable(SceneTable):
-    """Who it is. The URDF holds the chain ankle-tibia-femur-patella."""
-
-    urdf: Path
-    side: Literal["right", "left"] = Field(description="the knee that is modelled")
-    # From a child of six with a tumour prosthesis to the heaviest patients operated on.
-    mass_kg: Annotated[Number, within(20, 300, "give it in kilograms")] = Field(
-        description="body mass, 20 to 300; forces in BW are relative to it"
-    )
-    sex: Literal["male", "female"] | None = Field(
-        None, description="only for segments without <inertial>: picks the de Leva table"
-    )
-    # The same child to the tallest adults but a few.
-    height_mm: Annotated[
-        Number | None, within(1000, 2300, "give the standing height in millimetres")
-    ] = Field(None, description="body height, 1000 to 2300")
-    scale: Annotated[Number, within(0.7, 1.4, "1 is the patient as recorded")] = Field(
-        1.0,
-        description=(
-            "makes of the patient a synthetic one of the same shape: lengths, implants and knee "
-            "translations times this, masses and ground reaction times its cube; mass_kg and "
-            "height_mm stay those of the patient as recorded"
-        ),
-    )
 
 
 class FemoralImplantTable(SceneTable):

@@ -15,7 +15,7 @@ from tkamb.io.opensim.motion import CoordinateMotion, coordinate_motion, read_co
 from tkamb.io.opensim.read import read_osim
 from tkamb.io.recordings.filtering import Cutoff
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
-from tkamb.io.recordings.recordings import ForceRecording, Side
+from tkamb.io.recordings.recording_tables import GroundReactionTable, Side
 from tkamb.io.recordings.tables import read_table
 from tkamb.run.muscles.knee_trial import KneeTrial, knee_trial
 from tkamb.run.muscles.leg import foot_loads, leg_bones, leg_muscles, muscle_groups
@@ -46,7 +46,7 @@ class LegRecording:
     markers: Path | None
     laboratory_axes: str
     cutoff: Cutoff
-    ground: ForceRecording | None
+    ground: GroundReactionTable | None
     insert_placement: Array | None
     mesh_axes: str
     sharing: Sharing

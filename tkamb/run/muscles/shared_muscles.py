@@ -12,7 +12,6 @@ import numpy as np
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
 from tkamb.io.scene.case import Case
-from tkamb.io.scene.si import in_si
 from tkamb.io.scene.tables import MusclesTable
 from tkamb.knee.crossing import (
     CrossingLines,
@@ -220,7 +219,7 @@ def load_muscles(case: Case) -> SharedMuscles:
         markers=scene.motion.file if markers else None,
         laboratory_axes=markers.laboratory_axes if markers else "+x,+y,+z",
         cutoff=scene.motion.cutoff_Hz,
-        ground=None if ground is None else in_si(ground),
+        ground=ground,
         insert_placement=case.insert_placement,
         mesh_axes="+x,+y,+z" if insert is None else insert.axes,
         sharing=sharing_of(table),

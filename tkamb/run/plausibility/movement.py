@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.io.recordings.samples import OddSample
 from tkamb.io.scene.case import Case
-from tkamb.io.scene.recording_tables import GroundReactionTable
 from tkamb.run.plausibility.question import Question
 from tkamb.units import DEGREE, MILLIMETRE
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.io.recordings.motion import KneeMotion
+from tkamb.io.recordings.recording_tables import GroundReactionTable, MotionTable, TibiaTable
+from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.case import Case
-from tkamb.io.scene.recording_tables import GroundReactionTable, MotionTable, TibiaTable
-from tkamb.io.scene.table import SceneTable
 from tkamb.knee.load import LinkPoint
 from tkamb.units import MILLIMETRE
 

@@ -17,7 +17,6 @@ from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, Index, knee_pose
 from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.scene.case import Case, with_insert
-from tkamb.io.scene.si import in_si
 from tkamb.knee.chain import Chain
 from tkamb.knee.frame_contact import FrameContact
 from tkamb.run.contact_side import ContactSide
@@ -412,7 +411,7 @@ def _numbers(
 
 def _without_muscles(case: Case) -> Case:
     """Return a case of bones, ligaments and contact alone: nothing else is on the bench."""
-    chain = Chain(load_urdf(in_si(case.scene.patient), False), False)
+    chain = Chain(load_urdf(case.scene.patient, False), False)
     update = {"patella": None, "muscles": None, "quadriceps": None, "muscle": ()}
     scene = case.scene.model_copy(update=update)
     return replace(case, scene=scene, chain=chain, muscles=(), patellar_ligament=None, patella=None)

@@ -20,8 +20,8 @@ from tqdm import tqdm
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import sha256_of
+from tkamb.io.recordings.scene_table import Count, Number, SceneTable
 from tkamb.io.scene import Scene, load_scene
-from tkamb.io.scene.table import Count, Number, SceneTable
 from tkamb.io.toml_text import read_toml
 from tkamb.run.frame_choice import frames_slice
 from tkamb.run.summary import files_in

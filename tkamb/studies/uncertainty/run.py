@@ -1,22 +1,36 @@
-"""All samples of a scene: computed by workers, stored when finished, then turned into bands."""
+"""An uncertainty analysis, from a scene to bands and written files.
+
+Workers compute the samples. Each finished sample is stored at once, so that an interrupted run can
+be resumed. The samples give bands, tornado and, where asked for, Sobol' indices.
+"""
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import h5py
 import numpy as np
 
 from tkamb.errors import InputError
+from tkamb.files import write_rows
 from tkamb.geometry.frames import Array
 from tkamb.io.claim import claimed_directory
+from tkamb.io.hdf5_file import new_hdf5
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recorded import predicted_columns
 from tkamb.run.results import STATISTICS_LIMITS, Results
+from tkamb.run.results_folder import (
+    BANDS_NAME,
+    INDICES_NAME,
+    SAMPLES_NAME,
+    TORNADO_NAME,
+    write_results,
+)
 from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import chosen_frames, simulate
 from tkamb.run.workers import PoolOptions, Progress, Task, WorkerPool
@@ -30,12 +44,80 @@ from tkamb.studies.uncertainty.bands import (
     peak_band,
     peak_bands,
 )
-from tkamb.studies.uncertainty.correlation import correlation_root
-from tkamb.studies.uncertainty.folder import write_uncertainty
-from tkamb.studies.uncertainty.indices import SobolIndex, sobol_indices
 from tkamb.studies.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.studies.uncertainty.sample import BandWorker, Sample
-from tkamb.studies.uncertainty.sampling import Point, crossed_points, normal_samples
+from tkamb.studies.uncertainty.sampling import (
+    Point,
+    correlation_root,
+    crossed_points,
+    normal_samples,
+)
+from tkamb.studies.uncertainty.sensitivity import SobolIndex, sobol_indices
+
+if TYPE_CHECKING:
+    from tkamb.studies.uncertainty.sensitivity import SobolIndex
+
+
+def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
+    """Write the nominal results and, beside them, bands, tornado, samples and indices together.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+
+    def write_samples(path: Path) -> None:
+        with new_hdf5(path) as file:
+            file["result_names"] = uncertainty.names
+            file["input_names"] = [one.name for one in uncertainty.inputs]
+            file["input_units"] = [one.unit for one in uncertainty.inputs]
+            file["input_standard_deviations"] = [one.deviation for one in uncertainty.inputs]
+            file["time_s"] = uncertainty.results["time_s"]
+            for name, dtype in (("values", float), ("failed", bool), ("errors", float)):
+                content = np.array([getattr(one, name) for one in uncertainty.samples], dtype)
+                file.create_dataset(name, data=content, compression="gzip")
+            problems = [one.problems.tolist() for one in uncertainty.samples]
+            text = h5py.string_dtype()
+            file.create_dataset("problems", data=problems, dtype=text, compression="gzip")
+
+    more = {
+        BANDS_NAME: lambda path: write_rows(path, _band_rows(uncertainty.bands)),
+        TORNADO_NAME: lambda path: write_rows(path, _tornado_rows(uncertainty)),
+        SAMPLES_NAME: write_samples,
+    }
+    if uncertainty.indices:
+        more[INDICES_NAME] = lambda path: write_rows(path, _index_rows(uncertainty.indices))
+    write_results(uncertainty.results, folder, more=more)
+
+
+def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[str]]:
+    rows = zip(*(map(_cell, values) for values in columns.values()), strict=True)
+    return [list(columns), *rows]
+
+
+def _tornado_rows(uncertainty: "Uncertainty") -> list[Sequence[str]]:
+    by_name = {one.name: one for one in uncertainty.inputs}
+    rows: list[Sequence[str]] = [
+        ("result", "input", "standard_deviation", "unit", "variance_share", "change_per_sd")
+    ]
+    for one in uncertainty.tornado:
+        varied = by_name.get(one.name)
+        deviation, unit = (_cell(varied.deviation), varied.unit) if varied else ("", "")
+        rows.append((one.result, one.name, deviation, unit, _cell(one.share), _cell(one.change)))
+    return rows
+
+
+def _index_rows(indices: "Sequence[SobolIndex]") -> list[Sequence[str]]:
+    head = ("result", "input", "first_order", "first_order_se", "total", "total_se", "rows")
+    rows: list[Sequence[str]] = [head]
+    for one in indices:
+        numbers = (one.first, one.first_error, one.total, one.total_error)
+        rows.append((one.result, one.name, *map(_cell, numbers), str(one.rows)))
+    return rows
+
+
+def _cell(value: float) -> str:
+    return "" if np.isnan(value) else repr(float(value))
+
 
 SAMPLES = 256
 MOST_SAMPLES = 100_000

@@ -1,7 +1,16 @@
-"""Samples of standard normal inputs; each depends only on its number.
+"""Samples of standard normal inputs, independent or correlated.
 
-Sample number n is the same whatever the count of samples and whoever asks for it, so adding
-samples keeps the old ones and the order in which workers finish does not matter.
+Sample n depends on its number alone, not on the number of samples. More samples therefore keep the
+earlier ones, and the order in which workers finish does not matter.
+
+Correlated inputs ([[uncertainty.correlation]]): z = L x, with x independent standard normal and
+L L^T the correlation matrix (Cholesky). This is a Gaussian copula, because every input is a
+function of its own normal error. The method of Iman & Conover (1982) keeps the strata of every
+input, but its samples depend on their number.
+
+References: Cario & Nelson, Modeling and generating random vectors with arbitrary marginal
+distributions and correlation matrix, Northwestern University (1997); Iman & Conover, Commun Stat
+Simul Comput 11:311 (1982), doi:10.1080/03610918208812265.
 """
 
 from collections.abc import Sequence
@@ -14,6 +23,57 @@ from scipy.stats import qmc
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
+from tkamb.io.scene.uncertainty import CorrelationTable
+
+TABLE = "[[uncertainty.correlation]]"
+ROUNDING = 1e-10
+"""An eigenvalue, or a remaining variance, above minus this counts as not negative."""
+
+
+def correlation_root(tables: Sequence[CorrelationTable], names: Sequence[str]) -> Array:
+    """Return L (d, d), lower triangular, with L L^T the correlation matrix of the inputs.
+
+    Args:
+        tables: the pairs that are correlated; all others are not.
+        names: (d,) of the inputs that vary.
+
+    Raises:
+        InputError: an input that does not vary, a pair given twice, or no correlation matrix.
+    """
+    matrix = np.eye(len(names))
+    for table in tables:
+        row, column = (_place(name, names) for name in table.between)
+        if matrix[row, column] != 0.0:
+            raise InputError(f"'{table.between[0]}' and '{table.between[1]}' twice", TABLE)
+        matrix[row, column] = matrix[column, row] = table.coefficient
+    least = float(np.linalg.eigvalsh(matrix)[0])
+    if least < -ROUNDING:
+        raise InputError(
+            f"do not give a correlation matrix (smallest eigenvalue {least:.3g})",
+            TABLE,
+            "give smaller coefficients, or those of the other pairs too",
+        )
+    return _cholesky(matrix)
+
+
+def _place(name: str, names: Sequence[str]) -> int:
+    if name in names:
+        return names.index(name)
+    raise InputError(
+        f"'{name}' does not vary", TABLE, names_near(name, names, "the inputs that vary")
+    )
+
+
+def _cholesky(matrix: Array) -> Array:
+    """Return L of a positive semi-definite matrix; a column of zeros where nothing is left."""
+    root = np.zeros_like(matrix)
+    for k in range(len(matrix)):
+        rest = matrix[k, k] - root[k, :k] @ root[k, :k]
+        if rest > ROUNDING:
+            root[k, k] = np.sqrt(rest)
+            root[k + 1 :, k] = (matrix[k + 1 :, k] - root[k + 1 :, :k] @ root[k, :k]) / root[k, k]
+    return root
+
 
 Method = Literal["lhs", "sobol"]
 BLOCK = 64

@@ -16,8 +16,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.frames import pose as pose_of
 from tkamb.geometry.surface import Surface
-from tkamb.studies.wear.force_control import RestingPoses
 from tkamb.studies.wear.motion import CycleMotion
+from tkamb.studies.wear.simulator import RestingPoses
 
 GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
 """m along x where the search for the dwell position begins."""

@@ -17,11 +17,10 @@ from tkamb.geometry.surface import Surface
 from tkamb.io.vtk import write_triangles
 from tkamb.run.shards import remove_shards
 from tkamb.studies.wear.bands import WearBands
-from tkamb.studies.wear.force_control import UNITS
-from tkamb.studies.wear.kept import STATE_NAME
 from tkamb.studies.wear.materials import WearMaterial
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import CycleWear, FirstCycle, WearCase, WearState
+from tkamb.studies.wear.simulator import UNITS
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -29,8 +28,9 @@ if TYPE_CHECKING:
 
 
 MILLION = 1e6
-SAMPLES_NAME = ".wear_samples"
-"""Folder of the finished samples while a simulation is under way."""
+STATE_NAME, SAMPLES_NAME = ".wear.npz", ".wear_samples"
+"""File of the last finished block, and folder of the finished samples, of an unfinished
+simulation."""
 FIRST = (
     "Worn volume, mass and depth are proportional to the wear factor, which differs by a factor of "
     "two and more between laboratories."

@@ -1,24 +1,34 @@
-"""A wear simulation, from the user's options to the written files."""
+"""A wear simulation, from the user's options to the written files.
 
+Each finished block of cycles is stored in the folder, so that a kill loses one block.
+"""
+
+import hashlib
+import json
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from tkamb import code_identity
 from tkamb.errors import InputError
+from tkamb.files import FILE_LIMITS, read_bytes, replaced_file
 from tkamb.io.scene import Scene
 from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.plug_ins import foreign_code
 from tkamb.run.results import Results
-from tkamb.run.shards import Shards
+from tkamb.run.shards import UNREADABLE, Shards
 from tkamb.run.workers import PoolOptions
 from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
-from tkamb.studies.wear.kept import keep_state, kept_state, wear_identity
 from tkamb.studies.wear.laws import WearLaw
 from tkamb.studies.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
-from tkamb.studies.wear.report import SAMPLES_NAME, WearReport
+from tkamb.studies.wear.report import SAMPLES_NAME, STATE_NAME, WearReport
 from tkamb.studies.wear.setup import WearSetup, setup_of_results, wear_setup
 from tkamb.studies.wear.simulation import (
     CycleWear,
@@ -28,6 +38,80 @@ from tkamb.studies.wear.simulation import (
     first_cycle,
     simulate_wear,
 )
+
+
+def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -> str:
+    """Return the hash that identifies a simulation: bodies, motion, laws, numbers, code."""
+    digest = hashlib.sha256()
+    bodies = (setup.engine.femoral, case.articular.surface)
+    arrays = [array for body in bodies for array in (body.vertices, body.faces)]
+    drive = case.motion.drive
+    if drive is not None:
+        arrays += [drive.coordinates, drive.applied, drive.zero]
+    motion = case.motion
+    arrays += [one for one in (motion.seconds, *(motion.path or ())) if one is not None]
+    for array in (*arrays, case.motion.poses, case.motion.load):
+        digest.update(np.ascontiguousarray(array, "<f8").tobytes())
+    words = (setup.engine.model, setup.engine.material, setup.engine.bearing, case.law, case.creep)
+    numbers = (case.density, case.motion.duration, case.motion.passes, cycles, updates)
+    machine = () if drive is None else (drive.free, drive.springs)
+    others = (foreign_code(setup.engine.model), foreign_code(case.law))
+    digest.update(repr((words, numbers, machine, code_identity(), *others)).encode())
+    return digest.hexdigest()
+
+
+def keep_state(folder: Path, state: WearState, identity: str) -> None:
+    """Put the state in the folder, whole or not at all.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    arrays = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state) if f.name != "rows"}
+    rows = np.asarray(json.dumps(state.rows))
+    with replaced_file(folder / STATE_NAME) as temporary, open(temporary, "wb") as file:
+        np.savez(file, allow_pickle=False, identity=np.asarray(identity), rows=rows, **arrays)
+
+
+def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
+    """Return the state that a folder keeps; None where there is none.
+
+    Args:
+        folder: of the simulation.
+        identity: of the simulation to go on with.
+        count: of articular vertices.
+
+    Raises:
+        InputError: it is of another simulation, or cannot be read.
+    """
+    path = folder / STATE_NAME
+    if not path.is_file():
+        return None
+    try:
+        with np.load(BytesIO(read_bytes(path, FILE_LIMITS.mesh_bytes)), allow_pickle=False) as file:
+            content = dict(file)
+    except UNREADABLE as error:
+        raise _damaged(path, str(error) or type(error).__name__) from None
+    if str(content.pop("identity", "")) != identity:
+        what = "is of another simulation: bodies, motion, law, numbers or code differ"
+        raise InputError(what, path, "leave out resume=True, or choose another directory")
+    try:
+        rows = json.loads(str(content.pop("rows")))
+        values = {name: one.item() if one.ndim == 0 else one for name, one in content.items()}
+        state = WearState(rows=tuple(rows), **values)
+        whole = all(isinstance(row, dict) for row in rows)
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(path, str(error)) from None
+    numbers = (state.cycles, state.step, state.volume, state.creep_volume, state.map_error)
+    if not (whole and all(isinstance(one, float) and math.isfinite(one) for one in numbers)):
+        raise _damaged(path, "its values are not numbers")
+    arrays = (state.wear, state.creep, state.fall)
+    if not all(isinstance(one, np.ndarray) and one.shape == (count,) for one in arrays):
+        raise _damaged(path, f"its arrays are not of {count} vertices")
+    return state
+
+
+def _damaged(path: Path, why: str) -> InputError:
+    return InputError(f"is damaged ({why})", path, "leave --resume out to begin again")
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ from tkamb.run.summary import files_hash, scene_hash
 from tkamb.studies.uncertainty.inputs import uncertainty_of
 from tkamb.studies.wear.engine import ContactEngine
 from tkamb.studies.wear.motion import CycleMotion, check_closing, chosen_frames
-from tkamb.studies.wear.profile import Profile, read_profile
-from tkamb.studies.wear.springs import Springs, read_springs
+from tkamb.studies.wear.simulator import Profile, Springs, read_profile, read_springs
 from tkamb.studies.wear.worn_surface import ArticularSurface
 from tkamb.units import MILLIMETRE
 
@@ -89,8 +88,8 @@ def wear_setup(
 
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
-        simulator: a profile (`tkamb.studies.wear.profile`) in place of the scene's motion.
-        springs: a file of its springs (`tkamb.studies.wear.springs`), for force control.
+        simulator: a profile (`tkamb.studies.wear.simulator`) in place of the scene's motion.
+        springs: a file of its springs (`tkamb.studies.wear.simulator`), for force control.
         contact: contact model, in place of the scene's.
         resolution_mm: in place of the scene's.
         frames: largest number of frames of a recorded cycle, smallest of a simulator's; the cycle

@@ -10,9 +10,9 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
-from tkamb.studies.wear.creep import LogarithmicCreep
 from tkamb.studies.wear.engine import CycleMaps, carried, interpolation
 from tkamb.studies.wear.laws import WearLaw
+from tkamb.studies.wear.materials import LogarithmicCreep
 from tkamb.studies.wear.motion import CycleMotion
 from tkamb.studies.wear.sliding import SlidingHistory
 from tkamb.studies.wear.worn_surface import ArticularSurface, volume

@@ -7,11 +7,9 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from tkamb.geometry.frames import Array
-from tkamb.studies.designs.cam import Cam
 from tkamb.studies.designs.design import Design
-from tkamb.studies.designs.femoral import FemoralComponent
+from tkamb.studies.designs.femoral import Cam, FemoralComponent, SagittalProfile, normal
 from tkamb.studies.designs.insert import Insert
-from tkamb.studies.designs.sagittal import SagittalProfile, normal
 
 
 @dataclass(frozen=True)
