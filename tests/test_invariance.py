@@ -15,8 +15,8 @@ from tkamb.geometry import closest, condyles
 from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.patient import load_urdf
-from tkamb.io.scene import lines
 from tkamb.io.scene.case import Case, load_case
+from tkamb.io.scene.parts import ligament, read_muscles, read_patellar_ligament
 from tkamb.io.scene.scene import Scene, load_scene
 from tkamb.knee import contact_points, patellofemoral
 from tkamb.knee import equations as knee
@@ -240,9 +240,9 @@ def scaled_case(case: Case) -> Case:
         surface(case.femoral),
         surface(case.insert),
         surface(case.patella),
-        lines.ligaments(scene),
-        lines.muscles(scene, chain),
-        lines.patellar_ligament(scene),
+        tuple(ligament(table) for table in scene.ligament),
+        read_muscles(scene, chain),
+        read_patellar_ligament(scene),
     )
 
 

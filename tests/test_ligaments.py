@@ -11,7 +11,7 @@ from tkamb.geometry.frames import inverse, knee_pose
 from tkamb.geometry.surface import Surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.io.scene.lines import ligament
+from tkamb.io.scene.parts import ligament
 from tkamb.io.scene.tables import LigamentTable
 from tkamb.knee.ligaments import (
     LIGAMENT,

@@ -18,9 +18,10 @@ from tkamb.io.recordings import recording_tables
 from tkamb.io.recordings.meshes import load_surface
 from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.recordings.tibia import load_tibia
-from tkamb.io.scene import lines, tables
 from tkamb.io.scene import scene as scene_module
+from tkamb.io.scene import tables
 from tkamb.io.scene.case import load_case
+from tkamb.io.scene.parts import read_patellar_ligament
 from tkamb.io.scene.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
@@ -144,7 +145,7 @@ def test_the_case_leaves_the_scene_as_its_file_has_it(tmp_path):
     assert case.scene is scene
     assert [bundle.name[:11] for bundle in case.ligaments] == ["generic_MCL"] * 3
     left = scene.model_copy(update={"patient": scene.patient.model_copy(update={"side": "left"})})
-    one, other = (lines.patellar_ligament(each).distal.position for each in (scene, left))
+    one, other = (read_patellar_ligament(each).distal.position for each in (scene, left))
     assert other.tolist() == (MIRROR @ one).tolist()
     assert one[2] == pytest.approx(0.003)
     assert left.patellar_ligament == scene.patellar_ligament

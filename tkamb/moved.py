@@ -95,6 +95,7 @@ MODULES = {
     "tkamb.scene.table": "tkamb.io.recordings.scene_table",
     "tkamb.scene.recording_tables": "tkamb.io.recordings.recording_tables",
     "tkamb.scene.measured": "tkamb.io.recordings.recording_tables",
+    "tkamb.scene.lines": "tkamb.io.scene.parts",
     "tkamb.datasets.dataset": "tkamb.io.datasets",
     "tkamb.datasets.get": "tkamb.io.datasets",
     "tkamb.compiled": "tkamb.geometry.compiled",

@@ -9,15 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, pose
+from tkamb.geometry.frames import Array
 from tkamb.io.recordings.filtering import check_frames, differentiate_coordinates
 from tkamb.io.recordings.motion import KneeMotion, load_motion
 from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.recordings.recording_tables import MotionTable
+from tkamb.io.scene.parts import (
+    ImplantParts,
+    read_ligaments,
+    read_muscles,
+    read_patellar_ligament,
+)
 from tkamb.io.scene.scene import Scene
-from tkamb.io.scene.tables import FemoralImplantTable, PatellarImplantTable
 from tkamb.knee.chain import Chain
-from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -120,7 +124,7 @@ class Case:
 
 
 def _recordings(
-    scene: Scene, source: MotionTable, chain: Chain, parts: "_Parts | None"
+    scene: Scene, source: MotionTable, chain: Chain, parts: ImplantParts | None
 ) -> "tuple[KneeMotion, BodyMotion | None, GroundReaction | None]":
     """Return knee, shank and ground reaction at the frames of the motion."""
     released = scene.contact.released if scene.contact else ()
@@ -187,7 +191,7 @@ def load_case(scene: Scene) -> Case:
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
     # Tables before meshes, which take longer: a mistake in a table is reported at once.
-    parts = _Parts(scene) if scene.motion.interpretation == "pose" else None
+    parts = ImplantParts(scene) if scene.motion.interpretation == "pose" else None
     try:
         motion, tibia, ground = _recordings(scene, scene.motion, chain, parts)
     except InputError:
@@ -195,14 +199,21 @@ def load_case(scene: Scene) -> Case:
         if source is None:
             raise
         motion, tibia, ground = _recordings(scene, source, chain, parts)
-    parts = parts or _Parts(scene)
+    parts = parts or ImplantParts(scene)
     motion = _derived(scene, motion, parts)
     muscles: tuple[Muscle, ...] = ()
     patellar_ligament = None
     if scene.patella:
-        from tkamb.io.scene import lines
+        muscles, patellar_ligament = read_muscles(scene, chain), read_patellar_ligament(scene)
+    measured = emg = None
+    if scene.measured is not None:
+        from tkamb.io.recordings.measured import load_measured_force
 
-        muscles, patellar_ligament = lines.muscles(scene, chain), lines.patellar_ligament(scene)
+        measured = load_measured_force(scene.measured, motion.time)
+    if scene.muscles is not None and scene.muscles.emg is not None:
+        from tkamb.io.recordings.measured import load_envelopes
+
+        emg = load_envelopes(scene.muscles.emg, motion.time)
     case = Case(
         scene,
         chain,
@@ -212,11 +223,11 @@ def load_case(scene: Scene) -> Case:
         parts.femoral,
         parts.insert,
         parts.patella,
-        _ligaments(scene, parts, chain),
+        read_ligaments(scene, parts, chain),
         muscles,
         patellar_ligament,
-        _measured(scene, motion),
-        _emg(scene, motion),
+        measured,
+        emg,
         parts.post,
         parts.insert_placement,
     )
@@ -238,7 +249,7 @@ def with_insert(case: Case, mesh: Path) -> Case:
     insert = implant.insert.model_copy(update={"mesh": mesh})
     implant = implant.model_copy(update={"insert": insert})
     scene = case.scene.model_copy(update={"implant": implant})
-    parts = _Parts(scene, insert_alone=True)
+    parts = ImplantParts(scene, insert_alone=True)
     return replace(
         case,
         scene=scene,
@@ -248,7 +259,7 @@ def with_insert(case: Case, mesh: Path) -> Case:
     )
 
 
-def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
+def _derived(scene: Scene, motion: KneeMotion, parts: ImplantParts) -> KneeMotion:
     """Return the motion with coordinates that follow from the surfaces (seat, roll and slip)."""
     table = scene.motion
     if motion.unrecorded or table.motion == "roll-slip":
@@ -266,135 +277,3 @@ def _derived(scene: Scene, motion: KneeMotion, parts: "_Parts") -> KneeMotion:
             motion, parts.femoral, parts.insert, table.slip_share, table.cutoff_Hz
         )
     return motion
-
-
-def _measured(scene: Scene, motion: KneeMotion) -> "MeasuredForce | None":
-    if scene.measured is None:
-        return None
-    from tkamb.io.recordings.measured import load_measured_force
-
-    return load_measured_force(scene.measured, motion.time)
-
-
-def _emg(scene: Scene, motion: KneeMotion) -> "Envelopes | None":
-    if scene.muscles is None or scene.muscles.emg is None:
-        return None
-    from tkamb.io.recordings.measured import load_envelopes
-
-    return load_envelopes(scene.muscles.emg, motion.time)
-
-
-def _ligaments(scene: Scene, parts: "_Parts", chain: Chain) -> "tuple[Ligament, ...]":
-    """Return the scene's bundles and the generic ones that it asks for."""
-    bundles: tuple[Ligament, ...] = ()
-    if scene.ligament:
-        from tkamb.io.scene import lines
-        from tkamb.knee.ligaments import check_collateral_sides
-
-        bundles = lines.ligaments(scene)
-        check_collateral_sides(bundles, chain, scene.patient.side)
-    if scene.generic_ligaments:
-        from tkamb.knee.ligaments import generic_ligaments
-
-        assert parts.femoral is not None and parts.insert is not None
-        names = scene.generic_ligaments.ligaments
-        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, names)
-    return bundles
-
-
-class _Parts:
-    """The implant's surfaces in their own frames, and where their meshes' axes lie."""
-
-    def __init__(self, scene: Scene, insert_alone: bool = False) -> None:
-        implant, self._left = scene.implant, scene.patient.side == "left"
-        wants_insert = (
-            scene.contact is not None
-            or scene.generic_ligaments is not None
-            or scene.motion.interpretation == "pose"
-            or scene.motion.motion == "roll-slip"
-        )
-        wants_femoral = wants_insert or scene.patella is not None
-        self.femoral: Surface | None = None
-        self.insert: Surface | None = None
-        self.patella: Surface | None = None
-        self.post: Surface | None = None
-        self.insert_mesh_in_insert = self.femoral_mesh_in_femur = np.eye(4)
-        self.insert_placement: Array | None = None
-        if wants_insert:
-            if not implant.insert:
-                raise InputError(
-                    "interpretation = 'pose' is in the insert mesh's axes",
-                    "[motion]",
-                    "give [implant.insert] and [implant.femoral]",
-                )
-            self.insert = self._place_insert(scene)
-            if scene.contact is not None and scene.contact.post:
-                from tkamb.geometry.post import divide_insert
-
-                self.insert, self.post = divide_insert(self.insert)
-        elif implant.insert and scene.muscles is not None:  # where the model's insert lies
-            self._place_insert(scene)
-        if insert_alone:
-            return
-        if wants_femoral:
-            if not implant.femoral:
-                raise InputError("is missing", "[implant.femoral]", "the patella slides on it")
-            self.femoral, self.femoral_mesh_in_femur = self._place(
-                "femoral component", implant.femoral
-            )
-        if scene.patella is not None:
-            if not implant.patella:
-                raise InputError("is missing", "[implant.patella]", "[patella] needs its mesh")
-            self.patella, _ = self._place("patellar button", implant.patella)
-
-    def _place_insert(self, scene: Scene) -> "Surface":
-        """Read the insert, store its mesh's place in the insert frame, and return it there."""
-        from tkamb.geometry.flat_bottom import insert_placement
-        from tkamb.io.recordings.meshes import axes_rotation, load_surface
-
-        table = scene.implant.insert
-        assert table is not None
-        surface = load_surface(table.mesh, table.unit, table.axes, name="insert", closed=True)
-        try:
-            placement = insert_placement(surface, axes_rotation(table.axes))
-        except InputError as error:
-            if scene.implant.femoral and self._could_be_insert(scene.implant.femoral):
-                hint = (
-                    "check whether the meshes of [implant.femoral] and [implant.insert] are "
-                    "exchanged"
-                )
-                raise InputError(error.what, error.where, hint) from None
-            raise
-        self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
-        self.insert_placement = placement
-        return self._right(surface.moved(placement))
-
-    def _could_be_insert(self, table: FemoralImplantTable) -> bool:
-        """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
-        from tkamb.geometry.flat_bottom import insert_placement
-        from tkamb.io.recordings.meshes import axes_rotation, load_surface
-
-        try:
-            surface = load_surface(table.mesh, table.unit, table.axes, name="femoral component")
-            insert_placement(surface, axes_rotation(table.axes))
-        except InputError:
-            return False
-        return True
-
-    def _place(
-        self, name: str, table: FemoralImplantTable | PatellarImplantTable
-    ) -> "tuple[Surface, Array]":
-        from scipy.spatial.transform import Rotation
-
-        from tkamb.io.recordings.meshes import axes_rotation, load_surface
-
-        surface = load_surface(table.mesh, table.unit, table.axes, name=name)
-        turn = Rotation.from_euler("XYZ", table.rotation_deg, degrees=True).as_matrix()
-        placement = pose(turn, np.array(table.position_mm) * MILLIMETRE)
-        mesh_in_link = placement @ pose(axes_rotation(table.axes), np.zeros(3))
-        return self._right(surface.moved(placement)), mesh_in_link
-
-    def _right(self, surface: "Surface") -> "Surface":
-        from tkamb.io.recordings.meshes import mirrored
-
-        return mirrored(surface) if self._left else surface

@@ -1,0 +1,241 @@
+"""The parts of a scene's knee, in SI, as a right knee: implants, muscles and ligaments."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import MIRROR, Array, pose
+from tkamb.io.scene.scene import Scene
+from tkamb.io.scene.tables import (
+    Attachment,
+    BoneTable,
+    FemoralImplantTable,
+    LigamentTable,
+    MuscleTable,
+    MuscleWrapTable,
+    PatellarImplantTable,
+)
+from tkamb.knee.chain import Chain
+from tkamb.knee.load import LinkPoint
+from tkamb.units import DEGREE, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.geometry.surface import Surface
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.muscles import Muscle, PatellarLigament, SagittalWrap
+
+NAN = float("nan")
+
+
+class ImplantParts:
+    """The implant's surfaces in their own frames, and where their meshes' axes lie."""
+
+    def __init__(self, scene: Scene, insert_alone: bool = False) -> None:
+        implant, self._left = scene.implant, scene.patient.side == "left"
+        wants_insert = (
+            scene.contact is not None
+            or scene.generic_ligaments is not None
+            or scene.motion.interpretation == "pose"
+            or scene.motion.motion == "roll-slip"
+        )
+        wants_femoral = wants_insert or scene.patella is not None
+        self.femoral: Surface | None = None
+        self.insert: Surface | None = None
+        self.patella: Surface | None = None
+        self.post: Surface | None = None
+        self.insert_mesh_in_insert = self.femoral_mesh_in_femur = np.eye(4)
+        self.insert_placement: Array | None = None
+        if wants_insert:
+            if not implant.insert:
+                raise InputError(
+                    "interpretation = 'pose' is in the insert mesh's axes",
+                    "[motion]",
+                    "give [implant.insert] and [implant.femoral]",
+                )
+            self.insert = self._place_insert(scene)
+            if scene.contact is not None and scene.contact.post:
+                from tkamb.geometry.post import divide_insert
+
+                self.insert, self.post = divide_insert(self.insert)
+        elif implant.insert and scene.muscles is not None:  # where the model's insert lies
+            self._place_insert(scene)
+        if insert_alone:
+            return
+        if wants_femoral:
+            if not implant.femoral:
+                raise InputError("is missing", "[implant.femoral]", "the patella slides on it")
+            self.femoral, self.femoral_mesh_in_femur = self._place(
+                "femoral component", implant.femoral
+            )
+        if scene.patella is not None:
+            if not implant.patella:
+                raise InputError("is missing", "[implant.patella]", "[patella] needs its mesh")
+            self.patella, _ = self._place("patellar button", implant.patella)
+
+    def _place_insert(self, scene: Scene) -> "Surface":
+        """Read the insert, store its mesh's place in the insert frame, and return it there."""
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.io.recordings.meshes import axes_rotation, load_surface
+
+        table = scene.implant.insert
+        assert table is not None
+        surface = load_surface(table.mesh, table.unit, table.axes, name="insert", closed=True)
+        try:
+            placement = insert_placement(surface, axes_rotation(table.axes))
+        except InputError as error:
+            if scene.implant.femoral and self._could_be_insert(scene.implant.femoral):
+                hint = (
+                    "check whether the meshes of [implant.femoral] and [implant.insert] are "
+                    "exchanged"
+                )
+                raise InputError(error.what, error.where, hint) from None
+            raise
+        self.insert_mesh_in_insert = placement @ pose(axes_rotation(table.axes), np.zeros(3))
+        self.insert_placement = placement
+        return self._right(surface.moved(placement))
+
+    def _could_be_insert(self, table: FemoralImplantTable) -> bool:
+        """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
+        from tkamb.geometry.flat_bottom import insert_placement
+        from tkamb.io.recordings.meshes import axes_rotation, load_surface
+
+        try:
+            surface = load_surface(table.mesh, table.unit, table.axes, name="femoral component")
+            insert_placement(surface, axes_rotation(table.axes))
+        except InputError:
+            return False
+        return True
+
+    def _place(
+        self, name: str, table: FemoralImplantTable | PatellarImplantTable
+    ) -> "tuple[Surface, Array]":
+        from scipy.spatial.transform import Rotation
+
+        from tkamb.io.recordings.meshes import axes_rotation, load_surface
+
+        surface = load_surface(table.mesh, table.unit, table.axes, name=name)
+        turn = Rotation.from_euler("XYZ", table.rotation_deg, degrees=True).as_matrix()
+        placement = pose(turn, np.array(table.position_mm) * MILLIMETRE)
+        mesh_in_link = placement @ pose(axes_rotation(table.axes), np.zeros(3))
+        return self._right(surface.moved(placement)), mesh_in_link
+
+    def _right(self, surface: "Surface") -> "Surface":
+        from tkamb.io.recordings.meshes import mirrored
+
+        return mirrored(surface) if self._left else surface
+
+
+def muscle_tables(scene: Scene) -> tuple[MuscleTable, ...]:
+    """Return the scene's [[muscle]] tables, the short form [quadriceps] written out as one."""
+    short = scene.quadriceps
+    if short is None:
+        return scene.muscle
+    wrap = None
+    if short.wrap:
+        wrap = MuscleWrapTable(
+            bone=short.bone, half_thickness_mm=short.half_thickness_mm, band_mm=short.band_mm
+        )
+    path = (short.origin, short.insertion)
+    return (*scene.muscle, MuscleTable(name="quadriceps", path=path, wrap=wrap))
+
+
+def read_muscles(scene: Scene, chain: Chain) -> "tuple[Muscle, ...]":
+    """Return the muscles.
+
+    Raises:
+        InputError: they cannot be balanced (`tkamb.knee.muscles.check_muscles`), or a bone's mesh
+            cannot be read.
+    """
+    from tkamb.knee.muscles import Muscle, check_muscles
+
+    is_left = scene.patient.side == "left"
+    result = tuple(
+        Muscle(
+            table.name,
+            tuple(_point(end, is_left) for end in table.path),
+            _wrap(table.wrap, _bone(table.wrap.bone, chain, is_left)) if table.wrap else None,
+            NAN if table.force_N is None else table.force_N,
+            table.group,
+        )
+        for table in muscle_tables(scene)
+    )
+    check_muscles(result, chain)
+    return result
+
+
+def read_patellar_ligament(scene: Scene) -> "PatellarLigament | None":
+    """Return the patellar ligament; None where the scene has none."""
+    from tkamb.knee.muscles import PatellarLigament, SagittalWrap
+
+    table, is_left = scene.patellar_ligament, scene.patient.side == "left"
+    if table is None:
+        return None
+    wrap = None
+    if table.wrap:
+        wrap = SagittalWrap(table.band_mm * MILLIMETRE, table.half_thickness_mm * MILLIMETRE)
+    length = NAN if table.length_mm is None else table.length_mm * MILLIMETRE
+    return PatellarLigament(
+        _point(table.proximal, is_left), _point(table.distal, is_left), wrap, length
+    )
+
+
+def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Ligament, ...]":
+    """Return the bundles of the [[ligament]] tables, then those of [generic_ligaments].
+
+    Raises:
+        InputError: a collateral ligament runs on the wrong side of the knee.
+    """
+    if not (scene.ligament or scene.generic_ligaments):
+        return ()
+    from tkamb.knee.ligaments import check_collateral_sides, generic_ligaments
+
+    side = scene.patient.side
+    bundles = tuple(ligament(table, side == "left") for table in scene.ligament)
+    check_collateral_sides(bundles, chain, side)
+    if scene.generic_ligaments:
+        assert parts.femoral is not None and parts.insert is not None
+        names = scene.generic_ligaments.ligaments
+        bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, names)
+    return bundles
+
+
+def ligament(table: LigamentTable, left: bool = False) -> "Ligament":
+    """Return one bundle."""
+    from tkamb.knee.ligaments import Ligament
+
+    stiffness = table.stiffness_N_per_strain
+    if table.stiffness_N_per_mm is not None:
+        stiffness = table.stiffness_N_per_mm / MILLIMETRE
+    assert stiffness is not None
+    return Ligament(
+        table.name,
+        _point(table.proximal, left),
+        _point(table.distal, left),
+        table.law,
+        stiffness,
+        NAN if table.slack_length_mm is None else table.slack_length_mm * MILLIMETRE,
+        NAN if table.reference_strain is None else table.reference_strain,
+        table.reference_flexion_deg * DEGREE,
+    )
+
+
+def _point(end: Attachment, left: bool) -> LinkPoint:
+    position = np.array(end.point_mm) * MILLIMETRE
+    return LinkPoint(end.link, MIRROR @ position if left else position)
+
+
+def _wrap(table: MuscleWrapTable, bone: "Surface | None") -> "SagittalWrap":
+    from tkamb.knee.muscles import SagittalWrap
+
+    return SagittalWrap(table.band_mm * MILLIMETRE, table.half_thickness_mm * MILLIMETRE, bone)
+
+
+def _bone(table: BoneTable | None, chain: Chain, left: bool) -> "Surface | None":
+    """Return a bone's surface in the femur link's frame."""
+    if table is None:
+        return None
+    from tkamb.io.recordings.meshes import BONE_SIZE, load_surface, mirrored
+
+    surface = load_surface(table.mesh, table.unit, table.axes, name="bone", size=BONE_SIZE)
+    return (mirrored(surface) if left else surface).moved(chain.link_in(table.link, "femur"))
