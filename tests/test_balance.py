@@ -45,7 +45,7 @@ def dished():
 
 
 def sphere_depth(force):
-    """Return how deep a sphere sinks: force = M/h pi d² (R - d/3)."""
+    """Return the penetration d of a sphere: force = M/h pi d² (R - d/3)."""
     return brentq(lambda d: M / HEIGHT * np.pi * d**2 * (BALL - d / 3) - force, 0, HEIGHT / 2)
 
 
@@ -96,7 +96,8 @@ def hardening(guide=None):
     ],
 )
 def test_a_guide_to_the_stiffness_leads_to_the_same_rest(guide, most):
-    """One that is off by a third in fewer looks than differences take; a wrong one as well."""
+    """A tangent with an error of a third needs fewer trials than differences; a wrong one
+    converges, too."""
     plain, rest = hardening()
     alone = find_balance(plain, np.zeros(4))
     trial, _ = hardening(guide)
@@ -121,7 +122,7 @@ def test_loads_that_follow_the_motion_do_not_hold_up_the_search():
 
 @pytest.mark.parametrize("force_noise", [0.0, 0.4])
 def test_forces_are_balanced_to_what_they_are_known_to(force_noise):
-    """The answer of a model solved to a tolerance jumps by as much: here across the rest."""
+    """A force with an error jumps by that error, here across the equilibrium."""
 
     def jumping(x):
         jump = np.where(x < 1e-4, 0.3, -0.3)
@@ -133,7 +134,7 @@ def test_forces_are_balanced_to_what_they_are_known_to(force_noise):
 
 
 def test_a_start_at_rest_with_a_wrong_guide_is_stable():
-    """What was learnt, here nothing, does not name a rest unstable: it is looked at anew."""
+    """A learnt stiffness does not make an equilibrium unstable: differences are computed first."""
     stiffness = np.diag([2e5, 1e5])
     end = find_balance(lambda x: Trial(-stiffness @ x, -stiffness, exact=False), np.zeros(2))
     assert end.status is BalanceStatus.OK
@@ -158,7 +159,7 @@ def test_the_contact_s_gain_is_the_slope_of_the_imbalance():
 
 
 def test_a_start_at_the_rim_of_what_is_known_is_out_of_range():
-    """Forces at the start, none beside it: no stiffness by differences."""
+    """The force is known at the initial guess but not beside it, so that differences fail."""
     start = np.array([1e-3, 0.0])
     end = find_balance(
         lambda x: Trial(np.array([5.0, -3.0]) if x[0] <= start[0] else np.full(2, np.nan)), start
@@ -190,7 +191,7 @@ def test_energy_falls_in_every_step_through_a_stiffening_contact():
 
 
 def test_a_stiffness_that_is_singular_but_for_rounding_gets_a_status():
-    """Rank 1: no elimination solves it, though its smallest eigenvalue comes out as +2e-12."""
+    """A stiffness of rank 1 is singular, although rounding makes its smallest eigenvalue +2e-12."""
     matrix = np.array([[16000.0, 8000.0], [20000.0, 10000.0]])
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.solve(matrix, np.ones(2))
@@ -284,7 +285,7 @@ def test_split_and_tilt_follow_the_adduction_moment(flat, share):
 
 
 def test_a_condyle_lifts_off_where_its_force_would_cross_zero_and_lands_again(flat):
-    """A medial strap holds what tips over; a ramp up and down passes the same states.
+    """A medial ligament holds a femur that tips over; loading and unloading pass the same states.
 
     With both condyles on, N_medial = F (1 - e/b)/2 - T (b + a)/(2b) falls to zero at e = b
     while the strap is slack; beyond, its tension is T = F (e - b)/(a + b).
@@ -367,7 +368,7 @@ def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(dished, away):
 
 
 def test_work_depends_little_on_the_path_without_friction(dished):
-    """Round a loop of 0.5 mm sideways and 0.03 mm down the foundation gives or takes little."""
+    """Around a loop of 0.5 mm sideways and 0.03 mm down the work of the foundation is small."""
     model, state = dished
     probe = model.probe(state)
     corners = np.array([[0, 0], [0.5, 0], [0.5, -0.03], [0, -0.03], [0, 0]]) * 1e-3

@@ -1,4 +1,4 @@
-"""Numbers that can be had by hand from one frame of the shipped knee bend: signs, units, rules."""
+"""Hand calculations for one frame of the shipped knee bend: signs, units, rules."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def results():
 
 
 def with_ground(geometry, point, force):
-    """Return the frame with one more force of the ground on the shank, insert frame."""
+    """Return the frame with an additional ground force on the shank, insert frame."""
     ground = geometry.ground
     return replace(
         geometry,
@@ -135,7 +135,7 @@ def test_bundles_carry_what_the_published_toe_gives():
 
 
 def test_the_source_s_rule_divides_by_the_overlap_of_the_undeformed_bodies():
-    """A sphere that has come down by d overlaps the flat insert on pi (2 R d - d²)."""
+    """A sphere that penetrates the flat insert by d has the contact area pi (2 R d - d²)."""
     radius, load = 20e-3, 700.0
     model = contact_model("lattice-linear", 1.0, pressure_rule="source", cache=False)
     bodies = pair(

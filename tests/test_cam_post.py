@@ -56,13 +56,13 @@ def parts(insert):
 
 
 def place(flexion_deg, ap_mm=-6.5, rotation_deg=0.0, adduction_deg=0.0, ml_mm=0.0):
-    """Return a pose whose condyles lie about on the dishes."""
+    """Return a pose in which the condyles about touch the dishes."""
     lengths = np.array([ap_mm, 29.6, ml_mm]) * MILLIMETRE
     return knee_pose([*lengths, *np.radians([rotation_deg, adduction_deg, flexion_deg])])
 
 
 def cylinder(radius, length):
-    """Return a cylinder along z, fine where it looks forwards."""
+    """Return a cylinder along z with a fine mesh at its front."""
     turn = np.concatenate([np.linspace(-0.35, 0.35, 141), np.linspace(0.35, 5.933, 41)[1:-1]])
     ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     n, ends = len(ring), np.array([-0.5, 0.5]) * length
@@ -117,7 +117,7 @@ def test_the_post_is_divided_from_the_dishes_and_both_stay_closed(insert, parts)
 def test_condyles_alone_are_as_without_the_division(
     femoral, insert, parts, model, size_mm, tolerance
 ):
-    """Where the cam is far from the post both pairs together carry what the whole insert does.
+    """If the cam is far from the post, both pairs together carry the same load as the whole insert.
 
     The lattice's grid divides a box of another height, so that its cells are others.
     """
@@ -173,7 +173,7 @@ def test_a_cylinder_on_the_foundation_is_the_bonded_layers_closed_form():
 
 
 def test_work_of_the_cam_is_the_energy_of_the_foundation():
-    """The work of the force on the way in is what the linear springs hold."""
+    """The work of the force equals the energy of the linear springs."""
     pair, steps = cylinder_on_post("foundation-linear"), np.linspace(0.0, 0.4e-3, 17)
     work = np.trapezoid([pair.at(pressed_in(d)).force[0] for d in steps], steps)
     last = pair.model.evaluate(pair.state, pair.in_turned @ pressed_in(steps[-1]))
@@ -259,7 +259,7 @@ def knee(tmp_path_factory):
 
 @pytest.mark.parametrize(("released", "frame"), [((), 58), (("ap", "adduction"), 80)])
 def test_condyles_and_post_together_balance_the_shank(knee, released, frame):
-    """Ground, weight and inertia, ligaments, condyles, post and residuals add up to nothing."""
+    """The sum of ground, weight and inertia, ligaments, condyles, post and residuals is zero."""
     side = knee(*released)
     body, contact = side.frame(frame)
     geometry, values, friction = body.geometry, body.loads.values, side.mechanics.friction
@@ -329,7 +329,7 @@ def test_what_has_no_cam_or_no_line_contact_is_refused(femoral, parts):
 
 @pytest.mark.slow
 def test_a_left_knee_gives_the_right_knees_numbers(tmp_path):
-    """Everything reflected in the sagittal plane, file by file, gives the same columns."""
+    """Files that are reflected in the sagittal plane give the same columns."""
     overrides = {"contact.post": True, "contact.released": ["ap", "adduction"]}
     found = []
     for scene in (write_scene(tmp_path / "right"), write_mirrored_patient(tmp_path / "left")):

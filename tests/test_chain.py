@@ -51,7 +51,8 @@ def _t(values):
 
 
 def mujoco_state(state, data):
-    """Give MuJoCo's data a state of the chain; return what makes its forces (n,) the chain's."""
+    """Set a state of the chain in MuJoCo's data; return the matrix that converts its forces
+    (n,)."""
     root = Rotation.from_quat(state.q[3:7]).as_matrix()
     data.qpos[:] = np.r_[state.q[:3], state.q[6], state.q[3:6], state.q[7:]]
     data.qvel[:] = np.r_[root @ state.v[:3], state.v[3:]]
@@ -76,7 +77,7 @@ def test_rnea_agrees_with_mujoco_over_200_random_states():
 
 
 def test_locked_patella_rides_on_the_femur():
-    """Leaving the patella out equals moving it rigidly with the femur at neutral."""
+    """A chain without a patella equals one whose patella moves rigidly with the femur."""
     free, locked = leg(True), leg(False)
     rng = np.random.default_rng(3)
     motion = random_motion(locked, rng)

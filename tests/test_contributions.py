@@ -1,4 +1,5 @@
-"""What muscles add to the condyles: they sum up, and each is the statics of the shank by hand."""
+"""Contributions of muscles to the condyles: their sum, and each one against statics of the
+shank."""
 
 from dataclasses import replace
 
@@ -75,7 +76,8 @@ def on_link(loads, link):
 
 
 def test_a_cam_on_the_post_is_a_cause_of_its_own():
-    """With it the causes still sum up, and its own is the statics of the shank."""
+    """With a post the contributions sum up, and that of the post agrees with statics of the
+    shank."""
     place, push = np.array([-0.003, 0.02, 0.004]), np.array([400.0, -60.0, 20.0])
     post = (
         PointForces("tibia", place[None], push[None]),
@@ -94,7 +96,7 @@ def test_a_cam_on_the_post_is_a_cause_of_its_own():
 
 
 def test_the_quadriceps_presses_by_the_patellar_ligament_alone():
-    """The patella's balance in the sagittal plane gives the ligament, the shank the rest."""
+    """The equilibrium of the patella gives the ligament, that of the shank the condyles."""
     geometry, loads = solved("taut")
     parts = condyle_contributions(geometry, loads, FRICTION)
     extensor, femur = geometry.extensor, geometry.state.pose("femur")

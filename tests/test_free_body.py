@@ -1,4 +1,4 @@
-"""The product's loads against free bodies that were written from the raw files alone.
+"""Loads of tkamb against free bodies that are computed from the raw files alone.
 
 Own here (`raw_files`, `raw_leg`, `free_body`: numpy and scipy, no import of tkamb): reading of
 scene, URDF, tables, markers and STL; the documented smoothing spline; the rigid fit of the
@@ -88,7 +88,7 @@ def test_dm_is_in_balance_on_free_bodies(dm, k):
 
 
 def assert_same_loads(leg, frame, t):
-    """Assert that product and free bodies agree on every load that both know."""
+    """Assert that tkamb and the free bodies agree on every load that both compute."""
     assert not frame.loads.problems
     own = FreeBodies(leg, t, lent(frame)).loads()
     for k, axis in enumerate(("ap", "si", "ml")):
@@ -104,7 +104,7 @@ def assert_same_loads(leg, frame, t):
 
 
 def lent(frame):
-    """Return what the free bodies take from the product."""
+    """Return the inputs that the free bodies take from tkamb."""
     geometry, loads = frame.geometry, frame.loads
     quadriceps, ligament = (
         [(load.link, *pair) for load in line for pair in zip(load.points, load.forces, strict=True)]

@@ -1,4 +1,4 @@
-"""tkamb.Knee: the same knee by files, by objects, in a whole body; its forces and stiffness."""
+"""tkamb.Knee: the same knee by files, by objects and in a whole body; forces and stiffness."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -158,7 +158,7 @@ def residual_wrench(knee, loads):
 
 
 def test_forces_on_the_joints_are_internal(read):
-    """Contact, ligaments and extensor mechanism add up to nothing on the whole leg."""
+    """The sum of contact, ligaments and extensor mechanism on the whole leg is zero."""
     knee, motion, _ = read
     q, v = motion.q[60], motion.v[60]
     forces = knee.external_forces(q, v, 1000.0)
@@ -277,7 +277,8 @@ def test_equilibrium_leaves_no_force_and_its_contact_carries_the_loads(read):
 
 
 def test_files_and_object_find_the_same_equilibrium():
-    """A frame that no other goes before, with released coordinates."""
+    """A first frame with released coordinates has the same equilibrium by files and by the
+    object."""
     free = ["adduction", "axial_rotation", "ap", "ml"]
     scene = tkamb.load_scene(SCENE, FOUNDATION | {"contact.released": free})
     read = tkamb.read_scene(scene)
@@ -314,7 +315,7 @@ def test_warm_and_cold_calls_agree_and_leave_no_trace(read):
 
 
 def test_an_insert_anywhere_on_the_tibia_gives_the_same_forces(read):
-    """The mesh of the insert may stand in the tibia's own axes: its flat bottom is found."""
+    """If the mesh of the insert is given in the tibia's axes, its flat bottom is found."""
     plain, motion, _ = read
     in_tibia = inverse(plain.anatomy.tibia.placement.homogeneous) @ (
         plain.bridge.insert.placement.homogeneous

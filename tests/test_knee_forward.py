@@ -10,7 +10,7 @@ from tkamb.errors import ComputationError
 from tkamb.knee.integrate import implicit_step
 
 MASS, HEIGHT = 60.0, 1e-3
-"""kg and m: a femur with what stands on it, dropped from a millimetre."""
+"""kg and m: mass of the femur with its load, and the height of the drop."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,8 @@ def on_fixed_insert(plain, joints, coordinates, mass, **parts):
 
 
 def drop(plain, step, seconds):
-    """Return the energy (n,) of a femur that bounces on the insert, J, over that at the start."""
+    """Return the energy (n,), J, of a femur that bounces on the insert, less the energy at the
+    start."""
     joints = {"slide": pin.JointModelPY()}
     knee = on_fixed_insert(plain, joints, [-6.9e-3, 0, 0, 0, 0, 0.3], MASS)
     touch = knee.contact.pair.first_touch_height(knee.pose(np.zeros(1)).homogeneous)
@@ -57,7 +58,8 @@ def drop(plain, step, seconds):
 
 
 def test_a_dropped_femur_keeps_its_energy_to_the_order_of_the_scheme(plain):
-    """Second order: half the step, a quarter of the error; a kinked contact costs some of it."""
+    """Half of the step gives about a quarter of the error; kinks of the contact make it a little
+    more."""
     coarse, fine = (np.abs(drop(plain[0], h, 0.1) - 1.0).max() for h in (1e-3, 5e-4))
     assert coarse < 0.15
     assert fine < coarse / 3.0

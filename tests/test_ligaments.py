@@ -51,7 +51,8 @@ def bundle_of(**changes: object) -> Ligament:
     [(two_line_force, 9e4, 9e4 * SLACK), (quadratic_toe_force, 2750.0, 2750.0)],
 )
 def test_laws(law: object, stiffness: float, terminal: float) -> None:
-    """Slack carries nothing, both branches meet at 2 eps1, the terminal slope is k."""
+    """A slack ligament has no tension, both branches meet at 2 eps1, and the terminal slope is
+    k."""
     strain = np.array(
         [
             -0.5,
@@ -154,7 +155,7 @@ def test_condylar_axis_is_the_circles_centre() -> None:
 
 
 def test_generic_set_scales_with_the_implant() -> None:
-    """Twice the implant, twice the distances; the same strains; and it says what it is."""
+    """An implant of twice the size has twice the distances and the same strains."""
     small = generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4), ("MCL", "LCL"))
     large = generic_ligaments(cylinder(0.04, 0.14), slab(0.15), np.eye(4), ("MCL", "LCL"))
     assert [bundle.name for bundle in small] == [

@@ -1,4 +1,4 @@
-"""Six sets of loads at one knee: the place of the ground reaction decides which of them acts."""
+"""Six load states of one knee: the place of the ground reaction decides which one holds."""
 
 from dataclasses import replace
 from itertools import product
@@ -40,7 +40,8 @@ ASIDE = {"none": 0.0, "medial": 0.12, "lateral": -0.12}
 
 @pytest.mark.parametrize(("ahead", "lifted"), list(product(AHEAD, ASIDE)))
 def test_each_of_the_six_sets_is_found_where_the_ground_reaction_wants_it(knee, ahead, lifted):
-    """Behind the knee it wants the quadriceps, beside the condyles it lifts the far one."""
+    """A ground reaction behind the knee needs the quadriceps; one beside the condyles lifts the far
+    one."""
     x, z = AHEAD[ahead], ASIDE[lifted]
     loads = solve_knee(loaded(knee, 700 * UP, [x, -0.45, z]), FRICTION)
     assert loads.problems == ()
@@ -56,7 +57,7 @@ def test_each_of_the_six_sets_is_found_where_the_ground_reaction_wants_it(knee, 
 
 
 def test_a_slack_quadriceps_adds_nothing_to_the_contact_force(knee):
-    """Then the contact carries ground reaction less the weight of the shank, by hand."""
+    """With slack muscles the contact carries the ground reaction less the weight of the shank."""
     force = solve_knee(loaded(knee, 700 * UP, [0.08, -0.45, 0.0]), FRICTION).contact_force
     state = knee.state
     gravity = 9.80665 * 4.2
@@ -93,7 +94,7 @@ def test_a_patella_that_would_have_to_pull_fails_the_frame(knee):
 
 
 def test_a_knee_without_contact_that_must_be_extended_is_no_slack_one():
-    """Without contact the flexion left over is given on the femur: the other way round."""
+    """Without contact the residual flexion moment acts on the femur, with the opposite sign."""
     slack = LoadState(frozenset(), frozenset({"quadriceps"}))
 
     def wrong(name, moment):
@@ -129,7 +130,7 @@ def test_no_random_load_is_answered_with_a_wrong_sign(knee, aside, up, place, mo
 
 
 def shank_imbalance(geometry, loads):
-    """Return the force (3,) left over on the shank, insert frame."""
+    """Return the residual force (3,) on the shank, insert frame."""
     values, state = loads.values, geometry.state
     weight = -9.80665 * 4.2 * (state.pose("tibia")[:3, :3] @ UP)
     residual = np.array([values["residual_ap"], 0.0, values["residual_ml"]])

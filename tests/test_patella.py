@@ -160,7 +160,8 @@ def test_conditions_hold_and_guess_does_not_matter(mechanism: ExtensorMechanism)
 
 
 def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
-    """Virtual work: turning the patella with contact and ligament kept lengthens the muscle."""
+    """By virtual work, rotating the patella with constant contact and ligament lengthens the
+    muscle."""
     from tkamb.knee.patella_search import _Search
 
     state = solve_patella(mechanism, knee_at(25.0))
@@ -179,7 +180,7 @@ def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
 
 @pytest.mark.parametrize("aside", [-0.05, 0.05])
 def test_a_button_may_lie_anywhere_on_its_patella(aside: float) -> None:
-    """Moved along y in its own frame, and the patella back by as much: the same contact."""
+    """A button that is shifted along y, with the patella shifted back, has the same contact."""
     plain = PatellofemoralContact(cylinder(), dome())
     moved = PatellofemoralContact(cylinder(), dome().moved(translation(0.0, aside)))
     at = np.array([TROCHLEA + DOME - 0.004, 0.0, 0.0])
@@ -304,7 +305,7 @@ def test_ligament_too_short_to_reach_is_not_found(mechanism: ExtensorMechanism) 
 
 
 def test_end_of_the_femoral_mesh_is_reported(mechanism: ExtensorMechanism) -> None:
-    """The trochlea ends at y = -5 mm: contact beyond it is on the mesh's edge."""
+    """The trochlea ends at y = -5 mm; contact below is on the edge of the mesh."""
     whole = cylinder()
     kept = whole.faces[(whole.triangles[:, :, 1] > -5e-3).all(axis=1)]
     contact = PatellofemoralContact(Surface(whole.vertices, kept, "cut"), dome())
@@ -354,7 +355,7 @@ def test_shipped_patella_moves_smoothly(shipped: tuple[Array, list[PatellaState]
 
 
 def test_a_patella_that_is_lost_from_a_frame_far_off_is_found_from_its_own():
-    """A coarse choice of frames must not lose what the frames between would have found."""
+    """A coarse choice of frames finds the same patella as all frames."""
     starter = Path(starter_package.__file__).parent / "files" / "scene.toml"
     mechanics = mechanics_of(load_case(load_scene(starter)))
     extensor, pose = mechanics.extensor, mechanics.poses[0]
@@ -369,7 +370,7 @@ def test_a_patella_that_is_lost_from_a_frame_far_off_is_found_from_its_own():
 def test_a_recorded_contact_does_not_depend_on_what_was_looked_at_before(
     mechanism: ExtensorMechanism,
 ) -> None:
-    """A part of a motion has the answers of the whole: to the last digit, whatever came before."""
+    """A part of a motion has exactly the results of the whole motion."""
     places = [np.array([0.05 + 1e-4 * k, 1e-3 * k, 0.02 * k]) for k in range(8)]
     contact = mechanism.contact.unused()
     after_others = [contact.at(place) for place in places][-1]

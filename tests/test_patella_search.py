@@ -1,4 +1,4 @@
-"""The patella in a whole scene: links that carry its attachments, guesses, frames that are lost."""
+"""The patella in a whole scene: links with its attachments, initial guesses, and lost frames."""
 
 import re
 from dataclasses import replace
@@ -36,7 +36,8 @@ def turned_about_y(point):
 
 
 def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are(plain, tmp_path):
-    """A link turned by 180 deg about y and the same points in its axes: the same numbers."""
+    """A link rotated by 180 deg about y, with the same points in its axes, gives the same
+    results."""
     points = {
         "quadriceps__insertion": [8.0, 20.0, 0.0],
         "patellar_ligament__proximal": [6.0, -21.0, 0.0],
@@ -66,7 +67,8 @@ def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are
 
 @pytest.mark.parametrize("move", [0.02, 0.3, 3.0, 40.0])
 def test_what_is_known_of_a_place_near_by_shortens_the_search_alone(mechanism, move):  # noqa: F811
-    """The same place by fewer looks, a degree on or 40: there the quick look gives up."""
+    """From a degree away the search needs fewer evaluations; from 40 deg away it searches all
+    rotations."""
     near = solve_patella(
         mechanism, knee_at(20.0), solve_patella(mechanism, knee_at(19.0)).coordinates
     )
@@ -87,7 +89,7 @@ def test_what_is_known_of_a_place_near_by_shortens_the_search_alone(mechanism, m
 
 @pytest.mark.parametrize("wild", [[0.0, 0.0, 2.5], [0.045, 0.3, -3.0]])
 def test_a_guess_that_leads_nowhere_does_not_lose_the_patella(mechanism, wild):  # noqa: F811
-    """All rotations are searched then: the place is that of a search without a guess."""
+    """If the guess fails, the result is that of a search without a guess."""
     cold = solve_patella(mechanism, knee_at(25.0))
     warm = solve_patella(mechanism, knee_at(25.0), np.array(wild))
     assert warm.status is PatellaStatus.OK
@@ -95,7 +97,8 @@ def test_a_guess_that_leads_nowhere_does_not_lose_the_patella(mechanism, wild): 
 
 
 def test_a_guess_inside_the_outline_of_the_femur_does_not_lose_the_patella(mechanism):  # noqa: F811
-    """There the quadriceps cannot run; the search that follows finds the place."""
+    """At the guess an end of the quadriceps lies inside its outline; the full search finds the
+    place."""
     angle = np.linspace(0.0, 2 * np.pi, 181)[:-1]
     outline = 0.026 * np.column_stack([np.cos(angle), np.sin(angle)])
     wrapped = ExtensorMechanism(**{**vars(mechanism), "femoral_outline": outline})
@@ -120,7 +123,7 @@ def test_the_condition_that_fails_is_named(mechanism, change, conditions):  # no
 
 
 def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeypatch):
-    """Frame 5 of 11 is lost: it has a reason with its flexion; its neighbours hardly notice."""
+    """Frame 5 of 11 is lost and says why with its flexion; its neighbours change little."""
     scene = load_scene(MODEL / "scene.toml", FEW | {"contact.model": "foundation"})
     seen = []
 
@@ -144,7 +147,7 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
 
 
 def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain):
-    """At the same poses the same; a little elsewhere what a search of all rotations finds."""
+    """At the same poses the result is the same; at others it is that of a full search."""
     frames = plain.extensor
     same = frames.moved(frames.lines, plain.poses, range(2, 5))
     for k in range(11):
@@ -174,7 +177,7 @@ def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
 
 
 def test_the_patella_stays_at_its_equilibrium_and_its_rates_are_filtered():
-    """The filter moves no place: the button touches, the ligament has its length.
+    """The filter changes no place: the button touches, and the ligament has its length.
 
     The scene's own chain, asked without tkamb.Knee, has the same places and inertial forces.
     """
@@ -206,7 +209,7 @@ def test_the_patella_stays_at_its_equilibrium_and_its_rates_are_filtered():
 
 
 def test_the_moments_of_three_lines_on_the_patella_add_up_to_nothing(plain):
-    """About the femur's z, per unit tension: quadriceps, patellar ligament, contact."""
+    """The moments of quadriceps, patellar ligament and contact about the femur's z sum to zero."""
     for k in (3, 9):
         state, patella = plain.geometry(k).state, plain.extensor.states[k]
         muscle, ligament = plain.extensor.lines.paths(state)

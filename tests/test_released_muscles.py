@@ -83,7 +83,8 @@ def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
 
 
 def test_the_sharing_is_that_of_the_released_knee(resting):
-    """Quadriceps of sharing and equations agree to 1 N; what equilibrium removes is zero."""
+    """The quadriceps of sharing and equations agree to 1 N; residuals of released coordinates are
+    zero."""
     for body, contact in resting:
         quadriceps = body.geometry.extensor.tension(body.loads.values)
         assert quadriceps == pytest.approx(body.geometry.share.force[0], abs=1.0)
@@ -94,7 +95,7 @@ def test_the_sharing_is_that_of_the_released_knee(resting):
 
 
 def test_the_answer_does_not_hang_on_where_the_search_began(side, resting):
-    """The last frame by itself: the pose to the search's tolerance, every muscle to 0.1 N.
+    """The last frame alone has the same pose within the tolerance, and the same muscles to 0.1 N.
 
     Held at what it was in an early pass, the yielding that decides the muscles' arms made 1 % of
     the contact force and 8 N of a muscle's 52 N hang on the frames before.
@@ -160,7 +161,7 @@ def share_of(force):
 
 @pytest.mark.parametrize("slope", [0.2, -0.3, -1.0, -4.0])
 def test_relaxation_settles_what_would_go_round_in_a_circle(slope):
-    """f' = 100 + slope f: with a slope below -1 taking turns would never end."""
+    """With f' = 100 + slope f and a slope below -1, plain iteration diverges."""
     mixing = Relaxation()
     held = mixing.mixed(share_of(0.0))
     for _ in range(6):
@@ -173,7 +174,7 @@ def test_relaxation_settles_what_would_go_round_in_a_circle(slope):
 
 @pytest.mark.parametrize("steepness", [0.5, -0.9, -2.0])
 def test_how_the_knee_yields_settles_where_it_hangs_on_itself(steepness):
-    """g' = 1 + steepness (g - 1): below -1, taken as found it would go to and fro for ever."""
+    """With g' = 1 + steepness (g - 1) and a steepness below -1, plain iteration oscillates."""
     mixing, held = Relaxation(), None
     for _ in range(10):
         found = np.full(6, 3.0) if held is None else 1.0 + steepness * (held - 1.0)
@@ -196,7 +197,7 @@ def test_how_the_knee_yields_is_kept_at_last_and_what_is_open_told():
 @needs_jw
 @pytest.mark.parametrize(("contact", "cell"), [("foundation", 1.5), ("lattice", 2.0)])
 def test_frames_of_gait_run_alone_come_out_as_in_the_whole(contact, cell):
-    """og3's frames 46 to 52 as calibrated, and from 40 on: where the search began is forgotten."""
+    """og3's frames 46 to 52 do not depend on the frame at which the run begins."""
     changes = {"contact.model": contact, "contact.resolution_mm": cell}
     scene = load_scene(OG3.with_name("ngait_og3_measured.toml"), changes)
     alone, longer = (simulate(scene, frames=slice(start, 53)) for start in (46, 40))
@@ -208,7 +209,7 @@ def test_frames_of_gait_run_alone_come_out_as_in_the_whole(contact, cell):
 @pytest.mark.slow
 @needs_jw
 def test_activations_in_gait_are_continuous_at_100_Hz():
-    """Mid-stance of og3: no jump without a condyle that lands or lifts off."""
+    """In the mid-stance of og3 forces jump only where a condyle lands or lifts off."""
     changes = {
         "muscles.model": str(JW / "JW.osim"),
         "contact.resolution_mm": 1.5,
@@ -227,7 +228,7 @@ def test_activations_in_gait_are_continuous_at_100_Hz():
 
 
 def test_all_results_of_a_left_leg_with_muscles_are_the_right_ones(tmp_path, monkeypatch):
-    """From mirrored files to columns and map: forces by name, moments, parts, pressure."""
+    """Mirrored files give the same columns and the same map."""
 
     def given(case):
         left = case.scene.patient.side == "left"

@@ -27,7 +27,7 @@ def equilibrium(place, force=1000.0, problem=""):
 
 
 class Wells:
-    """A knee that comes to rest in the nearest of some places along AP."""
+    """A knee with several equilibria along AP, which finds the nearest one."""
 
     released = (0, 1)
 
@@ -41,7 +41,7 @@ class Wells:
 
 
 def found(knee, recorded, *previous):
-    """Return where a frame comes to rest that was recorded at an AP place, m."""
+    """Return the equilibrium of a frame that was recorded at an AP place, m."""
     pair = SimpleNamespace(first_touch_height=lambda pose: 0.0)
     instant = SimpleNamespace(coordinates=np.array([recorded, 0, 0, 0, 0, 0.0]), muscles=None)
     poses = InitialPoses(knee, pair, None)
@@ -82,7 +82,7 @@ def test_jw_at_3_275_s_has_two_equilibria(tmp_path, capsys):
 
 
 def test_a_frame_is_ok_only_if_its_measured_residual_is_small(monkeypatch):
-    """A search that ends too early is not believed: what is left at its pose is measured."""
+    """The residual at the returned pose shows that a search ended too early."""
     changes = {
         "contact.model": "foundation", "contact.resolution_mm": 2.0, "contact.released": RELEASED,
     }  # fmt: skip

@@ -53,7 +53,7 @@ def resting(bend):
 
 
 def test_the_shank_is_in_equilibrium(bend, resting):
-    """Ground, weight and inertia, ligaments, patellar ligament and contact add up to nothing."""
+    """The sum of ground, weight and inertia, ligaments, patellar ligament and contact is zero."""
     for k, (body, contact) in resting.items():
         geometry = contact.equilibrium.geometry
         total = external_wrench(geometry, contact.equilibrium.coordinates)
@@ -106,7 +106,8 @@ def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, resting, away):
 
 
 def test_a_frame_that_needs_flexors_rests_with_the_quadriceps_slack(bend):
-    """A ground reaction 0.2 m ahead: a line that may push drives the knee off the insert first."""
+    """With a ground reaction 0.2 m in front, a ligament that could push would drive the knee off
+    the insert."""
     case = case_of(BEND)
     ground = replace(case.ground, point=case.ground.point + np.array([0.2, 0, 0]))
     case = replace(case, ground=ground)
@@ -131,7 +132,8 @@ def test_a_start_over_the_rim_says_that_it_did_not_arrive(bend, resting):
 
 
 def test_friction_drags_the_knee_back(bend, resting):
-    """Without friction the same frame rests elsewhere, and every step of the search does work."""
+    """Without friction the equilibrium is another one, and every step of the search does positive
+    work."""
     smooth = side_of(BEND, friction=0.0)
     _, contact = smooth.frame(60)
     away = np.abs(
@@ -142,7 +144,7 @@ def test_friction_drags_the_knee_back(bend, resting):
 
 
 def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
-    """No ligaments, and the femur so far off that nothing catches it."""
+    """Without ligaments and far from the insert there is no equilibrium."""
     case = load_case(load_scene(BEND, COARSE | {"contact.released": ALL, "ligament": []}))
     side = contact_side(case, mechanics_of(case))
     start = case.motion.coordinates[60].copy()
@@ -154,7 +156,8 @@ def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
 def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishes():
-    """DM at half the cycle: one condyle carries all on its flank, until ml and tilt are free."""
+    """DM at half of the cycle: one condyle carries the whole load on its flank, unless ML and
+    adduction are released."""
     few = {"motion.frames": 21}
     body, contact = side_of(DM, few, released=[]).frame(10)
     lean = [np.degrees(np.arccos(c.normal[1])) for c in body.geometry.condyles.values()]
@@ -173,7 +176,7 @@ def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishe
 
 
 def test_a_femur_beside_the_insert_fails_with_the_reason(bend):
-    """The recorded pose far off: no start to search from."""
+    """A recorded pose far off the insert has no initial guess."""
     case = case_of(BEND)
     away = case.motion.coordinates + np.array([0.2, 0, 0, 0, 0, 0])
     case = replace(case, motion=replace(case.motion, coordinates=away))
@@ -185,7 +188,8 @@ def test_a_femur_beside_the_insert_fails_with_the_reason(bend):
 
 
 def test_a_frame_at_rest_whose_equations_fail_has_no_numbers(monkeypatch):
-    """Nothing is left but what was recorded, and what the search says of itself."""
+    """A frame without equilibrium has recorded values and the status of the search, and NaN
+    elsewhere."""
     overrides = COARSE | {"contact.released": ALL}
     solver = FrameSolver(load_case(load_scene(BEND, overrides)))
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""Wrong signs that the numbers do not show raise a question; right recordings raise none."""
+"""Recordings with wrong signs raise a question; correct recordings raise none."""
 
 import csv
 import shutil
@@ -32,7 +32,7 @@ def knee(tmp_path):
 
 
 def turn(path, column):
-    """Turn the sign of a column of a CSV."""
+    """Change the sign of a column of a CSV."""
     rows = list(csv.reader(path.open()))
     k = rows[0].index(column)
     for row in rows[1:]:
@@ -150,7 +150,7 @@ def test_a_mirrored_sideways_force_is_asked_about(applied):
 
 @pytest.mark.parametrize(("share", "asked"), [(0.05, True), (0.025, True), (0.01, False)])
 def test_how_far_outwards_a_force_may_point(knee, share, asked):
-    """Subject JW's stairs have 0.007; a shipped knee with so much sideways force, right side."""
+    """A sideways force like that of subject JW's stairs (0.007) raises no question."""
     case = load_case(load_scene(knee))
     case.ground.force[:, 2] = share * case.ground.force[:, 1]
     assert bool([q for q in direction_questions(case) if "outwards" in q.text]) is asked

@@ -147,7 +147,7 @@ def test_another_contact_model_changes_contact_columns_only(bend):
 
 
 def test_a_left_knee_gives_the_right_knees_numbers(tmp_path, bend):
-    """Everything reflected in the sagittal plane, file by file, gives the same columns."""
+    """Files that are reflected in the sagittal plane give the same columns."""
     from mirrored_patient import write_mirrored_patient
 
     left = simulate(write_mirrored_patient(tmp_path), frames=EVERY_TENTH)

@@ -111,7 +111,8 @@ def test_sliding_on_a_plate_is_all_slip(roller: Surface) -> None:
 
 
 def test_axial_rotation_is_taken_out(roller: Surface) -> None:
-    """Turned by 20 deg about its centre: the condyles travel apart, and none of it is slip."""
+    """A rotation of 20 deg about the centre moves the condyles in opposite directions without
+    slip."""
     angle = np.deg2rad(np.linspace(0.0, 20.0, FRAMES))
     medial, lateral = both(condyle_slip(roller, bed(False), 0.0, motion(0.0, 0.0, angle)))
     assert lateral.insert_arc[-1] == pytest.approx(0.015 * np.sin(angle[-1]), rel=2e-3)
@@ -191,7 +192,7 @@ def test_profile_of_the_trough() -> None:
 
 
 def test_arcs_agree_with_the_exact_sections() -> None:
-    """Shipped knee, 0-120 deg: circles between frames against splines along the sections."""
+    """On the shipped knee, 0-120 deg, circular arcs agree with splines along the sections."""
     path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
     case = load_case(load_scene(path))
     assert case.femoral is not None
@@ -212,7 +213,8 @@ def test_arcs_agree_with_the_exact_sections() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_forward_sliding_is_that_of_the_femoral_point_in_the_plane_of_the_centre(seed):
-    """The femur's point beside the contact, as far out as the centre: no spin about y in it."""
+    """At a point beside the contact, in the sagittal plane of the centre, the spin about y has no
+    part."""
     rng = np.random.default_rng(seed)
     place, rates = rng.normal(size=6) * [0.01, 0.01, 0.01, 0.3, 0.3, 0.3], rng.normal(size=6)
     centre, contact = rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.03

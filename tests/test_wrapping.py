@@ -99,7 +99,8 @@ def test_reaction_presses_the_bone_without_friction() -> None:
 
 
 def test_a_via_point_takes_the_turn_of_the_string_to_its_own_link() -> None:
-    """Three stretches by hand, the wrapped one in the middle; in sum no force and no moment."""
+    """Three stretches, the middle one wrapped, agree with a hand calculation; the sum of loads is
+    zero."""
     via = LinkPoint("shank", np.array([0.02, -0.09, 0.01]))
     start, end = between("hip", [-0.03, 0.3, 0.0], "shank", [0.0, -0.3, 0.02])
     origin = LinkPoint("femur", np.array([0.0, 0.2, 0.02]))

@@ -1,4 +1,5 @@
-"""What passes between muscles and knee are made of: smooth stiffness, rough passes, their end."""
+"""Parts of the passes between muscles and knee: smooth stiffness, tolerance of a pass, and their
+end."""
 
 from types import SimpleNamespace
 
@@ -56,7 +57,7 @@ def test_a_rough_search_leaves_no_more_than_it_may_and_says_so():
 
 
 def test_a_rough_search_does_not_end_where_nothing_holds_it():
-    """On a hilltop a short Newton step leads up it."""
+    """At a maximum of the energy a short Newton step leads uphill."""
     hilltop = find_balance(
         lambda x: Trial(1e5 * x, -1e5 * np.eye(1)), np.array([1e-4]), residual_share=0.5
     )
@@ -71,7 +72,7 @@ def test_what_is_ahead_of_passes_that_shrink_is_their_series(ratio):
 
 
 def test_what_is_ahead_is_not_guessed_from_passes_that_do_not_settle():
-    """One short pass after a long one foretells nothing: a search that trusts it ends too soon."""
+    """One short pass after a long one does not show convergence."""
     short = 1.5 * RELEASED_KNEE.knee_tolerance
     for ways in ([np.inf, np.inf, short], [np.inf, 1e-3, short], [1e-3, 0.9e-3, short]):
         assert ahead(ways) == 1.0
@@ -93,7 +94,7 @@ def test_a_search_begins_where_steady_frames_go_on_and_no_farther():
 
 
 def test_what_a_lost_patella_leaves_unknown_is_asked_for_again(monkeypatch):
-    """What the shank asks for is kept for a frame, but not where a lost patella made it NaN."""
+    """The external wrench is stored for a frame, unless a lost patella made it NaN."""
     asked = iter([np.full(6, np.nan), np.ones(6)])
     monkeypatch.setattr(released, "external_wrench", lambda *given: next(asked))
     monkeypatch.setattr(released, "joint_equilibrium", lambda *given: given[-1])

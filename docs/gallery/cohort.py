@@ -1,8 +1,8 @@
 """A cohort: one knee in three sizes.
 
-A cohort file makes many runs one table: here three legs of one shape (`scale`) with the same
-motion. Lengths grow with the size, weights with its cube and ligaments with its square, so forces
-in body weights are nearly the same. It is no statistical model of people.
+A cohort file makes one table of many runs. Here three legs of one shape (`scale`) have the same
+motion. Lengths grow with the size, weights with its cube and ligament stiffness with its square, so
+that forces in body weights are nearly the same. This is no statistical model of people.
 """
 
 import tempfile

@@ -1,7 +1,8 @@
 """Does it converge?
 
-A result that moves with the spacing of the map's points is not yet one. Here the approach by
-`foundation` at four spacings, against the finest: ask this of your own bodies before you publish.
+A result that still changes with the spacing of the map's points has not converged. This example
+compares the approach by `foundation` at four spacings with the finest one. Do the same with your
+own bodies before you publish.
 """
 
 from pathlib import Path

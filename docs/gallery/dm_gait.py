@@ -1,9 +1,9 @@
 """A recorded gait: subject DM.
 
-Fluoroscopy of the implant on a stride of marker and plate recordings. Only the quadriceps pulls
-here, so the force lies below the 2.3 to 2.6 body weights that instrumented knees measure in
-walking (D'Lima 2007, Kutzner 2010): what is missing are hamstrings, gastrocnemius and hip muscles,
-and most frames are flagged. It runs in a clone of the repository, which has models/, and needs
+The motion is fluoroscopy of the implant, with markers and force plates. Only the quadriceps pulls
+here, so that the force is below the 2.3 to 2.6 body weights that instrumented knees measure in
+walking (D'Lima 2007, Kutzner 2010): hamstrings, gastrocnemius and hip muscles are missing, and most
+frames are flagged. It runs in a clone of the repository, which has models/, and needs
 subject DM's files (models/dm/README.md).
 """
 

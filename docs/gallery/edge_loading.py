@@ -1,8 +1,8 @@
 """Half a degree of adduction.
 
-The femoral component is turned about the anterior axis in steps: within half a degree, which is
-what fluoroscopy knows, one condyle of this knee takes nearly all of the load. A medial share from a
-recorded pose says more about the recording than about the knee.
+The femoral component is rotated about the anterior axis in steps. Within half a degree, the error
+of fluoroscopy, one condyle of this knee takes nearly all of the load. A medial share from a
+recorded pose therefore says more about the recording than about the knee.
 """
 
 from pathlib import Path

@@ -1,8 +1,9 @@
 """Conformity and thickness of an insert: what a designer trades.
 
-A femoral component without cam is pressed at 60 deg of flexion with 1500 N into inserts that differ
-in one dimension: the conformity (femoral radius near extension over the dish's, sagittal plane) or
-the thickness. The same over a whole bend, and malposition: models/designs/sweep.toml.
+A femoral component without cam is pressed at 60 deg of flexion with 1500 N on inserts that differ
+in one dimension. It is the conformity (femoral radius near extension over the dish's radius, in the
+sagittal plane) or the thickness. models/designs/sweep.toml does the same over a whole bend, and
+with malposition.
 """
 
 from dataclasses import replace

@@ -1,9 +1,9 @@
 """A recorded squat: subject JW.
 
-Markers and plates of a two-legged squat. Nobody recorded where the implant sat, so adduction, axial
-rotation and sliding are found: contact, ligaments and muscle line balance. Watch the ratio of
-patellar ligament to quadriceps: the patella is a balance beam whose lever shortens as the knee
-bends. It runs in a clone of the repository, which has models/, and needs
+Markers and force plates of a two-legged squat. The pose of the implant was not recorded, so that
+adduction, axial rotation and AP follow from the equilibrium of contact, ligaments and muscle.
+The ratio of patellar ligament to quadriceps falls with flexion, because the lever arms at the
+patella change. It runs in a clone of the repository, which has models/, and needs
 subject JW's files (models/jw/README.md).
 """
 

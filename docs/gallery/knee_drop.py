@@ -1,9 +1,9 @@
 """A drop test: a femur falls on the insert.
 
-The insert is fixed, the femoral component with 60 kg on it slides down a rail from one millimetre
-above. `tkamb.knee.integrate.implicit_step`, a page of code around `pin.aba`, takes the steps. By
-the midpoint rule the femur keeps bouncing; by implicit Euler, which takes energy out, it comes to
-rest where the contact carries its weight.
+The insert is fixed. A femoral component with a mass of 60 kg slides down a rail from a height of
+one millimetre. `tkamb.knee.integrate.implicit_step` takes the time steps. By the midpoint rule the
+femur keeps bouncing. By implicit Euler, which dissipates energy, it comes to rest where the contact
+carries its weight.
 """
 
 from pathlib import Path

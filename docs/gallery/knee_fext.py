@@ -1,9 +1,9 @@
 """Contact and ligaments as `fext` in your own Pinocchio model.
 
-A leg of one's own: a thigh that hangs from the world by a ball joint, a knee with six degrees of
-freedom, a shank. The implant's meshes, two collateral ligaments and a contact model make a
-`tkamb.Knee`; its forces go into `pin.rnea` like any others. The femur is lowered onto the insert,
-and the joint's vertical force rises with the contact.
+The leg has a thigh that hangs from the world by a ball joint, a knee with six degrees of freedom,
+and a shank. The implant's meshes, two collateral ligaments and a contact model make a `tkamb.Knee`,
+whose forces are an argument of `pin.rnea`. The femur is lowered onto the insert, and the vertical
+force of the joint rises with the contact.
 """
 
 from pathlib import Path

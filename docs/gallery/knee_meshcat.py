@@ -1,8 +1,7 @@
 """The knee in your own MeshCat window, and the pressure map at one q.
 
-`Knee.show` adds implant, ligaments and pressure below the root node of a
-`pin.visualize.MeshcatVisualizer` that is there already; here the window is written into a page that
-opens anywhere.
+`Knee.show` adds implant, ligaments and pressure below the root node of an existing
+`pin.visualize.MeshcatVisualizer`. Here the window is written into an HTML page.
 """
 
 from pathlib import Path

@@ -1,8 +1,8 @@
 """A virtual knee simulator in thirty lines.
 
-Force-controlled: flexion is held, a load presses on a fixed line, AP, ML, axial rotation and
-adduction are free and held by springs alone, as in a machine of ISO 14243-1. The femur swings in
-and comes to rest; `Knee.equilibrium` finds the same place at once, without going there.
+Flexion is constant, and a load acts on a fixed line. AP, ML, axial rotation and adduction are free,
+with springs alone, as in a force-controlled machine of ISO 14243-1. The femur oscillates and comes
+to rest. `Knee.equilibrium` finds the same pose without time steps.
 """
 
 from pathlib import Path

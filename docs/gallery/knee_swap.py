@@ -1,7 +1,7 @@
 """A contact model swapped in a plugged-in knee.
 
-The same knee with three contact models: only the argument `contact` changes. Each is asked for its
-stiffness under 1500 N, which an implicit integration or an optimisation needs.
+The same knee has three contact models in turn: only the argument `contact` changes. The example
+compares the stiffness of each under 1500 N, which implicit integration or optimisation needs.
 """
 
 from pathlib import Path

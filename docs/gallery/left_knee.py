@@ -1,7 +1,8 @@
 """A left knee.
 
-Meshes of a left knee are its right one's mirror images. tkamb computes a left knee as a right one
-and hands back its own places: the forces are the same, the centres of pressure on the other side.
+The meshes of a left knee are the mirror images of those of a right knee. tkamb computes a left knee
+as its mirror image and converts its places back: the forces are the same, and the centres of
+pressure are on the other side.
 """
 
 import tempfile

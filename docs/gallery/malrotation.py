@@ -1,8 +1,8 @@
 """A component five degrees malrotated.
 
-The femoral component is turned about the long axis, five degrees either way, and held there: one
-condyle then takes nearly all of the load, and the peak rises by a fifth. This knee is symmetric:
-turned in or turned out, the peak is the same but for the faceting of the meshes.
+The femoral component is rotated about the long axis by five degrees in both directions, and stays
+there. One condyle then takes nearly all of the load, and the peak rises by a fifth. This knee is
+symmetric: internal and external rotation give the same peak within the faceting of the meshes.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
 """A bearing that slides on its tray.
 
-The same insert with its bottom held (fixed) and free to slide on a polished tray (mobile): what is
-free gives way more, so that the femoral component sinks deeper under the same load.
+The bottom of the same insert is fixed, or free to slide on a polished tray (mobile). The mobile
+insert is more compliant, so that the femoral component penetrates deeper under the same load.
 """
 
 from pathlib import Path
