@@ -1,4 +1,4 @@
-"""A leg in a plane, of three rods on hinges about z, with whatever muscles a test wants."""
+"""A plane leg of three rods on hinges about z, with the muscles of a test."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ COORDINATES = ("hip_flexion_r", "knee_flexion_r", "ankle_flexion_r")
 
 
 def hinge(name: str, parent: str, child: str, coordinate: str | None, place) -> Joint:
-    """Return a hinge at a place of the parent and the child's origin; welded without coordinate."""
+    """Return a hinge from a point of the parent to the child's origin; no coordinate: welded."""
     axes = () if coordinate is None else (JointAxis(Z, coordinate, Linear(1.0, 0.0)),)
     kind = "WeldJoint" if coordinate is None else "PinJoint"
     return Joint(name, kind, parent, child, pose(np.eye(3), place), np.eye(4), axes, ())

@@ -1,4 +1,4 @@
-"""Output folders: whose they are, one writer at a time, and files that change together."""
+"""Output folders: ownership, one writer at a time, and files that change together."""
 
 import json
 import os
@@ -30,7 +30,7 @@ def names(folder):
 
 @pytest.fixture
 def holder(tmp_path):
-    """Another process that holds the folder `out`."""
+    """Start another process that locks the folder `out`."""
     process = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path / "out")],
         stdin=subprocess.PIPE,
@@ -169,7 +169,7 @@ def test_files_change_together(tmp_path):
 
 
 def test_a_kill_between_the_renames_is_mended_by_the_next(tmp_path, monkeypatch):
-    """The process is gone after any number of renames: the new state comes, whole."""
+    """A process is killed after any number of renames: the next one completes the new state."""
     for renames in range(1, 4):
         folder = tmp_path / str(renames)
         folder.mkdir()

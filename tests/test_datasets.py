@@ -1,4 +1,4 @@
-"""`tkamb data get`: from a local server and from a folder, by SHA-256, whole or not at all."""
+"""`tkamb data get` from a local server and a folder: SHA-256 checks and complete files only."""
 
 import hashlib
 import http.server
@@ -45,7 +45,7 @@ def dataset(monkeypatch):
 
 
 class Server(http.server.ThreadingHTTPServer):
-    """Serves CONTENT under a commit; `answers` holds what is said instead for a path."""
+    """Serves CONTENT under a commit; `answers` maps a path to another answer."""
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)

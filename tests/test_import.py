@@ -1,4 +1,4 @@
-"""`tkamb import`: a model, a recording and meshes to a scene, and what is refused."""
+"""`tkamb import`: a scene from a model, a recording and meshes; and its errors."""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
 
 @pytest.mark.parametrize(("off", "asked"), [(10.0, 0), (14.0, 1)])
 def test_markers_of_another_subject_are_asked_about(tmp_path, off, asked):
-    """Clusters made larger by c: a rigid fit leaves c times their radius, rms over all markers."""
+    """If marker clusters grow by the share c, the rms of a rigid fit is c times their radius."""
     assert main(recorded_leg(tmp_path)) == 0
     scene = load_scene(tmp_path / "out" / "scene.toml")
     segments = scene.motion.markers.segment[:2]
@@ -101,7 +101,7 @@ def test_they_are_with_joints_passed_backwards_and_couplers():
 
 
 def check_normal_equations(model):
-    """Gradient and Hessian of the cost by finite differences of the markers and of the gradient."""
+    """Gradient and Hessian of the cost agree with finite differences."""
     chain = ModelChain(model, list(model.markers))
     rng = np.random.default_rng(2)
     q = chain.kinematics.coupled(rng.normal(0.0, 0.3, (3, len(model.coordinates))))

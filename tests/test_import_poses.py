@@ -1,4 +1,4 @@
-"""Recorded poses of the implant, with markers that place the shank alone."""
+"""Recorded poses of the implant, with markers that give only the shank's pose."""
 
 import xml.etree.ElementTree as ElementTree
 from importlib.machinery import SourceFileLoader
@@ -35,7 +35,7 @@ IMPLANT = {
     'name="femur_implant_r"><socket_parent>..</socket_parent><translation>0 -0.4 0</translation>'
     "<orientation>0 0 0</orientation></PhysicalOffsetFrame></components>"
 }
-"""The femoral mesh stands at the knee's pin, the insert's at the tibia's origin."""
+"""The femoral mesh is at the knee's pin joint, the insert's mesh at the tibia's origin."""
 needs_dm = pytest.mark.skipif(
     not DM.is_dir(), reason="subject DM's files are not beside the project"
 )
@@ -120,7 +120,7 @@ def test_the_femur_of_the_scene_stands_where_it_was(bent_leg, tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def block(tmp_path_factory) -> Path:
-    """Write an insert that is quickly read: a block of 50 × 10 × 80 mm on y = 0."""
+    """Write a simple insert: a block of 50 × 10 × 80 mm on y = 0."""
     path = tmp_path_factory.mktemp("block") / "insert.stl"
     mesh = flat_insert(10e-3, 25e-3, 40e-3).mesh.copy()
     mesh.apply_scale(1e3).export(path)
@@ -197,7 +197,7 @@ def test_the_script_writes_dms_scenes_that_are_shipped(name):
 
 
 def test_dms_links_are_where_its_model_has_them():
-    """Worked out from DM.osim by hand: insert in tibia, femur body in femur, knee centre, mm."""
+    """Computed by hand from DM.osim: insert in tibia, femur body in femur, knee centre (mm)."""
     robot = ElementTree.parse(ROOT / "models/dm/patient.urdf").getroot()
     origins = {j.get("name"): j.find("origin") for j in robot.findall("joint")}
     by_hand = {

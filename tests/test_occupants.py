@@ -1,4 +1,4 @@
-"""No command writes over or among another command's output, finished or under way."""
+"""No command overwrites or mixes another command's output, finished or unfinished."""
 
 import json
 
@@ -50,7 +50,7 @@ def test_a_command_is_refused_anothers_folder_and_nothing_changes(
 
 
 def test_a_run_is_not_what_an_uncertainty_run_wrote(tmp_path):
-    """A run takes the bands beside the results away: they took hours."""
+    """A run would remove the bands beside the results, which took hours."""
     for name in ("results.csv", "bands.csv"):
         (tmp_path / name).write_text("time_s\n")
     assert occupants(tmp_path) == {"uncertainty": "bands.csv"}

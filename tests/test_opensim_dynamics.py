@@ -8,7 +8,7 @@ from opensim_references import references
 from tkamb.io.opensim.motion import inverse_dynamics
 
 TOLERANCE = {"JW": 1e-8, "gait2392": 1e-8, "DM": 5e-3, "Rajagopal2016": 0.05}
-"""N and N·m. Where splines turn a joint OpenSim's own differ by that much: see the next test."""
+"""N and N·m. OpenSim differs by this much where splines rotate a joint: see the next test."""
 
 
 def energy(chain, q, rates):
@@ -29,7 +29,7 @@ def energy(chain, q, rates):
 
 @pytest.mark.parametrize("name", ["old_layout", "JW"])
 def test_power_is_the_rate_of_energy(name):
-    """Of the generalised forces, and of a wrench on the foot."""
+    """The power of generalised forces and of a wrench on the foot is the rate of the energy."""
     chain = kinematics(name)
     rng = np.random.default_rng(2)
     q, rates, second = rng.uniform(-0.8, 0.8, (3, 3, len(chain.coordinates)))
@@ -48,7 +48,7 @@ def test_power_is_the_rate_of_energy(name):
 
 @pytest.mark.parametrize("name", ["Rajagopal2016", "DM"])
 def test_force_on_the_pelvis_is_the_rate_of_momentum(name):
-    """By differences of the mass centre's path: OpenSim's forces are up to 0.03 N off here."""
+    """The force agrees with differences of the mass centre's path; OpenSim is up to 0.03 N off."""
     chain, truth = kinematics(name), references()[name]
     rates, second, _ = (np.array([v]) for v in truth["dynamics"][1])
     q, model = np.array(truth["q"][1:2]), chain.model

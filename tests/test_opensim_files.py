@@ -1,4 +1,4 @@
-"""OpenSim models as people write them: the same model in another form is the same model."""
+"""OpenSim models in the forms of public files: each form gives the same model."""
 
 import re
 from pathlib import Path
@@ -32,7 +32,7 @@ def written(folder: Path, text: str | bytes, name: str = "model.osim") -> Path:
 
 
 def assert_same(one: OpenSimModel, other: OpenSimModel) -> None:
-    """Two models give the same bodies, poses and lines."""
+    """Raise unless two models have the same bodies, poses and lines."""
     assert one.bodies.keys() == other.bodies.keys()
     for name, body in one.bodies.items():
         np.testing.assert_array_equal(body.inertia, other.bodies[name].inertia)
@@ -52,7 +52,7 @@ def cut_out(text: str, tag: str) -> tuple[str, str]:
 
 
 SETS = ("BodySet", "JointSet", "ConstraintSet", "ForceSet", "MarkerSet")
-"""MarkerSet: the model gets one of its own."""
+"""Sets that are moved into files; `MARKER` adds a MarkerSet to the model first."""
 MARKER = (
     '<MarkerSet name="markerset"><objects><Marker name="spot"><socket_parent_frame>/bodyset/tibia'
     "</socket_parent_frame><location>0.01 -0.1 0.02</location></Marker></objects></MarkerSet>"
@@ -74,7 +74,7 @@ def test_a_set_in_a_file_of_its_own_is_read(tmp_path, tag, wrapped):
 
 
 def test_a_run_reads_the_files_that_its_model_names(tmp_path):
-    """So that another ForceSet is another run, and `verify` sees it."""
+    """A change of a set in its own file makes another run, which `verify` detects."""
     held, rest = cut_out(NEW, "ForceSet")
     (tmp_path / "parts").mkdir()
     forces = written(tmp_path / "parts", held.replace("<objects>", '<objects file="more.xml">'))
@@ -380,7 +380,7 @@ def test_muscle_classes_by_their_older_names(tmp_path, kind):
 
 
 def as_connectors(text: str, style: str) -> str:
-    """Return version 4's sockets as documents of versions 30500 to 30515 write them."""
+    """Return a document of version 4 with the sockets of versions 30500 to 30515."""
     if style == "connectors":
         new = (
             r'<connectors><Connector_PhysicalFrame_ name="\1"><connectee_name>\2</connectee_name>'
@@ -408,7 +408,7 @@ def test_the_versions_between_3_and_4(tmp_path, style, version):
     ],
 )
 def test_a_frame_defined_by_stations(tmp_path, axes, turn):
-    """Along a to b, and across the triangle: the knee's frame on the femur, written so."""
+    """The knee's frame on the femur, given by stations, is the same frame."""
     places = {"a": (0, 0, 0), "b": (0.1, 0, 0), "c": (0.02, 0, -0.1), "o": (0, -0.4, 0)}
     stations = "".join(
         f'<Station name="{name}"><socket_parent_frame>/bodyset/femur_r</socket_parent_frame>'

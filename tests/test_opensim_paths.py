@@ -1,4 +1,4 @@
-"""Taut paths: closed forms, virtual work against differences, no jumps, OpenSim's own numbers."""
+"""Taut paths beside closed forms, finite differences and OpenSim; their lengths do not jump."""
 
 from dataclasses import replace
 
@@ -131,7 +131,7 @@ def test_ring_turns_a_string_at_its_inside():
 
 
 def test_two_objects_share_a_tangent():
-    """Over two equal spheres the string is level between their tops."""
+    """Between two equal spheres the string is horizontal."""
     radius, apart = 0.03, 0.1
     sphere = wrap("sphere", radius)
     poses = np.tile(np.eye(4), (1, 2, 1, 1))
@@ -158,7 +158,7 @@ def test_touching_begins_without_a_jump(shape):
 
 
 def test_an_ellipsoid_yields_to_a_point_that_moves_into_it():
-    """Length stays continuous; for a point of its own body it is passed as if not there."""
+    """The length stays continuous; a point of the object's own body ignores the object."""
     ellipsoid = wrap("ellipsoid", 0.05, 0.03, 0.07)
     depth = np.linspace(1.2, 0.6, 601)
     start = np.outer(depth, [-0.03, 0.02, 0.03])
@@ -193,7 +193,7 @@ def test_moment_arms_are_the_derivative_of_length(name):
 
 @pytest.mark.parametrize("name", [*OWN, *PUBLISHED])
 def test_paths_without_wraps_are_those_of_opensim(name):
-    """Straight, through conditional and moving points."""
+    """Straight paths, with conditional and moving points."""
     chain, truth = kinematics(name), references()[name]
     lengths = LineSet(chain, truth["paths"]).at(np.array(truth["q"])[: len(truth["lengths_m"])])
     np.testing.assert_allclose(lengths.lengths_m, truth["lengths_m"], atol=1e-9)
@@ -230,7 +230,7 @@ def test_moment_arms_over_the_range_of_the_joints(name):
     ],
 )
 def test_no_length_jumps_over_an_ellipsoid(coordinate, muscles):
-    """OpenSim's jump by up to 13.6 mm (psoas, -43 deg) and 12.9 mm (gracilis) in one degree."""
+    """OpenSim's jump by up to 13.6 mm (psoas, -43 deg) and 12.9 mm (gracilis) within a degree."""
     chain = kinematics("DM")
     column, step = chain.coordinates[coordinate], np.radians(1.0)
     low, high = chain.model.coordinates[coordinate].range
@@ -243,7 +243,7 @@ def test_no_length_jumps_over_an_ellipsoid(coordinate, muscles):
 
 
 def test_a_string_never_turns_back_where_it_leaves():
-    """JW's biceps at 136-144 deg: its end is 1 mm off the ellipsoid; the string ran past it."""
+    """JW's biceps at 136 to 144 deg ends 1 mm off the ellipsoid; the string must not overshoot."""
     chain = kinematics("JW")
     column = chain.coordinates["knee_flexion"]
     degrees = np.arange(-136.0, -144.1, -0.5)

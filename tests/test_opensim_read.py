@@ -1,4 +1,4 @@
-"""OpenSim models: both layouts mean the same, published ones are understood, the rest refused."""
+"""OpenSim models: both layouts give the same model, published models are read, errors refused."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_published_models(name, bodies, coordinates, muscles, ligaments, markers
 
 
 def test_traps_of_jw():
-    """Offset frames of one name in two joints; a knee that runs from tray to femur."""
+    """Two joints have offset frames of one name; the knee leads from the tray to the femur."""
     jw = model("JW")
     joints = {joint.name: joint for joint in jw.joints}
     weld, knee = joints["tibial_tray_weld"], joints["knee"]

@@ -1,4 +1,4 @@
-"""A whole trial beside OpenSim's own tools: inverse dynamics, static optimisation, knee reaction.
+"""A whole trial beside OpenSim's tools: inverse dynamics, static optimisation, knee reaction.
 
 The same model, coordinates, plates, cost (Σa², isometric muscles) and reserves. OpenSim's
 optimiser sometimes stops at a point that balances but is not the least: 80 times the cost in one
@@ -44,7 +44,7 @@ def test_generalised_forces_of_a_trial_are_those_of_opensims_tool(tools):
 
 
 class Compared:
-    """tkamb and OpenSim at every so many frames of the trial."""
+    """Results of tkamb and OpenSim at some frames of the trial."""
 
     def __init__(self, tools, wraps, every):
         trial = tools.trial

@@ -1,4 +1,4 @@
-"""Named presets: what they change in a scene, what overrides them, what they need."""
+"""Presets: their changes to a scene, the options that override them, the data that they need."""
 
 import json
 import sys
@@ -69,7 +69,7 @@ def test_another_contact_model_does_not_get_the_lattices_options(scene_file):
 
 
 def test_a_scene_that_is_read_already_takes_it_too(scene_file):
-    """The same scene as from the file, with its own overrides kept."""
+    """The scene is the same as from the file, and keeps its own overrides."""
     read = load_scene(scene_file, FAST)
     assert with_preset(read, SOURCE) == load_scene(scene_file, FAST, SOURCE)
     assert with_preset(read, SOURCE).preset == load_scene(scene_file, FAST, SOURCE).preset
@@ -132,7 +132,7 @@ def test_the_same_from_python_and_from_the_command_line(scene_file):
 
 
 def test_the_scene_of_such_results_is_read_as_they_were_run(scene_file, tmp_path):
-    """`view` and `export --deck` read it again; `run_again` says how to compute it anew."""
+    """`view` and `export --deck` read the scene again; `run_again` is the command for that run."""
     out = tmp_path / "out"
     run = ["run", str(scene_file), "--as", SOURCE, "--contact", "hertz", "--frames", "5:6"]
     assert main([*run, "--set", "motion.frames=11", "--out", str(out)]) == 0

@@ -30,7 +30,7 @@ PEAKS_BW: dict[str, dict[str, float]] = {
     "sitting down": {KUTZNER: 2.25},
     "one-leg stance": {KUTZNER: 2.59},
 }
-"""Activity -> source -> body weights."""
+"""Activity -> source -> mean peak force in body weights."""
 
 
 def peaks_words(activity: str) -> str:

@@ -40,17 +40,17 @@ WRITTEN = {
     "cohort": ("cohort.json",),
     "wear": ("wear.json", ".wear.npz"),
 }
-"""Command -> files that only it writes; results.csv is from `uncertainty` if there is a bands.csv.
+"""Command -> files that only it writes. Beside a bands.csv, results.csv is from `uncertainty`.
 
-The page of `compare` and the maps of `export --vtp` have other names and fit into any folder.
+The files of `compare` and `export --vtp` have other names and may be in any folder.
 """
 BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear"}}
-"""Command -> commands whose folder it may share: their file names differ, and the page of a run
-shows its wear."""
+"""Command -> other commands that may write into the same folder: their file names differ, and the
+page of a run shows its wear."""
 
 
 def occupants(folder: Path) -> dict[str, str]:
-    """Return command -> the file that says that its output, finished or under way, is there."""
+    """Return command -> name of a file of its output, finished or unfinished, in a folder."""
     result = {
         command: name
         for command, names in WRITTEN.items()
@@ -66,7 +66,7 @@ def occupants(folder: Path) -> dict[str, str]:
 
 
 def check_occupants(folder: Path, command: str) -> None:
-    """Raise an InputError where a folder holds another command's output than may be beside this."""
+    """Raise an InputError if a folder holds the output of a command that may not share it."""
     foreign = {
         other: name
         for other, name in occupants(folder).items()
@@ -78,7 +78,7 @@ def check_occupants(folder: Path, command: str) -> None:
 
 
 def _frames_of(folder: Path) -> tuple[str, str]:
-    """Return the command whose unfinished run is kept in a folder, and its file."""
+    """Return the command with an unfinished run in a folder ("": none), and the run's file."""
     name = ".frames/run.json"
     try:
         result = read_json(folder / name)
@@ -92,7 +92,7 @@ def _frames_of(folder: Path) -> tuple[str, str]:
 
 
 def _rows_of(folder: Path) -> tuple[str, str]:
-    """Return the command whose unfinished study is kept in a folder, and its file."""
+    """Return the command with an unfinished study in a folder ("": none), and the study's file."""
     name = "rows.jsonl"
     if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
         return "", name
@@ -107,7 +107,7 @@ def _rows_of(folder: Path) -> tuple[str, str]:
 
 CHOOSE = "choose another directory"
 LONGEST_WAIT = 5.0
-"""s: longest time that a reader waits for a writer that is moving finished files into place."""
+"""s: longest time that a reader waits while a writer moves finished files into place."""
 
 _held: set[tuple[int, int, int]] = set()
 """(thread, device, inode) of the folders that this process holds."""
@@ -115,21 +115,21 @@ _held: set[tuple[int, int, int]] = set()
 
 @contextmanager
 def claimed_directory(path: str | Path, force: bool = False, command: str = "") -> Iterator[Path]:
-    """Lock an output folder that can be written, is tkamb's own and is used by no other process.
+    """Lock an output folder for this process while the block runs.
 
-    Unfinished work of a killed process is finished or removed. After bad input the folder is as
-    it was before: new files and folders are removed. A thread may claim a folder that it holds
-    already.
+    Unfinished file changes of a killed process are completed or removed. If the block raises an
+    InputError, the new marker and new empty folders are removed. A thread may lock a folder that it
+    has locked already.
 
     Args:
-        path: of the folder; made if it is not there.
-        force: use it even if it holds other files, which are not changed, or another command's
-        output.
-        command: tkamb command that writes there; empty: output of any command may be there.
+        path: the folder; it is made if it does not exist.
+        force: use the folder even if it holds other files, which do not change, or another
+            command's output.
+        command: tkamb command that writes there; "": output of any command may be there.
 
     Raises:
-        InputError: it cannot be made or written, is not tkamb's, holds another command's output
-            (`tkamb.io.claim`), or another process holds it; or from the block.
+        InputError: the folder cannot be made or written, holds foreign files or another command's
+            output, or is locked by another process; or an error of the block.
     """
     path = Path(path)
     new_folders = [folder for folder in (path, *path.parents) if not _exists(folder)]
@@ -154,32 +154,32 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
                     check_occupants(path, command)
                 yield path
             except InputError:
-                # The kept part of an interrupted computation keeps the marker, so that it can go
-                # on.
+                # The marker stays beside stored frames of an interrupted computation, which can
+                # then be resumed.
                 if fresh and set(os.listdir(path)) - {MARKER} <= held_before:
                     (path / MARKER).unlink(missing_ok=True)
                 raise
             finally:
                 _held.discard(key)
     except InputError:
-        with suppress(OSError, ValueError):  # no longer empty, or never made
+        with suppress(OSError, ValueError):  # the folder is not empty, or does not exist
             for folder in new_folders:
                 folder.rmdir()
         raise
 
 
 def settle(folder: Path) -> None:
-    """Finish the interrupted file changes of a killed process in a folder, before it is read.
+    """Complete the interrupted file changes of a killed process in a folder, before it is read.
 
     Raises:
-        InputError: it cannot be finished.
+        InputError: they cannot be completed.
     """
     deadline = clock.monotonic() + LONGEST_WAIT
     while replacement_pending(folder):
         try:
             with _holding_lock(folder):
                 finish_replacement(folder)
-        except BusyFolderError:  # the one who holds it is about to finish it
+        except BusyFolderError:  # the process with the lock completes them itself
             if clock.monotonic() > deadline:
                 raise
             clock.sleep(0.02)
@@ -191,7 +191,7 @@ class BusyFolderError(InputError):
 
 @contextmanager
 def _holding_lock(path: Path) -> Iterator[None]:
-    """Hold the lock of a folder's marker, which is made if it is not there."""
+    """Lock a folder's marker while the block runs; the marker is made if it does not exist."""
     descriptor = _acquire_lock(path)
     try:
         yield
@@ -226,7 +226,7 @@ def _acquire_lock(path: Path) -> int:
 
 
 def _mark(path: Path) -> None:
-    """Write the marker if it says nothing yet."""
+    """Write the marker's content if it is empty."""
     if folder_token(path):
         return
     content = {
@@ -236,7 +236,9 @@ def _mark(path: Path) -> None:
     }
     marker = path / MARKER
     try:
-        with open(marker, "r+", encoding="utf-8") as file:  # in place: its inode has the lock
+        with open(
+            marker, "r+", encoding="utf-8"
+        ) as file:  # in place: the lock belongs to its inode
             file.truncate()
             file.write(json.dumps(content) + "\n")
             file.flush()
@@ -246,7 +248,7 @@ def _mark(path: Path) -> None:
 
 
 def _remove_temporaries(path: Path) -> None:
-    """Remove the unfinished temporary files of a killed process; they contain our token."""
+    """Remove the temporary files of a killed process; their names contain the folder's token."""
     token = folder_token(path)
     for entry in path.glob(f".tkamb-{token}-*.part"):
         if stat.S_ISREG(entry.lstat().st_mode):
@@ -254,7 +256,7 @@ def _remove_temporaries(path: Path) -> None:
 
 
 def _check_ours(path: Path, force: bool) -> None:
-    """Raise if a folder holds things and none of them says that it is tkamb's."""
+    """Raise if a folder holds files and tkamb has not written into it before."""
     if force or is_ours(path):
         return
     others = sorted(entry.name for entry in path.iterdir())
@@ -264,10 +266,10 @@ def _check_ours(path: Path, force: bool) -> None:
 
 
 def is_ours(path: Path) -> bool:
-    """Say whether tkamb has written into a folder before: this release or an earlier one.
+    """Return whether any release of tkamb has written into a folder before.
 
-    Releases before the marker left a summary.json that names tkamb's version, the identity of
-    an unfinished run, or the rows of a study.
+    Releases without the marker file wrote a summary.json with tkamb's version, the identity of an
+    unfinished run, or the rows of a study.
     """
     if (path / MARKER).is_file() and not (path / MARKER).is_symlink():
         return True
@@ -284,22 +286,22 @@ def is_ours(path: Path) -> bool:
 
 
 OWN_MARK = b"tkamb"
-"""Bytes at the beginning of every page, map and deck that tkamb writes."""
+"""Mark near the beginning of every page, map and deck that tkamb writes."""
 MARK_WITHIN = 4096
 """Number of bytes at the beginning of a file in which the mark is searched."""
 PICTURES = {".png": b"\x89PNG", ".gif": b"GIF8"}
-"""Formats without a mark: a picture takes the place of a picture."""
+"""Suffix -> first bytes of formats without a mark. A picture may replace any picture."""
 
 
 def check_output_file(path: str | Path | None, force: bool = False) -> None:
-    """Raise unless a file may be written here: its place is free, or holds one of tkamb's own.
+    """Raise unless the path is free or holds a file that tkamb has written.
 
     Args:
-        path: of the file; None: none is written.
-        force: replace whatever file is there.
+        path: the output file; None: no file is written.
+        force: whether any file may be replaced.
 
     Raises:
-        InputError: there is a file that tkamb did not write, or something that is no file.
+        InputError: the path holds a file that tkamb did not write, or is not a file.
     """
     if path is None or not os.path.lexists(path):
         return
@@ -321,7 +323,7 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
 
 
 def _object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; an empty one if there is none."""
+    """Return the object in a JSON file; an empty one if there is no such file or object."""
     try:
         claim = read_json(path)
     except InputError:
@@ -332,5 +334,5 @@ def _object(path: Path) -> dict[str, Any]:
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except (OSError, ValueError):  # a name that is too long, or with NUL: said when it is made
+    except (OSError, ValueError):  # too long a name, or NUL in it: making the folder reports that
         return True

@@ -1,4 +1,4 @@
-"""A material as a user gives it: the table [material] of a scene, or a file of the same keys."""
+"""A material from the table [material] of a scene, or from a file with the same keys."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -29,7 +29,7 @@ LAW_KEYS = {
     "ramberg-osgood": ("alpha", "reference_stress_MPa", "exponent"),
     "tabulated": ("strain", "stress_MPa"),
 }
-"""Law -> the keys that it needs."""
+"""Name of a law -> the keys that it needs."""
 NUMBERS = (
     *("young_modulus_MPa", "poisson_ratio", "yield_stress_MPa", "alpha"),
     *("reference_stress_MPa", "exponent"),
@@ -38,18 +38,19 @@ EXAMPLE = "see docs/materials.md"
 
 
 def given_material(table: Mapping[str, Any], where: object = "[material]") -> Material:
-    """Return the material that a table of the keys `KEYS` describes; None is not given.
+    """Return the material that a table with the keys `KEYS` describes.
 
-    With `base` alone it is that built-in material. With `base` and other keys it is changed;
-    a law that is given replaces the base's. Without `base` E, nu and a law's numbers are needed;
-    E of a tabulated curve is its own slope at the origin unless given, which scales the curve.
+    With only `base`, it is that built-in material. Further keys change it; a `law` replaces that of
+    the base. Without `base`, the table needs E, nu and the numbers of its law. E of a
+    tabulated curve is its slope at the origin; if E is given too, the curve is scaled to it.
 
     Args:
-        table: see docs/materials.md; MPa, strain dimensionless.
+        table: see docs/materials.md; stresses in MPa, strain dimensionless. None counts as
+            absent.
         where: the file or table, for messages.
 
     Raises:
-        InputError: an unknown, missing or superfluous key, or a value out of range.
+        InputError: a key is unknown, missing or superfluous, or a value is out of range.
     """
     entries = {key: value for key, value in table.items() if value is not None and value != ()}
     for key in entries:
@@ -84,13 +85,14 @@ def given_material(table: Mapping[str, Any], where: object = "[material]") -> Ma
 
 
 def named_material(name: str | Path | Material) -> Material:
-    """Return a built-in material, that of a TOML file of the keys of [material], or itself.
+    """Return a material by its name or file.
 
     Args:
-        name: a key of `MATERIALS`, a path that ends in .toml, or a material.
+        name: a key of `MATERIALS`, the path of a .toml file with the keys of [material], or a
+            material, which is returned unchanged.
 
     Raises:
-        InputError: no such material or file, or the file does not describe one.
+        InputError: no such material or file, or the file does not describe a material.
     """
     if isinstance(name, Material):
         return name
@@ -105,7 +107,7 @@ def named_material(name: str | Path | Material) -> Material:
 
 
 def material_as_json(chosen: Material) -> dict[str, Any]:
-    """Return all numbers of a material, MPa, and where they come from."""
+    """Return all numbers of a material (stresses in MPa) and their sources."""
     law = chosen.law
     curve: dict[str, Any] = {"law": type(law).__name__}
     if isinstance(law, LinearElastic):
@@ -134,7 +136,7 @@ def material_as_json(chosen: Material) -> dict[str, Any]:
 
 
 def material_in_words(values: Mapping[str, Any]) -> str:
-    """Return in one line what `material_as_json` holds."""
+    """Return one line of text from the result of `material_as_json`."""
     parts = [
         f"E = {values['young_modulus_MPa']:.4g} MPa",
         f"Poisson's ratio {values['poisson_ratio']:.3g}",
@@ -163,7 +165,7 @@ def _check_name(entries: Mapping[str, Any], where: object) -> None:
 
 
 def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
-    """Return the curve that is given, or the base's."""
+    """Return the law that the table gives, or the law of the base."""
     name = entries.get("law")
     if name is not None and name not in LAW_KEYS:
         raise InputError(f"no law '{name}'", where, names_near(str(name), LAW_KEYS))

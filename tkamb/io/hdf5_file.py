@@ -1,9 +1,9 @@
-"""HDF5 files that can be written on a disk that fills up.
+"""HDF5 files on a disk that may become full.
 
-The HDF5 library cannot close a file of which a write has failed: it tries again, fails, and ends
-the process with it. Here the library writes through a Python file that records the first failure
-and ignores all later writes, so that the library can close the file. The failure is raised
-afterwards, once, and the caller discards the file.
+The HDF5 library cannot close a file after a failed write: it tries again, fails, and ends the
+process. Here the library writes through a Python file object. The object records the first failure
+and ignores all later writes, so that the library can close the file. Then the failure is raised,
+and the caller discards the file.
 """
 
 import os
@@ -18,16 +18,16 @@ from tkamb.errors import InputError
 
 
 class NotingFile:
-    """A file for HDF5 that records the first failure of the system instead of raising it.
+    """A file object for HDF5 that records the first failed write instead of raising it.
 
     Args:
-        path: created, or emptied if it exists.
+        path: the file; it is created, or emptied if it exists.
 
     Attributes:
-        failure: the first error of a write; None: all is written.
+        failure: the error of the first failed write; None: every write has succeeded.
 
     Raises:
-        OSError: it cannot be opened.
+        OSError: the file cannot be opened.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -37,23 +37,23 @@ class NotingFile:
         self.failure: OSError | None = None
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a byte; return its number."""
+        """Move to a position; return it in bytes from the beginning."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size()}[whence]
         self._place = start + offset
         return self._place
 
     def tell(self) -> int:
-        """Return the number of the byte that is next."""
+        """Return the current position, in bytes from the beginning."""
         return self._place
 
     def read(self, size: int) -> bytes:
-        """Return so many bytes, as `readinto` gives them."""
+        """Return `size` bytes, as `readinto` reads them."""
         buffer = bytearray(size)
         self.readinto(buffer)
         return bytes(buffer)
 
     def readinto(self, buffer: Any) -> int:
-        """Fill a buffer; bytes that could not be written are zero."""
+        """Fill a buffer from the current position; bytes beyond the end of the file are zero."""
         view = memoryview(buffer).cast("B")
         content = os.pread(self._descriptor, len(view), self._place)
         view[: len(content)] = content
@@ -62,7 +62,7 @@ class NotingFile:
         return len(view)
 
     def write(self, content: Any) -> int:
-        """Write all bytes; after a failure none."""
+        """Write all bytes; after a failure, only move the position."""
         view = memoryview(content).cast("B")
         done = 0
         while done < len(view) and self.failure is None:
@@ -74,7 +74,7 @@ class NotingFile:
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Make the file so many bytes long."""
+        """Set the length of the file in bytes; default the current position."""
         size = self._place if size is None else size
         try:
             if self.failure is None:
@@ -84,7 +84,7 @@ class NotingFile:
         return size
 
     def flush(self) -> None:
-        """Do nothing: written bytes are with the system already."""
+        """Do nothing: the system has the written bytes already."""
 
     def close(self) -> None:
         """Close the file."""
@@ -98,13 +98,13 @@ class NotingFile:
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[Any]:
-    """Give a new HDF5 file, open for writing.
+    """Provide a new HDF5 file, open for writing.
 
     Args:
-        path: a temporary one: after a failure the file there is not whole.
+        path: a temporary file: after a failure it is incomplete.
 
     Raises:
-        InputError: it cannot be opened or written.
+        InputError: the file cannot be opened or written.
     """
     try:
         stream = NotingFile(path)
@@ -119,6 +119,6 @@ def new_hdf5(path: Path) -> Iterator[Any]:
 
 
 def check_written(stream: NotingFile, path: object) -> None:
-    """Raise an InputError where a write has failed."""
+    """Raise an InputError if a write has failed."""
     if stream.failure is not None:
         raise InputError(f"cannot be written ({stream.failure.strerror})", path)

@@ -1,4 +1,4 @@
-"""Files made from a mesh: the lattice of an insert, and one of several bodies."""
+"""Files made from a mesh: the lattice of an insert, or one of the mesh's separate bodies."""
 
 import os
 from dataclasses import asdict, dataclass
@@ -24,13 +24,13 @@ BODY_FORMATS = (".stl", ".ply", ".obj")
 
 @dataclass(frozen=True, eq=False)
 class LatticeReport:
-    """A lattice, how good it is and where it was written.
+    """A lattice, its quality and its file.
 
     Args:
-        lattice: in the insert frame.
-        quality: its measures.
-        out: the .vtu file, None when none was asked for.
-        side: of the knee; a left insert's lattice is its mirror image.
+        lattice: the lattice in the insert frame.
+        quality: measures of its quality.
+        out: the .vtu file; None: not written.
+        side: side of the knee; the lattice of a left insert is mirrored.
     """
 
     lattice: Lattice
@@ -63,18 +63,18 @@ def lattice_of_file(
     side: str = "right",
     out: str | Path | None = None,
 ) -> LatticeReport:
-    """Build the lattice of an insert's mesh and write it as .vtu if `out` is given.
+    """Build the lattice of an insert's mesh, and write it to `out` if given.
 
     Args:
-        insert: STL, OBJ or PLY file, closed.
-        resolution_mm: wanted edge of a cell.
-        units: of the mesh: "m", "cm", "mm" or "inch".
-        axes: mesh axes that point anterior, superior and right.
-        side: of the knee; a left one is mirrored.
-        out: .vtu file (metres, insert frame).
+        insert: STL, OBJ or PLY file with a closed surface.
+        resolution_mm: edge length (mm) of a cell.
+        units: unit of the mesh: "m", "cm", "mm" or "inch".
+        axes: axes of the mesh that point anterior, superior and right.
+        side: side of the knee; a left insert is mirrored.
+        out: .vtu file (metres, insert frame); None: not written.
 
     Raises:
-        InputError: bad file, unit, axes, side or resolution, or a mesh that is open.
+        InputError: bad file, unit, axes, side or resolution, or an open mesh.
     """
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is not a .vtu file", "out", "give a name like lattice.vtu")
@@ -96,19 +96,21 @@ def lattice_of_file(
 
 
 def write_body(path: str | Path, number: int, out: str | Path) -> str:
-    """Write a separate body of a mesh, repaired as on loading, in the file's units and axes.
+    """Write one of the separate bodies of a mesh, in the file's unit and axes.
+
+    The mesh is repaired first, as for a run.
 
     Args:
         path: the mesh.
-        number: of the body, as `tkamb mesh check` counts: 1 is the one with the largest skin.
+        number: number of the body, as in `tkamb mesh check`; 1 has the largest surface.
         out: a new file, .stl, .ply or .obj.
 
     Returns:
-        What was written, in a line.
+        One line on what was written.
 
     Raises:
-        InputError: the mesh cannot be read, it has no such body, or `out` exists already, has
-            another format, or cannot be written.
+        InputError: the mesh cannot be read or has no such body, or `out` exists, has another
+            format, or cannot be written.
     """
     out = Path(out)
     if out.suffix.lower() not in BODY_FORMATS:

@@ -18,16 +18,16 @@ from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError
 
 MODEL, OPTIONS = "contact.model", "contact.options"
-"""Options belong to the contact model that the preset names."""
+"""Keys of the contact model and of its options."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One key that a preset set.
+    """A key of the scene whose value a preset has changed.
 
     Args:
-        key: dotted, as for `--set`.
-        before: value in the scene; None: not given, so that the default would hold.
+        key: dotted key, as for `--set`.
+        before: value in the scene; None: absent, so that the default applies.
         after: value of the preset; None: the table is left out.
     """
 
@@ -38,14 +38,14 @@ class Change:
 
 @dataclass(frozen=True)
 class AppliedPreset:
-    """A preset as it was applied to a scene.
+    """The result of applying a preset to a scene.
 
     Args:
-        name: as given to `--as`.
-        source: of the study.
+        name: name of the preset, as in `--as`.
+        source: reference of the study.
         changes: keys whose value in the scene was different.
-        overridden: keys of the preset that `--set` or another option replaced.
-        departures: in words, remaining differences between the scene and the study.
+        overridden: keys of the preset that `--set` or another option has replaced.
+        departures: remaining differences between the scene and the study, in words.
     """
 
     name: str
@@ -55,7 +55,7 @@ class AppliedPreset:
     departures: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what summary.json holds."""
+        """Return the entry for summary.json."""
         return {
             "name": self.name,
             "source": self.source,
@@ -65,7 +65,7 @@ class AppliedPreset:
         }
 
     def sentences(self) -> list[str]:
-        """Return what the report says about it."""
+        """Return the sentences for the report."""
         changed = "; ".join(
             f"{change.key} = {_words(change.after, 'left out')} "
             f"(scene: {_words(change.before, 'not given')})"
@@ -89,13 +89,13 @@ def _words(value: Any, none: str) -> str:
 
 
 class Preset:
-    """The choices of a study. Subclass it, and name the class in the registry.
+    """The choices of a study. A subclass is one preset; `BUILT_IN` or an entry point names it.
 
     Attributes:
-        name: as given to `--as`.
-        source: of the study, to cite.
-        settings: dotted key of the scene -> value; None leaves out a table.
-        needs: dotted key of a table -> why the study cannot be run without it.
+        name: name of the preset, as in `--as`.
+        source: reference of the study.
+        settings: dotted key of the scene -> value; None: the table is left out.
+        needs: dotted key of a table -> why the study needs it.
     """
 
     name: ClassVar[str]
@@ -104,10 +104,10 @@ class Preset:
     needs: ClassVar[Mapping[str, str]] = {}
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return in words why the study cannot use a scene, beside missing tables; None: it can.
+        """Return in words what a scene lacks for the study, beside tables; None: nothing.
 
         Args:
-            content: of the scene, as its file is written.
+            content: content of the scene's file.
         """
         del content
         return None
@@ -116,7 +116,7 @@ class Preset:
         """Return in words the differences between a scene and the study that remain.
 
         Args:
-            content: of the scene, as its file is written.
+            content: content of the scene's file.
         """
         del content
         return ()
@@ -124,15 +124,15 @@ class Preset:
     def apply(
         self, content: dict[str, Any], overrides: Mapping[str, Any], where: object
     ) -> AppliedPreset:
-        """Lay the preset over a scene's content, which is changed in place.
+        """Apply the preset to a scene's content, in place.
 
         Args:
-            content: of the scene, as its file is written.
-            overrides: dotted key -> value that replaces the preset's afterwards.
-            where: of the scene, for messages.
+            content: content of the scene's file.
+            overrides: dotted key -> value that later replaces the preset's value.
+            where: name of the scene in messages.
 
         Raises:
-            InputError: the scene lacks what the study needs.
+            InputError: the scene lacks data that the study needs.
         """
         self._check_needs(content, where)
         other_model = overrides.get(MODEL, self.settings.get(MODEL)) != self.settings.get(MODEL)
@@ -167,7 +167,7 @@ class Preset:
 
 
 def _value_at(content: Mapping[str, Any], dotted: str) -> Any:
-    """Return the value of a dotted key, None where it is not given."""
+    """Return the value of a dotted key; None: it is absent."""
     value: Any = content
     for part in dotted.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -175,7 +175,7 @@ def _value_at(content: Mapping[str, Any], dotted: str) -> Any:
 
 
 def _put(content: dict[str, Any], dotted: str, value: Any) -> None:
-    """Set a dotted key, or remove it for None; a table that is not there is made."""
+    """Set a dotted key, with new tables if needed; None removes the key."""
     *tables, last = dotted.split(".")
     for name in tables:
         if not isinstance(content.get(name), dict):
@@ -192,7 +192,7 @@ def _put(content: dict[str, Any], dotted: str, value: Any) -> None:
 class Sharma2008(Preset):
     """Sharma, dissertation, University of Tennessee, Knoxville (2008), chapter 4.
 
-    Each choice that a key of the scene can express, with the section that describes it.
+    It sets each choice that a key of the scene can express. Comments name the source's section.
     """
 
     name: ClassVar[str] = "sharma-2008"
@@ -237,7 +237,7 @@ class Sharma2008(Preset):
     )
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return why a motion without fluoroscopy cannot be used."""
+        """Return what a motion of skin markers lacks; None: the motion can be used."""
         if content.get("motion", {}).get("interpretation") != "markers":
             return None
         return (
@@ -246,7 +246,7 @@ class Sharma2008(Preset):
         )
 
     def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return in words the differences between a scene and the study that remain."""
+        """Return the remaining differences between a scene and the study, in words."""
         result = []
         kind = content["tibia"].get("kind")
         if kind != "sagittal":
@@ -272,6 +272,6 @@ def find_preset(name: str) -> Preset:
     """Return the preset of that name.
 
     Raises:
-        InputError: no such name, a name clash, or it cannot be imported.
+        InputError: no such preset, two presets of one name, or the class cannot be imported.
     """
     return PRESETS.find(name)()

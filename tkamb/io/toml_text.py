@@ -1,4 +1,4 @@
-"""TOML from users, read within limits, and values as TOML writes them.
+"""TOML of users, read within limits, and values as TOML text.
 
 A small text must not take hours or gigabytes. The time of Python's reader grows with the square of
 the parts of a dotted key, its memory with nesting. It refuses integers of thousands of digits in
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TomlLimits:
-    """Limits of a TOML text. Scenes, cohorts and materials stay a hundred times below them."""
+    """Limits of a TOML text. Scenes, cohorts and materials stay far below them."""
 
     size: int = 8 * MEGABYTE
-    """Bytes of a file: ten seconds of Python's reader."""
+    """Size (bytes) of a file: Python's reader takes ten seconds for it."""
     key_parts: int = 16
-    """Parts of a dotted key or of a table's name; a scene has four."""
+    """Number of parts of a dotted key or of a table's name; a scene has four."""
     digits: int = 100
-    """Digits of a number without a point between them; the largest float has 309."""
+    """Number of successive digits in a number."""
     depth: int = 32
-    """Lists and inline tables inside one another; a scene has four."""
+    """Depth of nested lists and inline tables; a scene has four."""
 
 
 LIMITS = TomlLimits()
 
-# Strings and comments, whose content is not structure; each is replaced by an empty string.
+# Strings and comments are not structure; each is replaced by an empty string.
 _STRINGS = re.compile(
     r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
 )
@@ -50,10 +50,10 @@ def read_toml(path: str | Path, *, what: str) -> dict[str, Any]:
 
     Args:
         path: the file.
-        what: what to call it in messages.
+        what: name of the kind of file in messages.
 
     Raises:
-        InputError: as `tkamb.files.read_text` and `parse_toml`.
+        InputError: as for `tkamb.files.read_text` and `parse_toml`.
     """
     return parse_toml(read_text(path, LIMITS.size, what=what), path)
 
@@ -62,11 +62,11 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     """Return the content of TOML text.
 
     Args:
-        text: to read.
+        text: the TOML text.
         where: file or option, for messages.
 
     Raises:
-        InputError: it is not TOML, or beyond `TomlLimits`.
+        InputError: it is not TOML, or exceeds `TomlLimits`.
     """
     check_limits(text, where)
     try:
@@ -78,13 +78,13 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
 
 
 def check_key(dotted: str, where: object) -> None:
-    """Raise an InputError for a dotted key of more parts than any table has."""
+    """Raise an InputError if a dotted key has too many parts."""
     if dotted.count(".") >= LIMITS.key_parts:
         raise InputError(f"a key has more than {LIMITS.key_parts} parts", where, "check the dots")
 
 
 def check_limits(text: str, where: object) -> None:
-    """Raise an InputError for TOML text, or a value of it, beyond `TomlLimits`."""
+    """Raise an InputError if a TOML text, or a value in it, exceeds `TomlLimits`."""
     structure = _STRINGS.sub('""', text)
     for match in _KEYS.finditer(structure):
         check_key(match.group(), where)
@@ -98,27 +98,27 @@ def check_limits(text: str, where: object) -> None:
 
 
 def toml_text(value: str) -> str:
-    """Return a text in quotes."""
+    """Return a text as TOML, in quotes."""
     return json.dumps(value, ensure_ascii=False)
 
 
 def toml_numbers(values: "Array") -> str:
-    """Return numbers to three decimals."""
+    """Return numbers as TOML, with three decimals."""
     return "[" + ", ".join(f"{round(float(v), 3) + 0.0:.3f}" for v in values) + "]"
 
 
 def toml_mm(point: "Array") -> str:
-    """Return a place, m, in mm to three decimals."""
+    """Return a point (3,) m as TOML, in mm with three decimals."""
     return toml_numbers(point * 1e3)
 
 
 def toml_key(label: str, whole: bool = False) -> str:
-    """Return a marker's label, quoted where TOML wants it; not `whole`: without its prefix."""
+    """Return a marker's label as a TOML key, with its prefix if `whole`."""
     plain = label if whole else label.rpartition(":")[2]
     return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_text(plain)
 
 
 def toml_markers(points: Mapping[str, "Array"], whole: bool = False) -> str:
-    """Return markers, by their `whole` labels or without prefix, and their places as TOML in mm."""
+    """Return an inline table of markers and their places in mm; with prefixes if `whole`."""
     places = [f"{toml_key(label, whole)} = {toml_mm(point)}" for label, point in points.items()]
     return f"{{ {', '.join(places)} }}"

@@ -1,7 +1,7 @@
 """VTK XML files for ParaView and meshio: lattices as .vtu, contact maps as .vtp.
 
-The format is small enough to be written here: raw arrays in base64, each preceded by its
-length in bytes (UInt64), little-endian, uncompressed. Coordinates are written in metres.
+Arrays are written in base64, little-endian and uncompressed, each after its length in bytes
+(UInt64). Coordinates are in metres.
 """
 
 import base64
@@ -76,13 +76,13 @@ def write_triangles(
 
 
 def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
-    """Write the maps of a run for ParaView: one .vtp a frame, and a .pvd that gives their times.
+    """Write the maps of a run for ParaView: a .vtp for each frame, and a .pvd with their times.
 
-    Frames without a map (failed ones hold NaN) have no file; ParaView shows nothing there.
+    A failed frame has no map (NaN) and gets no file.
 
     Args:
-        maps: of the run.
-        folder: where to.
+        maps: the maps of the run.
+        folder: folder of the files.
 
     Returns:
         The names of the files, the .pvd first.
@@ -123,7 +123,7 @@ def _append_data(
 
 
 def _append(block: Element, name: str, values: NDArray) -> None:
-    """Append one array (n,) or (n, d), as float64 or its own integer type."""
+    """Append one array (n,) or (n, d), as float64 or in its own integer type."""
     kind = values.dtype.str[1:]
     values = values if kind in TYPES else values.astype("<f8")
     array = SubElement(

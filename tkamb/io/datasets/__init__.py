@@ -27,11 +27,11 @@ class DataFile:
     """A file of a data set.
 
     Args:
-        name: its path in the data set's folder.
-        sha256: of its content, hexadecimal.
-        commit: of the repository; None where it is not known where the file is published.
-        path: inside the repository; None as `commit`.
-        size: bytes, as registered; None where it is not known.
+        name: path in the data set's folder.
+        sha256: SHA-256 of the content, hexadecimal.
+        commit: commit of the repository; None: no published address is known.
+        path: path in the repository; None likewise.
+        size: registered size (bytes); None: unknown.
     """
 
     name: str
@@ -41,13 +41,13 @@ class DataFile:
     size: int | None = None
 
     def url(self, base: str) -> str | None:
-        """Return its address below that of the repository's raw files; None if unknown."""
+        """Return the file's address below `base`, the address of all raw files; None: unknown."""
         if self.commit is None or self.path is None:
             return None
         return f"{base.rstrip('/')}/{self.commit}/{quote(self.path)}"
 
     def places(self, folder: Path) -> list[Path]:
-        """Return where it may lie in a folder of downloads: by its name here, or as published."""
+        """Return possible paths in a folder of downloads: by the name here, or as published."""
         names = [self.name, PurePosixPath(self.name).name]
         if self.path:
             names += [self.path, PurePosixPath(self.path).name]
@@ -56,7 +56,7 @@ class DataFile:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set: what it is, its licence, its address, its folder and its files."""
+    """A data set: description, licence, repository, address of raw files, folder and files."""
 
     says: str
     licence: str
@@ -67,7 +67,7 @@ class Dataset:
 
 
 def read_dataset(name: str) -> Dataset:
-    """Return a data set of the package by its name, one of `NAMES`."""
+    """Return the data set of a name, one of `NAMES`."""
     text = (files("tkamb.io.datasets") / f"{name}.json").read_text(encoding="utf-8")
     content = json.loads(text)
     return Dataset(
@@ -86,18 +86,18 @@ def read_dataset(name: str) -> Dataset:
 
 
 TIMEOUT_S = 30
-"""s: time without an answer after which the download fails."""
+"""s: after this time without an answer the download fails."""
 LONGEST_S = 1800.0
-"""s: longest time for one file, 500 MB at 0.3 MB/s."""
+"""s: longest time for one file; enough for 500 MB at 0.3 MB/s."""
 LARGEST = 1_000_000_000
-"""Bytes: largest file whose size is not registered."""
+"""Bytes: largest accepted size of a file without a registered size."""
 CHUNK = 65_536
 """Bytes that are read at a time."""
 
 
 @dataclass
 class Got:
-    """Names of the files that were kept, written, or not found."""
+    """Names of the files that were there already, were written, or were not found."""
 
     kept: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
@@ -105,19 +105,19 @@ class Got:
 
 
 def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
-    """Download what is missing of a data set.
+    """Download the missing files of a data set.
 
     Args:
-        dataset: what to get.
-        to: its folder, made if need be.
-        url: of a mirror with the same paths; default the data set's own.
+        dataset: the data set.
+        to: its folder; it is made if it does not exist.
+        url: address of a mirror with the same paths; None: the data set's own address.
 
     Returns:
-        What was kept, what was written, and what is not published at a known address.
+        Files that were there already, were written, or have no known address.
 
     Raises:
-        InputError: pooch is not installed, no answer, another content than registered, or a
-            file that is there with another content. Files that were complete stay.
+        InputError: pooch is not installed, no answer, content other than registered, or an
+            existing file of other content. Complete files stay.
     """
     try:
         import pooch
@@ -138,20 +138,20 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
 
 
 def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
-    """Copy what is missing of a data set from a folder of downloads, or from a clone.
+    """Copy the missing files of a data set from a folder of downloads or a clone.
 
     Args:
-        dataset: what to get.
-        to: its folder, made if need be.
-        folder: holds the files under their names here or those of the repository, with the
-            folders around them or without.
+        dataset: the data set.
+        to: its folder; it is made if it does not exist.
+        folder: folder with the files, under their names here or in the repository, with or
+            without their sub-folders.
 
     Returns:
-        What was kept, what was written, and what the folder does not hold.
+        Files that were there already, were written, or are not in the folder.
 
     Raises:
-        InputError: no such folder, none of the files in it, one of another content than
-            registered, or a file that is there with another content.
+        InputError: no such folder, no file of the data set in it, content other than
+            registered, or an existing file of other content.
     """
     if not folder.is_dir():
         raise InputError("is not a folder", folder, "give the folder of what you downloaded")
@@ -166,7 +166,13 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
 
 
 def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | None]) -> Got:
-    """Write what is missing. `fetch`, given a folder to use, returns a file's content or None."""
+    """Write the missing files of a data set.
+
+    Args:
+        dataset: the data set.
+        to: its folder.
+        fetch: function of a file and a temporary folder; returns the path of the content, or None.
+    """
     missing = [file for file in dataset.files if not _is_there(file, to)]
     got = Got(kept=[file.name for file in dataset.files if file not in missing])
     for file in missing:
@@ -186,7 +192,7 @@ def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | No
 
 
 def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
-    """Download a file into a folder, and check its content."""
+    """Download a file into a folder, check its content, and return its path."""
     import pooch
     from requests.exceptions import HTTPError, RequestException
 
@@ -211,7 +217,7 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class _LimitedDownload:
-    """Downloads a file of at most so many bytes in at most `LONGEST_S`, for pooch."""
+    """Downloader for pooch that stops at `size` bytes and after `LONGEST_S`."""
 
     size: int
 
@@ -241,7 +247,7 @@ class _LimitedDownload:
 
 
 def _found(file: DataFile, folder: Path) -> Path | None:
-    """Return where a folder of downloads holds a file; None where it does not."""
+    """Return the path of a file in a folder of downloads; None: it is not there."""
     copies = [place for place in file.places(folder) if place.is_file()]
     for place in copies:
         if sha256_of(place) == file.sha256:

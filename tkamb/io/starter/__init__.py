@@ -1,4 +1,4 @@
-"""`tkamb new`: a folder with a commented scene and its files, which runs as it is."""
+"""`tkamb new`: a folder with a commented scene and its files, ready to run."""
 
 import argparse
 import shutil
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 def lay_out(directory: Path, person: "Person | None" = None) -> Path:
     """Write the starter scene with its files into a new or empty folder; return the scene.
 
-    The folder appears whole or not at all.
+    The folder is written completely or not at all.
 
     Args:
         directory: the folder.
         person: the patient; None: a man of 75 kg and 1.75 m, right knee.
 
     Raises:
-        InputError: the folder holds something, or cannot be written.
+        InputError: the folder is not empty, or cannot be written.
     """
     directory = Path(directory)
     try:
@@ -70,7 +70,7 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _person(options: argparse.Namespace) -> "Person | None":
-    """Return the patient of the options; None: the default one."""
+    """Return the patient that the options describe; None: the default patient."""
     given = {
         "side": options.side,
         "mass": options.mass_kg,

@@ -1,10 +1,10 @@
-"""A patient from mass, height, sex and side: the starter's files for that person.
+"""The starter's files for a patient of given mass, height, sex and side.
 
 Lengths are shares of body height (Drillis and Contini 1966, as in Winter 2009, figure 4.1): ankle
 0.039, shank 0.246, thigh 0.245. Masses and inertias are those of de Leva (1996),
-`tkamb.io.recordings.patient`. The implant keeps its size. Joint centres, attachments on bone, the
-ground reaction and its point scale; attachments near the knee move with it. A left leg is the
-mirror image: positions along z, the force to the right and the meshes.
+`tkamb.io.recordings.patient`. The implant is not scaled. Joint centres, attachments on the shafts,
+the ground reaction and its point are scaled; attachments near the knee move with it. A left leg is
+the mirror image: positions along z, the force to the right, and the meshes.
 
 References: Winter (2009), Biomechanics and Motor Control of Human Movement, 4th ed., Wiley,
 doi:10.1002/9780470549148; de Leva (1996), J Biomech 29:1223, doi:10.1016/0021-9290(95)00178-6.
@@ -33,11 +33,11 @@ class LegProportionSettings:
     """Lengths of a leg as shares of body height, and how the implant sits in it."""
 
     ankle: float = 0.039
-    """Height of the ankle's centre over body height; Winter (2009)."""
+    """Height of the ankle's centre above ground, as a share (1) of body height; Winter (2009)."""
     shank: float = 0.246
-    """Ankle to knee centre over body height; Winter (2009)."""
+    """Distance from ankle centre to knee centre, as a share (1) of body height; Winter (2009)."""
     thigh: float = 0.245
-    """Knee to hip centre over body height; Winter (2009)."""
+    """Distance from knee centre to hip centre, as a share (1) of body height; Winter (2009)."""
     insert_below_knee: float = 0.018662
     """m: depth of the insert's bottom below the knee's centre. Chosen: as in the shipped
     patient."""
@@ -45,13 +45,13 @@ class LegProportionSettings:
     """m: height of the femoral component's origin above the knee's centre, as in the shipped
     patient."""
     lightest: float = 20.0
-    """kg; lightest body that is accepted. Chosen: it leaves out masses in other units."""
+    """kg; smallest accepted mass. Chosen: it excludes masses in other units."""
     heaviest: float = 300.0
-    """kg; heaviest body that is accepted. Chosen: it leaves out masses in other units."""
+    """kg; greatest accepted mass. Chosen: it excludes masses in other units."""
     shortest: float = 1.0
-    """m; smallest height that is accepted. Chosen: it leaves out heights in other units."""
+    """m; smallest accepted height. Chosen: it excludes heights in other units."""
     tallest: float = 2.3
-    """m; greatest height that is accepted. Chosen: it leaves out heights in other units."""
+    """m; greatest accepted height. Chosen: it excludes heights in other units."""
 
 
 LEG_PROPORTIONS = LegProportionSettings()
@@ -62,13 +62,13 @@ class Person:
     """The patient of the starter's files.
 
     Args:
-        side: of the knee.
-        mass: kg, of the body.
-        height: m, of the body.
-        sex: which table of de Leva.
+        side: side of the knee.
+        mass: body mass (kg).
+        height: body height (m).
+        sex: "female" or "male", which selects the table of de Leva (1996).
 
     Raises:
-        InputError: a mass or height outside of `LegProportionSettings`.
+        InputError: mass or height is outside the limits of `LegProportionSettings`.
     """
 
     side: Literal["left", "right"] = "right"
@@ -106,10 +106,10 @@ class Person:
 
 
 def write_person(folder: Path, person: Person) -> None:
-    """Rewrite the starter's files in a folder for a person.
+    """Adapt the starter's files in a folder to a person.
 
     Args:
-        folder: with the files of `tkamb new`.
+        folder: folder with the files of `tkamb new`.
         person: the patient.
     """
     urdf, scene = folder / "patient.urdf", folder / "scene.toml"
@@ -146,7 +146,7 @@ def patient_urdf(text: str, person: Person) -> str:
         name, axis = joint.get("name", ""), joint.find("axis")
         if name in heights:
             _child(joint, "origin").set("xyz", f"0 {heights[name]:.6f} 0")
-        # A mirrored leg turns the other way about its anterior and superior axes.
+        # In a mirrored leg, rotations about the anterior and superior axes have the other sign.
         if person.side == "left" and axis is not None and joint.get("type") == "revolute":
             x, y, z = (float(value) for value in axis.get("xyz", "").split())
             axis.set("xyz", f"{-x:g} {-y:g} {z:g}".replace("-0 ", "0 "))
@@ -176,9 +176,9 @@ def scene_text(text: str, person: Person) -> str:
     def point(match: re.Match[str]) -> str:
         x, y, z = (float(value) for value in match["point"].split(","))
         if match["link"] == "tibia":
-            y += knee_up  # every attachment on the tibia is near the knee
+            y += knee_up  # all attachments on the tibia are near the knee
         elif match["link"] == "femur" and y > LEG_PROPORTIONS.insert_below_knee * 1e3:
-            y *= thigh  # on the shaft; points near the joint move with the implant instead
+            y *= thigh  # on the shaft; points near the joint do not move relative to the implant
         z = mirror * z + 0.0
         return f'link = "{match["link"]}", point_mm = [{x:g}, {round(y, 3):g}, {z:g}]'
 
@@ -206,7 +206,7 @@ def _numbers(values: Array) -> str:
 
 
 def _scale(path: Path, factors: dict[str, float]) -> None:
-    """Multiply columns of a table; what is written keeps the digits of the file."""
+    """Multiply columns of a table by factors; the other columns keep their text."""
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
     factor_of: list[Callable[[str], str]] = [
@@ -224,7 +224,7 @@ def _scale(path: Path, factors: dict[str, float]) -> None:
 
 
 def _mirror_mesh(path: Path) -> None:
-    """Reflect a mesh in the sagittal plane; its triangles keep their outward side."""
+    """Mirror a mesh in the sagittal plane; its triangles still face outwards."""
     import trimesh
 
     mesh = trimesh.load_mesh(path, process=False)
