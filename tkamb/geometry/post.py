@@ -16,6 +16,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import connected_parts
 from tkamb.units import MILLIMETRE
 
 
@@ -154,7 +155,7 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     if post is None:
         raise InputError("the insert has no post", where, "leave the key out")
     vertices, below, above = split_faces(*merged(insert.vertices, insert.faces), 1, post.foot)
-    number = pieces(vertices, above)
+    number = connected_parts(above)
     middles = vertices[above].mean(axis=1)[:, [0, 2]]
     own = number == number[np.hypot(*(middles - [post.x, post.z]).T).argmin()]
     dishes = closed_by_fans(vertices, np.concatenate([below, above[~own]]), insert.name)
@@ -220,14 +221,6 @@ def split_faces(
     upper = [faces[count == 3], tips[tip_above], rests[rest_above]]
     joined = np.concatenate([vertices, start + share * (end - start)])
     return joined, np.concatenate(lower), np.concatenate(upper)
-
-
-def pieces(vertices: Array, faces: Index) -> Index:
-    """Return the number of the connected piece that each face (k,) belongs to."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    shape = (len(vertices), len(vertices))
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape)
-    return np.asarray(connected_components(graph, directed=False)[1][faces[:, 0]], np.int64)
 
 
 def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Index]:
