@@ -1,4 +1,4 @@
-"""How much of a surface is in contact, and how much of it is above a pressure."""
+"""The area of a surface that is in contact, and the area above a given pressure."""
 
 from dataclasses import dataclass
 
@@ -18,8 +18,8 @@ class ContactAreaSettings:
     nodes is unknown: the femoral surface ends between them, or is steeper than 45 deg. Chosen: the
     middle, because contact may end anywhere between the nodes."""
     least_gap: float = 1e-12
-    """m: smallest gap of a node that is not in contact. Chosen: it keeps a division from zero; gaps
-    that matter are above 1e-7 m."""
+    """m: smallest gap of a node that is not in contact. Chosen: it prevents a division by zero;
+    gaps that matter are above 1e-7 m."""
 
 
 CONTACT_AREA = ContactAreaSettings()
@@ -35,26 +35,26 @@ def covered_areas(
 ) -> Array:
     """Return the area in contact around each node (n,), m²; its sum is the contact area.
 
-    The edge of contact crosses the sides of the triangles from nodes in contact to others. At
-    a distance d from the edge of a smooth frictionless contact, whatever the bodies' shapes,
+    The edge of contact crosses a triangle's side between a node in contact and one that is not. At
+    a distance d from the edge of a smooth frictionless contact of any shape,
 
         p = C sqrt(d) inside,   gap = 4 C / (3 E*) d^(3/2) outside,   E* = E / (1 - nu²)
 
-    so that p at a node, the gap at its neighbour and the distance h between them say where it
-    is: y = C^(-2/3) solves p² y³ + (3 E* gap / 4)^(2/3) y = h. A triangle's part within the
-    edge is shared evenly by its nodes in contact.
+    The pressure p at the node, the gap at its neighbour and their distance h therefore determine
+    the edge: y = C^(-2/3) solves p² y³ + (3 E* gap / 4)^(2/3) y = h. The nodes in contact share a
+    triangle's part within the edge evenly.
 
     Args:
-        points: (n, 3) m.
-        triangles: (k, 3) nodes.
+        points: (n, 3) m, nodes.
+        triangles: (k, 3) nodes of each triangle.
         triangle_area: (k,) m².
         pressure: (n,) Pa, a node's force over its tributary area; positive in contact.
-        gap: (n,) m, of the deformed body where contact is near.
-        material: of the body.
+        gap: (n,) m, gap of the deformed body near the contact.
+        material: material of the body.
 
     Reference:
-        Johnson, Contact Mechanics, Cambridge 1985, sections 4.2 (line contact) and 5.1 (every
-        smooth edge is like its), doi:10.1017/CBO9781139171731.
+        Johnson, Contact Mechanics, Cambridge 1985, sections 4.2 (line contact) and 5.1 (any smooth
+        edge behaves like that of a line contact), doi:10.1017/CBO9781139171731.
     """
     touched = pressure > 0
     a, b, c = touched[triangles.T].view(np.int8)
@@ -88,7 +88,7 @@ def _share(
     gap: Array,
     material: Material,
 ) -> Array:
-    """Return which share of the sides from nodes in contact (m, 2) to others is in contact."""
+    """Return the share in contact of sides (m, 2) from a node in contact to one that is not."""
     distance = np.linalg.norm(points[inside] - points[outside], axis=2)
     smooth = gap[outside] < distance
     opening = np.where(smooth, np.maximum(gap[outside], CONTACT_AREA.least_gap), distance)
@@ -107,16 +107,16 @@ def _share(
 def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:
     """Return the area (m²) where the pressure exceeds a level.
 
-    On each triangle q = p² is interpolated linearly between the corners. A constant is added to
-    it: the mean difference between a quadratic q and its linear interpolation. It is the sum over
-    the edges of (g_i - g_j).(x_j - x_i) / 24, with the gradients g of q at the corners. For a
-    Hertzian pressure the mean of q is exact, because q is then quadratic in the position.
-    The area is a continuous function of the pressures; a count of nodes would jump.
+    On each triangle q = p² is interpolated linearly between the corners. The mean difference of a
+    quadratic q from its linear interpolation is added as a constant: the sum over the edges of
+    (g_i - g_j).(x_j - x_i) / 24, with the gradients g of q at the corners. For a Hertzian pressure
+    the mean of q is exact, because q is then quadratic in the position. The area is a continuous
+    function of the pressures.
 
     Args:
-        points: (n, 3) m.
-        triangles: (k, 3) of them.
-        pressure: (n,) Pa.
+        points: (n, 3) m, nodes.
+        triangles: (k, 3) nodes of each triangle.
+        pressure: (n,) Pa, at the nodes.
         level: Pa, positive.
     """
     # p² is interpolated, because it is linear at the rim of a Hertzian contact while p has a
@@ -126,7 +126,7 @@ def area_above(points: Array, triangles: Index, pressure: Array, level: float) -
 
 @compiled_as_written
 def _area_above(points: Array, triangles: Index, square: Array, level: float) -> float:
-    """Return what `area_above` does, from p² and the level's square."""
+    """Return the result of `area_above`, from p² (n,) and the squared level, Pa²."""
     near, total = np.zeros(len(points), np.bool_), np.zeros((len(points), 4))
     for k in range(len(triangles)):
         a, b, c = triangles[k, 0], triangles[k, 1], triangles[k, 2]

@@ -1,18 +1,19 @@
 """Cam and post as a contact pair of its own: the same contact model, in a turned frame.
 
 Contact models press a femoral component along -y into an insert whose flat bottom lies in
-y = 0. A cam meets the post from behind. The post is therefore turned until its posterior face
-looks up. With the insert's axes x anterior, y superior, z to the right, the turned axes are
+y = 0. A cam touches the post from behind. The post is therefore turned so that its posterior face
+faces up. With the insert's axes x anterior, y superior, z to the right, the turned axes are
 
     x' = y,    y' = x_f - x,    z' = z,
 
-x_f the flat front of the post (`tkamb.geometry.post.divide_insert`). Its posterior face then
-looks up along y', its front is the bottom that the models hold, and its depth their
-thickness: **the post does not bend at its root**. The pair is evaluated at a pose, never pressed.
+where x_f is the flat front of the post (`tkamb.geometry.post.divide_insert`). The posterior face
+then faces up along y'. The front is the fixed bottom of the layer, and the post's depth is the
+layer's thickness: **the post does not bend at its root**. The pair is evaluated at a pose, never
+pressed.
 
-With R and t of pose_insert_in_turned and X = [[R, t x R], [0, R]], which takes the small
-displacement of the femur (of its point at the origin, then rotation) into the turned frame, power
-is the same in both, so that wrench and stiffness come back as
+R and t are rotation and translation of pose_insert_in_turned. X = [[R, t x R], [0, R]] maps a small
+displacement of the femur (translation of its point at the origin, then rotation) into the turned
+frame. Power is the same in both frames, so wrench and stiffness in the insert frame are
 
     w = X^T w',    K = X^T K' X.
 """
@@ -44,31 +45,32 @@ class CamPostSettings:
     ray_start_height: float = 1e-3
     """m: height above the post at which rays down begin. Chosen well above the noise of a mesh."""
     search_margin: float = 3 * MILLIMETRE
-    """m: the part of the component within this distance beside the post counts as cam. Chosen: the
-    femur moves from side to side."""
+    """m: the cam is searched up to this distance beside the post. Chosen: the femur moves from side
+    to side."""
 
 
 CAM_POST = CamPostSettings()
 
 TICKS, ZOOMS = 41, 3
-"""Rays along each edge of the grid on which the clearance is searched, and how often the grid is
-made twenty times finer. Over 16 mm the place is then known to less than a micrometre."""
+"""Rays along each edge of the grid on which the clearance is searched, and number of grids, each
+twenty times finer than the last. A place within 16 mm is then known to a few micrometres."""
 NO_LINE_CONTACT = ("hertz",)
-"""Models that know no contact along a line."""
+"""Models that cannot compute contact along a line."""
 
 
 class PostPair(ContactPair):
-    """A cam and a post in the turned frame: one contact, whatever its side."""
+    """A cam and a post in the turned frame: one contact without medial and lateral side."""
 
     @property
     def split(self) -> None:
         """None: cam and post are not divided into medial and lateral."""
 
     def clearance(self, pose: Array) -> float:
-        """Return the least distance (m) along y' between cam and post; NaN beside each other.
+        """Return the smallest distance (m) along y' from post to cam; NaN beside each other.
 
-        Rays along y' on a grid over the post find the smallest distance; two finer grids around
-        it follow. Nearest vertices would not do: long triangles meet along lines.
+        Rays along y' on a grid over the post find the smallest distance; two finer grids follow
+        around it. A search over vertices alone would miss contact along the lines of long
+        triangles.
 
         Args:
             pose: (4, 4) pose_femoral_in_turned.
@@ -106,12 +108,12 @@ class PostContact:
     """Cam and post at one pose, insert frame. Without contact the force is zero.
 
     Args:
-        load: on the insert, normal forces alone; None where nothing is carried.
-        gap: m along x between cam and post; negative: they overlap.
-        area: m².
+        load: wrench of the normal forces on the insert; None without contact.
+        gap: m, distance along x between cam and post; negative: they overlap.
+        area: m², contact area.
         peak_pressure: Pa.
-        flags: plain words that a reader must know.
-        problem: why there is no result, or empty.
+        flags: warnings in words.
+        problem: reason why there is no result; empty if there is one.
     """
 
     load: CondyleWrench | None
@@ -123,14 +125,14 @@ class PostContact:
 
     @property
     def force(self) -> Array:
-        """(3,) N on the insert; NaN where it could not be computed."""
+        """(3,) N, force on the insert; NaN if it could not be computed."""
         if self.problem:
             return np.full(3, np.nan)
         return np.zeros(3) if self.load is None else self.load.wrench[:3]
 
     @property
     def centre(self) -> Array:
-        """(3,) m, the centre of pressure; NaN where nothing is carried."""
+        """(3,) m, centre of pressure; NaN without contact."""
         return np.full(3, np.nan) if self.load is None else self.load.centre
 
 
@@ -140,12 +142,12 @@ class CamPost:
     Args:
         model: the contact model.
         femoral: femoral component with its cam, femoral frame.
-        post: closed, insert frame, flat in front (`divide_insert`).
+        post: closed post, insert frame, flat in front (`divide_insert`).
         split: z (m, femoral frame) between the condyles.
-        material: of the post.
+        material: material of the post.
 
     Raises:
-        InputError: the model knows no contact along a line, or there is no cam.
+        InputError: the model cannot compute contact along a line, or there is no cam.
     """
 
     def __init__(
@@ -173,11 +175,11 @@ class CamPost:
 
     @property
     def material(self) -> Material:
-        """Of the post."""
+        """Material of the post."""
         return self.state.pair.material
 
     def of_material(self, material: Material) -> "CamPost":
-        """Return the same cam and post of another material."""
+        """Return the same cam and post with another material."""
         other = object.__new__(CamPost)
         other.in_turned, other._foot = self.in_turned, self._foot
         other._prepare(self.model, replace(self.state.pair, material=material))
@@ -206,7 +208,7 @@ class CamPost:
     def clearance(self, pose: Array) -> float:
         """Return the least distance (m) along x between cam and post at a pose (4, 4).
 
-        Negative: they overlap; NaN: they do not lie behind one another.
+        It is negative if they overlap, and NaN if the cam does not lie behind the post.
         """
         pair: PostPair = self.state.pair
         return pair.clearance(self.in_turned @ pose)
@@ -220,7 +222,7 @@ class CamPost:
         return CondylesAndPost(condyles, self.probe())
 
     def seen(self, contact: ProbedContact) -> ProbedContact:
-        """Return a probed contact of the turned frame as the post's in the insert frame."""
+        """Return a probed contact of the turned frame as the contact of the post, insert frame."""
         load = contact.condyles.get("medial")
         post = None if load is None else self._in_insert(load)
         return replace(contact, condyles={}, post=post)
@@ -247,7 +249,7 @@ class PostProbe:
         self._cam_post, self._turned = cam_post, rotated_model
 
     def at(self, pose: Array) -> ProbedContact:
-        """Return the contact at a pose_femoral_in_insert (4, 4): its post alone."""
+        """Return the contact of the post at a pose_femoral_in_insert (4, 4)."""
         return self._cam_post.seen(self._turned.at(self._cam_post.in_turned @ pose))
 
 
@@ -267,7 +269,7 @@ class CondylesAndPost:
         return _together(self._condyles.at(pose), self._post.at(pose))
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
-        """Return the contact there with a stiffness without jumps; the post's is as it is."""
+        """Return the contact with a smoothed stiffness of the condyles; the post's is unchanged."""
         condyles = self._condyles.smoothed(pose, replace(contact, post=None))
         return _together(condyles, replace(contact, condyles={}))
 
@@ -284,10 +286,10 @@ def _together(condyles: ProbedContact, post: ProbedContact) -> ProbedContact:
 
 
 def twist_matrix(pose: Array) -> Array:
-    """Return X (6, 6), which takes displacement and rotation of one frame into another's.
+    """Return X (6, 6), which maps a twist (translation, then rotation) from frame A to frame B.
 
     Args:
-        pose: (4, 4) pose of the first frame in the other.
+        pose: (4, 4) pose_A_in_B.
     """
     turn, (x, y, z) = pose[:3, :3], pose[:3, 3]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -295,15 +297,15 @@ def twist_matrix(pose: Array) -> Array:
 
 
 def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
-    """Return the cam: what lies between the condyles in the posterior half of the component.
+    """Return the cam: the triangles between the condyles, in the posterior half of the component.
 
     Args:
         femoral: femoral component, femoral frame.
         split: z (m) between the condyles.
-        reach: m; triangles within it on either side of the split count.
+        reach: m, largest distance of the triangles from the split, along z.
 
     Raises:
-        InputError: nothing lies there.
+        InputError: the component has no triangles there, or one condyle only.
     """
     if split is None:
         hint = "leave the key out, or give a component with two condyles"

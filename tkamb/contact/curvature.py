@@ -1,4 +1,4 @@
-"""Smooth shape of two meshes about a contact point: quadrics fitted to local patches."""
+"""Curvatures of two meshes at a contact point, from quadrics fitted to local patches."""
 
 from dataclasses import dataclass
 
@@ -16,16 +16,16 @@ class CurvatureSettings:
     """Rays per side of the square patch. Chosen: a quadric has six coefficients, 441 rays
     average out the mesh."""
     max_iterations: int = 12
-    """Iterations that find the contact point at most. Chosen: contacts of knees need fewer."""
+    """Largest number of iterations for the contact point. Chosen: contacts of knees need fewer."""
     position_tolerance: float = 1e-7
     """m: the contact point has converged when an iteration moves it by less. Chosen: far below the
     size of a triangle."""
     max_distance: float = 3.0
-    """Patch radii: farthest distance of the contact point from where the meshes touch first.
-    Chosen: farther away the two surfaces are not described by the patch."""
+    """Largest distance of the contact point from first touch, in patch radii. Chosen: the patch
+    does not describe the surfaces farther away."""
     least_cover: float = 0.6
-    """Share of a patch, 1: part that both meshes must cover. Chosen: with less the quadric is an
-    extrapolation."""
+    """1: least share of a patch that both meshes cover. Chosen: with a smaller share the quadric is
+    an extrapolation."""
 
 
 CURVATURE = CurvatureSettings()
@@ -33,15 +33,15 @@ CURVATURE = CurvatureSettings()
 
 @dataclass(frozen=True, eq=False)
 class OsculatingContact:
-    """Two quadrics at the place where the smooth surfaces are nearest along their normal.
+    """Quadrics of both surfaces at the place where they are nearest along their common normal.
 
     Args:
         point: (3,) m, insert frame, on the insert's quadric.
         normal: (3,) unit, out of the insert.
         axes: (2, 3) unit tangents along the smaller and the larger relative curvature.
-        gap: m, between the two quadrics at the point, along the normal.
-        relative: (2,) 1/m, relative curvatures along `axes`, ascending; the gap grows by
-            half of each times the squared distance.
+        gap: m, distance of the two quadrics at the point, along the normal.
+        relative: (2,) 1/m, relative curvatures k along `axes`, ascending; at the distance s the gap
+            grows by k s²/2.
         insert_curvature: (2,) 1/m along `axes`, negative where the insert is concave.
         femoral_curvature: (2,) 1/m along `axes`, positive where the femur is convex.
     """
@@ -60,23 +60,22 @@ def osculate(
 ) -> OsculatingContact | None:
     """Fit both surfaces about a contact point and move it to where the quadrics are nearest.
 
-    On a disc of `radius` in the tangent plane both meshes are sampled by rays along the
-    normal, evenly spaced. z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each by
-    least squares. The disc is then moved to the minimum of the difference, with the mean normal
-    there, until it no longer moves. Facets smaller than the disc average out; on a sphere of
-    radius R the curvature comes out too large by radius²/(4 R²),
-    relative (the quartic term).
+    On a disc of `radius` in the tangent plane, evenly spaced rays along the normal sample both
+    meshes. A quadric z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each mesh by least
+    squares. The disc is then moved to the minimum of their difference, with the mean normal there,
+    until the iteration has converged. Facets smaller than the disc average out. On a sphere of
+    radius R the relative error of the curvature is radius²/(4 R²), from the quartic term.
 
     Args:
         insert: ray caster, insert frame.
         femoral: ray caster, femoral frame.
-        pose: (4, 4) pose_femoral_in_insert at which the meshes about touch.
-        start: (3,) m, where they touch, insert frame.
-        radius: m.
+        pose: (4, 4) pose_femoral_in_insert close to first touch.
+        start: (3,) m, place of first touch, insert frame.
+        radius: m, radius of the disc.
 
     Returns:
-        None when a patch leaves a surface or the nearest place runs away: the surfaces do
-        not curve apart there.
+        The quadrics at the contact point. None if a patch leaves a surface or the iteration
+        diverges, because the surfaces do not curve apart.
     """
     point, normal = start, _start_normal(insert, start)
     # The point depends on the normal and the normal on the point: fit, step, turn the frame.

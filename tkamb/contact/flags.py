@@ -25,10 +25,10 @@ class NarrowContactSettings:
     """When a contact is too narrow for the map's points."""
 
     least_inner_points: int = 5
-    """Points with contact all around, from which a peak is right within 8 %, wherever the
-    contact lies among the points. That is a sphere's contact with about 17 points, or three
-    rows of points under a cylinder. With no such point a lattice's peak is 5 to 96 % too
-    low (docs/lattice.md)."""
+    """Least number of points with contact all around. With this number a peak is right within 8 %,
+    wherever the contact lies among the points: a sphere's contact then has about 17 points, a
+    cylinder's three rows. Without such a point a lattice's peak is 5 to 96 % too low
+    (docs/lattice.md)."""
 
 
 NARROW_CONTACT = NarrowContactSettings()
@@ -42,13 +42,13 @@ def narrow_flags(
 ) -> Iterator[str]:
     """Yield a flag for each condyle with fewer than `NARROW_CONTACT.least_inner_points`.
 
-    An inner point has contact all around.
+    An inner point has contact all around, see `surrounded`.
 
     Args:
-        triangles: (k, 3) of the contact surface.
-        touched: (n,) which of its points are in contact.
-        sides: side -> (n,) which points are under it.
-        points: what a user makes finer, in a word.
+        triangles: (k, 3) triangles of the contact surface.
+        touched: (n,) whether a point is in contact.
+        sides: side -> (n,) whether a point is under that condyle.
+        points: word for the points in the message, e.g. "cells".
     """
     within = surrounded(triangles, touched)
     for side, own in sides.items():
@@ -63,7 +63,7 @@ def narrow_flags(
 
 
 def surrounded(triangles: Index, touched: Mask) -> Mask:
-    """Return which points (n,) have contact all around: at every corner of their triangles."""
+    """Return which points (n,) are inner points: all corners of their triangles are in contact."""
     a, b, c = touched[triangles.T]
     edge = triangles[(a | b | c) & ~(a & b & c)]
     within = touched.copy()
@@ -72,29 +72,29 @@ def surrounded(triangles: Index, touched: Mask) -> Mask:
 
 
 AT_EDGE = "contact reaches the edge of the insert's articular surface"
-"""Words of the flag, after "the <side> "."""
+"""Text of the flag after "the <side> "."""
 DOWN = np.array([0.0, -1.0, 0.0])
 
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """When contact is at the edge of an insert."""
+    """When a contact counts as being at the insert's edge."""
 
     spacing: float = 0.5 * MILLIMETRE
     """m: spacing of the vertical rays that find the edge. Chosen: the distance from the edge is
     known to half of it."""
     steepest: float = 50.0 * DEGREE
-    """rad from the horizontal: a steeper surface beside the outline belongs to the rim. Chosen: it
-    is 50 deg, steeper than any part of a dish that carries."""
+    """rad: a surface beside the outline with a steeper slope belongs to the rim. Chosen: 50 deg is
+    steeper than any loaded part of a dish."""
     rim: float = 4.0 * MILLIMETRE
     """m: largest width of the rim. Chosen: a steep surface farther inside is a flank of the
     eminence or of a post."""
     reach: float = 2.5 * MILLIMETRE
-    """m: contact that is nearer to the edge is flagged. Chosen: the radius of a usual insert's
-    rounded rim (1 to 2 mm) plus half the spacing of a map."""
+    """m: a contact nearer to the edge is flagged. Chosen: the radius of a usual insert's rounded
+    rim (1 to 2 mm) plus half the spacing of a map."""
     share: float = 0.05
-    """1: share of the peak pressure from which a point counts as loaded. Chosen: a smaller pressure
-    does no harm."""
+    """1: a point counts as loaded from this share of the peak pressure on. Chosen: a smaller
+    pressure does no harm."""
 
 
 EDGE = EdgeSettings()
@@ -115,11 +115,11 @@ class ArticularEdge:
 
     @classmethod
     def of(cls, insert: Surface, settings: EdgeSettings = EDGE) -> "ArticularEdge":
-        """Return the edge of an insert: where it ends, or turns down to its walls.
+        """Return the edge of an insert, where it ends or turns down to its walls.
 
         Args:
-            insert: in the insert frame.
-            settings: when contact is at the edge.
+            insert: insert, insert frame.
+            settings: definition of the edge.
         """
         from scipy.ndimage import distance_transform_edt  # a report needs the words alone
 
@@ -151,7 +151,7 @@ class ArticularEdge:
 
 
 def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
-    """Return the connected parts of a mask (a, b) that hold a cell outside the insert."""
+    """Return the connected parts of a mask (a, b) that contain a cell outside the insert."""
     from scipy.ndimage import label  # a report needs the words alone
 
     part, _ = label(flat, structure=np.ones((3, 3)))
@@ -169,11 +169,11 @@ def edge_of_insert_flags(
     """Yield a flag for each condyle whose contact reaches the edge of the articular surface.
 
     Args:
-        edge: of the insert.
-        points: (n, 3) m, of the map.
+        edge: edge of the insert.
+        points: (n, 3) m, map points.
         pressure: (n,) Pa.
-        sides: side -> (n,) which points are under it.
-        settings: when contact is at the edge.
+        sides: side -> (n,) whether a point is under that condyle.
+        settings: definition of a contact at the edge.
     """
     for side, own in sides.items():
         own_pressure = np.where(own, pressure, 0.0)

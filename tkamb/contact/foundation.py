@@ -30,16 +30,16 @@ class FoundationSettings:
     """The elastic foundation (bed of springs)."""
 
     least_thickness: float = 1e-6
-    """m: a layer thinner than this, at the insert's rim, counts as this thick. Chosen: it keeps
+    """m: smallest thickness of the layer; at the rim it replaces smaller values. Chosen: it keeps
     pressure = modulus * penetration / thickness finite."""
     approach_step: float = 1e-9
-    """m: distance of two approaches between which a reaction is taken as constant. Chosen: with a
-    stiffness of some 1e8 N/m it changes by 0.1 N."""
+    """m: the reaction is taken as constant between two approaches this near to each other. Chosen:
+    with a stiffness of about 1e8 N/m it changes by 0.1 N."""
     reached_share: float = 0.99
     """1: a reaction below `reached_share` * load - `reached_force` cannot rise to the load within
     `approach_step`. Chosen: the reaction jumps by less when map points come into contact."""
     reached_force: float = 1.0
-    """N: see `reached_share`. Chosen: ten times what `approach_step` changes."""
+    """N: see `reached_share`. Chosen: ten times its change within `approach_step`."""
 
 
 FOUNDATION = FoundationSettings()
@@ -49,18 +49,18 @@ OVER_THE_EDGE = (
     "the femoral component reaches over the insert's edge, deeper than half of its thickness there"
 )
 WIDEST_EDGE = NEAR
-"""m: upper limit of the change of the gap across one column (`FoundationProbe.smoothed`)."""
+"""m: largest change of the gap across one column (`FoundationProbe.smoothed`)."""
 SUMS = 46
-"""Count of the sums over the columns of one condyle; see `_add_up`."""
+"""Number of sums over the columns of one condyle; see `_add_up`."""
 
 
 @dataclass(frozen=True)
 class ElasticFoundation(ContactModel):
     """A layer of local thickness h bonded to a rigid plate, pressed by a rigid body.
 
-    Each column of the layer is a spring of its own, without lateral strain and without
-    friction. With d the penetration along the insert's normal, E and nu of the material at
-    the origin, sigma its uniaxial curve, and the confined modulus
+    Each column of the layer is an independent spring without lateral strain and without friction.
+    Let d be the penetration along the insert's normal, E and nu the material's constants at the
+    origin, and sigma its uniaxial curve. With the confined modulus
 
         M = E (1 - nu) / ((1 + nu)(1 - 2 nu))      (nu = 0.45: M = 3.79 E)
 
@@ -69,19 +69,19 @@ class ElasticFoundation(ContactModel):
         linear:      p = M d/h
         nonlinear:   p = sigma( (M/E) * -ln(1 - d/h) )
 
-    The nonlinear law has two parts. The column keeps its cross-section, so true stress is p
-    and true strain is -ln(1 - d/h) (Blankevoort 1991). The polyethylene softens at the
-    pressure it carries: M is scaled with the secant modulus E_s of the uniaxial curve at
-    the stress p, p = (M/E) E_s(p) eps, as in Bei & Fregly (2004); since sigma = E_s(sigma)
-    * eps this is the curve itself at (M/E) eps. A truly confined column would hardly yield,
-    because its stress is nearly hydrostatic. But a contact patch of a knee is only as wide as
-    the insert is thick, so its columns are not confined; hence they soften here. With a linear
-    material it is Blankevoort's law p = -M ln(1 - d/h).
+    The nonlinear law has two parts. First, the column keeps its cross-section, so the true stress
+    is p and the true strain eps is -ln(1 - d/h) (Blankevoort 1991). Second, the polyethylene
+    softens with pressure, as in Bei & Fregly (2004): p = (M/E) E_s(p) eps, with the secant modulus
+    E_s of the uniaxial curve at the stress p. Since sigma = E_s(sigma) eps, this is the curve
+    itself at (M/E) eps. A fully confined column would hardly yield, because its stress is nearly
+    hydrostatic. A contact patch of a knee, however, is only as wide as the insert is thick, so its
+    columns are not fully confined. With a linear material the law is Blankevoort's,
+    p = -M ln(1 - d/h).
 
-    Limits: neighbours do not help to carry, so that pressure ends at the edge of the
-    overlap and peaks at rims are too high. A penetration of half the thickness or more, along y
-    or along the normal, is OUT_OF_RANGE. Walls parallel to y carry nothing. A mobile bearing
-    is pressed like a fixed one.
+    Limits: neighbouring columns do not share load, so the pressure ends at the edge of the overlap,
+    and peaks at rims are too high. A penetration of half the thickness or more, along y or along
+    the normal, is OUT_OF_RANGE. Walls parallel to y carry no load. A mobile bearing is pressed like
+    a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -126,8 +126,8 @@ class ElasticFoundation(ContactModel):
     ) -> ContactResult:
         """Find the approach that carries `load` (N); see `ContactModel`.
 
-        The search looks only at the columns near the femoral component; the whole bed is
-        evaluated at its end, and searched again if that finds another reaction.
+        The search evaluates only the columns near the femoral component. At its end all columns are
+        evaluated. If their reaction differs, the search is repeated with all columns.
         """
         nearby = _NearColumns(self.law, state, pose, guess)
         result = press_by_search(self, state, load, pose, guess, nearby.reaction)
@@ -139,12 +139,11 @@ class ElasticFoundation(ContactModel):
         return press_by_search(self, state, load, pose, guess)
 
     def _holds(self, nearby: "_NearColumns", load: float) -> bool:
-        """Return whether the whole bed, too, goes out of range before it carries the load.
+        """Return whether all columns together go out of range before they carry the load.
 
-        The near columns are a part of the bed: where they are out of range, so is the bed. The
-        reaction rises with the approach. So one evaluation of the bed is enough, at the largest
-        approach that is in range: if it carries less than the load there, it
-        carries less at every approach in range.
+        If the near columns are out of range, all columns are. The reaction rises with the approach.
+        One evaluation of all columns is therefore enough, at the largest approach in range: if the
+        reaction is below the load there, it is below the load at every approach in range.
         """
         if nearby.beyond - nearby.within > FOUNDATION.approach_step:
             return False
@@ -175,8 +174,8 @@ class _NearColumns:
     """The reaction of the columns whose gap to the femoral component is less than `NEAR`.
 
     Attributes:
-        within: m, the greatest approach so far that is in range; -inf: none.
-        beyond: m, the smallest approach so far that is out of range; inf: none.
+        within: m, largest evaluated approach that is in range; -inf: none.
+        beyond: m, smallest evaluated approach that is out of range; inf: none.
     """
 
     def __init__(self, law: Law, state: SampledContact, pose: Array, guess: Guess | None) -> None:
@@ -244,18 +243,18 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
 class FoundationProbe:
     """Forces and tangent stiffness of the near columns; see `tkamb.contact.model.Probe`.
 
-    A femoral displacement u at the point that a column meets, with femoral normal m there,
-    changes the gap along the insert's normal n by (m . u)/(m . n). With p'(d) the slope of the
-    layer's pressure, a column of area A adds to the stiffness of the wrench on the insert
+    A column meets the femur at a point h with the femoral normal m. A displacement u of that point
+    changes the gap along the insert's normal n by (m . u)/(m . n). A column of area A at the point
+    x of the insert, with the slope p'(d) of the layer's pressure, adds to the stiffness
 
         A p'(d)/(m . n)  [n; x cross n] [m; h cross m]^T
 
-    x the point on the insert, h the point met. The meshes' facets are taken as they are, so the
-    stiffness is the exact tangent wherever no ray crosses from facet to facet.
+    of the wrench on the insert. The facets of the meshes are not smoothed. The stiffness is the
+    exact tangent unless a ray crosses from facet to facet.
 
     Args:
-        law: of the layer.
-        state: what its `prepare` returned.
+        law: law of the layer.
+        state: state that the model's `prepare` returned.
     """
 
     exact: ClassVar[bool] = True
@@ -283,7 +282,7 @@ class FoundationProbe:
     def _of(
         self, samples: SurfaceSamples, gap: Array, femoral_normal: Array, pose: Array
     ) -> ProbedContact:
-        """Return the contact of the loaded columns, with gaps (n,) and femoral normals (n, 3)."""
+        """Return the contact of loaded columns with gaps (n,), m, and femoral normals (n, 3)."""
         if not len(gap):
             return ProbedContact({}, tangent=True)
         strain = -gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
@@ -302,10 +301,10 @@ class FoundationProbe:
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a column's width; see `Probe`.
 
-        The stiffness of a column jumps when the column is touched; the transverse stiffness of
-        the contact may jump by half. Here a column counts by the share of its cell that lies
-        inside the edge of contact, with a linear gap across the cell. Femoral normals are those
-        of the smooth surface: their mean over a displacement by one cell.
+        The stiffness of a column jumps when the column comes into contact, and the transverse
+        stiffness of the contact may jump by half. Here the weight of a column is the share of its
+        cell inside the edge of contact, with a linear gap across the cell. The femoral normals are
+        those of the smooth surface, which is their mean over a displacement by one cell.
         """
         samples, (gap, _, face) = self._columns(pose)
         near = gap < WIDEST_EDGE
@@ -332,7 +331,7 @@ class FoundationProbe:
         return self._seen[1:]
 
     def _rate(self, samples: SurfaceSamples, gap: Array) -> Array:
-        """Return the slope (n,) of the columns' forces by their penetrations, N/m."""
+        """Return the derivative (n,), N/m, of the columns' forces by their penetrations."""
         thickness = np.maximum(samples.thickness, FOUNDATION.least_thickness)
         slope = layer_slope(self._law, self._state.pair.material, -gap / thickness)
         return slope * samples.area / thickness
@@ -346,7 +345,7 @@ class FoundationProbe:
         rate: Array,
         pose: Array,
     ) -> dict[str, Array]:
-        """Return side -> sums over its columns (`SUMS`,), see `_add_up`."""
+        """Return the sums (`SUMS`,) over the columns of each side, see `_add_up`."""
         medial = medial_points(samples.points, pose, self._state.pair.split)
         sums = np.zeros((2, SUMS))
         _add_up(samples.points, samples.normals, femoral_normal, gap, force, rate, medial, sums)

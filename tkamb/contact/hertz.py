@@ -29,7 +29,7 @@ ELLIPSE = EllipseSettings()
 
 @dataclass(frozen=True)
 class ContactEllipse:
-    """The patch and what it carries.
+    """The elliptical patch of contact and its load.
 
     Args:
         long_axis: a, m, semi-axis along the smaller relative curvature.
@@ -47,7 +47,7 @@ class ContactEllipse:
 def contact_ellipse(
     flat: float, steep: float, approach: float, plane_modulus: float
 ) -> ContactEllipse:
-    """Return the patch of two bodies that approach each other, gap A u² + B v² at touch.
+    """Return the patch of two bodies whose gap at first touch is A u² + B v².
 
     With k = b/a, e² = 1 - k² and complete elliptic integrals K(e), E(e) (Johnson, Contact
     Mechanics, 1985, equations 4.24-4.32, doi:10.1017/CBO9781139171731):
@@ -62,7 +62,7 @@ def contact_ellipse(
     Args:
         flat: A, 1/m, positive; half the smaller relative curvature.
         steep: B >= A, 1/m.
-        approach: delta, m, positive, of distant points along the normal.
+        approach: delta, m, positive: mutual approach of distant points along the normal.
         plane_modulus: E* = E/(1 - nu²), Pa (the other body rigid).
     """
     # The axis ratio follows from the curvatures alone; size and pressure then from the approach.
@@ -97,20 +97,19 @@ class HertzSettings:
     """Hertz's contact of a condyle."""
 
     short_axis_sub_cells: int = 10
-    """Sub-cells on the ellipse's short semi-axis over which the pressure of a map point is
-    averaged. Chosen: the mean of the semi-ellipsoid is then exact to a per cent."""
+    """Sub-cells along the ellipse's short semi-axis; the pressure of a map point is the mean over
+    the sub-cells of its cell. Chosen: the mean is then exact to 1 %."""
     least_share_on_insert: float = 0.95
     """1: share of the semi-ellipsoid of pressure that must lie on the insert. Chosen: with less the
     contact reaches over the rim and Hertz's solution does not hold."""
     smallest_curvature_ratio: float = 1e-6
-    """1: smallest ratio of the two relative curvatures that still makes an ellipse. Chosen: below
-    it, a line contact."""
+    """1: smallest ratio of the two relative curvatures. Chosen: a line contact has less."""
 
 
 HERTZ = HertzSettings()
 
 FEWEST_SUB_CELLS, MOST_SUB_CELLS = 6, 50
-"""Bounds of the sub-cells per edge of a grid cell."""
+"""Smallest and largest number of sub-cells per edge of a grid cell."""
 
 
 CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
@@ -118,11 +117,11 @@ CONFORMING = "conforms to the insert: no ellipse (relative curvature is not posi
 
 @dataclass(frozen=True, eq=False)
 class CondyleGeometry:
-    """How one condyle meets the insert at a rotation, x and z.
+    """First touch of one condyle at a given rotation, x and z.
 
     Args:
         height: m, y of the femoral origin at which the condyle's triangles touch.
-        contact: the osculating quadrics there; None when they do not curve apart.
+        contact: osculating quadrics at the touch; None if the surfaces do not curve apart.
     """
 
     height: float
@@ -133,28 +132,26 @@ class CondyleGeometry:
 class Hertz(ContactModel):
     """Elliptical Hertz contact, condyle by condyle.
 
-    At a rotation, x and z each condyle's first touch along -y gives its contact point;
-    quadrics fitted there give normal and relative curvatures (`curvature.osculate`), the
-    elliptic solution gives the law F = c delta^1.5 with E* = E/(1 - nu²) of the insert at
-    zero strain (`contact_ellipse`). Both condyles move down together, so each has
-    delta = travel beyond its own touch times n_y: the tilt decides how they share the load.
-    Contact point and curvatures stay those of first touch. E is the slope of the material's
-    curve at the origin.
+    The contact point of each condyle is its first touch along -y at the given rotation, x and z.
+    Quadrics fitted there give the normal and the relative curvatures (`osculate`). Hertz's solution
+    then gives F = c delta^1.5 (`contact_ellipse`), with E* = E/(1 - nu²) of the insert; E is the
+    slope of the material's curve at the origin. Both condyles move down together: delta of each is
+    its travel beyond first touch times n_y. The tilt therefore decides how they share the load.
+    Contact point and curvatures remain those of first touch.
 
-    The map holds the semi-ellipsoid, averaged over each grid cell and scaled so that its
-    vertical force is the law's exactly; the wrench is the sum over the map. Area and peak
-    of a condyle are the ellipse's own (pi a b, p0), not the map's.
+    The map contains the semi-ellipsoid of pressure, averaged over each grid cell and scaled so that
+    its vertical force is exact. The wrench is the sum over the map. Area and peak of a condyle are
+    those of the ellipse (pi a b, p0), not of the map.
 
-    OUT_OF_RANGE: a condyle that conforms to the insert (relative curvature <= 0, concave
-    radius <= convex radius) or whose ellipse leaves the insert. Flag: an ellipse wider than
-    the insert is thick, where the half-space no longer holds (the layer is stiffer). A
-    mobile bearing is pressed like a fixed one.
+    A result is OUT_OF_RANGE if a condyle conforms to the insert (relative curvature <= 0) or its
+    ellipse leaves the insert. It is flagged if the ellipse is wider than the insert is thick: the
+    half-space is then too soft. A mobile bearing is pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
-        patch_radius: m, of the discs on which curvatures are fitted. On a sphere of 20 mm
-            4 mm makes the force 0.5 % too small; on a real implant (relative radii 70 and
-            240 mm) 4 to 6 mm move area and peak by 8 %, below 3 mm facets dominate.
+        patch_radius: m, radius of the discs on which curvatures are fitted. With 4 mm the force on
+            a sphere of 20 mm is 0.5 % too small. On a real implant (relative radii 70 and 240 mm)
+            area and peak differ by 8 % between 4 and 6 mm; below 3 mm facets dominate.
 
     Reference: Johnson, Contact Mechanics (1985), chapter 4, doi:10.1017/CBO9781139171731.
     """
@@ -205,9 +202,9 @@ class Hertz(ContactModel):
 def condyle_geometry(
     state: SampledContact, pose: Array, patch_radius: float
 ) -> tuple[CondyleGeometry | None, CondyleGeometry | None]:
-    """Return how each condyle meets the insert; the pose's y does not matter.
+    """Return the first touch of each condyle; the pose's y does not matter.
 
-    None for a condyle that does not lie over the insert. The last few answers are kept.
+    It is None for a condyle that does not lie over the insert. The last eight results are cached.
     """
     level = np.array(pose, float)
     # The geometry does not depend on the height, so that presses at one pose share it.
@@ -227,10 +224,10 @@ def indentation(geometry: CondyleGeometry, pose: Array) -> float:
 def map_pressure(
     samples: SurfaceSamples, contact: OsculatingContact, patch: ContactEllipse
 ) -> tuple[Array, float]:
-    """Return the semi-ellipsoid on the samples (n,), Pa, and the share of it that they hold.
+    """Return the pressure (n,), Pa, at the samples, and the share of the force on the insert.
 
-    Averaged over sub-cells of each grid cell, then scaled so that the vertical force is the
-    patch's force times n_y. A patch much narrower than a cell goes to the nearest point.
+    The pressure is averaged over sub-cells of each grid cell, and scaled so that the vertical force
+    is the patch's force times n_y. The nearest point carries a patch much narrower than a cell.
     """
     pressure = np.zeros(len(samples.points))
     offset = samples.points - contact.point

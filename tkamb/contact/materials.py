@@ -1,9 +1,9 @@
-"""What the insert is made of: one-dimensional stress-strain laws and Poisson's ratio.
+"""The material of the insert: one-dimensional stress-strain laws and Poisson's ratio.
 
-The laws relate true (Cauchy) stress to true (logarithmic) strain, odd-symmetric in tension
-and compression, as the polyethylene data were measured and fitted. A model that works in
-small strain feeds its engineering strain instead and says so (the two differ by 5 % at 10 %
-strain). Loading and unloading follow the same curve: no hysteresis, no set.
+The laws relate true (Cauchy) stress to true (logarithmic) strain, like the measured polyethylene
+data. They are odd functions: tension and compression have the same curve. A small-strain model uses
+its engineering strain instead; the two differ by 5 % at 10 % strain. Loading and unloading follow
+the same curve, without hysteresis or permanent set.
 """
 
 from dataclasses import dataclass, field
@@ -52,10 +52,10 @@ class LinearElastic:
 class RambergOsgood:
     """Ramberg and Osgood: eps = sigma/E + alpha (|sigma|/sigma0)^(n-1) sigma/E.
 
-    Stress is found by Newton's method from above on the convex increasing function
-    u + alpha u^n = E |eps| / sigma0, u = |sigma|/sigma0, which never overshoots, to machine
-    precision. Defined for every finite strain up to 1000; NaN stays NaN. Beyond the strain
-    that was measured the curve is an extrapolation, and it has no barrier at -100 %.
+    Newton's method solves u + alpha u^n = E |eps| / sigma0 for u = |sigma|/sigma0 to machine
+    precision. It starts above the solution and does not overshoot, because the function is convex
+    and increasing. The law is defined for every finite strain up to 1000; NaN stays NaN. Beyond the
+    measured strain it is an extrapolation, without a barrier at -100 %.
 
     Args:
         alpha: yield offset, >= 0.
@@ -100,7 +100,7 @@ class RambergOsgood:
 
 @compiled_as_written
 def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) -> None:
-    """Write the solutions u (n,) of u + alpha u^n = elastic (n,), not negative."""
+    """Write the solutions u (n,) of u + alpha u^n = elastic (n,), which is not negative."""
     for k in range(len(elastic)):
         # Both the elastic and the plastic part alone are upper bounds of the ratio. Newton's method
         # falls monotonically from the smaller one, because the equation is convex.
@@ -122,13 +122,13 @@ def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) ->
 class TabulatedLaw:
     """A measured true stress-strain curve, monotone and once differentiable (PCHIP).
 
-    The table is mirrored through the origin, scaled so that its slope there is 1, and
-    multiplied by Young's modulus: changing E scales the whole curve. Beyond the last point
-    it goes on straight with the slope of the last chord.
+    The table is mirrored through the origin, scaled to a slope of 1 there, and multiplied by
+    Young's modulus, so that a change of E scales the whole curve. Beyond the last point the curve
+    continues straight with the slope of the last chord.
 
     Args:
-        strain: increasing, from 0.
-        values: stress at those strains, Pa, not falling, from 0.
+        strain: strains, increasing from 0.
+        values: stresses at these strains, Pa, from 0, not falling.
     """
 
     strain: tuple[float, ...]
@@ -156,14 +156,14 @@ class TabulatedLaw:
 
     @cached_property
     def _curve(self) -> PchipInterpolator:
-        """The mirrored table; one more step of the last chord gives it that slope at its end."""
+        """The mirrored table, extended by one step of the last chord."""
         strain, values = np.asarray(self.strain, float), np.asarray(self.values, float)
-        # One more point in line with the last two: the curve leaves its table with a slope that
-        # PCHIP does not flatten to an end condition.
+        # The extra point lies in line with the last two, so that PCHIP's end condition does not
+        # change the slope at the table's last point.
         strain = np.append(strain, 2 * strain[-1] - strain[-2])
         values = np.append(values, 2 * values[-1] - values[-2])
-        # Mirrored at the origin, so that tension follows compression and the slope at zero is that
-        # of the curve itself. PCHIP keeps the stress from falling between points.
+        # The mirror image makes tension follow compression and removes an end condition at zero.
+        # PCHIP is monotone, so that the stress does not fall between points.
         return PchipInterpolator(
             np.concatenate([-strain[:0:-1], strain]), np.concatenate([-values[:0:-1], values])
         )
@@ -180,7 +180,7 @@ class TabulatedLaw:
     def stress(self, strain: Array, young_modulus: float) -> Array:
         """Return stress, Pa."""
         inside = np.clip(strain, -self.strain[-1], self.strain[-1])
-        # Beyond the table the curve goes on with its last slope.
+        # Beyond the table the curve continues with its last slope.
         beyond = (strain - inside) * self._slope(self.strain[-1])
         return (self._curve(inside) + beyond) * (young_modulus / self.young_modulus)
 
@@ -198,8 +198,8 @@ class Material:
         name: name in messages.
         young_modulus: E, Pa, the slope at the origin.
         poisson_ratio: nu, -1 < nu < 0.5.
-        law: shape of the curve.
-        sources: where the numbers come from; not compared between materials.
+        law: shape of the stress-strain curve.
+        sources: origin of the numbers; not compared between materials.
 
     Raises:
         InputError: E not positive and finite, or nu out of range.
@@ -276,7 +276,7 @@ MATERIALS = {
     "polyethylene": "Ramberg-Osgood fit to true stress-strain of UHMWPE, E 561.5 MPa, nu 0.45",
     "polyethylene-linear": "linear elastic, E 561.5 MPa, nu 0.45",
 }
-"""Names that `material` knows, and what they are."""
+"""Names of the built-in materials, and their descriptions."""
 
 
 def material(name: str, **overrides: float) -> Material:

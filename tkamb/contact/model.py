@@ -29,14 +29,13 @@ from tkamb.geometry.frames import Array, cross
 
 
 class ContactModel(ABC):
-    """A frozen set of parameters that answers the contract.
+    """Base class of the contact models.
 
-    A subclass is a frozen dataclass whose fields are its options; every model takes
-    `resolution` (m), the spacing of its map points. `guess`, an earlier result or
-    a `WarmStart`, may change the time that an answer takes, but not the answer beyond the
-    tolerance; nothing is kept from call to call. `mobile_bearing`: whether a mobile
-    bearing's bottom slides; a model that presses it like a fixed one leaves False, and every
-    press and run says so.
+    A subclass is a frozen dataclass, and its fields are its options. Every model has `resolution`
+    (m), the spacing of its map points. A `guess`, an earlier result or a `WarmStart`, changes the
+    computing time, and the result by no more than the tolerance. A model stores nothing between
+    calls. `mobile_bearing` says whether the bottom of a mobile bearing slides. If it is False, the
+    model presses a mobile bearing like a fixed one, and every press and run has a note of that.
     """
 
     name: ClassVar[str]
@@ -47,10 +46,10 @@ class ContactModel(ABC):
     resolution: float
 
     def prepare(self, pair: ContactPair) -> Any:
-        """Do the work that depends on geometry and material alone.
+        """Return the state of a pair: the work that depends on geometry and material alone.
 
-        Here: sample the insert's surface, ready the first touch. A model that prepares more
-        returns a `tkamb.contact.pair.PreparedContact` of its own.
+        This method samples the insert's surface and prepares the first touch. A model that prepares
+        more returns a subclass of `tkamb.contact.pair.PreparedContact`.
         """
         pair.touch_at(np.eye(4))
         return SampledContact(pair, sample_surface(pair.insert, self.resolution))
@@ -65,45 +64,45 @@ class ContactModel(ABC):
         """Find the approach along -y (rotation, x and z as given) that carries `load` (N).
 
         The load is the superior-inferior force on the insert. This generic search calls
-        `evaluate`; a model may bring a faster one.
+        `evaluate`; a model may override it with a faster one.
         """
         return press_by_search(self, state, load, pose, guess)
 
     def evaluate_from(
         self, state: Any, pose: Array, start: Guess | None = None
     ) -> tuple[ContactResult, WarmStart]:
-        """Return what `evaluate` does, and the start for a contact near by."""
+        """Return the result of `evaluate`, and the warm start for a contact at a nearby pose."""
         result = self.evaluate(state, pose, start)
         return result, WarmStart.after(result)
 
     def press_from(
         self, state: Any, load: float, pose: Array, start: Guess | None = None
     ) -> tuple[ContactResult, WarmStart]:
-        """Return what `press` does, and the start for a contact near by.
+        """Return the result of `press`, and the warm start for a contact at a nearby pose.
 
-        A model whose solver can begin where another one ended overrides this and
-        `evaluate_from`.
+        A model whose solver uses a warm start overrides this and `evaluate_from`.
         """
         result = self.press(state, load, pose, start)
         return result, WarmStart.after(result)
 
     def probe(self, state: Any, guess: Guess | None = None) -> Any:
-        """Return a `tkamb.contact.model.Probe`: wrenches at many neighbouring poses.
+        """Return a `Probe`, which evaluates many neighbouring poses.
 
-        The generic one calls `evaluate`; a model may bring a faster one, with stiffness.
+        The generic probe calls `evaluate`; a model may return a faster one, with stiffness.
         """
         return Probe(self, state, guess)
 
 
 @dataclass(frozen=True, eq=False)
 class CondyleWrench:
-    """What one condyle does to the insert.
+    """The wrench of one condyle on the insert.
 
     Args:
         wrench: (6,) force (N) and moment about the insert's origin (N·m), on the insert.
         centre: (3,) m, centre of pressure.
-        stiffness: (6, 6) change of the wrench per small displacement of the femoral component
-            (of its point at the insert's origin, m, then rotation, rad); None if unknown.
+        stiffness: (6, 6) derivative of the wrench by a small displacement of the femoral component:
+            translation (m) of its point at the insert's origin, then rotation (rad); None if it is
+            unknown.
     """
 
     wrench: Array
@@ -117,15 +116,15 @@ class CondyleWrench:
 
     @cached_property
     def normal(self) -> Array:
-        """(3,) unit, out of the insert into the femur: against the resultant on the insert."""
+        """(3,) unit, from the insert to the femur: opposite to the force on the insert."""
         return -self.wrench[:3] / self.force
 
     @cached_property
     def point(self) -> Array:
         """(3,) m, the point on the resultant's line of action nearest to the centre.
 
-        The nodal forces of a curved contact are not parallel; about their centre of pressure
-        they leave a small moment, about this point only its part along the resultant.
+        The nodal forces of a curved contact are not parallel, so that they have a small moment
+        about their centre of pressure. About this point the moment is parallel to the resultant.
         """
         force = self.wrench[:3]
         moment = self.wrench[3:] - cross(self.centre, force)
@@ -140,11 +139,11 @@ class ProbedContact:
 
     Args:
         condyles: side -> wrench.
-        known: False where the model is out of range or has not converged.
+        known: False if the model is out of range or has not converged.
         tangent: whether the condyles' stiffness is known.
-        exact: whether that stiffness is the exact tangent, not an approximation.
-        accuracy: share of the contact force to which the model knows it.
-        post: what a cam does to the insert's post; None where it carries nothing.
+        exact: whether that stiffness is the exact tangent.
+        accuracy: 1, relative error of the contact force.
+        post: wrench of a cam on the insert's post; None if the post is unloaded.
     """
 
     condyles: dict[str, CondyleWrench]
@@ -166,16 +165,18 @@ class ProbedContact:
 
 
 class Probe:
-    """The probe of any model: `evaluate`, each pose the start of the next.
+    """Evaluations of a contact model at neighbouring poses, each with the last one's warm start.
+
+    A model that knows its tangent has a faster probe with stiffness.
 
     Args:
         model: any contact model.
-        state: what its `prepare` returned.
-        start: an earlier result or warm start.
+        state: state that its `prepare` returned.
+        start: earlier result or warm start for the first evaluation.
 
     Attributes:
-        exact: every answer brings the tangent, and it costs less than a press.
-        start: where the next evaluation begins.
+        exact: whether every result contains the tangent and costs less than a press.
+        start: warm start of the next evaluation.
     """
 
     exact: ClassVar[bool] = False
@@ -192,7 +193,7 @@ class Probe:
         return self.seen(result, start)
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
-        """Return the contact at a pose (4, 4), of which only the forces need be right."""
+        """Return the contact at a pose (4, 4); only its forces have to be correct."""
         return self._model.evaluate_from(self._state, pose, self.start)
 
     def pressed(
@@ -201,12 +202,12 @@ class Probe:
         pose: Array,
         start: Guess | None,
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact under a load (N), of which only the forces need be right.
+        """Return the contact under a load (N); only its forces have to be correct.
 
         Args:
             load: N.
             pose: (4, 4) pose_femoral_in_insert.
-            start: of a contact at a neighbouring pose.
+            start: result or warm start of a contact at a neighbouring pose.
         """
         return self._model.press_from(self._state, load, pose, start)
 
@@ -215,17 +216,17 @@ class Probe:
 
         Args:
             pose: (4, 4) pose_femoral_in_insert.
-            contact: contact at that pose. A model without an averaged stiffness returns it.
+            contact: contact at that pose; a model without an averaged stiffness returns it.
         """
         return contact
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
-        """Return what a result, and the warm start that came with it, say of the condyles."""
+        """Return the wrenches of the condyles from a result and its warm start."""
         return ProbedContact(condyle_wrenches(result, self._state.pair.split))
 
 
 def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, CondyleWrench]:
-    """Return what each condyle that carries load does to the insert.
+    """Return the wrench of each loaded condyle on the insert.
 
     Args:
         result: a contact.

@@ -1,4 +1,4 @@
-"""The two bodies of a contact, and what a model prepares of them."""
+"""The two bodies of a contact, and the state that a model prepares from them."""
 
 import copy
 import math
@@ -23,7 +23,7 @@ Bearing = Literal["fixed", "mobile"]
 
 @dataclass(frozen=True, eq=False)
 class ContactPair:
-    """The two bodies and what the insert is made of.
+    """The two bodies of a contact and the insert's material.
 
     Args:
         femoral: rigid femoral component, in the femoral frame.
@@ -44,32 +44,32 @@ class ContactPair:
 
     @cached_property
     def first_touch(self) -> FirstTouch:
-        """How far the femoral component travels until each condyle touches."""
+        """Search for the travel of the femoral component until each condyle touches."""
         return FirstTouch(self.femoral, self.insert, self.split)
 
     @cached_property
     def articular_edge(self) -> ArticularEdge:
-        """Where the insert's articular surface ends."""
+        """Edge of the insert's articular surface."""
         return ArticularEdge.of(self.insert)
 
     @cached_property
     def closest_points(self) -> "ClosestPointQuery":
-        """Closest points of the two undeformed bodies, at any pose."""
+        """Search for the closest points of the two undeformed bodies."""
         from tkamb.geometry.closest import ClosestPointQuery
 
         return ClosestPointQuery(self.femoral, self.insert, self.split)
 
     def of_material(self, material: Material) -> "ContactPair":
-        """Return the bodies with an insert of another material; what is known of them stays."""
+        """Return the pair with another material; computed geometry is kept."""
         other = copy.copy(self)
         object.__setattr__(other, "material", material)
         return other
 
     def touch_at(self, pose: Array) -> Touch | None:
-        """Return the first touch of either condyle, whatever the pose's y; travel from y = 0.
+        """Return the first touch of either condyle; the travel starts at y = 0.
 
-        None if the femoral component does not lie over the insert or the pose is not finite.
-        The last few answers are kept.
+        The pose's own y does not matter. The result is None if the femoral component does not lie
+        over the insert or the pose is not finite. The last eight results are cached.
         """
         level = np.array(pose, float)
         if not np.isfinite(level).all():
@@ -80,8 +80,8 @@ class ContactPair:
     def first_touch_height(self, pose: Array) -> float:
         """Return the y (m) of the femoral origin at which the bodies first touch.
 
-        It depends on the rotation, x and z of pose_femoral_in_insert, not on its y; NaN where
-        `touch_at` finds nothing.
+        It depends on the rotation, x and z of pose_femoral_in_insert, not on its y. It is NaN if
+        there is no touch.
         """
         touch = self.touch_at(pose)
         return math.nan if touch is None else -touch.travel
@@ -105,7 +105,7 @@ def _first_touch(pair: ContactPair, level: bytes) -> Touch | None:
 
 @dataclass(frozen=True, eq=False)
 class ContactSurface:
-    """The insert's articular surface as points: what every pressure map stands on.
+    """The points of a pressure map, on the insert's articular surface.
 
     Args:
         points: (n, 3) m, insert frame, on the undeformed insert.
@@ -124,7 +124,7 @@ class ContactSurface:
 
 @dataclass(frozen=True, eq=False)
 class PreparedContact:
-    """What `prepare` returns: read-only; a model may add what it needs.
+    """The state that `prepare` returns: read-only; a model may add fields in a subclass.
 
     Args:
         pair: the two bodies.
@@ -146,5 +146,5 @@ class PreparedContact:
 
     @property
     def node_count(self) -> int:
-        """Nodes that the model solves for; the map's points where it has no others."""
+        """Number of nodes that the model solves for; by default the number of map points."""
         return len(self.points)

@@ -1,4 +1,4 @@
-"""The generic way to press: find the approach along -y that carries a load.
+"""The press of any contact model: the search for the approach along -y that carries a load.
 
 It also checks that the bodies are not pressed through each other.
 """
@@ -25,23 +25,23 @@ class PressSettings:
     load_tolerance: float = 1e-6
     """1: relative difference of reaction and load below which the search has converged."""
     coarse_tolerance: float = 1e-3
-    """1: the same for a model whose reaction jumps, as map points come into contact one by
-    one. Above it the press has not converged."""
+    """1: the tolerance for a model whose reaction jumps, because map points come into contact one
+    by one. If the difference is larger, the press has not converged."""
     first_approach: float = 5e-5
-    """m: initial guess of the approach where the caller has none."""
+    """m: initial guess of the approach if the caller gives none."""
     max_approach: float = 0.02
     """m: largest approach that is searched; no insert carries a load beyond it."""
     least_bracket: float = 1e-16
-    """m: width of a bracket that cannot be narrowed, the rounding of an approach of 1 mm."""
+    """m: width at which a bracket is not narrowed further: the rounding of an approach of 1 mm."""
     max_evaluations: int = 80
     """Evaluations of the reaction in one press; bisection of `max_approach` to `least_bracket`
     needs 48."""
     flagged_thickness_share: float = 0.5
-    """1: approach over thickness from which a result is flagged. Chosen: at 1 the result is a
-    failed contact."""
+    """1: a result is flagged from this ratio of approach to thickness. Chosen: from 1 on the
+    contact has failed."""
     rim_distance: float = 0.5 * MILLIMETRE
-    """m: near the rim the largest thickness within this distance counts. Chosen: the insert has no
-    thickness at the rim itself."""
+    """m: near the rim the thickness is the largest one within this distance. Chosen: at the rim
+    itself the thickness is zero."""
     ray_start_depth: float = 1e-7
     """m: depth below the surface at which rays into the insert begin; it is also the smallest
     thickness. Chosen: above the rounding of a mesh."""
@@ -58,35 +58,35 @@ Reaction = Callable[[float], float]
 
 
 class Evaluates(Protocol):
-    """What the search needs of a contact model."""
+    """The part of a contact model that the search needs."""
 
     def evaluate(self, state: Any, pose: Array, guess: Guess | None = None) -> ContactResult:
         """Return the contact at a pose."""
 
 
 class Presses(Evaluates, Protocol):
-    """A contact model that finds the approach of a load, too, and says where to go on."""
+    """A contact model with evaluations and presses that use and return a warm start."""
 
     def evaluate_from(
         self, state: Any, pose: Array, start: Guess | None = None
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact at a pose, and the start of the next."""
+        """Return the contact at a pose, and the warm start of the next one."""
 
     def press_from(
         self, state: Any, load: float, pose: Array, start: Guess | None = None
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact under a load (N), and the start of the next."""
+        """Return the contact under a load (N), and the warm start of the next one."""
 
 
 @dataclass(frozen=True)
 class LoadSearch:
-    """What the search for a load found.
+    """Result of the search for a load.
 
     Args:
-        approach: m; NaN when the load cannot be reached.
-        evaluations: how often the reaction was computed.
-        residual: |reaction - load| / load there.
-        deepest: m, the greatest approach that was tried.
+        approach: m; NaN if the load cannot be reached.
+        evaluations: number of computed reactions.
+        residual: |reaction - load| / load at that approach.
+        deepest: m, largest approach that was tried.
     """
 
     approach: float
@@ -111,22 +111,22 @@ def press_by_search(
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
 
-    Rotation, x and z of `pose` are kept, its y is not used. The reaction is minus the y
+    The rotation, x and z of `pose` are kept; its y is not used. The reaction is minus the y
     component of the force on the insert.
 
     Args:
         model: any contact model.
-        state: what its `prepare` returned.
+        state: state that its `prepare` returned.
         load: N, superior-inferior.
         pose: (4, 4) pose_femoral_in_insert.
         guess: an earlier result or warm start; its approach starts the search.
-        reaction: a faster way to the reaction (N) at an approach (m) than `evaluate`; inf
-            where it is out of range.
+        reaction: function that returns the reaction (N) at an approach (m) faster than `evaluate`;
+            inf if the approach is out of range.
 
     Returns:
-        The result at the approach found. OUT_OF_RANGE and NaN when the load cannot be
-        reached or the femoral component does not lie over the insert; NOT_CONVERGED when
-        the reaction jumps over the load. Zero load: first touch, no pressure.
+        The contact at the approach that carries the load. It is OUT_OF_RANGE, with NaN, if the load
+        cannot be reached or the femoral component does not lie over the insert. It is NOT_CONVERGED
+        if the reaction jumps over the load. With a load of zero it is the first touch.
 
     Raises:
         InputError: the load is negative or not finite.
@@ -197,9 +197,10 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
     with its power 1.5 to 2.
 
     Args:
-        reaction: N at an approach in m; 0 at 0; inf where it is out of range.
+        reaction: function that returns the reaction (N) at an approach (m): 0 at 0, inf if the
+            approach is out of range.
         load: N, positive.
-        start: m, where the search begins.
+        start: m, initial guess of the approach.
     """
     # The root of the reaction is nearly linear in the approach (F ~ d^2 for a sphere on a layer,
     # d^1.5 on a half-space), so that the secant converges fast.
@@ -237,14 +238,14 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
 
 
 def _ahead(trial: float, force: float, load: float) -> float:
-    """Return a deeper trial, extrapolated by a quadratic reaction; at most 4 times deeper."""
+    """Return a deeper trial (m), extrapolated quadratically; at most 4 times deeper."""
     # No upper end yet: extrapolate by F ~ d^2, a little beyond, so that the load is bracketed next.
     factor = 2.0 if force <= 0 else min(1.05 * math.sqrt(load / force), 4.0)
     return min(trial * factor + 1e-9, PRESS.max_approach)
 
 
 def _between(low: float, low_value: float, high: float, high_value: float) -> float:
-    """Return false position in the bracket, its middle where an end is out of range."""
+    """Return the next trial (m): false position, or the middle if an end is out of range."""
     middle = 0.5 * (low + high)
     # Out of range at the upper end: a secant through infinity says nothing, so bisect.
     if not math.isfinite(high_value):
@@ -264,13 +265,13 @@ def unloaded_result(model: Evaluates, state: Any, pose: Array) -> ContactResult:
 def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResult:
     """Return the result if the bodies are not pressed through each other.
 
-    OUT_OF_RANGE where the approach is as large as the insert is thick; a flag from half of
-    that on. See `compression`.
+    It is OUT_OF_RANGE if the approach is as large as the insert's thickness, and is flagged from
+    half of that on. See `compression`.
 
     Args:
         state: prepared contact.
-        result: a contact.
-        more: flags to add.
+        result: contact to be checked.
+        more: flags to be added.
     """
     touch = state.pair.touch_at(result.pose)
     if touch is not None and result.approach > 0:
@@ -283,16 +284,17 @@ def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResul
 
 
 def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple[float, str]:
-    """Return the largest ratio of approach to insert thickness, and in words where it is.
+    """Return the largest ratio of approach to insert thickness, and a description of its place.
 
-    The undeformed bodies overlap by the whole approach where they first touch. It is compared
-    with the insert's thickness there and under each condyle's centre of pressure: a spike of
-    the femoral component is met at the one, a spike of the insert at the other.
+    At first touch the undeformed bodies overlap by the whole approach. The approach is compared
+    with the insert's thickness at that place, which detects a spike of the femoral component. It is
+    also compared with the thickness under each condyle's centre of pressure, which detects a spike
+    of the insert.
 
     Args:
         pair: the two bodies.
-        touch: where they first touch at the result's rotation, x and z.
-        result: a contact with an approach.
+        touch: first touch at the result's rotation, x and z.
+        result: contact with a positive approach.
     """
     condyles = {"medial": result.medial, "lateral": result.lateral}
     positions = {"where the meshes first touch": touch.point} | {
@@ -314,8 +316,8 @@ def thickness_near(pair: ContactPair, positions: Array) -> Array:
     """Return the insert's thickness (n,), m, along y at positions (n, 3), from its top down.
 
     The thickness ends where a ray from the top first leaves the insert. Near a rim it is the
-    largest one within `PRESS.rim_distance`. Where no ray meets the insert, it is the height above
-    the bottom.
+    largest thickness within `PRESS.rim_distance`. If no ray meets the insert, it is the height
+    above the bottom.
     """
     low, high = pair.insert.bounds[:, 1]
     columns = (positions[:, None] + COLUMNS).reshape(-1, 3)

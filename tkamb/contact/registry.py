@@ -30,8 +30,8 @@ MAP_GRID = MapGridSettings()
 
 
 OPTION_RANGES = {"tolerance": (1e-9, 0.1), "patch_radius": (5e-4, 3e-2)}
-"""Option -> least and largest value that it may have. Below the least tolerance rounding decides;
-above the largest the pressures are no answer. Discs of 0.5 to 30 mm fit on a condyle."""
+"""Smallest and largest value of an option. A smaller tolerance is below rounding; with a larger one
+the pressures are meaningless. Discs of 0.5 to 30 mm fit on a condyle."""
 
 BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
@@ -81,7 +81,7 @@ def contact_model(
     Args:
         name: one of `contact_names()`.
         resolution_mm: spacing of its map points, mm; 1 mm if neither is given.
-        resolution: the same in metres, instead.
+        resolution: spacing of the map points, m; an alternative to `resolution_mm`.
         options: the model's own options, the fields of its class (SI).
 
     Raises:
@@ -124,7 +124,7 @@ def _options(model: type[ContactModel]) -> list[str]:
 
 
 def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
-    """Return the words that an option declared as Literal may be; empty for another type."""
+    """Return the allowed values of an option declared as Literal; empty for another type."""
     kind = get_type_hints(model)[option]
     return get_args(kind) if get_origin(kind) is Literal else ()
 
@@ -149,9 +149,9 @@ def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) 
 
 
 def contact_descriptions() -> dict[str, str]:
-    """Return for every name one line: what the model assumes, what it needs, its options.
+    """Return one line per model: its assumptions, its needs and its options.
 
-    A model that cannot be loaded says so in its line.
+    The line of a model that cannot be loaded is the error message.
     """
     lines = {}
     for name in contact_names():

@@ -24,14 +24,14 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class ContactResultSettings:
-    """Limits from which a contact result is flagged, and counts as two condyles."""
+    """Limits from which a contact result is flagged."""
 
     max_measured_pressure: float = 100.0 * MEGAPASCAL
     """Pa: peak pressure beyond which polyethylene's stress-strain curves are extrapolated. Chosen:
     they end at 40 to 60 MPa."""
     least_patch_share: float = 0.05
-    """1: share of the force that a patch of contact must carry to count as a second condyle's.
-    Chosen: a smaller patch is a crumb of one condyle's contact."""
+    """1: a patch of contact with a smaller share of the force is no second condyle's. Chosen: it
+    belongs to the contact of the first one."""
     least_patch_distance: float = 15.0 * MILLIMETRE
     """m: smallest distance between the centres of two condyles' patches. Chosen: those of a knee
     are 40 to 50 mm apart."""
@@ -50,7 +50,7 @@ class ContactStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class CondyleContact:
-    """What one condyle carries.
+    """The contact of one condyle.
 
     Args:
         force: N, magnitude of the summed normal forces on the insert.
@@ -72,14 +72,14 @@ class CondyleContact:
 
 @dataclass(frozen=True, eq=False)
 class ContactResult:
-    """Pressure map and wrench at one pose; made by `ContactResult.of`.
+    """Pressure map and wrench at one pose; `ContactResult.of` makes it.
 
     The map has the same n points in every result of one state. Arrays are in the insert
     frame, SI.
 
     Args:
         pair: the two bodies.
-        pose: (4, 4) pose_femoral_in_insert at which it holds (after pressing in).
+        pose: (4, 4) pose_femoral_in_insert of this contact (after a press: the pressed pose).
         points: (n, 3) map points on the undeformed insert.
         normals: (n, 3) outward unit normals of the insert there.
         pressure: (n,) Pa, >= 0.
@@ -87,12 +87,12 @@ class ContactResult:
         gap: (n,) m, positive when apart.
         nodal_force: (n, 3) N on the insert.
         wrench_on_insert: (6,) force (N) and moment about the insert origin (N·m).
-        medial: what the medial condyle (or the only one) carries; None when nothing.
-        lateral: what the lateral condyle carries; None when nothing, or no such condyle.
+        medial: contact of the medial (or only) condyle; None if it is unloaded.
+        lateral: contact of the lateral condyle; None if it is unloaded or does not exist.
         status: how the evaluation ended.
-        iterations: of the model's own solver.
+        iterations: number of iterations of the model's solver.
         residual: relative residual of that solver.
-        flags: plain words for what a reader must know (strain below -0.4, ...).
+        flags: warnings in words (strain below -0.4, ...).
     """
 
     pair: ContactPair
@@ -126,7 +126,7 @@ class ContactResult:
     def approach(self) -> float:
         """m, travel along -y since first touch; 0 when apart, NaN when out of range.
 
-        Worked out when it is first asked for, from the pose and the undeformed bodies.
+        It is computed at its first use, from the pose and the undeformed bodies.
         """
         if self.status is ContactStatus.OUT_OF_RANGE:
             return math.nan
@@ -145,22 +145,22 @@ class ContactResult:
         medial: Mask | None = None,
         **ending: Any,
     ) -> "ContactResult":
-        """Return the result of a pressure map: sides, wrench, areas and sums follow from it.
+        """Return the result that belongs to a pressure map.
 
-        The force on point i is -p_i A_i n_i, the wrench the sum over the points, moments about
-        the insert's origin. A pressure that is not finite makes it OUT_OF_RANGE.
+        The force on point i is -p_i A_i n_i. The wrench is the sum over the points, with moments
+        about the insert's origin. If a pressure is not finite, the result is OUT_OF_RANGE.
 
         Args:
-            state: what `prepare` returned.
+            state: state that `prepare` returned.
             pose: (4, 4) pose_femoral_in_insert.
             pressure: (n,) Pa, >= 0.
             gap: (n,) m, positive when apart.
-            nodal_force: (n, 3) N on the insert, for a model that knows it better.
-            area: (n,) m², area of each point's force; by default the tributary area.
-            covered: (n,) m², in contact around each point, for the condyles' areas; by
+            nodal_force: (n, 3) N on the insert; by default -p_i A_i n_i.
+            area: (n,) m², area of each point; by default the tributary area.
+            covered: (n,) m², area in contact around each point, whose sum is a condyle's area; by
                 default `area`.
-            medial: (n,) points under the medial condyle; by default `medial_points`.
-            ending: status, iterations, residual, flags.
+            medial: (n,) whether a point is under the medial condyle; by default `medial_points`.
+            ending: status, iterations, residual and flags of the result.
         """
         surface, pose = state.surface, np.array(pose, float)
         if not np.isfinite(pressure).all():
@@ -255,9 +255,9 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
 def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) -> Iterator[str]:
     """Yield a flag where a component with one condyle presses on two separate patches.
 
-    Patches are the loaded points that triangles of the map join. Two patches
-    count where each carries `CONTACT_RESULT.least_patch_share` of the force and their centres are
-    `CONTACT_RESULT.least_patch_distance` apart.
+    A patch is a set of loaded points that triangles of the map connect. There is a flag if two
+    patches carry at least `CONTACT_RESULT.least_patch_share` of the force each, and their centres
+    are at least `CONTACT_RESULT.least_patch_distance` apart.
 
     Args:
         surface: the map's points and triangles.
@@ -296,10 +296,10 @@ def wrench_of(points: Array, nodal_force: Array) -> Array:
 def _summed(
     chosen: Mask, points: Array, pressure: Array, area: Array, nodal_force: Array, thickness: Array
 ) -> CondyleContact | None:
-    """Return what the chosen points (n,) carry; None when there are none.
+    """Return the contact of the chosen points (n,); None if there are none.
 
-    The area is at least the force over the peak pressure: where contact is smaller than the
-    cells the mean pressure is not above the peak.
+    The area is at least the force divided by the peak pressure, so that the mean pressure of a
+    contact smaller than a cell is not above its peak.
     """
     if not chosen.any():
         return None
@@ -324,7 +324,7 @@ def thickness_under(position: Array, points: Array, thickness: Array) -> float:
 
 
 def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
-    """Yield a flag for each condyle whose peak pressure is beyond the fitted material laws."""
+    """Yield a flag for each condyle with a peak pressure beyond the fitted material laws."""
     limit = CONTACT_RESULT.max_measured_pressure
     for side, condyle in sides.items():
         if condyle is not None and condyle.peak_pressure > limit:
@@ -336,16 +336,16 @@ def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """An earlier contact, as far as a next one of the same prepared state may begin with it.
+    """The initial guess that an earlier contact gives to the next one of the same state.
 
-    It may save time, and changes no answer beyond the model's tolerance.
+    It saves time, and changes the result by no more than the model's tolerance.
 
     Args:
         pair: the two bodies.
-        pose: (4, 4) pose_femoral_in_insert.
-        points: (n, 3) m, the map's.
-        pressure: (n,) Pa; NaN where the contact failed.
-        gap: (n,) m.
+        pose: (4, 4) pose_femoral_in_insert of the earlier contact.
+        points: (n, 3) m, map points.
+        pressure: (n,) Pa; NaN if the contact failed.
+        gap: (n,) m, positive when apart.
     """
 
     pair: ContactPair
@@ -356,15 +356,15 @@ class WarmStart:
 
     @classmethod
     def after(cls, result: ContactResult) -> "WarmStart":
-        """Return the start that an answer by itself gives."""
+        """Return the warm start that a result gives without the model's help."""
         return WarmStart(result.pair, result.pose, result.points, result.pressure, result.gap)
 
     @cached_property
     def approach(self) -> float:
-        """m, travel along -y since first touch; NaN where the contact failed."""
+        """m, travel along -y since first touch; NaN if the contact failed."""
         failed = bool(np.isnan(self.pressure).any())
         return float("nan") if failed else self.pair.approach(self.pose)
 
 
 Guess = ContactResult | WarmStart
-"""What a press may begin with: both have `pose`, `points`, `pressure`, `gap` and `approach`."""
+"""Initial guess of a press; both types have `pose`, `points`, `pressure`, `gap`, `approach`."""

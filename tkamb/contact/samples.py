@@ -21,21 +21,22 @@ class MapPointSettings:
     """The map points on the articular surface."""
 
     rim_rays: int = 8
-    """Rays per edge of a map cell at the rim, by which its covered part is measured (64 rays a
-    cell)."""
+    """Rays along each edge of a map cell at the rim; the 64 rays of the cell measure its covered
+    share."""
     least_normal_y: float = 0.1
-    """1: smallest superior component of the normal that a tributary area is divided by: 84 deg from
-    the horizontal. Chosen: it keeps a division from zero."""
+    """1: smallest superior component of a normal by which a covered area is divided; a slope of 84
+    deg. Chosen: it prevents a division by zero."""
     side_start_normal_y: float = 0.5
-    """1: below this superior component of the normal (60 deg) a column begins well beside its
-    point, seen from above. Chosen: flatter surfaces have their column below the point."""
+    """1: if the superior component of the normal is smaller (steeper than 60 deg), the start of a
+    column may lie in the femur beside the point. Chosen: on flatter surfaces it lies below the
+    point."""
     ray_start_depth: float = 1e-6
     """m: depth below the surface at which rays into the insert begin. Chosen: above the rounding of
     a mesh."""
     max_map_cells: int = 4_000_000
-    """Map cells over the bounding box. Chosen: a knee's map at about 0.03 mm."""
+    """Largest number of map cells over the bounding box. Chosen: a knee's map at about 0.03 mm."""
     max_inner_walls: int = 8
-    """Walls within the insert that a ray along the normal passes at most. Chosen: an insert of
+    """Largest number of inner walls that a ray along the normal passes. Chosen: an insert of
     several bodies has fewer."""
 
 
@@ -44,14 +45,14 @@ MAP_POINT = MapPointSettings()
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples(ContactSurface):
-    """Map points on the surface that rays from above see first, eminence and post included.
+    """Map points on the upper surface: the first hits of rays from above, also on a post.
 
-    The points lie on the mesh itself, the normals are `Surface.smooth_normals`. A point's area is
-    the part of its grid cell that the insert covers, divided by n_y: under a uniform pressure the
-    vertical force is exactly pressure times covered projection.
+    The points lie on the mesh, and the normals are `Surface.smooth_normals`. The area of a point is
+    the covered part of its grid cell divided by n_y. Under a uniform pressure the vertical force is
+    therefore exactly the pressure times the covered area in the plan view.
 
     Args:
-        depth: (n,) m, along the inward normal to where the insert ends.
+        depth: (n,) m, distance along the inward normal to the end of the insert.
         resolution: m, edge of the grid cells.
     """
 
@@ -81,12 +82,11 @@ class SampledContact(PreparedContact):
 def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     """Sample the upper surface of the insert by vertical rays on an x-z grid.
 
-    One point per cell, at its centre; at the rim at the centre of what is covered. Cells lie
-    symmetrically about x = 0 and z = 0. Walls parallel to y are seen by no vertical ray and
-    carry no point. The midpoint rule makes integrals over them second-order in the
-    resolution: on two real implants 1 mm gives force within 0.5 %, peak within 2 % and area
-    within 4 % of 0.25 mm, where the centroids of the mesh's own triangles give 2 to 6 % and
-    2 to 10 % for force and area.
+    Each cell has one point, at its centre; at the rim it lies at the centre of the covered part.
+    The cells are symmetric about x = 0 and z = 0. A wall parallel to y has no point, because no
+    vertical ray hits it. Integrals over the points are second-order in the resolution (midpoint
+    rule). On two real implants the force at 1 mm is within 0.5 %, the peak within 2 % and the area
+    within 4 % of the values at 0.25 mm.
 
     Args:
         insert: closed, in the insert frame.
@@ -111,12 +111,11 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
 def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Array:
     """Return the gap (n,) m along the insert's normals; negative = penetration.
 
-    Rays start half-way through the insert, outside the femoral component, and go up along
-    the normal; the first crossing counts. The gap is inf where no femoral surface lies above,
-    and -inf where the femoral component reaches deeper than the start of the ray. Columns of a
-    steep rim start under the dish, beside the rim. The femoral component may be there without
-    touching the rim: such a penetration counts only where the point of the surface, too, lies
-    inside the femoral component.
+    A ray starts half-way through the insert and runs outward along the normal. Its first crossing
+    with the femoral component gives the gap. The gap is inf if there is no crossing, and -inf if
+    the ray starts inside the femoral component. On a steep rim the ray starts beside the rim, under
+    the dish, where the femoral component may be without touching the rim. A penetration there
+    counts only if the surface point lies inside the femoral component, too.
     """
     return _gaps(samples, femoral, inverse(pose))[0]
 
@@ -124,16 +123,18 @@ def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -
 def gaps_and_facets(
     samples: SurfaceSamples, femoral: Surface, pose: Array
 ) -> tuple[Array, Array, Index]:
-    """Return the gap (n,), see `gaps_along_normals`, and normals (n, 3) and numbers (n,) of facets.
+    """Return the gaps (n,), m, and the femoral facets that the columns meet.
 
-    They are those of the femoral facets that are met, the normals in the insert frame.
+    Returns:
+        Gap (n,), see `gaps_along_normals`; unit normals (n, 3) of the facets, insert frame; facets
+        (n,).
     """
     gap, face = _gaps(samples, femoral, inverse(pose))
     return gap, rotate(pose, femoral.face_normals[face]), face
 
 
 def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array, Index]:
-    """Return the gap (n,), m, and the facet met (n,), for the pose of the insert in the femur."""
+    """Return the gap (n,), m, and the femoral facet (n,), for the insert's pose in the femur."""
     columns = samples.points, samples.normals, samples.thickness, samples.depth
     origins, normals, below = _columns(*columns, back)
     gap, face = _first_entry(femoral, origins, normals)
@@ -169,7 +170,7 @@ def _columns(
 
 
 def _first_entry(femoral: Surface, origins: Array, directions: Array) -> tuple[Array, Index]:
-    """Return where rays (n, 3) first enter the femur (n,), m, and the facet; -inf: start inside."""
+    """Return the distance (n,), m, to the femur along rays, and the facet; -inf: starts inside."""
     distance, face = femoral.rays.first(origins, directions)
     _mark_within(distance, face, directions, femoral.face_normals)
     return distance, face
@@ -177,7 +178,7 @@ def _first_entry(femoral: Surface, origins: Array, directions: Array) -> tuple[A
 
 @compiled_as_written
 def _mark_within(distance: Array, face: Index, directions: Array, normals: Array) -> None:
-    """Put -inf where a ray leaves through the facet that it meets first."""
+    """Write -inf for each ray that leaves the femur through the first facet that it meets."""
     for n in range(len(face)):
         if face[n] >= 0:
             facing = 0.0
@@ -190,7 +191,7 @@ def _mark_within(distance: Array, face: Index, directions: Array, normals: Array
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
-    """Return cell centres (n, 2) as x, z, and how many there are along x and z."""
+    """Return the cell centres (n, 2), x and z, and the number of cells along x and z."""
     # Symmetric about the origin, so that a mirrored insert gets mirrored points.
     half = np.abs(insert.bounds[:, [0, 2]]).max(axis=0)
     count = np.maximum(np.ceil(half / resolution), 1)
@@ -249,8 +250,8 @@ def _above(surface: Surface, xz: Array) -> Array:
 def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Index, Array]:
     """Return first hits (n, 3), their faces (n,) and the thickness (n,) below them.
 
-    The thickness ends where the column leaves the insert for good. A wall or a void within the
-    insert does not end it, because the material below transmits the load.
+    The thickness ends where the column finally leaves the insert. An inner wall or a void does not
+    end it, because the material below transmits the load.
     """
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)
@@ -269,9 +270,9 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
 
 
 def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -> Array:
-    """Return how far the insert goes along the inward normals (n,), m.
+    """Return the depth (n,), m, of the insert along the inward normals.
 
-    A wall within the insert does not end it: the insert goes on where the ray has left it.
+    An inner wall does not end the insert: the ray is continued behind it.
     """
     depth = np.zeros(len(points))
     open_ = np.arange(len(points))
@@ -308,19 +309,19 @@ NEAR = 3e-4
 OBLIQUE = 2.0
 """1: largest ratio of the change of a gap, along the column, to the femoral displacement."""
 FARTHEST = 3e-3
-"""m: a greater gap counts as this, because another part of the femoral component may come from
-the side."""
+"""m: larger gaps are cut to this value, because another part of the femoral component may approach
+from the side."""
 
 
 class Neighbourhood:
-    """The columns that the femoral component may reach, from their last evaluation.
+    """Selection of the columns that the femoral component may reach; the others are skipped.
 
-    A column had the gap g when it was evaluated last, and the femoral component has moved past
-    it by m since. Its gap is then at least g - 2 m, as long as the column and the femoral normal
-    are less than 60 deg apart. Where that is above `NEAR` the column is skipped.
+    Let g be the gap of a column at its last evaluation, and m the distance by which the femoral
+    component has moved past it since. The gap is now at least g - 2 m if the angle between column
+    and femoral normal is less than 60 deg. A column is skipped if this bound is above `NEAR`.
 
     Args:
-        state: what the model's `prepare` returned.
+        state: state that the model's `prepare` returned.
     """
 
     def __init__(self, state: SampledContact) -> None:
@@ -330,7 +331,7 @@ class Neighbourhood:
         """(n, 3) m, femoral frame: position of the columns at their last evaluation."""
 
     def take(self, pose: Array, gap: Array) -> None:
-        """Take the gaps (n,) of the whole bed at a pose (4, 4)."""
+        """Store the gaps (n,) of all columns at a pose (4, 4)."""
         self._gap, self._seen_at = np.minimum(gap, FARTHEST), self._places(pose)
 
     def at(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:

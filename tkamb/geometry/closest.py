@@ -37,7 +37,7 @@ HEIGHT_BOUND = HeightBoundSettings()
 
 
 class HeightBound:
-    """Planes over the cells of an x-z grid that the surface, seen from above, stays under.
+    """One plane per cell of an x-z grid, with the surface below it: a bound of the height.
 
         y <= c + g . (x, z)      for every upward triangle over the cell
 
@@ -45,7 +45,7 @@ class HeightBound:
     height where the surface slopes.
 
     Args:
-        surface: any surface; its x and z span the grid.
+        surface: the surface; its extent in x and z is the grid's.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -108,14 +108,14 @@ class ClosestPointSettings:
     """How the closest points of two surfaces are searched and weighted."""
 
     region_radius: float = 1.6e-2
-    """m; the close region ends this far from the closest point. Chosen: a condyle's contact lies
+    """m; radius of the close region around the closest point. Chosen: a condyle's contact lies
     within it."""
     facing_cosine: float = 0.7
     """Cosine of the angle between the surfaces, above which they face each other. Chosen: surfaces
     at more than 45 deg do not touch face to face."""
     clearance: float = 1e-6
-    """m: a point farther than this above the bound of the insert's height is outside the insert,
-    whatever the rounding. Chosen: above the rounding of a mesh."""
+    """m: a point that is higher than this above the bound of the insert's height is outside the
+    insert. Chosen: above the rounding of a mesh."""
     gap_range: float = 10 * CONDYLE.facet_depth
     """m: samples count up to this much above the smallest gap. Chosen: their weight there is
     5e-5."""
@@ -126,7 +126,7 @@ class ClosestPointSettings:
     """Triangles that are searched around each nearest vertex. Chosen: the nearest triangle is among
     them."""
     batch_size: int = 64
-    """Samples that are projected together, for speed alone. Chosen: it changes speed alone."""
+    """Samples that are projected together. Chosen: it changes speed alone."""
 
 
 CLOSEST_POINT = ClosestPointSettings()
@@ -141,10 +141,10 @@ class CondyleGap:
             below the insert's surface.
         point_on_femoral: (3,) m, insert frame.
         point_on_insert: (3,) m, insert frame.
-        centre: (3,) m, insert frame: centre on the insert of the region in which the gap is
-            the smallest to within the meshes' resolution. The line of action goes through it.
-        normal: (3,) unit, insert frame, out of the insert into the femur: mean over that
-            region of the insert's vertex normals.
+        centre: (3,) m, insert frame, on the insert: centre of the region in which the gap is
+            smallest within the resolution of the meshes. The line of action goes through it.
+        normal: (3,) unit, insert frame, from the insert to the femur: mean of the insert's vertex
+            normals over that region.
     """
 
     gap: float
@@ -156,7 +156,7 @@ class CondyleGap:
 
 @dataclass(frozen=True, eq=False)
 class CondyleGaps:
-    """Both condyles; `lateral` is None where the femoral part has one condyle only."""
+    """The gaps of both condyles; `lateral` is None if the femoral part has one condyle only."""
 
     medial: CondyleGap
     lateral: CondyleGap | None
@@ -165,15 +165,15 @@ class CondyleGaps:
 class ClosestPointQuery:
     """Closest points of one pair of bodies, prepared for many poses.
 
-    Apart, the distance of the two triangulated surfaces (python-fcl, exact). Overlapping,
-    the largest distance of a point of the femoral surface inside the insert from the
-    insert's surface: vertices first, then the triangles about the deepest ones, cut to 1/8
-    of an edge (about 1 µm of depth on implants). Both are the smallest signed distance to
-    the insert over the condyle, so the gap is continuous through touch.
+    The gap is the smallest signed distance of the condyle's surface to the insert, so that it is
+    continuous through touch. If the bodies are apart, it is the exact distance of the two
+    triangulated surfaces (python-fcl). If they overlap, the deepest femoral vertices in the insert
+    are found first. The triangles around them are then divided to 1/8 of an edge, which resolves
+    about 1 µm of depth on implants.
 
-    The normal is the mean of the insert's interpolated vertex normals over the region in which
-    the surfaces are as close as their meshes can tell, not the normal of a facet nor the line
-    between the points: it is defined at touch and turns smoothly as the contact moves.
+    The normal is the mean of the insert's interpolated vertex normals over the region in which the
+    gap is smallest within the resolution of the meshes. It is defined at touch and turns smoothly
+    as the contact moves; the normal of a facet would not.
 
     Args:
         femoral: femoral component, femoral frame.
@@ -238,10 +238,10 @@ class ClosestPointQuery:
         return condyle.around(condyle.vertices[[np.argmin(distance)]])
 
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
-        """Return the deepest few vertices inside the insert, deepest first; none if apart.
+        """Return the few deepest vertices inside the insert, deepest first; none if apart.
 
-        The depth along y is an upper bound of the depth and orders the search. A vertex above every
-        upward-facing triangle over its place is outside.
+        The depth along y is an upper bound of the depth, and the search takes vertices in its
+        order. A vertex above the bound of the insert's height is outside and is skipped.
         """
         near, points = _within_box(condyle.points, pose, *self.insert.bounds)
         under = points[:, 1] < self._ceiling.over(points) + CLOSEST_POINT.clearance
@@ -258,13 +258,13 @@ class ClosestPointQuery:
         return condyle.vertices[near[order[np.argsort(-depth)[: CLOSEST_POINT.kept_candidates]]]]
 
     def _depth_along_y(self, points: Array) -> Array:
-        """Return the distance (n,) up to the insert's surface, 0 for points outside it."""
+        """Return the distance (n,), m, along +y to the insert's surface; 0 for points outside."""
         distance, face = self.insert.rays.first(points, np.array([0.0, 1.0, 0.0]))
         inside = (face >= 0) & (self.insert.face_normals[face, 1] > 0)
         return np.where(inside, distance, 0.0)
 
     def _refined(self, faces: Index, pose: Array) -> tuple[float, Array, Array]:
-        """Return gap and points of the deepest point of triangles; the deepest are subdivided."""
+        """Return the gap (m) of the deepest point of triangles, that point, and the insert's."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
         _, first = np.unique(self.femoral.faces[faces], return_index=True)
@@ -288,7 +288,7 @@ class ClosestPointQuery:
 
 
 class _Condyle:
-    """The triangles of one condyle: their tree, their vertices."""
+    """One condyle: its triangles, vertices and tree."""
 
     def __init__(self, femoral: Surface, faces: Index) -> None:
         self.faces, self._femoral = faces, femoral
@@ -301,7 +301,7 @@ class _Condyle:
 
     @cached_property
     def tree(self) -> fcl.BVHModel:
-        """The triangles as a tree; needed only for a condyle that is apart."""
+        """The triangles as a tree for fcl."""
         return _tree(self._femoral, self.faces)
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
@@ -318,13 +318,15 @@ class _Condyle:
 class _CloseRegion:
     """Part of one body's surface, prepared to find its close region with another body.
 
-    On conforming surfaces the closest point of two meshes wanders by millimetres from pose
-    to pose, for differences in gap of a few micrometres. The centre of the region,
+    On conforming surfaces the closest point of two meshes moves by millimetres from pose to pose,
+    although the gap differs by a few micrometres only. The centre of the close region moves
+    smoothly:
 
-        c = sum w_i p_i / sum w_i,   w_i = A_i exp(-(g_i - g) / FACET_DEPTH)
+        c = sum w_i p_i / sum w_i,   w_i = A_i exp(-(g_i - g) / d)
 
-    over samples i of area A_i and signed gap g_i (g the smallest gap, p_i the foot on the
-    other body), moves smoothly and coincides with the closest point where that is sharp.
+    Sample i has the area A_i, the signed gap g_i and the nearest point p_i on the other body; g is
+    the smallest gap and d the depth of a facet (`CONDYLE.facet_depth`). If the gap has a sharp
+    minimum, the centre is the closest point.
 
     Args:
         surface: the body, own frame.
@@ -343,10 +345,10 @@ class _CloseRegion:
         """Return the centre (3,) on the other body and its mean unit normal (3,) there.
 
         Args:
-            other: nearest points of the other body, whose frame all points are in.
-            pose: (4, 4) of this body in the other's frame.
+            other: nearest points of the other body.
+            pose: (4, 4) of this body in the frame of the other body, in which results are given.
             gap: m, the smallest signed gap.
-            closest: (3,) m, this body's point with that gap.
+            closest: (3,) m, point of this body with that gap, in the other's frame.
         """
         own = transform(inverse(pose), closest)
         near = _facing_alike(self._samples, self._normals, own, CLOSEST_POINT.region_radius)
@@ -369,7 +371,7 @@ class _CloseRegion:
 
 
 def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
-    """Return the index of one sample per cube of the spacing, and the area of all in the cube."""
+    """Return one sample per cube of the sample spacing, and the area of all samples in the cube."""
     cubes = np.floor(samples / CONDYLE.sample_spacing).astype(np.int64)
     cubes -= cubes.min(axis=0)
     number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
@@ -382,8 +384,8 @@ def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
 def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
     """Return the triangles as a tree in millimetres.
 
-    fcl compares with absolute tolerances: in metres it finds small triangles that are 30 µm
-    apart to touch.
+    fcl compares with absolute tolerances. In metres it reports a touch of small triangles that are
+    30 µm apart.
     """
     model = fcl.BVHModel()
     model.beginModel(len(surface.vertices), len(faces))
@@ -414,13 +416,13 @@ def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[In
 
 @compiled_as_written
 def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
-    """Return the samples within a radius of a place that face within 60 deg of the nearest.
+    """Return the samples near a place whose normals are within 60 deg of the nearest sample's.
 
     Args:
         samples: (n, 3) m.
-        normals: (n, 3) unit.
+        normals: (n, 3) unit normals of the samples.
         place: (3,) m.
-        radius: m.
+        radius: m, largest distance from the place.
     """
     square, nearest = np.empty(len(samples)), 0
     for i in range(len(samples)):

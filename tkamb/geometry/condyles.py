@@ -14,7 +14,7 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 @dataclass(frozen=True)
 class CondyleSettings:
-    """How the two condyles of a femoral component are told apart."""
+    """How the two condyles of a femoral component are found."""
 
     notch_depth: float = 2e-3
     """m: a component with a shallower notch along z has one condyle. Chosen: real components with
@@ -108,10 +108,10 @@ def condyle_split(femoral: Surface) -> float | None:
 
     The lower outline of the component in the frontal plane is taken at flexions from 0 to
     120 deg (rotation about +z, as in `tkamb.geometry.frames`), in strips of 1 mm along z,
-    as height above its lowest point, and averaged over flexion. Two condyles show as two
-    valleys with a ridge, the notch, between them. It must rise at least 3 mm above both, or 2 mm
-    where it is there in extension too; the split is the middle of the notch at half its height. A
-    sphere, a cylinder along z or a unicondylar part has one valley.
+    as height above its lowest point, and averaged over flexion. In this outline two condyles are
+    two valleys, and the notch between them is a ridge. The ridge must rise at least 3 mm above both
+    valleys, or 2 mm if it exists in extension, too. The split is the middle of the ridge at half
+    its height. A sphere, a cylinder along z or a unicondylar part has one valley.
 
     In a right knee z above the split is lateral, below it medial.
 
@@ -144,9 +144,9 @@ def condyle_split(femoral: Surface) -> float | None:
 def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float, float]:
     """Return how far the line through both condyles is turned from z, and its notch.
 
-    The notch is looked for along every horizontal direction. It is deepest along the line
-    through both condyles. The mean of the directions, weighted by the depth where it is more
-    than half the largest, is that line.
+    The notch is searched along every horizontal direction. It is deepest along the line through
+    both condyles. The angle of that line is the mean over all directions whose notch is deeper than
+    half the deepest one, weighted by depth.
 
     Args:
         femoral: in the femoral frame.
@@ -170,7 +170,7 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
         depth[n] = _rise(outline).max()
     deepest = float(depth.max())
     weight = np.where(depth > deepest / 2, depth, 0.0)
-    doubled = weight @ np.exp(2j * yaws)  # a line has no sense: its angle is known modulo 180 deg
+    doubled = weight @ np.exp(2j * yaws)  # the angle of a line is defined modulo 180 deg
     return float(np.angle(doubled) / 2), deepest
 
 
@@ -278,9 +278,9 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
     """Return height (n,) of the outline above its lowest point and z (n,) of the strips, m.
 
     Args:
-        samples: (s, 3) m, of the surface.
-        width: m, of the strips along z.
-        flexions: (f,) rad, over which the outline is averaged.
+        samples: (s, 3) m, samples of the surface.
+        width: m, width of the strips along z.
+        flexions: (f,) rad, flexions over which the outline is averaged.
     """
     low, high = samples[:, 2].min(), samples[:, 2].max()
     count = max(int(np.ceil((high - low) / width)), 3)
@@ -299,7 +299,7 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
 
 
 def _rise(outline: Array) -> Array:
-    """Return by how much each strip (n,) of an outline rises above the valleys beside it, m."""
+    """Return the height (n,), m, of each strip above the higher of the two valleys beside it."""
     least_before = np.minimum.accumulate(outline)
     right = np.minimum.accumulate(outline[::-1])[::-1]
     return np.asarray(outline - np.maximum(least_before, right), float)
@@ -308,9 +308,9 @@ def _rise(outline: Array) -> Array:
 class LowestPoints:
     """Lowest point of each condyle along the insert's y, prepared for many poses.
 
-    y is that of the lowest vertex. x and z are the mean of the condyle's surface, weighted
-    with exp(-height / FACET_DEPTH) of the height above that vertex, so that the point rolls with
-    the condyle and does not jump from vertex to vertex of the mesh.
+    The point has the y of the lowest vertex. Its x and z are a weighted mean over the condyle's
+    surface, with the weight exp(-height / `CONDYLE.facet_depth`) for the height above that vertex.
+    It therefore moves smoothly and does not jump from vertex to vertex.
 
     Args:
         femoral: femoral component, femoral frame.
@@ -327,7 +327,7 @@ class LowestPoints:
     def at(self, pose_femoral_in_insert: Array) -> tuple[Array, Array | None]:
         """Return the points (3,) m, insert frame, of the medial and the lateral condyle.
 
-        The lateral one is None where there is no split.
+        The lateral point is None for a component with one condyle.
         """
         pose = np.asarray(pose_femoral_in_insert, float)
         points = [condyle.lowest(pose) for condyle in self._condyles]
@@ -336,14 +336,14 @@ class LowestPoints:
 
 @dataclass(frozen=True, eq=False)
 class _SampledCondyle:
-    """A condyle's samples, in boxes of a few, so that most samples need not be evaluated.
+    """A condyle's samples in small boxes, so that only the samples of low boxes are evaluated.
 
     Args:
         vertices: (v, 3) m, femoral frame.
-        samples: (n, 3) m.
-        areas: (n,) m².
-        centres: (b, 3) m, of the boxes.
-        halves: (b, 3) m, half their edges.
+        samples: (n, 3) m, femoral frame.
+        areas: (n,) m², area of each sample.
+        centres: (b, 3) m, centres of the boxes.
+        halves: (b, 3) m, half the edges of the boxes.
     """
 
     vertices: Array
@@ -378,7 +378,7 @@ class _SampledCondyle:
         return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])
 
     def _low_samples(self, up: Array, height: float) -> Index:
-        """Return the samples in boxes that reach down to a height, m along up (3,)."""
+        """Return the samples of all boxes that reach below a height (m) along `up` (3,)."""
         least = self.centres @ up - self.halves @ np.abs(up)
         # The rounding of a box is far smaller than the height over which samples have weight.
         boxes = np.flatnonzero(least < height)

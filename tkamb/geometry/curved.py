@@ -20,15 +20,15 @@ from tkamb.geometry.topology import Ragged, edge_use
 
 @dataclass(frozen=True)
 class SubdivisionSettings:
-    """When coarse triangles of a surface are divided."""
+    """How a flat subdivision of coarser triangles is recognised."""
 
     halving_tolerance: float = 1e-6
-    """1: largest distance of a halved edge's middle from its line, as a share of the surface's
-    size. Chosen: files round coordinates by less."""
+    """1: largest distance of a vertex from the middle of the coarser edge, as a share of the
+    surface's size. Chosen: files round coordinates by less."""
     most_levels: int = 8
-    """Times that a triangle may be divided. Chosen: a triangle is then divided into 65,536."""
+    """Largest number of subdivisions that are undone. Chosen: 8 make 65,536 triangles of one."""
     most_parts: int = 100
-    """Parts of a surface beyond which it is left as it is. Chosen: no implant has as many."""
+    """A surface of more parts than this stays unchanged. Chosen: no implant has as many."""
 
 
 SUBDIVISION = SubdivisionSettings()
@@ -36,12 +36,12 @@ SUBDIVISION = SubdivisionSettings()
 
 @dataclass(frozen=True, eq=False)
 class Coarsened:
-    """A surface and its triangles' places on a finer one.
+    """The coarser triangles of a subdivided surface, and where the finer ones lie on them.
 
     Args:
         surface: the coarser triangles.
-        parent: (k,) the one that each finer triangle is part of.
-        corners: (k, 3, 3) barycentric coordinates there of each finer triangle's corners.
+        parent: (k,) coarser triangle that holds each finer one.
+        corners: (k, 3, 3) barycentric coordinates, on the parent, of each finer triangle's corners.
     """
 
     surface: Surface
@@ -50,10 +50,9 @@ class Coarsened:
 
 
 def coarsened(surface: Surface) -> Coarsened | None:
-    """Return the surface of which this one is a flat subdivision, as often as it was done.
+    """Return the coarsest surface of which this one is a flat subdivision; None if it is none.
 
-    Parts of a surface are looked at one by one; a part is undone as a whole or not at all.
-    None where nothing is to be undone.
+    Each connected part is examined on its own. Its subdivision is undone as a whole or not at all.
     """
     coarse: Coarsened | None = None
     for _ in range(SUBDIVISION.most_levels):
@@ -94,10 +93,10 @@ def _coarsened_once(surface: Surface) -> Coarsened | None:
 
 
 class _Search:
-    """Searches the middle triangles of triangles that were cut into four.
+    """Search for the middle triangles of coarser triangles that were divided into four.
 
-    A middle triangle's corners are the middles of the edges between the tips of its three
-    neighbours. From one of them the next are found across the neighbours' tips.
+    The corners of a middle triangle halve the edges between the tips of its three neighbours. The
+    search begins at one middle triangle and finds the next ones across the neighbours' tips.
     """
 
     def __init__(self, surface: Surface, across: Index) -> None:
@@ -108,13 +107,13 @@ class _Search:
         self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
 
     def tips(self, middle: Index) -> Index:
-        """Return the vertices (m, 3) of the neighbours across from each corner's edge."""
+        """Return the tips (m, 3): vertices of the three neighbours that are not shared."""
         others, own = self._faces[self._across[middle]], self._faces[middle]
         shared = (others[:, :, :, None] == own[:, None, None]).any(axis=3)
         return np.take_along_axis(others, np.argmin(shared, axis=2)[..., None], axis=2)[..., 0]
 
     def middles_of(self, part: Index) -> Index:
-        """Return the middle triangles of a part (faces that hang together); none: not cut."""
+        """Return the middle triangles of a connected part; none if it was not subdivided."""
         first = part[0]
         starts = [[first], *([face] for face in self._across[first])]
         if len(part) % 4 == 0:
@@ -125,7 +124,7 @@ class _Search:
         return np.zeros(0, np.int64)
 
     def _spread(self, start: Index) -> Index | None:
-        """Return all middle triangles that follow from one; None if they contradict each other."""
+        """Return all middle triangles that follow from a first one; None on a contradiction."""
         kind = np.zeros(len(self._faces), np.int8)  # 1: middle, 2: at a tip
         even = np.zeros(len(self._points), bool)
         new, layers = start, []
@@ -154,7 +153,7 @@ class _Search:
         return bool(np.abs(halves - self._points[self._faces[faces]]).max() <= self._near)
 
     def _beyond(self, tips: Index) -> Index:
-        """Return the faces across from each tip of all the faces around it."""
+        """Return the faces across the edges that are opposite to the tips."""
         return np.unique(self._across.ravel()[self._corners.of(tips)[1]])
 
 
@@ -182,7 +181,7 @@ def _parts(across: Index) -> tuple[int, Index]:
 
 
 SMALLEST_COSINE = 0.1
-"""Smallest cosine between normal and direction by which a shift is divided: 84 deg."""
+"""Smallest cosine of the angle between normal and direction in a shift's denominator: 84 deg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,19 +192,18 @@ class CurvedSurface:
 
         h = 4 (b2 b3 s1 + b3 b1 s2 + b1 b2 s3),    s = t_i t_j / (2 (t_i + t_j))
 
-    s is the sagitta of the edge e from corner i to j, t_i = -n_i.e / n_i.N and
-    t_j = n_j.e / n_j.N how far the tangent planes at its ends rise over it. On a quadratic
-    surface t_i = t_j and h is exact. Where they differ, s uses their harmonic mean; where they
-    have opposite signs, s is zero. So a flat that meets a fillet stays flat; the arithmetic mean
-    would swell it. Where triangles were subdivided without being curved, the patches are those of
-    the coarser triangles (`coarsened`).
+    s is the sagitta of the edge e from corner i to j. t_i = -n_i.e / n_i.N and t_j = n_j.e / n_j.N
+    are the heights of the tangent planes of one end over the other end. On a quadratic surface
+    t_i = t_j, and h is exact. If they differ, s uses their harmonic mean; if they have opposite
+    signs, s is zero. A flat that meets a fillet therefore stays flat. If triangles are a flat
+    subdivision of coarser ones, the patches are those of the coarser triangles (`coarsened`).
 
     Args:
-        surface: its triangles share their vertices.
+        surface: the triangles of the patches, with shared vertices.
         normals: (k, 3, 3) unit normals at the corners, see `Surface.corner_normals`.
-        sagittas: (k, 3) m, of the edge opposite each corner, along the triangle's normal.
-        finer: the triangles that points are given on, and where they lie on the surface's;
-            None: they are the surface's own.
+        sagittas: (k, 3) m, sagitta of the edge opposite each corner, along the triangle's normal.
+        finer: the finer triangles on which points are given; None: points are given on the
+            triangles of `surface`.
 
     Reference:
         Vlachos et al., Curved PN triangles, Proc I3D 2001, doi:10.1145/364338.364387 (the
@@ -231,18 +229,18 @@ class CurvedSurface:
         return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
 
     def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
-        """Return how far the patches are from points on their triangles along a direction.
+        """Return the distance from points on triangles to the patches along a direction.
 
-        To first order in the patch's height.
+        It is correct to first order in the patch's height.
 
         Args:
             faces: (n,) triangles, of the finer surface if there is one; -1 for none.
-            weights: (n, 3) barycentric coordinates of points on them.
+            weights: (n, 3) barycentric coordinates of the points on these triangles.
             direction: (3,) unit vector.
 
         Returns:
-            Signed distance (n,), m, and outward unit normals (n, 3), which are interpolated
-            between the corners; NaN without a triangle.
+            Signed distance (n,), m, and outward unit normals (n, 3), interpolated between the
+            corners; NaN for the triangle -1.
         """
         if self.finer is not None:
             weights = np.einsum("ij,ijk->ik", weights, self.finer.corners[faces])

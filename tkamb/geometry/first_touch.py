@@ -31,8 +31,8 @@ class Touch:
     """Where one condyle first touches the insert as it moves down.
 
     Args:
-        travel: m along -y until it touches; negative when it is in the insert already.
-        point: (3,) m, insert frame, on the insert.
+        travel: m, distance along -y until it touches; negative if it overlaps the insert already.
+        point: (3,) m, insert frame, contact point on the insert.
     """
 
     travel: float
@@ -42,16 +42,16 @@ class Touch:
 class FirstTouch:
     """Vertical clearance between two triangulated surfaces, exact for their triangles.
 
-    It is the least, over all pairs of triangles that lie over each other, of the difference of
-    their heights: linear over the polygon that both cover in the projection, so least at one of
-    its corners. Pairs of boxes and of triangles are skipped if they cannot be below the smallest
-    clearance so far.
+    The clearance of two triangles is the smallest difference of their heights where one lies over
+    the other. The difference is linear over the polygon that both cover in the plan view, so it is
+    smallest at a corner of that polygon. The search takes the smallest value over all pairs, and
+    skips pairs of boxes and of triangles that cannot be below the best value so far.
 
     Args:
-        femoral: in the femoral frame.
-        insert: in the insert frame.
-        split: z between the condyles in the femoral frame, m; None: one condyle (medial). A
-            triangle belongs to the side that its middle lies on.
+        femoral: femoral component, femoral frame.
+        insert: insert, insert frame.
+        split: z (m, femoral frame) between the condyles; None: one condyle (medial). The centroid
+            of a triangle decides to which side it belongs.
     """
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
@@ -64,7 +64,7 @@ class FirstTouch:
 
     @cached_property
     def _condyles(self) -> list[tuple[Array, Array, Array] | None]:
-        """Medial and lateral; None for one without a triangle."""
+        """Trees of the medial and the lateral condyle; None for a side without a triangle."""
         sides = condyle_faces(self._femoral, self._split)
         return [
             _arrays(TriangleTree(self._femoral, faces)) if len(faces) else None for faces in sides
@@ -73,7 +73,7 @@ class FirstTouch:
     def at(self, pose: ArrayLike) -> tuple[Touch | None, Touch | None]:
         """Return the touch of the medial and of the lateral condyle.
 
-        None where no part of that condyle lies over the insert, or the pose is not finite.
+        A touch is None if no part of that condyle lies over the insert, or the pose is not finite.
 
         Args:
             pose: (4, 4) pose_femoral_in_insert; its y is where the travel starts.
@@ -107,7 +107,7 @@ def _arrays(tree: TriangleTree) -> tuple[Array, Array, Array]:
 
 @compiled_as_written
 def _turned_box(box: Array, rotation: Array, translation: Array, result: Array) -> None:
-    """Write the box (6,) about a box at another place."""
+    """Write the bounding box (6,) of a box that is rotated and translated."""
     for i in range(3):
         middle, half = translation[i], 0.0
         for j in range(3):
@@ -125,18 +125,18 @@ def _bound(
     rotation: Array,
     translation: Array,
 ) -> float:
-    """Return a lower bound of the clearance of two boxes' contents; inf: not over each other.
+    """Return a lower bound (m) of the clearance of two boxes' triangles; inf: not over each other.
 
-    It is that of the boxes or, over the rectangle that both cover, that of the planes that bound
-    the heights of their triangles.
+    It is the larger of two bounds: the clearance of the boxes, and the clearance of the planes that
+    bound the triangles' heights, over the rectangle that both boxes cover.
 
     Args:
-        upper: (6,) m, at its place.
-        lower: (6,) m.
-        upper_support: (4,) see `TriangleTree.supports`, own frame.
-        lower_support: (4,) likewise.
-        rotation: (3, 3) of the upper one's frame.
-        translation: (3,) m, likewise.
+        upper: (6,) m, box of the upper body, in the lower body's frame.
+        lower: (6,) m, box of the lower body.
+        upper_support: (4,) plane of the upper box (`TriangleTree.supports`), in its own frame.
+        lower_support: (4,) plane of the lower box.
+        rotation: (3, 3) from the upper body's frame to the lower body's.
+        translation: (3,) m, origin of the upper body's frame in the lower body's.
     """
     x0, x1 = max(upper[0], lower[0]), min(upper[3], lower[3])
     z0, z1 = max(upper[2], lower[2]), min(upper[5], lower[5])
@@ -183,7 +183,7 @@ def _over(upper: Array, lower: Array) -> bool:
 
 @compiled_as_written
 def _beyond(upper: Array, plane: tuple[float, float, float, float]) -> float:
-    """Return the least height of a triangle's corners above another's plane, m."""
+    """Return the smallest height (m) of a triangle's corners above the plane of another one."""
     least = np.inf
     for corner in range(0, 9, 3):
         height = plane[0] + plane[1] * upper[corner] + plane[2] * upper[corner + 2]
@@ -202,7 +202,10 @@ def _cut(
     bz: float,
     way: float,
 ) -> int:
-    """Write the part of a polygon (n, 3) of x, z, clearance on one side of an edge; return n."""
+    """Write the part of a polygon that lies on one side of the line a-b; return its corner count.
+
+    A corner (3,) holds x, z and the clearance there, m. `way` is 1 or -1 and selects the side.
+    """
     number = 0
     for corner in range(count):
         following = (corner + 1) % count
@@ -238,13 +241,13 @@ def _over_each_other(
     """Return the least clearance of two triangles (9,) where it is below the best so far.
 
     Args:
-        upper: m, at its place.
-        lower: m.
-        plane: of the lower one, not a wall.
-        best: m.
-        polygon: (`MOST_CORNERS`, 3) to work in.
-        spare: likewise.
-        point: (3,) m, written where a smaller clearance is found: on the lower triangle.
+        upper: (9,) m, corners of the upper triangle, in the lower body's frame.
+        lower: (9,) m, corners of the lower triangle.
+        plane: plane of the lower triangle, see `_plane`; its area is not zero.
+        best: m, smallest clearance so far.
+        polygon: (`MOST_CORNERS`, 3) work array.
+        spare: (`MOST_CORNERS`, 3) work array.
+        point: (3,) m, output: the place on the lower triangle, if a smaller clearance is found.
     """
     height, a, b, area = plane
     for corner in range(3):

@@ -27,11 +27,11 @@ class FlatBottomSettings:
     """1: of two flats that face down, the larger one is the bottom if the other has less than this
     share of its area. Chosen: where their areas differ by less, the user has to decide."""
     uneven_noise: float = 1e-6
-    """m: a rougher bottom gets a notice: its mesh is noisy, or it is not flat. Chosen: a mesh in
-    single precision rounds by less."""
+    """m: a bottom with a larger noise gets a notice. Chosen: a mesh in single precision rounds by
+    less."""
     level_tilt: float = 1e-6
-    """rad; a smaller tilt is rounding and stays as it is. Chosen: it moves no end of the insert by
-    more than rounding does."""
+    """rad; a smaller tilt is not corrected. Chosen: it moves the ends of the insert by less than
+    rounding."""
 
 
 FLAT_BOTTOM = FlatBottomSettings()
@@ -45,8 +45,8 @@ class InnerFlatSettings:
     """Flat faces inside a part."""
 
     inner_share: float = 0.5
-    """1: a flat face of which a larger share faces material is a wall inside the part. Chosen: the
-    larger part decides."""
+    """1: a flat is an inner wall if material lies in front of more than this share of its area.
+    Chosen: the majority decides."""
 
 
 INNER_FLAT = InnerFlatSettings()
@@ -58,7 +58,7 @@ _log = logging.getLogger("tkamb")
 
 @dataclass(frozen=True, eq=False)
 class FlatBottom:
-    """A flat: the triangles of one plane.
+    """Triangles of a surface that lie in one plane.
 
     Args:
         normal: (3,) unit outward normal, in the surface's frame.
@@ -78,12 +78,13 @@ class FlatBottom:
 
 
 def find_flats(surface: Surface) -> list[FlatBottom]:
-    """Return the flats that compete to be the bottom, largest first.
+    """Return the flats that may be the bottom, largest first.
 
-    Area-weighted clustering over normal and offset: the normals vote on a sphere, the
-    faces within 15 deg of a peak vote on the offset, a plane is fitted to the winners and
-    refitted with tolerances that follow the mesh's own noise. Its triangles are set aside
-    and the search repeats while a flat of comparable area is found.
+    The search clusters triangles by normal and offset, weighted by area. The direction that the
+    most area faces is found first, then the most frequent offset of the faces within 15 deg of it.
+    A plane is fitted to these faces, and fitted again with tolerances that follow the noise of the
+    mesh. The triangles of the flat are then removed, and the search is repeated until no flat of
+    comparable area is left.
     """
     normals, area = surface.face_normals, surface.areas
     free = area > 0
@@ -113,7 +114,7 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
             messages.
 
     Raises:
-        InputError: no flat, a flat that faces another axis, or two that are equally good.
+        InputError: there is no flat, none faces -y, or two are about equally large.
     """
     rotation = np.eye(3) if rotation is None else rotation
     flats = find_flats(surface)
@@ -238,8 +239,8 @@ def _largest_flat(
 
 
 def _peaks(normals: Array, area: Array) -> list[Array]:
-    """Return the directions (3,) that the most area faces, at most 8, 15 deg apart."""
-    # One number for each cell of the sphere: unique is ten times as fast as on rows.
+    """Return the directions (3,) that the most area faces: at most 8, at least 15 deg apart."""
+    # One number per cell of the sphere: `np.unique` is ten times faster than on rows.
     number = np.round(normals * 6.0).astype(np.int64) @ [400, 20, 1]
     cells, cell = np.unique(number, return_inverse=True)
     weight = np.bincount(cell, area, len(cells))
@@ -292,7 +293,7 @@ def _grown(
 
 
 def _sharpened(direction: Array, normals: Array, weight: Array) -> Array:
-    """Return the direction shifted to the mean of narrowing cones about it."""
+    """Return the mean normal (3,) near a direction; the cone around it is narrowed step by step."""
     for cone in np.radians([15.0, 8.0, 4.0, 2.0, 2.0]):
         mean = (weight * (normals @ direction > math.cos(cone))) @ normals
         length = np.linalg.norm(mean)
@@ -321,7 +322,7 @@ def _median(values: Array, weight: Array) -> float:
 def _plane(corners: Array, weight: Array, towards: Array) -> tuple[Array, float]:
     """Return normal and offset of the plane that fits triangles (k, 3, 3) best.
 
-    The second moment of each triangle about the common centre is exact.
+    The fit is a least-squares fit over the area: each triangle's second moment is exact.
     """
     total = weight.sum()
     middle = corners.mean(axis=1)

@@ -3,13 +3,13 @@
 `pose_A_in_B` maps points given in frame A to frame B. Every function broadcasts over
 leading axes.
 
-The insert frame is x anterior, y superior, z to the subject's right. For a right knee
-(left knees are mirrored at input) the femoral component stands in it by
+The insert frame is x anterior, y superior, z to the subject's right. The pose of
+the femoral component of a right knee (left knees are mirrored at input) is
 
     R = Ry(-axial_rotation) Rx(-adduction) Rz(flexion),   t = (ap, si, ml)
 
-flexion about the femoral ML axis (positive in flexion), adduction about the floating axis
-(positive: varus), axial rotation about the tibial SI axis (positive: femur external).
+with flexion about the femoral ML axis (positive in flexion), adduction about the floating axis
+(positive: varus), and axial rotation about the tibial SI axis (positive: femur external).
 
 Reference: Grood & Suntay, J Biomech Eng 105:136 (1983), doi:10.1115/1.3138397.
 """
@@ -28,10 +28,10 @@ KNEE_COORDINATES = ("ap", "si", "ml", "axial_rotation", "adduction", "flexion")
 """Order of the six knee coordinates: translations (m), then rotations (rad)."""
 
 KNEE_JOINT_NAMES = tuple(f"knee_{name}" for name in KNEE_COORDINATES)
-"""Their joints in the URDF, in the same order."""
+"""Names of the six joints in the URDF, in the same order."""
 
 PATELLA_COORDINATES = PATELLA_JOINT_NAMES = ("patella_ap", "patella_si", "patella_rotation")
-"""The patella's in the femur's sagittal plane, and their joints: m, m, rad."""
+"""Coordinates of the patella in the femur's sagittal plane (m, m, rad), also their joint names."""
 
 SIDES = ("medial", "lateral")
 """The condyles."""
@@ -79,7 +79,7 @@ def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return a x b of vectors (..., 3): `np.cross` to the last bit, without its 40 µs a call."""
+    """Return a x b of vectors (..., 3): equal to `np.cross`, but faster by 40 µs per call."""
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
@@ -93,12 +93,12 @@ def knee_pose(coordinates: ArrayLike) -> Array:
 
 @lru_cache(maxsize=32)
 def _pose_of_knee(coordinates: bytes) -> Array:
-    """Return the pose of one place: a search asks for the same again and again."""
+    """Return one pose, cached because a search asks for the same pose repeatedly."""
     return _poses_of_knee(np.frombuffer(coordinates))
 
 
 def _poses_of_knee(c: Any) -> Array:
-    """Return the product of the three rotations, written out."""
+    """Return the poses (..., 4, 4), with the product of the three rotations written out."""
     (sa, sb, sg), (ca, cb, cg) = (
         np.moveaxis(f(_TURNS * c[..., 3:]), -1, 0) for f in (np.sin, np.cos)
     )
@@ -127,7 +127,7 @@ def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
 
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
-"""Reflection in the sagittal plane: turns a left knee into a right one, at input."""
+"""Reflection in the sagittal plane, which turns a left knee into a right one."""
 
 
 def mirrored_pose(pose_a_in_b: ArrayLike) -> Array:
@@ -154,8 +154,8 @@ def knee_twist(coordinates: ArrayLike, rates: ArrayLike) -> tuple[Array, Array]:
 def knee_axes(coordinates: ArrayLike) -> Array:
     """Return the femur's twist per unit rate of each knee coordinate.
 
-    A wrench w (force, moment about the insert's origin) on the femur does the generalised
-    forces `knee_axes(q) @ w` in the six coordinates.
+    A wrench w (force, moment about the insert's origin) on the femur has the generalised forces
+    `knee_axes(q) @ w` in the six coordinates.
 
     Args:
         coordinates: (..., 6) knee coordinates, m and rad.
@@ -170,7 +170,7 @@ def knee_axes(coordinates: ArrayLike) -> Array:
 
 @lru_cache(maxsize=32)
 def _axes_of_knee(coordinates: bytes) -> Array:
-    """Return the axes of one place: a search asks for the same again and again."""
+    """Return the axes at one pose, cached because a search asks for them repeatedly."""
     return _axes_of_knees(np.frombuffer(coordinates))
 
 

@@ -1,17 +1,17 @@
-"""Where the lines of a structured grid run inside a closed surface, exactly and at once.
+"""The intervals in which the lines of a structured grid run inside a closed surface.
 
-Every triangle is compared with the grid lines in its own projected rectangle. Three signed areas
-tell whether a line passes through it. Their signs are computed in whole numbers and exact
-(`tkamb.geometry.winding.PlanGrid`), so that no line slips between two triangles. A line that meets
-an edge exactly is moved by an infinitesimal distance into each of the four quadrants around it
-(simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990),
-doi:10.1145/77635.77639); what is inside for any of the four is inside, so that a line along a wall
-belongs to the part.
+Every triangle is compared with the grid lines that cross its bounding rectangle in the plane across
+the lines. Three signed areas tell whether a line passes through the triangle. Their signs are
+exact, because they are computed with integers (`tkamb.geometry.winding.PlanGrid`), so no line
+passes between two triangles. A line that meets an edge exactly is moved by an infinitesimal
+distance into each of the four quadrants around it (simulation of simplicity, Edelsbrunner & Muecke,
+ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). A place that is inside for any of the four
+counts as inside, so that a line along a wall belongs to the part.
 
-A place is inside where the surface winds around it (`tkamb.geometry.winding`): the number of
-entries below it is larger than the number of exits. So a wall between two touching bodies divides
-nothing, and a void stays empty. A line through a hole of the mesh has unequal numbers of entries
-and exits; its crossings are taken in pairs.
+A place is inside if the surface winds around it (`tkamb.geometry.winding`): more entries than exits
+lie below it. A wall between two touching bodies therefore divides nothing, and a void stays empty.
+A line through a hole of the mesh has unequal numbers of entries and exits; its crossings are taken
+in pairs.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from tkamb.geometry.winding import PlanGrid
 
 @dataclass(frozen=True)
 class HeightFieldSettings:
-    """How vertical lines through a surface are read."""
+    """How the crossings of lines with a surface are paired and repaired."""
 
     odd_share: float = 0.01
     """1: up to this share of lines with an odd number of crossings the lines are repaired; above it
@@ -53,14 +53,14 @@ BODY_CONTACT = BodyContactSettings()
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """The parts of grid lines that run inside the surface, sorted by line, then upwards.
+    """The parts of grid lines that run inside the surface, sorted by line, then by height.
 
     Args:
         first: (m,) index of the line along the axis after `axis` (cyclic: y, z, x, y).
         second: (m,) index of the line along the axis before `axis`.
-        lower: (m,) m, where the line enters, along `axis`.
-        upper: (m,) m, where it leaves.
-        mended: lines whose odd number of crossings was repaired from their neighbours.
+        lower: (m,) m, coordinate along `axis` at which the line enters.
+        upper: (m,) m, coordinate at which it leaves.
+        mended: number of lines with an odd number of crossings, repaired from their neighbours.
     """
 
     first: Index
@@ -81,7 +81,7 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
 
     Raises:
         InputError: more than 1 % of the lines cross the surface an odd number of times, or an
-            odd line has no sound neighbour to be mended from.
+            odd line has no neighbour from which it can be repaired.
     """
     line, height, rising, sides = _crossings(surface, axis, first, second)
     shape = (len(first), len(second))
@@ -127,11 +127,16 @@ def united(line: Index, lower: Array, upper: Array) -> tuple[Index, Array, Array
 def _crossings(
     surface: Surface, axis: int, first: Array, second: Array
 ) -> tuple[Index, Array, Mask, Mask]:
-    """Return line (m,), height (m,), rising (m,) and, per quadrant, whether it counts (4, m)."""
+    """Return the crossings of all lines with all triangles.
+
+    Returns:
+        line (m,); height (m,) m; rising (m,), whether the triangle faces along the line; counts
+        (4, m), whether the line passes through the triangle if it is moved into each quadrant.
+    """
     across, along = [(axis + 1) % 3, (axis + 2) % 3], axis
     flat = surface.vertices[:, across]
     corners = flat[surface.faces]
-    grid = PlanGrid.over(flat)  # its rounding may bring a line onto a triangle beside it
+    grid = PlanGrid.over(flat)  # rounding to its steps may move a line onto the next triangle
     low, high = corners.min(axis=1) - grid.step, corners.max(axis=1) + grid.step
     a0, a1 = np.searchsorted(first, low[:, 0], "left"), np.searchsorted(first, high[:, 0], "right")
     b0, b1 = (
@@ -167,16 +172,16 @@ def _crossings(
 def _signed_areas(
     faces: Index, flat: Array, points: Array, whole_flat: Index, whole_points: Index
 ) -> tuple[Array, NDArray[np.int8]]:
-    """Return twice the signed areas (3, m) opposite each corner, and signs (3, 4, m).
+    """Return twice the signed areas (3, m), m², opposite each corner, and their signs (3, 4, m).
 
-    The second axis of the signs is the quadrant into which a tied point is moved.
+    The second axis of the signs is the quadrant into which a point on an edge is moved.
 
     Args:
-        faces: (m, 3).
-        flat: (n, 2) m, the vertices.
-        points: (m, 2) m.
-        whole_flat: (n, 2), the vertices in whole numbers, from which the signs are taken.
-        whole_points: (m, 2), likewise.
+        faces: (m, 3) one triangle per pair of triangle and line.
+        flat: (n, 2) m, positions of the vertices across the lines.
+        points: (m, 2) m, positions of the lines.
+        whole_flat: (n, 2) the vertices' positions as integers, which give the signs.
+        whole_points: (m, 2) the lines' positions as integers.
     """
     area = np.empty((3, len(faces)))
     sides = np.empty((3, 4, len(faces)), np.int8)
@@ -203,12 +208,12 @@ def _signed_areas(
 
 
 def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index, Array]:
-    """Return where lines enter and leave the inside, in turn, sorted by line and height.
+    """Return line and height of all entries and exits, in turn, sorted by line and height.
 
     Args:
-        line: (m,) of each crossing.
-        height: (m,) m.
-        rising: (m,) whether the triangle faces along the lines, so that they leave there.
+        line: (m,) line of each crossing.
+        height: (m,) m, height of each crossing.
+        rising: (m,) whether the triangle faces along the line, so that the line leaves there.
         count: number of lines.
     """
     step = np.where(rising, -1, 1)
@@ -232,7 +237,7 @@ def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index
 
 
 def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
-    """Return crossings sorted by line and height, those of duplicate faces once."""
+    """Return the crossings sorted by line and height; duplicate faces count once."""
     order = np.lexsort((height, rising, line))
     line, height, rising = line[order], height[order], rising[order]
     keep = np.ones(len(line), bool)
@@ -249,7 +254,7 @@ def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
 def _mend(
     line: Index, height: Array, odd: Mask, shape: tuple[int, int], name: str
 ) -> tuple[Index, Array]:
-    """Return the crossings with odd lines completed from the mean of their neighbours'."""
+    """Return the crossings; lines with an odd number are completed from their neighbours."""
     if not odd.any():
         return line, height
     crossed = np.count_nonzero(np.bincount(line, minlength=odd.size))
@@ -285,7 +290,12 @@ def _around(ray: int, odd: Mask, shape: tuple[int, int]) -> list[int]:
 
 
 def _completed(own: Array, neighbours: list[Array]) -> Array | None:
-    """Return `own` (odd) with the crossing it lacks, or without the one it has too many."""
+    """Return a line's heights with a crossing added or removed, so that their number is even.
+
+    Args:
+        own: (n,) m, heights of the line's crossings; n is odd.
+        neighbours: heights of the crossings of the lines around it.
+    """
     for count in (len(own) + 1, len(own) - 1):
         fitting = [n for n in neighbours if len(n) == count]
         if len(fitting) < 2:

@@ -36,9 +36,9 @@ BOX_TREE = BoxTreeSettings()
 
 
 def rows(vectors: ArrayLike) -> Array:
-    """Return vectors (n, 3) as the loops take them; one (3,) as (1, 3).
+    """Return vectors (n, 3), or one vector (3,), as an array (n, 3) that the loops accept.
 
-    Contiguous, writable, double precision: other arrays would compile the loops again.
+    It is contiguous, writable and in double precision: the loops are compiled for this type only.
     """
     return np.require(vectors, np.float64, ["C", "W", "E"]).reshape(-1, 3)
 
@@ -47,12 +47,12 @@ class TriangleTree:
     """The tree of one surface, in its frame.
 
     Args:
-        surface: of any triangles.
-        chosen: which of them; None: all.
+        surface: the surface, open or closed.
+        chosen: (m,) its triangles that the tree holds; None: all.
 
     Attributes:
-        boxes: (2 p, 6) m, smallest and largest coordinates; those of leaf l are at p + l.
-        faces: (p c,) the triangles of the leaves, c each; some of them twice.
+        boxes: (2 p, 6) m, smallest and largest coordinates of each box; leaf l is box p + l.
+        faces: (p c,) triangles of the p leaves, c per leaf; a few triangles appear twice.
     """
 
     def __init__(self, surface: "Surface", chosen: Index | None = None) -> None:
@@ -82,10 +82,11 @@ class TriangleTree:
 
     @cached_property
     def supports(self) -> Array:
-        """Planes (2 p, 4) that all triangles of a box stay behind: unit normals n, and n . x, m.
+        """One plane (2 p, 4) per box, with all triangles of the box behind it.
 
-        The normals are the mean ones of the triangles, so that the planes lie close where the
-        surface is nearly flat; zero where there is none.
+        A row holds the unit normal n and the offset n . x (m). The normal is the mean normal of
+        the triangles, so the plane is close to a nearly flat surface. It is zero if the mean
+        vanishes.
         """
         count = len(self.boxes) // 2
         planes = np.zeros((2 * count, 4))
@@ -102,24 +103,24 @@ class TriangleTree:
 
 
 def _halved(centres: Array) -> Index:
-    """Return the triangles of the leaves (p, c), p a power of two; some twice, to fill them."""
+    """Return the triangles of the leaves (p, c), p a power of two; some twice, to fill the rows."""
     leaves = 1
     while leaves * BOX_TREE.triangles_per_leaf < len(centres):
         leaves *= 2
     room = leaves * -(-len(centres) // leaves)
-    order = np.arange(room) * len(centres) // room  # sorted ones stay sorted, and quickly parted
+    order = np.arange(room) * len(centres) // room  # a sorted input is sorted again quickly
     _halve(np.ascontiguousarray(centres), order, leaves)
     return order.reshape(leaves, -1)
 
 
 @compiled_as_written
 def _halve(centres: Array, order: Index, leaves: int) -> None:
-    """Order triangles: halves, quarters, eighths ... each parted along its longest side.
+    """Sort triangles into the leaves: each part is divided along the longest side of its box.
 
     Args:
-        centres: (n, 3) m.
-        order: (m,) triangles, to be sorted; m a multiple of the leaves.
-        leaves: how many parts there are at last, a power of two.
+        centres: (n, 3) m, centres of the triangles' boxes.
+        order: (m,) triangle numbers, sorted in place; m is a multiple of `leaves`.
+        leaves: number of leaves, a power of two.
     """
     parts = 1
     while parts < leaves:
@@ -138,15 +139,15 @@ def _halve(centres: Array, order: Index, leaves: int) -> None:
 
 @compiled_as_written
 def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle: int) -> None:
-    """Move smaller values before the middle of a part, larger ones behind it (Hoare 1961).
+    """Move the smaller values of a part before its middle, the larger ones behind (Hoare 1961).
 
     Args:
-        centres: (n, 3) m.
-        order: (m,).
-        axis: by which they are compared.
-        first: place of the first in the order.
-        last: of the last.
-        middle: place whose item is the one that a full sort would put there.
+        centres: (n, 3) m, centres of the triangles' boxes.
+        order: (m,) triangle numbers, changed in place.
+        axis: 0, 1 or 2, the coordinate that is compared.
+        first: index of the part's first item in `order`.
+        last: index of its last item.
+        middle: index that gets the same item as in a full sort.
     """
     while first < last:
         pivot = centres[order[(first + last) // 2], axis]
@@ -169,30 +170,30 @@ def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle
 
 @dataclass(frozen=True)
 class NearestSettings:
-    """Nearest points of two surfaces."""
+    """Samples that cover a surface."""
 
     max_samples: int = 150_000
-    """Samples of a surface at most. Chosen: it bounds memory and time."""
+    """Largest number of samples of a surface. Chosen: it bounds memory and time."""
 
 
 NEAREST = NearestSettings()
 
 FLAT = 1e-14
-"""1: a triangle with a smaller ratio of squared area to squared edges has no plane."""
+"""1: a triangle counts as a line if 4 area² / (edge² edge²) is smaller."""
 DEEPEST = 64
-"""Largest number of boxes on the stack: one of each level."""
+"""Largest number of boxes that wait in a search: one per level of the tree."""
 NO_TRIANGLE = -1
 
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Nearest points of a surface to n points.
+    """The points of a surface that are nearest to n given points.
 
     Args:
-        distance: (n,) m.
-        faces: (n,) triangle of each.
-        weights: (n, 3) barycentric coordinates in it.
-        surface: whose points they are.
+        distance: (n,) m, from each given point.
+        faces: (n,) triangle on which the nearest point lies.
+        weights: (n, 3) its barycentric coordinates there.
+        surface: the search that found the points.
     """
 
     distance: Array
@@ -207,16 +208,17 @@ class Nearest:
 
     @cached_property
     def normals(self) -> Array:
-        """Unit normals (n, 3) there, interpolated from the vertices."""
+        """Unit normals (n, 3) at the points, interpolated from the vertices."""
         return self.surface.surface.vertex_normals_at(self.faces, self.weights)
 
 
 class NearestPoints:
-    """Answers for the nearest points of one surface, exactly.
+    """Exact search for the nearest points of one surface.
 
     Args:
-        surface: whose points they are.
-        tree: of its triangles, if there is one."""
+        surface: the surface.
+        tree: its tree, if it exists already.
+    """
 
     def __init__(self, surface: "Surface", tree: TriangleTree | None = None) -> None:
         self.surface = surface
@@ -226,12 +228,12 @@ class NearestPoints:
     def at(self, points: ArrayLike) -> Nearest:
         """Return the nearest points to `points` (n, 3), m, in the surface's frame.
 
-        NaN, infinitely far, in the triangle -1, for a point that is not finite.
+        A point that is not finite gets the distance inf, the triangle -1 and NaN weights.
         """
         return self._found(points, np.inf)
 
     def within(self, points: Array, reach: float) -> tuple[Index, Nearest]:
-        """Return which points (n, 3) have one within `reach`, m, and what `at` says of those."""
+        """Return the points (n, 3) within `reach` (m) of the surface, and what `at` returns."""
         nearest = self._found(points, reach)
         near = np.flatnonzero(nearest.faces >= 0)
         return near, Nearest(
@@ -245,9 +247,9 @@ class NearestPoints:
 def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     """Return samples (n, 3) that cover every triangle, the triangle (n,) and area (n,) of each.
 
-    A triangle is cut into n² like ones so that no edge is longer than the spacing; the
-    samples are their centres. The spacing grows where a surface would need more than
-    150 000 samples.
+    A triangle is divided into n² similar triangles whose edges are at most `spacing` (m) long. The
+    samples are their centres. The spacing grows if the surface needs more than
+    `NEAREST.max_samples` samples.
     """
     triangles = surface.triangles
     longest = surface.longest_edges
@@ -266,7 +268,7 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
 
 
 def _centres(n: int) -> Array:
-    """Return barycentric centres (n², 3) of a triangle cut n times along each edge."""
+    """Return the centres (n², 3), barycentric, of the parts of a triangle with n parts per edge."""
     i, j = np.divmod(np.arange(n * n), n)
     upright, inverted = i + j < n, i + j < n - 1
     first = np.concatenate([i[upright] + 1 / 3, i[inverted] + 2 / 3]) / n
@@ -286,19 +288,20 @@ def _apart(box: Array, point: Array) -> float:
 
 @compiled_as_written
 def _on_edge(along: float, length: float) -> float:
-    """Return where on an edge the nearest point lies, 0 to 1."""
+    """Return the position of the nearest point on an edge, from 0 to 1."""
     return min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
 
 
 @compiled_as_written
 def _foot(corners: Array, point: Array) -> tuple[float, float, float]:
-    """Return the squared distance of a triangle's nearest point and its barycentrics 2 and 3.
+    """Return the squared distance (m²) of a triangle's nearest point and its barycentrics 2 and 3.
 
-    The foot on the triangle's plane where that lies inside, else the nearest of the feet on the
-    three edges. Free of absolute tolerances, so right for triangles of any size.
+    The nearest point is the projection onto the triangle's plane if that lies inside the triangle,
+    else the nearest projection onto an edge. There is no absolute tolerance, so the result is right
+    for triangles of any size.
 
     Args:
-        corners: (9,) m.
+        corners: (9,) m, the triangle's corners.
         point: (3,) m.
     """
     ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
@@ -340,19 +343,19 @@ def _nearest_place(
     waiting: Index,
     apart: Array,
 ) -> tuple[int, float, float, float]:
-    """Return where the triangle lies that is nearest to a point, -1 for none within reach.
+    """Return the position in `faces` of the triangle nearest to a point; -1: none within reach.
 
-    Of equally near ones that of the lowest number.
+    Of several equally near triangles the one with the lowest number is taken.
 
     Args:
-        boxes: (2 p, 6) m.
+        boxes: (2 p, 6) m, see `TriangleTree`.
         faces: (p c,) triangles of the leaves.
-        corners: (p c, 9) m, theirs.
+        corners: (p c, 9) m, corners of these triangles.
         point: (3,) m.
-        reach: m.
-        guess: place of a triangle that is likely to be near, which speeds up the search; -1: none.
-        waiting: (`DEEPEST`,) to work in.
-        apart: likewise.
+        reach: m, largest distance that counts.
+        guess: position in `faces` of a triangle that is probably near; it saves time. -1: none.
+        waiting: (`DEEPEST`,) work array.
+        apart: (`DEEPEST`,) work array.
 
     Returns:
         Place in `faces`, squared distance (m²), barycentrics 2 and 3 of the nearest point.

@@ -64,10 +64,10 @@ def sagittal_outline(
     """Return the convex outline (n, 2) of the sections of surfaces that share one frame.
 
     Args:
-        surfaces: e.g. femur and femoral component, in the femur's frame.
-        z_values: m, the planes; the outline is that of all sections laid upon each other.
-        offset: m, e.g. half the thickness of the tendon that wraps.
-        below: m, leave out what would reach above this y after growing.
+        surfaces: surfaces in one frame, e.g. femur and femoral component.
+        z_values: m, planes of the sections; the outline encloses all sections.
+        offset: m, growth of the outline, e.g. half the thickness of a wrapping tendon.
+        below: m, largest y of the grown outline; parts of the sections above it are left out.
 
     Returns:
         Strictly convex polygon, counter-clockwise, x-y, m.
@@ -82,7 +82,7 @@ def sagittal_outline(
 def _outline(
     surfaces: tuple[Surface, ...], z_values: tuple[float, ...], offset: float, below: float
 ) -> Array:
-    """Return what `sagittal_outline` does; the last few are cached, for a scene's many samples."""
+    """Return the result of `sagittal_outline`; the last four are cached."""
     cuts = [sagittal_section(surface, z) for surface in surfaces for z in z_values]
     points = _points_below(np.concatenate([*cuts, np.empty((0, 2, 2))]), below - offset)
     if len(points) == 0:
@@ -93,7 +93,7 @@ def _outline(
             "check the line's points and the mesh's unit and place",
         )
     outline = convex_outline(points, offset)
-    outline.flags.writeable = False  # shared by all who ask
+    outline.flags.writeable = False  # the cache returns the same array again
     return outline
 
 
@@ -112,10 +112,10 @@ def _points_below(segments: Array, y: float) -> Array:
 
 @dataclass(frozen=True)
 class PolygonSettings:
-    """Polygons of a section."""
+    """Cutting of polygons into triangles."""
 
     area_rounding: float = 1e-12
-    """1: a signed area below this share of the polygon's extent is zero. Chosen: above rounding."""
+    """1: a signed area below this share of the polygon's area is zero. Chosen: above rounding."""
     least_area_share: float = 1e-9
     """1: a polygon that encloses a smaller share of the area that it covers crosses itself. Chosen:
     above rounding."""
@@ -131,14 +131,14 @@ class CrossedPolygonError(ValueError):
 def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     """Return polygons as triangles (k, 3), wound as the polygons are.
 
-    A polygon is cut into a fan about its first corner, if that covers it. If not, it is concave
-    there, and its ears are cut off one after the other (Meisters, Am Math Monthly 82:648, 1975).
-    Polygons of fewer than three corners are left out.
+    A polygon becomes a fan about its first corner. If that fan leaves the polygon, because it is
+    concave, ears are cut off one by one (Meisters, Am Math Monthly 82:648, 1975). Polygons of fewer
+    than three corners are left out.
 
     Args:
-        vertices: (n, 3).
+        vertices: (n, 3) positions.
         corners: (m,) vertices of all polygons, one polygon after the other.
-        ends: (p,) where each polygon ends in `corners`.
+        ends: (p,) index in `corners` at which each polygon ends.
 
     Raises:
         CrossedPolygonError: a polygon crosses itself.
@@ -171,12 +171,12 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
 
 
 def ears(vertices: Array, ring: Index, normal: Array) -> Index:
-    """Return a polygon (m,) cut into triangles (m - 2, 3), ear after ear.
+    """Return a polygon as triangles (m - 2, 3); ears are cut off one by one.
 
     Args:
-        vertices: (n, 3).
-        ring: its corners.
-        normal: (3,) twice its area along its normal.
+        vertices: (n, 3) positions.
+        ring: (m,) vertices of the polygon, in order.
+        normal: (3,) the polygon's normal, its length twice the polygon's area.
     """
     axis = int(np.argmax(np.abs(normal)))
     plane = [(axis + 1) % 3, (axis + 2) % 3]
@@ -211,14 +211,14 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
 def _is_ear(
     points: Array, remaining: list[int], ear: tuple[int, int, int], least: float, flat: bool
 ) -> bool:
-    """Say whether a corner can be cut off: it is convex, and no other corner lies in it.
+    """Say whether a corner is an ear: it is convex, and its triangle holds no other corner.
 
     Args:
         points: (m, 2) all corners.
-        remaining: those that are not cut off yet.
-        ear: the corner between its neighbours.
-        least: twice the area of a triangle that is none.
-        flat: whether a corner on the line between its neighbours will do.
+        remaining: corners that are not cut off yet.
+        ear: the corner's predecessor, the corner itself and its successor.
+        least: twice the area below which a triangle counts as a line.
+        flat: whether a corner on the line between its neighbours counts as an ear, too.
     """
     a, b, c = points[list(ear)]
     area = _twice_area(a, b, c)

@@ -1,8 +1,8 @@
-"""The post of an insert: finds it, and separates it from the dishes if its contact is modelled.
+"""The post of an insert: its search, and its separation from the dishes.
 
-A posterior-stabilised insert carries a post that meets a cam of the femoral component
-sideways. Contact along y, as of the condyles, cannot see that: `divide_insert` makes two bodies of
-the insert, the dishes for the condyles and the post for the cam.
+In a posterior-stabilised insert a cam of the femoral component pushes against the post from behind.
+The contact models press along y and do not see that contact. `divide_insert` therefore divides the
+insert into two bodies: the dishes for the condyles, and the post for the cam.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,13 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.topology import connected_parts
 from tkamb.units import MILLIMETRE
 
 
 @dataclass(frozen=True)
 class CutSettings:
-    """How a plane that cuts a mesh avoids its vertices."""
+    """How a cutting plane avoids the vertices of a mesh."""
 
     vertex_clearance: float = 1e-9
     """m; the plane keeps at least this distance from every vertex (see `plane_shift`). Chosen:
@@ -41,19 +42,20 @@ class PostSettings:
     line_spacing: float = 1e-3
     """m between the lines along y. Chosen: a post is several times as wide."""
     least_rise: float = 8e-3
-    """m: what stands higher than this above the dishes may be a post. Chosen: flanks and lips of
-    dishes are lower."""
+    """m: a part that rises more than this above the lowest dish may be a post. Chosen: flanks and
+    lips of dishes are lower."""
     side_drop: float = 3e-3
-    """m: a side of a post falls by this within two lines (see `steep_share`). Chosen: it is 56 deg,
-    steeper than a dish."""
+    """m: the side of a post falls by at least this within two lines (see `steep_share`). Chosen: a
+    slope of 56 deg is steeper than a dish."""
     steep_share: float = 0.75
-    """1: share of a post's outline that must be as steep as `side_drop` says. Chosen: a post may
-    lean on the rest."""
+    """1: least share of a post's outline that is steeper than `side_drop`. Chosen: a post may merge
+    into the insert along the rest."""
     middle_share: float = 0.25
     """1: the centre of a post lies within this share of the width from the middle. Chosen: dishes
     lie farther out."""
     foot_clearance: float = 0.25e-3
-    """m above the dishes' level: where the post is cut off. Chosen: above the noise of a mesh."""
+    """m: height above its surroundings at which the post is cut off. Chosen: above the noise of a
+    mesh."""
     back_share: float = 0.75
     """1: height above the foot, as a share of the post's height, at which its front is measured."""
     least_thickness: float = 2e-3
@@ -63,22 +65,22 @@ class PostSettings:
 POST = PostSettings()
 
 FOOT_RING = (3, 5)
-"""Lines outwards from the patch between which the ground around the foot is measured, beyond the
-slanted sides of the post."""
+"""Inner and outer distance from the patch, in lines, of the ring in which the height of the
+surroundings is measured. It lies beyond the slanted sides of the post."""
 
 
 @dataclass(frozen=True)
 class Post:
-    """A post: where it stands and how high it is, insert frame.
+    """Place and size of a post, insert frame.
 
     Args:
-        x: m, its centre.
-        z: m, its centre.
-        height: m, of its tip above the lowest dish.
-        area: m², its footprint.
-        foot: m, y above which it stands free of everything around it.
+        x: m, x of its centre.
+        z: m, z of its centre.
+        height: m, height of its tip above the lowest dish.
+        area: m², area of its footprint.
+        foot: m, y above which nothing around it is as high.
         front: m, x of its anterior face, at three quarters of its height above the foot.
-        half_width: m, along z.
+        half_width: m, half its width along z.
     """
 
     x: float
@@ -100,10 +102,10 @@ class Post:
 
 
 def find_post(insert: Surface) -> Post | None:
-    """Return the post of an insert (insert frame), None if it has none.
+    """Return the post of an insert (insert frame); None if it has none.
 
-    A post is a patch of the top that stands at least 8 mm above the lowest dish, steep on
-    3/4 of its outline, in the middle of the width.
+    A post is a part of the upper surface that rises at least 8 mm above the lowest dish, lies in
+    the middle of the width and is steep along 3/4 of its outline.
     """
     low, high = insert.bounds
     x, z = (np.arange(low[a] + POST.line_spacing / 2, high[a], POST.line_spacing) for a in (0, 2))
@@ -121,7 +123,7 @@ def find_post(insert: Surface) -> Post | None:
         if centred and patch.sum() >= 9 and _steep_share(top, patch) >= POST.steep_share:
             tip = float(top[patch].max())
             foot = _ground(top, patch, dish) + POST.foot_clearance
-            if tip <= foot:  # what surrounds it is higher
+            if tip <= foot:  # its surroundings are higher
                 continue
             high = patch & (top > foot + POST.back_share * (tip - foot))
             return Post(
@@ -139,10 +141,9 @@ def find_post(insert: Surface) -> Post | None:
 def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     """Return the insert without its post, and the post, both closed, insert frame.
 
-    The post is what stands above its foot, a plane across y just above all that surrounds it;
-    what is below it belongs to the dishes. In front the post ends in a plane across x. That plane
-    is the fixed bottom of the cam's contact: the part before it is left out, and the plane does not
-    deform.
+    A horizontal plane just above the surroundings separates them: the post is above it, the dishes
+    are below. In front the post ends in a plane x = const. That plane is the fixed bottom of the
+    cam's contact: it does not deform, and the material in front of it is left out.
 
     Args:
         insert: closed, insert frame.
@@ -154,7 +155,7 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     if post is None:
         raise InputError("the insert has no post", where, "leave the key out")
     vertices, below, above = split_faces(*merged(insert.vertices, insert.faces), 1, post.foot)
-    number = pieces(vertices, above)
+    number = connected_parts(above)
     middles = vertices[above].mean(axis=1)[:, [0, 2]]
     own = number == number[np.hypot(*(middles - [post.x, post.z]).T).argmin()]
     dishes = closed_by_fans(vertices, np.concatenate([below, above[~own]]), insert.name)
@@ -165,14 +166,14 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
 
 
 def _ground(top: Array, patch: Mask, dish: float) -> float:
-    """Return the highest y (m) of what surrounds the foot of a patch; `dish` if nothing does."""
+    """Return the largest y (m) of the surface around a patch; `dish` if there is none."""
     near, far = (binary_dilation(patch, iterations=n) for n in FOOT_RING)
     ring = top[far & ~near]
     return float(ring[np.isfinite(ring)].max(initial=dish))
 
 
 def _steep_share(top: Array, patch: Mask) -> float:
-    """Return the share of the columns around a patch that lie far below its edge."""
+    """Return the share of the lines around a patch that end at least `side_drop` below its edge."""
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
     edge = float(np.median(top[patch & ~_eroded(patch)]))
@@ -188,14 +189,14 @@ def split_faces(
 ) -> tuple[Array, Index, Index]:
     """Return the vertices with those of the cut, and the faces below and above the plane.
 
-    Triangles that the plane crosses are divided; the parts share the vertices of the cut, on
-    edges of the mesh.
+    Triangles that the plane crosses are divided. Both parts share the vertices of the cut, which
+    lie on edges of the mesh.
 
     Args:
-        vertices: (n, 3) m; vertices at one place are one.
-        faces: (k, 3).
-        axis: 0, 1 or 2: the plane's normal.
-        level: m, where it stands; moved by a fraction of a micrometre off the vertices.
+        vertices: (n, 3) m, no two at the same place.
+        faces: (k, 3) vertices of the triangles.
+        axis: 0, 1 or 2: the axis along the plane's normal.
+        level: m, coordinate of the plane; it is moved by up to a micrometre off the vertices.
     """
     height = vertices[:, axis] - level
     while (np.abs(height) < CUT.vertex_clearance).any():
@@ -222,24 +223,16 @@ def split_faces(
     return joined, np.concatenate(lower), np.concatenate(upper)
 
 
-def pieces(vertices: Array, faces: Index) -> Index:
-    """Return the number of the connected piece that each face (k,) belongs to."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    shape = (len(vertices), len(vertices))
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape)
-    return np.asarray(connected_components(graph, directed=False)[1][faces[:, 0]], np.int64)
-
-
 def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Index]:
-    """Return vertices and faces of the surface with every hole closed by triangles to its middle.
+    """Return vertices and faces of the surface; a fan of triangles closes every hole.
 
     Args:
         vertices: (n, 3) m.
-        faces: (k, 3), whose open edges lie in planes.
-        name: what to call the part in a message.
+        faces: (k, 3) vertices of the triangles; each hole is plane.
+        name: name of the part in a message.
 
     Raises:
-        InputError: a hole's outline is not seen whole from its middle.
+        InputError: a hole has a part of its outline that its centre does not see.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     key, back = (edges * [len(vertices), 1]).sum(1), (edges * [1, len(vertices)]).sum(1)
@@ -269,6 +262,6 @@ def _loops(edges: Index, count: int) -> Index:
 
 
 def merged(vertices: Array, faces: Index) -> tuple[Array, Index]:
-    """Return the surface with vertices at the same place made one."""
+    """Return vertices and faces of the surface; vertices at the same place are merged."""
     places, number = np.unique(vertices, axis=0, return_inverse=True)
     return places, number.reshape(-1)[faces].astype(np.int64)

@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.nearest import TriangleTree, rows
 from tkamb.geometry.threads import in_halves
+from tkamb.geometry.topology import connected_parts
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -25,24 +24,23 @@ class RaySettings:
     """1: a crossing up to this far outside a triangle, in barycentric coordinates, belongs to it.
     Chosen: above rounding."""
     same_crossing: float = 1e-10
-    """Crossings of one ray nearer than this, relative to the part's radius, are one crossing.
-    Chosen: above rounding."""
+    """1: crossings of one ray that are nearer to each other than this share of the part's radius
+    are one crossing. Chosen: above rounding."""
     usual_crossings: int = 4
     """Crossings per ray for which memory is reserved at first. Chosen: most rays have fewer."""
     threaded_rays: int = 500
-    """Number of rays from which two threads share them. Chosen: for fewer, starting a thread costs
-    more than it gains."""
+    """From this number of rays on, two threads share them. Chosen: for fewer rays a thread costs
+    more time than it saves."""
 
 
 RAY = RaySettings()
 
 STILL = 1e-200
-"""A smaller component of a direction counts as zero; its inverse, times a length, is still
-finite."""
+"""A component of a direction below this counts as zero, so that its inverse stays finite."""
 PARALLEL = 1e-9
 """Sine of the angle to a triangle's plane below which a ray does not cross it."""
 DEEPEST = 64
-"""Largest number of boxes on the stack: one of each level."""
+"""Largest number of boxes that wait in a search: one per level of the tree."""
 NO_TRIANGLE = -1
 
 
@@ -60,13 +58,13 @@ RAY_GAP = RayGapSettings()
 class RayCaster:
     """Crossings of rays with one surface.
 
-    A ray that touches an edge or vertex of the surface's outline may be a hit or a miss; on
-    edges and vertices inside the surface there are no leaks. Distances are exact to rounding
-    (about 1e-16 m over the sine of the incidence) in the plane of the triangle reported.
+    No ray passes through the surface at an inner edge or vertex. A ray that touches an edge or a
+    vertex of the outline may hit or miss. Distances are exact to rounding (about 1e-16 m divided by
+    the sine of the angle to the surface).
 
     Args:
-        surface: (n, 3) vertices in metres, any frame; rays are given in the same frame.
-        tree: of its triangles, if there is one.
+        surface: the surface; rays are given in its frame.
+        tree: its tree, if it exists already.
     """
 
     def __init__(self, surface: "Surface", tree: TriangleTree | None = None) -> None:
@@ -92,11 +90,11 @@ class RayCaster:
         return distance, face
 
     def last_exit(self, origins: ArrayLike, directions: ArrayLike) -> Array:
-        """Return the distance (n,) m at which each ray leaves the part for good; inf: never.
+        """Return the distance (n,) m at which each ray finally leaves the part; inf: never.
 
-        A wall within the part, where one shell ends and the next begins at once, does not count,
-        nor does a closed void, whose shell is another than the one that the ray came through. An
-        undercut that is open to the outside ends the part.
+        An exit does not count at an inner wall, where the next shell begins at once, or into a
+        closed void, whose shell differs from the one that the ray entered through. An undercut that
+        is open to the outside ends the part.
 
         Args:
             origins: (n, 3) m.
@@ -132,16 +130,12 @@ class RayCaster:
     def _shells(self) -> Index:
         """Return which connected shell each face (k,) belongs to."""
         _, merged = np.unique(np.round(self.surface.vertices, 9), axis=0, return_inverse=True)
-        corners = np.asarray(merged).reshape(-1)[self.surface.faces]
-        sides = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]]])
-        count = int(corners.max()) + 1
-        graph = coo_array((np.ones(len(sides), bool), tuple(sides.T)), shape=(count, count))
-        return np.asarray(connected_components(graph, directed=False)[1][corners[:, 0]], np.int64)
+        return connected_parts(np.asarray(merged).reshape(-1)[self.surface.faces])
 
     def first_in_face(
         self, origins: ArrayLike, directions: ArrayLike
     ) -> tuple[Array, Index, Array]:
-        """Return what `first` does, and where in the triangle each ray crosses.
+        """Return the result of `first`, and the place in the triangle at which each ray crosses.
 
         Returns:
             distance (n,) m, face (n,), barycentric coordinates (n, 3), NaN where nothing is hit.
@@ -270,16 +264,16 @@ def _first_crossings(
     least: float,
     outside: float,
 ) -> tuple[Array, Index, Array]:
-    """Return the first crossing of each ray; of equally near ones that of the lowest number.
+    """Return the first crossing of each ray; of equally near triangles the lowest number counts.
 
     Args:
-        boxes: (2 p, 6) m.
+        boxes: (2 p, 6) m, see `TriangleTree`.
         faces: (p c,) triangles of the leaves.
-        planes: (p c, 12) theirs, see `_crossing`.
+        planes: (p c, 12) planes of these triangles, see `_crossing`.
         origins: (n, 3) m.
-        directions: (n, 3) of any length, or (1, 3) for all.
-        least: m, the smallest distance that counts.
-        outside: barycentric units; so far outside its triangle a crossing still counts.
+        directions: (n, 3) of any length, or (1, 3) for all rays.
+        least: m, smallest distance that counts.
+        outside: 1, largest distance outside the triangle in barycentric coordinates.
 
     Returns:
         Distance (n,) m, inf for none; triangle (n,), -1; barycentrics (n, 3), NaN.
@@ -342,16 +336,16 @@ def _all_crossings(
     """Count every crossing of every ray, and write as many as fit into the arrays.
 
     Args:
-        boxes: see `_first_crossings`, as all but the following.
-        faces: (p c,).
-        planes: (p c, 12).
+        boxes: (2 p, 6) m, see `TriangleTree`.
+        faces: (p c,) triangles of the leaves.
+        planes: (p c, 12) planes of these triangles, see `_crossing`.
         origins: (n, 3) m.
-        directions: (n, 3) of any length, or (1, 3) for all.
-        least: m.
-        outside: barycentric units.
-        ray: (m,) the ray of each crossing, to be written.
-        distance: (m,) m, likewise.
-        face: (m,), likewise.
+        directions: (n, 3) of any length, or (1, 3) for all rays.
+        least: m, smallest distance that counts.
+        outside: 1, largest distance outside the triangle in barycentric coordinates.
+        ray: (m,) output: ray of each crossing.
+        distance: (m,) m, output: distance of each crossing.
+        face: (m,) output: triangle of each crossing.
     """
     leaves, number = len(boxes) // 2, 0
     leaf_size = len(faces) // leaves

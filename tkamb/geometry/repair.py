@@ -54,10 +54,10 @@ class Repair:
 
     Args:
         vertices: (n, 3) m.
-        faces: (k, 3), wound consistently; outward if closed.
-        notices: one phrase per kind of repair; empty when there was nothing to repair.
+        faces: (k, 3) vertices of the triangles, wound consistently; outward if closed.
+        notices: one phrase per kind of repair; empty if nothing was repaired.
         holes: the loops that stay open, widest first.
-        forks: (m,) vertex indices where an odd number (3 or more) of faces share an edge.
+        forks: (m,) vertices of edges that an odd number (3 or more) of faces share.
         one_sided: whether the surface has no consistent winding (a Möbius strip).
     """
 
@@ -70,15 +70,15 @@ class Repair:
 
 
 def repair(vertices: Array, faces: Index) -> Repair:
-    """Repair duplicate and degenerate faces, winding, cracks, small holes, loose vertices.
+    """Repair duplicate and degenerate faces, winding, cracks, small holes and loose vertices.
 
-    The corners of the triangles may be unmerged, as in an STL file; merging equal corners
-    is not a repair. Triangles of no area but three different corners stay: they close the
+    Triangles may have their own corners, as in an STL file: equal corners are merged without a
+    notice. A triangle without area but with three different corners stays, because it closes the
     surface.
 
     Args:
         vertices: (n, 3) m, finite.
-        faces: (k, 3) indices into the vertices.
+        faces: (k, 3) vertices of the triangles.
     """
     unused = len(vertices) - int(_used(vertices, faces).sum())
     vertices, faces = _merged(vertices, faces)
@@ -132,7 +132,11 @@ def _without_collapsed(faces: Index) -> tuple[Index, int]:
 
 
 def _without_duplicates(faces: Index) -> tuple[Index, int]:
-    """Keep one of equal faces; of two back to back (a fold without thickness) keep none."""
+    """Remove duplicates of a face, and both faces of a pair that lie back to back.
+
+    Returns:
+        The other faces, and the number of faces removed.
+    """
     corners = np.sort(faces, axis=1)
     most = int(faces.max(initial=0)) + 1
     _, pair = np.unique(corners[:, 0] * most + corners[:, 1], return_inverse=True)
@@ -160,10 +164,13 @@ def _without_duplicates(faces: Index) -> tuple[Index, int]:
 
 
 def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
-    """Turn the minority (by area) of each connected part so that neighbours agree.
+    """Reverse faces so that the windings of neighbours agree; the smaller area is reversed.
 
-    Every face has two states, as it is and reversed. A graph links the states of neighbours that
-    agree. Both states of a face are in one component only on a one-sided surface.
+    Every face has two states, original and reversed. A graph links the states of neighbours that
+    agree. Only on a one-sided surface both states of a face are in one component.
+
+    Returns:
+        The faces, the number of reversed faces, and whether the surface is one-sided.
     """
     k = len(faces)
     edge, count = edge_use(faces)
@@ -191,7 +198,7 @@ def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
 
 
 def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Join ends of open edges that lie within WELD_DISTANCE of one another."""
+    """Merge ends of open edges that are within `REPAIR.weld_distance` of each other."""
     loose = np.unique(open_edges(faces))
     if len(loose) == 0:
         return faces, 0
@@ -207,7 +214,7 @@ def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
 
 
 def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
-    """Close small holes: three edges by their triangle, more by a fan about their centre."""
+    """Close small holes: one of three edges by a triangle, a larger one by a fan of triangles."""
     new_vertices, new_faces = [vertices], [faces]
     widest, total, filled = 0.0, len(vertices), 0
     for loop in boundary_loops(vertices, faces):
@@ -228,7 +235,7 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
 
 
 def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Turn closed bodies that are inside out; a void within another body stays a void."""
+    """Reverse the faces of inside-out bodies; a void within another body stays a void."""
     part = connected_parts(faces)
     volume = np.bincount(part, signed_volumes(vertices, faces))
     if (volume >= 0).all():
@@ -259,7 +266,7 @@ def _referenced(vertices: Array, faces: Index) -> tuple[Array, Index]:
 
 
 def _used(vertices: Array, faces: Index) -> Mask:
-    """Say which vertices (n,) a face has."""
+    """Say which vertices (n,) belong to a face."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     return used
@@ -276,12 +283,13 @@ class InnerWallSettings:
     """Walls inside a part."""
 
     probe_distance: float = 2e-5
-    """m: distance from a triangle at which the program checks for material. Chosen: bodies with a
-    wider gap are separate."""
+    """m: distance from a triangle at which material is looked for. Chosen: bodies with a wider gap
+    are separate."""
     edge_distance: float = 1e-6
-    """m: a vertex this near to an open edge lies on it. Chosen: above the rounding of a mesh."""
+    """m: a vertex nearer to an open edge than this lies on it. Chosen: above the rounding of a
+    mesh."""
     least_area: float = 2e-6
-    """m²: smaller areas are not a wall. Chosen: triangles in a narrow corner have less."""
+    """m²: a smaller area is no wall. Chosen: triangles in a narrow corner have less."""
 
 
 INNER_WALL = InnerWallSettings()
@@ -290,7 +298,7 @@ SAMPLES = np.array(
     [[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.45, 0.45, 0.1],
      [0.1, 0.45, 0.45], [0.45, 0.1, 0.45]]
 )  # fmt: skip
-"""Barycentric coordinates of the places at which a triangle is tested."""
+"""Barycentric coordinates of the points of a triangle at which material is looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,10 +306,10 @@ class InnerWall:
     """A wall inside a part, and the part without it.
 
     Args:
-        faces: (m,) the triangles of the wall, both sides.
-        area: m², of one side.
-        centre: (3,) m.
-        without: vertices and faces of the part without the wall; None where it has to stay.
+        faces: (m,) triangles of both sides of the wall.
+        area: m², area of one side.
+        centre: (3,) m, centroid of the wall.
+        without: vertices and faces of the part without the wall; None if the wall has to stay.
     """
 
     faces: Index
@@ -319,13 +327,14 @@ def facing_material(surface: Surface, faces: Index) -> Mask:
 
 
 def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
-    """Return the walls inside a closed surface as one; None if there are none.
+    """Return all walls inside a closed surface as one `InnerWall`; None if there are none.
 
-    None, too, where a whole body lies within another one: that may be a void with wrong winding.
+    If a whole body lies within another one, the result is None, too: the inner body may be a void
+    with wrong winding.
 
     Args:
         vertices: (n, 3) m.
-        faces: (k, 3), outward.
+        faces: (k, 3) vertices of the triangles, wound outward.
     """
     surface = Surface(vertices, faces, merged=True)
     within = facing_material(surface, np.arange(len(faces)))
@@ -346,13 +355,13 @@ def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
 
 
 def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: Index) -> int:
-    """Return how many groups of bodies there are that touch or overlap one another.
+    """Return the number of groups of bodies; bodies of a group touch or overlap.
 
     Args:
         vertices: (n, 3) m.
-        bodies: the triangles of each.
-        faces: (k, 3).
-        wall: (m,) triangles of the walls inside.
+        bodies: triangles of each body.
+        faces: (k, 3) vertices of the triangles.
+        wall: (m,) triangles of the inner walls.
     """
     group = list(range(len(bodies)))
     skins = [Surface(vertices, faces[own], merged=True) for own in bodies]
@@ -369,7 +378,7 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
 
 
 def _joined_along_rims(vertices: Array, faces: Index) -> Index:
-    """Return the triangles with open edges divided where other open vertices lie on them."""
+    """Return the triangles; open edges are divided at the open vertices that lie on them."""
     edges = open_edges(faces)
     if not len(edges):
         return faces
@@ -395,7 +404,13 @@ def _joined_along_rims(vertices: Array, faces: Index) -> Index:
 
 
 def _divided(vertices: Array, faces: Index, dividing: dict[tuple[int, int], Index]) -> Index:
-    """Return the triangles (k, 3) with vertices put into some of their directed edges."""
+    """Return the triangles after vertices were inserted into some of their directed edges.
+
+    Args:
+        vertices: (n, 3) m.
+        faces: (k, 3) vertices of the triangles.
+        dividing: directed edge -> vertices to be inserted, in order.
+    """
     by_face: dict[int, list[int]] = defaultdict(list)
     starts = {start for start, _ in dividing}
     for face in np.flatnonzero(np.isin(faces, list(starts)).any(axis=1)):

@@ -39,16 +39,16 @@ SMOOTH_WITHIN = np.radians(30.0)
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangulated surface, outward normals by the right-hand rule.
+    """A triangulated surface; the right-hand rule gives the outward normals.
 
-    Derived objects that are costly (rays, nearest points, normals) are made on first use and kept
-    with the surface.
+    Objects that are costly to compute (rays, nearest points, normals) are computed at their first
+    use and stored with the surface.
 
     Args:
-        vertices: (n, 3) m, in the frame that the owner states.
-        faces: (k, 3) indices into the vertices.
+        vertices: (n, 3) m.
+        faces: (k, 3) vertices of the triangles.
         name: name in messages.
-        merged: whether no two vertices lie at one place, as in a mesh that has been read.
+        merged: whether all vertices lie at different places.
     """
 
     vertices: Array
@@ -90,14 +90,16 @@ class Surface:
 
     @cached_property
     def _cross(self) -> Array:
-        """Normals (k, 3) as long as twice the triangles' areas, m²."""
+        """Normals (k, 3) whose length is twice the triangle's area, m²."""
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         return np.cross(b - a, c - a)
 
     @cached_property
     def barycentric_rows(self) -> Array:
-        """Rows (k, 2, 3), 1/m: times a point's offset from the first corner they give its
-        second and third barycentric coordinate in the plane; NaN for a degenerate triangle.
+        """Rows (k, 2, 3), 1/m, that give barycentric coordinates; NaN for a degenerate triangle.
+
+        Their product with a point's offset from the triangle's first corner is the second and the
+        third barycentric coordinate.
         """
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         first, second, normal = b - a, c - a, self._cross
@@ -108,7 +110,8 @@ class Surface:
     def barycentric(self, points: Array, faces: Index) -> Array:
         """Return the barycentric coordinates (n, 3) of points (n, 3), m, on triangles (n,).
 
-        Those of a point beside its triangle are cut to 0 to 1; thirds on a degenerate one.
+        For a point beside its triangle they are clipped to 0 to 1. On a degenerate triangle all are
+        one third.
         """
         weights = np.empty((len(points), 3))
         offset = points - self.triangles[faces, 0]
@@ -127,18 +130,18 @@ class Surface:
 
     @cached_property
     def corner_vertices(self) -> Index:
-        """The faces (k, 3) with vertices at the same place taken for one."""
+        """The faces (k, 3); vertices at the same place have the same number."""
         return self.faces if self.merged else same_places(self.vertices)[1][self.faces]
 
     @cached_property
     def corners_at_vertices(self) -> Ragged:
-        """The corners (3 face + corner) at each of the `corner_vertices`."""
+        """For each of the `corner_vertices` its corners, numbered 3 face + corner."""
         vertex = self.corner_vertices.ravel()
         return Ragged.by_key(vertex, int(vertex.max(initial=-1)) + 1)
 
     @cached_property
     def corner_normals(self) -> Array:
-        """Unit normals (k, 3, 3) at the corners: angle-weighted, edges over 40 deg kept sharp.
+        """Unit normals (k, 3, 3) at the corners, angle-weighted; edges over 40 deg stay sharp.
 
         Their error is at most a tenth of the error of facet normals.
         """
@@ -160,25 +163,25 @@ class Surface:
     def smooth_normals(self, points: Array, faces: Index) -> Array:
         """Return unit normals (n, 3) at points (n, 3), m, on triangles `faces` (n,).
 
-        Interpolated between angle-weighted normals at the corners, which leave out triangles
-        beyond a crease of 30 deg. A box keeps its face normals, a faceted sphere gets radial
-        ones to second order.
+        They are interpolated between angle-weighted normals at the corners. Triangles beyond a
+        crease of 30 deg do not count there: a box keeps its face normals. On a faceted sphere the
+        normals are radial to second order.
         """
         weights = self.barycentric(points, faces)
         return _mean_normals(weights, self._smooth_corner_normals[faces])
 
     @cached_property
     def tree(self) -> "TriangleTree":
-        """Boxes over its triangles, in its own frame."""
+        """The tree of all triangles."""
         from tkamb.geometry.nearest import TriangleTree  # numba, which not all need
 
         return TriangleTree(self)
 
     @cached_property
     def upward_tree(self) -> "TriangleTree":
-        """The same over its triangles that face up (+y); over all where none does.
+        """The tree of the triangles that face up (+y); of all triangles if none does.
 
-        Triangles that face down or sideways are topmost only at an edge of one that faces up.
+        A triangle that faces down or sideways is topmost only at an edge of one that faces up.
         """
         from tkamb.geometry.nearest import TriangleTree
 
@@ -187,54 +190,54 @@ class Surface:
 
     @cached_property
     def rays(self) -> "RayCaster":
-        """Rays against the surface, in its own frame."""
+        """Ray caster of the surface."""
         from tkamb.geometry.rays import RayCaster
 
         return RayCaster(self, self.tree)
 
     @cached_property
     def nearest(self) -> "NearestPoints":
-        """The surface's nearest points, in its own frame."""
+        """Search for the surface's nearest points."""
         from tkamb.geometry.nearest import NearestPoints
 
         return NearestPoints(self, self.tree)
 
     @cached_property
     def winding(self) -> "WindingNumber":
-        """How often the surface winds around points, in its own frame."""
+        """Winding numbers of points about the surface."""
         from tkamb.geometry.winding import WindingNumber
 
         return WindingNumber(self)
 
     @cached_property
     def volume(self) -> float:
-        """The enclosed volume, m³; that of overlapping bodies counts once for each."""
+        """The enclosed volume, m³; an overlap of two bodies counts twice."""
         a, b, c = np.moveaxis(self.triangles - self.bounds.mean(axis=0), 1, 0)
         return float(np.einsum("kj,kj->", a, np.cross(b, c)) / 6.0)
 
     def moved(self, pose_here_in_there: Array) -> "Surface":
-        """Return the surface in another frame; where that is the same, itself."""
+        """Return the surface in another frame; the surface itself if the pose is the identity."""
         if np.array_equal(pose_here_in_there, np.eye(4)):
             return self
         vertices = transform(pose_here_in_there, self.vertices)
         return Surface(vertices, self.faces, self.name, self.merged)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out derived objects: they are far larger, and are made again where needed."""
+        """Return the fields alone: derived objects are far larger and can be computed again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
     """Return unit normals (k, 3, 3), one per triangle and corner.
 
-    Each is the weighted mean of the normals of those triangles at the vertex that turn by at
-    most `crease` from the triangle itself, so that a rim does not tilt the normals of the
-    surface beside it. A triangle without area has zero normals.
+    A normal is the weighted mean over the triangles at the vertex whose normals differ by at most
+    `crease` from the triangle's own. A rim therefore does not tilt the normals beside it. A
+    triangle without area has zero normals.
 
     Args:
-        surface: vertices at the same place count as one.
-        crease: rad; `NO_CREASE`: the same normal for all corners at a vertex.
-        weights: (k, 3) of each triangle at its corners: `corner_angles`, or its area.
+        surface: the surface; vertices at the same place count as one.
+        crease: rad; with `NO_CREASE` all corners at a vertex have the same normal.
+        weights: (k, 3) weight of each triangle at its corners: `corner_angles`, or its area.
     """
     normals, vertex = np.repeat(surface.face_normals, 3, axis=0), surface.corner_vertices.ravel()
     weighted = weights.reshape(-1, 1) * normals
@@ -271,7 +274,7 @@ def _mean_normals(weights: Array, normals: Array) -> Array:
 
 
 def sharp_edges(surface: Surface, sharp: float = SHARP_EDGE) -> Mask:
-    """Return (k, 3): whether the edge opposite each corner is sharp, open or shared by many."""
+    """Return whether the edge opposite each corner (k, 3) is sharp, open or shared by many."""
     edge, count = edge_use(surface.faces)
     cosine = 0.5 * (_sums(edge, np.repeat(surface.face_normals, 3, axis=0)) ** 2).sum(axis=1) - 1
     flags = (count != 2) | (cosine < np.cos(sharp))

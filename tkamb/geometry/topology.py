@@ -29,7 +29,7 @@ class BoundaryLoop:
 
 
 def half_edges(faces: Index) -> Index:
-    """Return the directed edges (3k, 2) of the faces (k, 3), face by face."""
+    """Return the directed edges (3k, 2) of faces (k, 3), face by face."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
@@ -42,7 +42,7 @@ def edge_use(faces: Index) -> tuple[Index, Index]:
 
 
 def is_closed(faces: Index) -> bool:
-    """Say whether two faces meet in every edge, and run through it in opposite directions."""
+    """Say whether two faces share every edge and run through it in opposite directions."""
     edge, count = edge_use(faces)
     start, end = half_edges(faces).T
     balance = np.bincount(edge, np.sign(end - start), len(count))
@@ -50,12 +50,15 @@ def is_closed(faces: Index) -> bool:
 
 
 def same_places(points: Array) -> tuple[Index, Index]:
-    """Return which points (n, 3) are the first of those at one place, and each one's place (n,).
+    """Group points (n, 3) that are equal.
 
-    Places are numbered in the order of their first points. Points are grouped by a hash of their
-    bits, and compared where the hashes agree.
+    Points are grouped by a hash of their bits. If a hash stands for different points, they are
+    sorted instead.
+
+    Returns:
+        First point of each group (g,), in order, and the group (n,) of every point.
     """
-    bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # of -0 and 0 the same
+    bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # -0 becomes 0
     mixed = bits * _ODD
     mixed ^= mixed >> np.uint64(32)
     _, first, place = np.unique((mixed * _ODD).sum(axis=1), return_index=True, return_inverse=True)
@@ -81,8 +84,8 @@ def open_edges(faces: Index) -> Index:
 def boundary_loops(vertices: Array, faces: Index) -> list[BoundaryLoop]:
     """Return the loops of open edges, widest first.
 
-    Two holes that touch in a vertex come out as two loops. Chains that do not close (where
-    the winding is inconsistent) are returned as if they did.
+    Two holes that share a vertex are two loops. A chain that does not close, because the winding
+    is inconsistent, is returned as a loop.
     """
     loops = [_measured(vertices, loop) for loop in _traced(open_edges(faces))]
     return sorted(loops, key=lambda loop: -loop.width)
@@ -167,9 +170,9 @@ class Body:
 
     Args:
         faces: (m,) indices of its faces.
-        extents: (3,) size along the axes, units of the surface.
-        centre: (3,) of its bounding box, units of the surface.
-        area: of its outer skin, square units of the surface.
+        extents: (3,) size of its bounding box, units of the surface.
+        centre: (3,) centre of the box, units of the surface.
+        area: area of its outer skin, square units of the surface.
         closed: whether its skin has no open edge.
     """
 
@@ -183,12 +186,12 @@ class Body:
 def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
     """Return the bodies of a surface, the one with the largest skin first.
 
-    A closed part of negative volume (its normals point to its inside) whose bounding box lies
-    within another closed part's is a void of that one, not a body.
+    The normals of a void point into it, so its volume is negative. A closed part is a void of
+    another closed part if its volume is negative and its bounding box lies within the other's.
 
     Args:
-        vertices: (n, 3).
-        faces: (k, 3), as `tkamb.geometry.repair.repair` leaves them.
+        vertices: (n, 3), any unit.
+        faces: (k, 3) vertices of the triangles, after `tkamb.geometry.repair.repair`.
     """
     label = connected_parts(faces)
     parts = [np.flatnonzero(label == part) for part in range(int(label.max(initial=-1)) + 1)]
@@ -234,8 +237,8 @@ class Ragged:
     """Rows of different lengths: row r is `items[first[r] : first[r + 1]]`.
 
     Args:
-        first: (n + 1,) where each row begins, and the end of the last.
-        items: (m,).
+        first: (n + 1,) start of each row in `items`, then the end of the last row.
+        items: (m,) items of all rows, row after row.
     """
 
     first: Index
@@ -243,18 +246,18 @@ class Ragged:
 
     @classmethod
     def by_key(cls, keys: Index, count: int) -> "Ragged":
-        """Return for each key from 0 to `count` - 1 the places in `keys` (m,) that hold it."""
+        """Return one row per key from 0 to `count` - 1: indices in `keys` (m,) with that key."""
         order = np.argsort(keys, kind="stable")
         return cls(np.searchsorted(keys[order], np.arange(count + 1)), order)
 
     def of(self, rows: Index) -> tuple[Index, Index]:
-        """Return for chosen rows (k,) each item's place in `rows`, and the items."""
+        """Return the items of chosen rows (k,), preceded by the index in `rows` of each item."""
         begin = self.first[rows]
         owner, rank = counted(self.first[rows + 1] - begin)
         return owner, self.items[begin[owner] + rank]
 
 
 def counted(counts: Index) -> tuple[Index, Index]:
-    """Return for groups of `counts` (k,) members: each member's group, and its rank there."""
+    """Return the group of each member, and its rank there; group g has `counts[g]` members."""
     group = np.repeat(np.arange(len(counts)), counts)
     return group, np.arange(len(group)) - (np.cumsum(counts) - counts)[group]

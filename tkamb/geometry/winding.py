@@ -1,24 +1,24 @@
-"""How often a closed surface winds around points: what is inside, whatever the mesh is like.
+"""Winding numbers of points about a closed surface: they tell which points are inside.
 
 A vertical ray leaves a body through a triangle that faces up and enters it through one that faces
 down. The winding number of a point is the number of exits less the number of entries above it:
 
     w = sum of sign(n_y) over the triangles above the point
 
-It is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one file overlap. A wall
-between two touching bodies changes it by -1 and +1 at one place, so that the wall does not count.
-(The number of crossings alone, even or odd, gets all three wrong.)
+The number is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one file overlap.
+A wall between two touching bodies changes it by -1 and +1 at one place, so the wall does not count.
+The parity of the number of crossings would be wrong for voids with wrong winding, overlaps and
+walls.
 
-No ray is undecided. The signs of three areas in the plan view tell whether it passes a triangle.
-There, positions are whole numbers (`PlanGrid`, steps of about 1e-10 m), so that the
-areas are exact and all triangles about an edge or a vertex agree. A ray that meets an edge exactly
-is moved by an infinitesimal to +z, and by a much smaller one to +x (simulation of simplicity,
-Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). The answer is
-therefore right for all points that do not lie on the surface itself.
+The signs of three areas in the plan view tell whether a ray passes through a triangle. Positions in
+the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The areas are therefore exact, and
+all triangles at an edge or a vertex agree. A ray that meets an edge exactly is moved by an
+infinitesimal distance to +z, and by a much smaller one to +x (simulation of simplicity,
+Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). The result is right
+for all points that do not lie on the surface itself.
 
-A ray may leave through a small hole in the mesh unseen. Then the count of the triangles above
-differs from that of the triangles below, which must be equal in a closed surface; the larger one
-is taken.
+A ray may leave through a small hole of the mesh. The count of the triangles above then differs from
+the count of those below; in a closed surface they are equal. The larger count is taken.
 """
 
 from dataclasses import dataclass
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WindingSettings:
-    """Winding numbers by a plan view."""
+    """The plan view in which winding numbers are computed."""
 
     max_buckets: int = 1_000_000
     """Largest number of buckets of the plan view. Chosen: more would cost memory and not save
     time."""
     plan_bits: int = 29
-    """Bits of half the size of the plan view. Chosen: products of differences fit into 63 bits."""
+    """Bits of the largest integer position. Chosen: products of differences fit into 63 bits."""
 
 
 WINDING = WindingSettings()
@@ -50,11 +50,11 @@ WINDING = WindingSettings()
 
 @dataclass(frozen=True, eq=False)
 class PlanGrid:
-    """Positions in a plane as whole numbers.
+    """Conversion of positions in a plane to integers.
 
     Args:
-        middle: (2,) m, where the numbers are 0.
-        scale: numbers per metre.
+        middle: (2,) m, position that becomes (0, 0).
+        scale: 1/m, integer steps per metre.
     """
 
     middle: Array
@@ -69,11 +69,11 @@ class PlanGrid:
 
     @property
     def step(self) -> float:
-        """Distance of two whole numbers, m."""
+        """Distance of two neighbouring integers, m."""
         return 1.0 / self.scale
 
     def whole(self, plan: Array) -> Index:
-        """Return positions (n, 2), m, as whole numbers; positions far outside are clipped."""
+        """Return positions (n, 2), m, as integers; positions far outside are clipped."""
         numbers = np.rint((plan - self.middle) * self.scale)
         return np.clip(
             numbers, -(2 ** (WINDING.plan_bits + 1)), 2 ** (WINDING.plan_bits + 1)
@@ -99,7 +99,7 @@ class WindingNumber:
 
     @cached_property
     def _buckets(self) -> tuple[Index, Index, Index, Index, Index]:
-        """Lower corner (2,), edge (2,) and number (2,) of the buckets; first ones; triangles."""
+        """Lower corner (2,), edge (2,) and number (2,) of the buckets, and their triangles."""
         low = self._plan.min(axis=0)
         per_side = int(np.ceil(np.sqrt(min(max(len(self._faces), 1), WINDING.max_buckets))))
         count = np.array([per_side, per_side], np.int64)
@@ -132,8 +132,8 @@ def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index
 
     Args:
         first: (k, 2) lowest bucket of each triangle along x and z.
-        last: (k, 2) highest.
-        count: (2,) buckets along x and z.
+        last: (k, 2) highest bucket of each triangle.
+        count: (2,) number of buckets along x and z.
     """
     starts = np.zeros(count[0] * count[1] + 1, np.int64)
     for face in range(len(first)):
@@ -153,7 +153,7 @@ def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index
 
 @compiled_as_written
 def _signed_area(plan: Index, start: int, end: int, x: int, z: int) -> tuple[int, int]:
-    """Return twice the signed area of an edge and a point of the plan view, and its sign.
+    """Return twice the signed area of the triangle of an edge and a point, and its sign.
 
     A point on the edge counts as moved by an infinitesimal to +z, and by a much smaller one
     to +x: then the sign is 0 only for an edge that is a point in the plan view.
@@ -183,13 +183,13 @@ def _winding_numbers(
 
     Args:
         points: (n, 3) m.
-        plan: (n, 2) their x and z in whole numbers.
-        bucket: (n,) of each; -1 beside the surface.
-        starts: (b + 1,) where each bucket's triangles begin.
-        items: (m,) triangles.
+        plan: (n, 2) x and z of the points as integers.
+        bucket: (n,) bucket of each point; -1 for a point beside the surface.
+        starts: (b + 1,) where the triangles of each bucket begin in `items`.
+        items: (m,) triangles, bucket after bucket.
         vertices: (v, 3) m.
-        vertex_plan: (v, 2) their x and z in whole numbers.
-        faces: (k, 3).
+        vertex_plan: (v, 2) x and z of the vertices as integers.
+        faces: (k, 3) vertices of the triangles.
     """
     result = np.zeros(len(points), np.int64)
     for n in range(len(points)):
