@@ -11,14 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere
 from scenes import write_scene
-from shapes import bicondylar, sphere
+from shapes import bicondylar, joined, sphere
 from tkamb import simulate
 from tkamb.cli import main
 from tkamb.contact.foundation import LinearFoundation
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.errors import InputError
-from tkamb.geometry.condyles import condyle_split, condyle_yaw
+from tkamb.geometry.condyles import condyle_split, condyle_yaw, orientation
+from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.meshes import load_surface
 from tkamb.run.press import press_meshes
@@ -167,3 +168,24 @@ def test_one_condyle_on_two_separate_patches_is_flagged():
 
 def test_one_condyle_on_one_patch_is_not_flagged():
     assert flags_of(graded_sphere(20 * MM), flat_insert(8 * MM)) == ()
+
+
+@pytest.mark.parametrize("kind", ["shipped", "dm", "jw"])
+def test_the_shape_shows_the_flexion(kind):
+    """Whatever the pose: flexion within 10 deg, tilt, and where the front points."""
+    body = femoral(kind)
+    for flexion in (-30.0, 0.0, 90.0, 150.0):
+        for turn in (0.0, 20.0, 170.0):
+            turned = Rotation.from_euler("YXZ", [turn, 8.0, flexion], degrees=True).as_matrix()
+            stands = orientation(body, pose(turned, np.zeros(3)))
+            assert np.degrees(stands.flexion) == pytest.approx(flexion, abs=10.0)
+            assert np.degrees(stands.tilt) == pytest.approx(8.0, abs=0.1)
+            assert stands.forward == pytest.approx(np.cos(np.radians(turn)), abs=0.1)
+
+
+SPHERES_APART = joined(*(sphere(0.005, 3, (0.0, 0.0, z)) for z in (-0.03, 0.03)))
+
+
+@pytest.mark.parametrize("shape", [sphere(0.02), bicondylar(), SPHERES_APART])
+def test_a_part_that_is_no_shell_shows_no_flexion(shape):
+    assert orientation(shape, np.eye(4)) is None

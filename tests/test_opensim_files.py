@@ -107,10 +107,10 @@ def test_a_files_own_defaults_hold_for_its_own_elements(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (None, "not there"),
-        ("<ForceSet><objects/></ForceSet>", "holds no <JointSet>"),
-        ("<OpenSimDocument><ForceSet/></OpenSimDocument>", "holds no <JointSet>"),
-        ('<JointSet file="JointSet.xml"/>', "leads back"),
+        (None, "does not exist"),
+        ("<ForceSet><objects/></ForceSet>", "instead of a <JointSet>"),
+        ("<OpenSimDocument><ForceSet/></OpenSimDocument>", "without a <JointSet>"),
+        ('<JointSet file="JointSet.xml"/>', "names it in turn"),
         ("<JointSet><objects>", "no element found: line 1"),
     ],
 )
@@ -125,7 +125,7 @@ def test_a_set_whose_file_cannot_be_used_is_refused(tmp_path, content, words):
 
 def test_a_controllers_file_may_be_missing(tmp_path):
     text = NEW.replace("</Model>", '<ControllerSet file="controls.xml"/></Model>')
-    assert "ControllerSet left out" in read_osim(written(tmp_path, text)).notices[0]
+    assert "ControllerSet is left out" in read_osim(written(tmp_path, text)).notices[0]
 
 
 AMONG = "<credits>{}</credits><gravity>"
@@ -247,9 +247,9 @@ def test_couplers_in_a_chain_do_not_depend_on_their_order(tmp_path, order):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (coupler("d", "knee_r_0", "ankle_r_0", 1.0), "follow a second coordinate"),
-        (coupler("d", "ankle_r_0", "knee_r_0", 1.0), "follow itself"),
-        (coupler("d", "knee_r_0", "knee_r_0", 1.0), "follow"),
+        (coupler("d", "knee_r_0", "ankle_r_0", 1.0), "depend on a second coordinate"),
+        (coupler("d", "ankle_r_0", "knee_r_0", 1.0), "depend on itself"),
+        (coupler("d", "knee_r_0", "knee_r_0", 1.0), "depend"),
     ],
 )
 def test_couplers_that_contradict_each_other_are_refused(tmp_path, more, words):

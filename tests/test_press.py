@@ -19,6 +19,7 @@ from tkamb.commands.mesh import add_mesh, add_press
 from tkamb.contact.registry import contact_class, contact_names
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
+from tkamb.io import starter
 from tkamb.io.recordings.vtp import read_vtp
 from tkamb.run import press
 from tkamb.run.press import read_pose
@@ -392,3 +393,49 @@ def test_every_unit_that_mesh_check_names_is_one_that_the_commands_take():
         press = ["press", "a.stl", "b.stl", "--load", "1", "--units", unit]
         assert parser.parse_args(press).units == unit
         assert parser.parse_args(["mesh", "lattice", "b.stl", "--units", unit]).units == unit
+
+
+STARTER = Path(starter.__file__).parent / "files"
+SHIPPED = (STARTER / "femoral_component.stl", STARTER / "insert.stl")
+
+
+@pytest.mark.parametrize(
+    ("turns", "fault"),
+    [
+        ((180, 0, 0), "stands upside down"),
+        ((0, 0, 180), "stands upside down"),
+        ((0, 180, 180), "stands upside down"),
+        ((0, 0, -160), "stands upside down"),
+        ((90, 0, 0), "lies on its side"),
+        ((-80, 0, 0), "lies on its side"),
+    ],
+)
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_femoral_component_whose_condyles_face_away_is_refused(turns, fault, side):
+    with pytest.raises(InputError, match=fault):
+        press_meshes(*SHIPPED, 500.0, pose=(0, 0, 0, *turns), resolution_mm=3.0, side=side)
+
+
+@pytest.mark.parametrize(
+    ("turns", "axes", "remark"),
+    [
+        ((0, 0, 0), "+x,+y,+z", None),
+        ((0, 0, 140), "+x,+y,+z", None),
+        ((0, 0, -20), "+x,+y,+z", None),
+        ((10, 15, 90), "+x,+y,+z", None),
+        ((0, 0, -90), "+x,+y,+z", "not its condyles, faces the insert"),
+        ((0, 0, 0), "-x,+y,-z", "points backward"),
+        ((0, 90, 0), "+x,+y,+z", "by 90 deg"),
+    ],
+)
+def test_a_pose_that_no_knee_takes_gets_a_remark(turns, axes, remark):
+    """From 20 deg of hyperextension to 140 deg of flexion nothing is said."""
+    report = press_meshes(*SHIPPED, 500.0, pose=(0, 0, 0, *turns), axes=axes, resolution_mm=3.0)
+    said = "\n".join(report.as_dict()["flags"])
+    about_pose = [w for w in ("faces the insert", "points backward", "turns the") if w in said]
+    assert (remark in said) if remark else not about_pose
+
+
+def test_exchanged_meshes_are_named():
+    with pytest.raises(InputError, match="shape of a femoral component"):
+        press_meshes(*reversed(SHIPPED), 500.0)

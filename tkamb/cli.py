@@ -1,4 +1,4 @@
-"""The command line: arguments in, exit status out. Nothing is computed here."""
+"""The command line: it parses the arguments, calls a command and returns the exit status."""
 
 import argparse
 import gc
@@ -54,10 +54,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _keep_to_one_thread() -> None:
-    """Have BLAS take one thread, unless the environment says how many or it runs already.
+    """Limit BLAS to one thread, unless the environment sets a number or NumPy is loaded already.
 
-    The lattice's solves wait for memory; further threads wait for each other, which on a
-    busy machine takes several times as long.
+    Memory limits the lattice's solves. More threads wait for each other, which takes several times
+    longer on a busy machine.
     """
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     if "numpy" not in sys.modules and not any(name in os.environ for name in limits):
@@ -65,7 +65,7 @@ def _keep_to_one_thread() -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Bad arguments are one line too, without the usage before it."""
+    """Parser whose errors are one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         for kind, words in (("float", "is not a number"), ("int", "is not a whole number")):
@@ -102,14 +102,24 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_run(commands: Any) -> None:
-    run = commands.add_parser("run", help="motion in, condyle forces and report out")
+    run = commands.add_parser(
+        "run", help="compute condyle forces from a motion, and write a report"
+    )
     add_scene_options(run)
     add_preset(run)
     add_no_cache(run)
-    run.add_argument("--force", action="store_true", help="write into a folder that is not tkamb's")
+    run.add_argument(
+        "--force", action="store_true", help="write into a folder that tkamb did not make"
+    )
     run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
-    run.add_argument("--workers", type=int, default=1, metavar="N", help="processes for the frames")
-    run.add_argument("--profile", action="store_true", help="files and modules used, time per part")
+    run.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="number of processes for the frames"
+    )
+    run.add_argument(
+        "--profile",
+        action="store_true",
+        help="list the files and modules used, and the time of each part",
+    )
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
@@ -167,7 +177,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _scene_of(options: argparse.Namespace) -> "Scene":
-    """Return the scene of `run` with what the command line overrides."""
+    """Return the scene of `run` with the values of the command line."""
     from tkamb.io.scene import load_scene
 
     overrides = overrides_of(options)

@@ -12,7 +12,7 @@ class MessageSettings:
     """How messages are written."""
 
     max_names: int = 8
-    """Number of names that a message lists. Chosen: a message stays short."""
+    """Largest number of names in a message. Chosen: a message stays short."""
 
 
 MESSAGE = MessageSettings()
@@ -23,8 +23,8 @@ class TkambError(Exception):
 
     Args:
         what: what is wrong.
-        where: file, key or frame number, if there is one.
-        hint: what the user can do about it.
+        where: file, key, argument or frame; None: nowhere in particular.
+        hint: what the user can do; None: nothing is known.
         mend: former name of `hint`, accepted until release 0.3.
     """
 
@@ -58,13 +58,13 @@ def _warn_of_old_name() -> None:
 
 
 class InputError(TkambError):
-    """The user's input cannot be used: exit status 2, nothing written."""
+    """The user's input cannot be used: exit status 2, and nothing is written."""
 
     exit_status = 2
 
 
 class ComputationError(TkambError):
-    """Sound input, but nothing could be computed from it: exit status 1."""
+    """The input is valid, but nothing could be computed: exit status 1."""
 
 
 def not_installed(package: str, where: object, extra: str) -> InputError:
@@ -73,7 +73,7 @@ def not_installed(package: str, where: object, extra: str) -> InputError:
 
 
 def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
-    """Return "did you mean ..." with the names that resemble one, and the first of all names."""
+    """Return "did you mean ..." with similar names, and the first of all names."""
     all_names = list(names)
     lower = {each.lower(): each for each in all_names}
     close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.6)
@@ -87,9 +87,9 @@ def renamed(module: str, name: str, names: Mapping[str, Any]) -> Any:
     """Return the object that a module had under a former name, with a DeprecationWarning.
 
     Args:
-        module: its dotted name.
-        name: that was asked for.
-        names: former name -> what it names.
+        module: dotted name of the module.
+        name: name that was asked for.
+        names: former name -> object.
 
     Raises:
         AttributeError: the module has nothing of that name.

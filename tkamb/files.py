@@ -34,7 +34,7 @@ MEGABYTE = 1_000_000
 
 @dataclass(frozen=True)
 class FileLimitSettings:
-    """Sizes of the largest files that are read; a larger file is not of the stated kind."""
+    """Largest sizes of the files that are read."""
 
     text_bytes: float = 16 * MEGABYTE
     """Bytes of a scene, a URDF or a summary. Chosen: a thousand times the size of the shipped

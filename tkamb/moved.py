@@ -33,7 +33,7 @@ FOLDERS = {
     "tkamb.muscles": "tkamb.run.muscles",
     "tkamb.plausibility": "tkamb.run.plausibility",
 }
-"""Folder of release 0.1 -> where its modules are."""
+"""Folder of release 0.1 -> folder where its modules are now."""
 MODULES = {
     "tkamb.atomic": "tkamb.files",
     "tkamb.memory": "tkamb.geometry.memory",
@@ -131,7 +131,7 @@ MODULES = {
 
 
 def new_name(name: str) -> str | None:
-    """Return where a module of release 0.1 is now; None for one that has not moved."""
+    """Return the new name of a module of release 0.1; None: it has not moved."""
     if name in MODULES:
         return MODULES[name]
     part = name.removeprefix("tkamb.").removesuffix(".command")
@@ -157,9 +157,9 @@ class _Alias(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Give the module its own spec back, by which its files are found.
+        """Restore the module's own spec, by which its files are found.
 
-        It has been executed at its new place; the import has put the spec of the old name there.
+        The module has been executed under its new name; the import has replaced the spec.
         """
         module.__spec__ = self.own_spec
 
@@ -170,7 +170,7 @@ class _MovedFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a spec that leads to the new place; None for what has not moved."""
+        """Return a spec of the new module; None: it has not moved."""
         new = new_name(fullname)
         if new is None:
             return None
@@ -180,6 +180,6 @@ class _MovedFinder(MetaPathFinder):
 
 
 def accept_old_names() -> None:
-    """Let former import paths lead to the new places; once for a process."""
+    """Make former import paths work; once per process."""
     if not any(isinstance(finder, _MovedFinder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _MovedFinder())  # before the path of a moved folder is searched

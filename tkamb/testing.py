@@ -1,4 +1,4 @@
-"""The conformance test that any contact model, built in or from elsewhere, can run.
+"""Test of a contact model against the contract of contact models.
 
 from tkamb.testing import check_contact_model
 check_contact_model(MyModel(resolution=1e-3))
@@ -24,29 +24,29 @@ BLOCK = (32e-3, 10e-3, 56e-3)
 
 @dataclass(frozen=True)
 class ModelCheckSettings:
-    """Checks of a contact model of a plug-in."""
+    """Tolerances of the test."""
 
     stiffness_tolerance: float = 0.1
-    """Relative, between finite differences over 10 and 5 % of the approach. Chosen: contact nodes
-    that come in one by one make small steps."""
+    """1: relative difference of the stiffnesses over 10 and over 5 % of the approach. Chosen: the
+    force has small steps where single nodes come into contact."""
 
 
 MODEL_CHECK = ModelCheckSettings()
 
 
 class ConformanceError(TkambError):
-    """A contact model breaks the contract; the message names the property."""
+    """A contact model does not have a property of the contract, which the message names."""
 
 
 @dataclass(frozen=True, eq=False)
 class ConformanceCase:
-    """Case on which a model is tested.
+    """The bodies, pose, load and tolerances of a test.
 
     Args:
         pair: the two bodies.
-        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
-        load: N.
-        tolerance: relative, of what the model solves for.
+        pose: (4, 4) pose_femoral_in_insert; its y is ignored.
+        load: N, compressive.
+        tolerance: 1, relative tolerance of forces, approach and pressure.
         integral_tolerance: relative, of the integral of pressure over the map.
     """
 
@@ -65,18 +65,19 @@ def check_contact_model(
     tolerance: float = 2e-3,
     integral_tolerance: float = 2e-2,
 ) -> None:
-    """Try a contact model against every property of the contract; silence means that all hold.
+    """Raise unless a contact model has every property of the contract.
 
     Args:
-        model: the model.
-        pair: bodies to try it on; default: `two_sphere_pair`.
+        model: the contact model.
+        pair: the two bodies; default: `two_sphere_pair`.
         pose: (4, 4) pose_femoral_in_insert; default: 10 deg of flexion, 0.2 deg of varus.
-        load: N to press with.
-        tolerance: relative, of forces, approach and pressure between equivalent runs.
-        integral_tolerance: relative, of the integral of pressure over the map.
+        load: N, compressive.
+        tolerance: 1, relative tolerance of forces, approach and pressure between equivalent
+            evaluations.
+        integral_tolerance: 1, relative tolerance of the integral of pressure over the map.
 
     Raises:
-        ConformanceError: names the first property that does not hold.
+        ConformanceError: the first property that the model does not have.
     """
     pair = two_sphere_pair() if pair is None else pair
     pose = knee_pose([0, 0, 0, 0, np.radians(0.2), np.radians(10)]) if pose is None else pose
@@ -95,7 +96,7 @@ def check_contact_model(
 
 
 def two_sphere_pair() -> ContactPair:
-    """Return two spheres of 20 mm, 24 mm apart along z, over a block of polyethylene."""
+    """Return two spheres of 20 mm, 24 mm apart along z, above a block of polyethylene."""
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=SPHERE_RADIUS)
     aside = np.array([0.0, 0.0, SPHERE_OFFSET])
     vertices = np.concatenate([sphere.vertices - aside, sphere.vertices + aside])
@@ -203,10 +204,10 @@ def _check_integral(case: ConformanceCase, pressed: ContactResult) -> None:
 def _check_femoral_frame(
     model: ContactModel, case: ConformanceCase, pressed: ContactResult
 ) -> None:
-    """Describe the femoral mesh in another frame, with the same relative placement.
+    """Check that the result does not depend on the frame of the femoral mesh.
 
-    The contract fixes the insert frame, so this has the same effect as moving both bodies
-    together. The other frame is turned about z, which keeps the sides.
+    The contract fixes the insert frame, so that this is equivalent to moving both bodies together.
+    The other frame is rotated about z, so that medial and lateral stay.
     """
     other = knee_pose([3e-3, -5e-3, 0.5e-3, 0.0, 0.0, np.radians(25)])
     pair = ContactPair(

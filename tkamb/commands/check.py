@@ -1,4 +1,4 @@
-"""`tkamb check`: from its arguments to lines, a picture or a page, and the exit status."""
+"""`tkamb check`: its arguments, and its lines, picture or page."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ POLICY = (
     "default-src 'none'; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
     "img-src data:; base-uri 'none'; form-action 'none'"
 )
-"""Content security of the page, which stands by itself."""
+"""Content security policy of the page: nothing is loaded from elsewhere."""
 
 
 def add_check(commands: Any) -> None:

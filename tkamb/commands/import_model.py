@@ -59,20 +59,23 @@ def add_import(commands: Any) -> None:
     p.add_argument("model", type=Path, metavar="MODEL.osim", help="an OpenSim model")
     source = p.add_mutually_exclusive_group(required=True)
     source.add_argument("--c3d", type=Path, metavar="F", help="markers and force plates")
-    source.add_argument("--trc", type=Path, metavar="F", help="markers alone")
+    source.add_argument("--trc", type=Path, metavar="F", help="markers")
     source.add_argument("--motion", type=Path, metavar="F", help="the model's coordinates")
     p.add_argument("--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions")
     p.add_argument(
         "--grf-force",
         metavar="NAME,NAME",
-        help="how the names of the foot's columns in --grf begin, like ground_force_2; several are "
-        "summed",
+        help="first part of the names of the foot's columns in --grf, like ground_force_2; several "
+        "are summed",
     )
     p.add_argument(
-        "--static", type=Path, metavar="F", help="standing trial that shows where the markers sit"
+        "--static",
+        type=Path,
+        metavar="F",
+        help="standing trial, from which the marker positions on the segments follow",
     )
-    p.add_argument("--side", choices=("right", "left"), required=True, help="of the knee")
-    p.add_argument("--mass-kg", type=float, required=True, metavar="KG", help="of the subject")
+    p.add_argument("--side", choices=("right", "left"), required=True, help="side of the knee")
+    p.add_argument("--mass-kg", type=float, required=True, metavar="KG", help="mass of the subject")
     for part in ("femoral", "insert", "patella"):
         p.add_argument(f"--{part}", type=Path, metavar="F", help=f"mesh of the {part} component")
         p.add_argument(
@@ -113,7 +116,11 @@ def add_import(commands: Any) -> None:
         default="foundation",
         help="the scene's contact model; default: %(default)s",
     )
-    p.add_argument("--activity", choices=get_args(Activity), help="what the report compares with")
+    p.add_argument(
+        "--activity",
+        choices=get_args(Activity),
+        help="activity whose published values the report shows",
+    )
     p.add_argument(
         "--muscles",
         action="store_true",
@@ -144,7 +151,7 @@ def add_import(commands: Any) -> None:
         dest="scale",
         action="store_false",
         default=None,
-        help="take the model's masses as they are",
+        help="use the model's masses unchanged",
     )
     p.set_defaults(command=_import)
 
@@ -176,7 +183,7 @@ def _add_inferred(p: argparse.ArgumentParser) -> None:
         "--method",
         choices=("segments", "chain"),
         default="segments",
-        help="fit markers of thigh and shank each by itself, or the whole leg as a chain; default: "
+        help="fit the markers of thigh and shank separately, or the whole leg as a chain; default: "
         "segments",
     )
     p.add_argument(

@@ -1,4 +1,4 @@
-"""Commands on meshes, without a scene (`press`, `mesh`, `contact`): arguments in, status out."""
+"""`tkamb press`, `tkamb mesh` and `tkamb contact`: commands on meshes, without a scene."""
 
 import argparse
 import json
@@ -13,12 +13,12 @@ from tkamb.units import LENGTH
 
 UNIT_OPTIONS = ("--units", "--mesh-unit")
 AXES_OPTIONS = ("--axes", "--mesh-axes")
-"""Either spelling is read by every command that takes meshes."""
+"""Two spellings of an option, which every command on meshes accepts."""
 
 
 def add_press(commands: Any) -> None:
     """Add `press` to the command line."""
-    press = commands.add_parser("press", help="contact alone: press two meshes together")
+    press = commands.add_parser("press", help="press two meshes together, without a scene")
     press.add_argument("femoral", type=Path, help="mesh of the femoral component")
     press.add_argument("insert", type=Path, help="mesh of the insert")
     press.add_argument(
@@ -26,18 +26,19 @@ def add_press(commands: Any) -> None:
         type=float,
         required=True,
         metavar="N",
-        help="along the normal of the insert's bottom",
+        help="load (N) along the normal of the insert's bottom",
     )
-    _add_units(press, "of both meshes")
+    _add_units(press, "unit of both meshes")
     pose = press.add_mutually_exclusive_group()
     pose.add_argument(
         "--pose",
         type=float,
         nargs=6,
         metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
-        help="femoral mesh in the insert mesh's axes: mesh units, degrees (intrinsic x-y-z)",
+        help="pose of the femoral mesh in the insert mesh's axes: mesh units, degrees (intrinsic "
+        "x-y-z)",
     )
-    pose.add_argument("--pose-file", type=Path, metavar="F", help="the same six numbers in a file")
+    pose.add_argument("--pose-file", type=Path, metavar="F", help="file with these six numbers")
     press.add_argument(
         "--contact",
         default=CONTACT_MODEL,
@@ -50,33 +51,37 @@ def add_press(commands: Any) -> None:
         type=float,
         default=1.0,
         metavar="MM",
-        help="spacing of the map points, the lattice's cell size; default: 1",
+        help="spacing of the map points and cell size of the lattice; default: 1",
     )
     press.add_argument(
         "--bearing",
         choices=("fixed", "mobile"),
         default="fixed",
-        help="how the insert is held; default: fixed",
+        help="fixation of the insert; default: fixed",
     )
     press.add_argument(
         "--material",
         default="polyethylene",
         metavar="NAME|F.toml",
-        help="built-in, or a file of the keys of a scene's [material]; default: %(default)s",
+        help="name of a material, or a file with the keys of a scene's [material]; default: "
+        "%(default)s",
     )
     _add_side(press)
     press.add_argument(
         "--adjust",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="first move the femoral mesh until both condyles touch; default: no",
+        help="before the press, move the femoral mesh until both condyles touch; default: no",
     )
     press.add_argument(
         "--restore-when",
         choices=("both", "either"),
-        help="with --adjust: what must exceed the adjustment for it to be undone; default: both",
+        help="with --adjust: whether penetration and angle, or either of them, must exceed the "
+        "adjustment to undo it; default: both",
     )
-    press.add_argument("--out", type=Path, metavar="F.vtp", help="the pressure map, for ParaView")
+    press.add_argument(
+        "--out", type=Path, metavar="F.vtp", help="file for the pressure map, for ParaView"
+    )
     add_force(press)
     press.add_argument("--json", action="store_true", help="print the result as JSON")
     press.set_defaults(command=_press)
@@ -119,21 +124,27 @@ def add_mesh(commands: Any) -> None:
     """Add the command `mesh` and its verbs to the parser's commands."""
     mesh = commands.add_parser("mesh", help="check a mesh before it is used")
     verbs = mesh.add_subparsers(required=True, metavar="VERB")
-    check = verbs.add_parser("check", help="health, and unit and axes as questions")
+    check = verbs.add_parser("check", help="report holes, unit and axes of meshes")
     check.add_argument("files", type=Path, nargs="+", metavar="FILE", help="meshes")
     check.add_argument("--json", action="store_true", help="print the findings as JSON")
     check.set_defaults(command=_mesh_check)
     part = verbs.add_parser("part", help="write one of several bodies to a separate file")
     part.add_argument("file", type=Path, metavar="FILE", help="mesh of several bodies")
-    part.add_argument("number", type=int, metavar="N", help="as `tkamb mesh check` numbers them")
+    part.add_argument(
+        "number", type=int, metavar="N", help="number of the body in `tkamb mesh check`"
+    )
     part.add_argument("--out", type=Path, required=True, metavar="F", help=".stl, .ply or .obj")
     part.set_defaults(command=_mesh_part)
-    lattice = verbs.add_parser("lattice", help="the lattice of an insert, and how good it is")
+    lattice = verbs.add_parser(
+        "lattice", help="make the lattice of an insert and report its quality"
+    )
     lattice.add_argument("insert", type=Path, metavar="INSERT", help="mesh of the insert")
     lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
     _add_units(lattice, "of the mesh")
     _add_side(lattice)
-    lattice.add_argument("--out", type=Path, metavar="F.vtu", help="for ParaView or meshio")
+    lattice.add_argument(
+        "--out", type=Path, metavar="F.vtu", help="file for the lattice, for ParaView or meshio"
+    )
     add_force(lattice)
     lattice.add_argument("--json", action="store_true", help="print the report as JSON")
     lattice.set_defaults(command=_mesh_lattice)
@@ -179,7 +190,7 @@ def add_contact(commands: Any) -> None:
     """Add the command `contact` and its verb."""
     contact = commands.add_parser("contact", help="contact models")
     verbs = contact.add_subparsers(required=True, metavar="VERB")
-    verbs.add_parser("list", help="names, what each assumes and needs").set_defaults(
+    verbs.add_parser("list", help="list names, assumptions and needs").set_defaults(
         command=_contact_list
     )
 
@@ -208,7 +219,7 @@ def _add_units(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _add_side(command: argparse.ArgumentParser) -> None:
-    """Add --axes and --side: how a mesh lies in the knee."""
+    """Add --axes and --side, the orientation of meshes in the knee."""
     command.add_argument(
         *AXES_OPTIONS,
         dest="axes",
@@ -217,14 +228,17 @@ def _add_side(command: argparse.ArgumentParser) -> None:
         help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
     )
     command.add_argument(
-        "--side", choices=("right", "left"), default="right", help="of the knee; default: right"
+        "--side",
+        choices=("right", "left"),
+        default="right",
+        help="side of the knee; default: right",
     )
 
 
 def add_no_cache(command: argparse.ArgumentParser) -> None:
     """Add --no-cache to a command."""
     command.add_argument(
-        "--no-cache", action="store_true", help="neither read nor keep prepared operators on disk"
+        "--no-cache", action="store_true", help="do not use the cache of prepared operators on disk"
     )
 
 

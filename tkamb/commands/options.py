@@ -21,7 +21,9 @@ def add_scene_options(command: Any) -> None:
     command.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
     command.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
     command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
-    command.add_argument("--frames", type=_frames, metavar="A:B:STEP", help="frames, as in Python")
+    command.add_argument(
+        "--frames", type=_frames, metavar="A:B:STEP", help="frames, as a slice in Python"
+    )
     add_set(command)
 
 
@@ -56,7 +58,7 @@ def add_force(command: argparse.ArgumentParser) -> None:
 
 
 def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Return dotted key -> value of what `add_scene_options` was given."""
+    """Return dotted key -> value for the scene, from the options of `add_scene_options`."""
     overrides = dict(options.set)
     if options.contact:
         overrides["contact.model"] = options.contact
@@ -93,14 +95,14 @@ def _setting(text: str) -> tuple[str, Any]:
 
 @dataclass(frozen=True)
 class Rule:
-    """When an option means something.
+    """The condition under which an option has an effect.
 
     Args:
-        option: its name on the command line.
-        needs: options of which at least one must be there; none: no such need.
-        excludes: options beside which it means nothing.
-        because: reason, after "does not go with --x" or "needs --x".
-        unless: value of the excluded option with which the option is allowed.
+        option: name of the option on the command line.
+        needs: options of which at least one must be given; empty: none.
+        excludes: options beside which the option has no effect.
+        because: reason, which follows "does not go with --x" or "needs --x".
+        unless: value of the excluded option beside which the option has an effect.
     """
 
     option: str
@@ -200,15 +202,15 @@ RULES: dict[str, tuple[Rule, ...]] = {
 def check_options(
     parser: argparse.ArgumentParser, arguments: Sequence[str], options: argparse.Namespace
 ) -> None:
-    """Raise if an option is given that its companions make meaningless.
+    """Raise if an option is given that has no effect beside the other options.
 
     Args:
-        parser: of the whole command line.
-        arguments: that it has accepted.
-        options: what it made of them.
+        parser: parser of the whole command line.
+        arguments: arguments that it has accepted.
+        options: the parsed options.
 
     Raises:
-        InputError: names the option, and what it needs or excludes.
+        InputError: an option has no effect; the message names what it needs or excludes.
     """
     command, leaf, rest = command_of(parser, arguments)
     given = _given(leaf, rest)
@@ -261,9 +263,9 @@ def _verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser
 
 
 def _given(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str]:
-    """Return the long names of the options that arguments hold, shortened ones too.
+    """Return the long names of all given options, also of abbreviated ones.
 
-    A positional argument that may be left out goes by its metavar.
+    An optional positional argument is named by its metavar.
     """
     names = {
         name: next(o for o in action.option_strings if o.startswith("--"))

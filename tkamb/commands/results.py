@@ -15,21 +15,25 @@ def add_compare(commands: Any) -> None:
     """Add `compare` to the command line."""
     compare = commands.add_parser("compare", help="two or more folders of results, side by side")
     compare.add_argument(
-        "folders", type=Path, nargs="+", metavar="DIR", help="that `tkamb run` wrote; two or more"
+        "folders",
+        type=Path,
+        nargs="+",
+        metavar="DIR",
+        help="folders that `tkamb run` wrote, two or more",
     )
     compare.add_argument(
         "--axis",
         choices=("flexion", "cycle", "time"),
-        help="common axis; default: the one that all of them ask for",
+        help="common axis; default: that of all runs",
     )
     compare.add_argument(
         "--frame",
         type=int,
         metavar="K",
-        help="of the first run: maps there; default: largest force",
+        help="frame of the first run whose maps are shown; default: that of the largest force",
     )
     compare.add_argument(
-        "--out", type=Path, metavar="DIR", help=f"folder of {PAGE_NAME}; default out/compare"
+        "--out", type=Path, metavar="DIR", help=f"folder for {PAGE_NAME}; default out/compare"
     )
     compare.add_argument("--force", action="store_true", help="write into a folder not tkamb's")
     compare.add_argument("--json", action="store_true", help="print the differences as JSON")
@@ -55,22 +59,26 @@ def _compare(options: argparse.Namespace) -> int:
 
 def add_export(commands: Any) -> None:
     """Add the command `export` to the parser's commands."""
-    export = commands.add_parser("export", help="results for other programs")
-    export.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    export = commands.add_parser("export", help="write results for other programs")
+    export.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
     kind = export.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--sto", type=Path, metavar="F.sto", help="all columns, for OpenSim")
+    kind.add_argument("--sto", type=Path, metavar="F.sto", help="write all columns, for OpenSim")
     kind.add_argument(
-        "--vtp", action="store_true", help="pressure maps over time, for ParaView; needs --out"
+        "--vtp",
+        action="store_true",
+        help="write pressure maps over time, for ParaView; needs --out",
     )
     kind.add_argument(
-        "--deck", choices=("ccx", "feb"), help="one frame's contact, for CalculiX or FEBio 4"
+        "--deck",
+        choices=("ccx", "feb"),
+        help="write the contact of one frame, for CalculiX or FEBio 4",
     )
     export.add_argument(
-        "--out", type=Path, metavar="DIR2", help="folder of --vtp; file of --deck (.inp, .feb)"
+        "--out", type=Path, metavar="DIR2", help="folder for --vtp, or file for --deck (.inp, .feb)"
     )
-    export.add_argument("--frame", type=int, metavar="K", help="of --deck: row of results.csv")
+    export.add_argument("--frame", type=int, metavar="K", help="for --deck: row of results.csv")
     export.add_argument(
-        "--resolution", type=float, metavar="MM", help="of --deck: edge of its hexahedra"
+        "--resolution", type=float, metavar="MM", help="for --deck: edge of the hexahedra"
     )
     export.add_argument("--force", action="store_true", help="--out may be a folder not tkamb's")
     export.set_defaults(command=_export)
@@ -134,16 +142,16 @@ def _export_maps(options: argparse.Namespace) -> int:
 def add_folder_commands(commands: Any) -> None:
     """Add `verify`, `report` and `methods` to the command line."""
     verify = commands.add_parser("verify", help="check that a folder of results is unchanged")
-    verify.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    verify.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
     verify.set_defaults(command=_verify)
     report = commands.add_parser("report", help="write report.html of a folder of results again")
-    report.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    report.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
     report.set_defaults(command=_report)
     methods = commands.add_parser(
         "methods",
         help="the Methods paragraph of a paper, from a folder of results",
     )
-    methods.add_argument("folder", type=Path, metavar="DIR", help="that `tkamb run` wrote")
+    methods.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
     methods.set_defaults(command=_methods)
 
 

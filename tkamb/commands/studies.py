@@ -13,10 +13,10 @@ from tkamb.run.guard import say
 
 @dataclass(frozen=True)
 class CohortOutputSettings:
-    """Output of `tkamb cohort`."""
+    """Length of the output of `tkamb cohort`."""
 
     max_failed_runs: int = 10
-    """Number of failed runs that are printed; the folder has them all. Chosen: they fit on a
+    """Largest number of failed runs that are printed; the folder lists all. Chosen: they fit on a
     screen."""
 
 
@@ -29,19 +29,28 @@ def add_cohort(commands: Any) -> None:
     Args:
         commands: the parser's subcommands.
     """
-    command = commands.add_parser("cohort", help="subjects, trials and designs as one table")
-    command.add_argument(
-        "file", type=Path, metavar="FILE.toml", help="subjects, trials, designs and contact models"
+    command = commands.add_parser(
+        "cohort", help="run subjects, trials and designs, and write one table"
     )
-    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
-    command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
-    command.add_argument("--shard", type=_part, metavar="I/N", help="every n-th run, for a queue")
+    command.add_argument(
+        "file",
+        type=Path,
+        metavar="FILE.toml",
+        help="file of subjects, trials, designs and contact models",
+    )
+    command.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="number of processes; default 1"
+    )
+    command.add_argument("--dask", metavar="ADDRESS|local", help="compute on a Dask cluster")
+    command.add_argument(
+        "--shard", type=_part, metavar="I/N", help="every N-th run from the I-th, for a job queue"
+    )
     command.add_argument("--frames", metavar="A:B:STEP", help="frames of every trial")
     command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
     command.add_argument(
         "--force", action="store_true", help="write into a folder that is not tkamb's"
     )
-    command.add_argument("--resume", action="store_true", help="go on with what is finished")
+    command.add_argument("--resume", action="store_true", help="go on with an interrupted cohort")
     command.set_defaults(command=_cohort)
 
 
@@ -94,15 +103,23 @@ NOT_OURS = "write into a folder that is not tkamb's, or another command's"
 
 def add_tradeoff(commands: Any) -> None:
     """Add `tradeoff` to the command line."""
-    tradeoff = commands.add_parser("tradeoff", help="speed against accuracy of the contact models")
+    tradeoff = commands.add_parser(
+        "tradeoff", help="compare speed and accuracy of the contact models"
+    )
     tradeoff.add_argument(
-        "scene", type=Path, nargs="?", metavar="SCENE", help="measure on your own scene too"
+        "scene",
+        type=Path,
+        nargs="?",
+        metavar="SCENE",
+        help="your own scene, which is measured, too",
     )
     size = tradeoff.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="two cases, 2 mm, within a minute")
     size.add_argument("--full", action="store_true", help="every setting on every case")
-    tradeoff.add_argument("--peer", choices=("calculix",), help="another program, side by side")
-    tradeoff.add_argument("--recompute", action="store_true", help="the references too (slow)")
+    tradeoff.add_argument("--peer", choices=("calculix",), help="compare with another program")
+    tradeoff.add_argument(
+        "--recompute", action="store_true", help="compute the references again, too (slow)"
+    )
     tradeoff.add_argument("--resume", action="store_true", help="go on with a stopped study")
     tradeoff.add_argument(
         "--out",
@@ -179,10 +196,12 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
 
 def add_stability(commands: Any) -> None:
     """Add `stability` to the command line."""
-    stability = commands.add_parser("stability", help="the contact models at the extremes")
+    stability = commands.add_parser("stability", help="test the contact models in extreme cases")
     stability.add_argument("--quick", action="store_true", help="a tenth of the contact cases")
     stability.add_argument("--resume", action="store_true", help="go on with a stopped study")
-    stability.add_argument("--workers", type=int, default=2, metavar="N", help="cases at a time")
+    stability.add_argument(
+        "--workers", type=int, default=2, metavar="N", help="number of processes; default 2"
+    )
     stability.add_argument(
         "--out",
         type=Path,

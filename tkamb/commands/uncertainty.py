@@ -1,4 +1,4 @@
-"""`tkamb uncertainty`: arguments in, exit status out."""
+"""`tkamb uncertainty`: its arguments, and what it prints."""
 
 import argparse
 from pathlib import Path
@@ -11,32 +11,44 @@ if TYPE_CHECKING:
     from tkamb.studies.uncertainty.run import Uncertainty
 
 SHOWN = 5
-"""Inputs of the tornado table that are printed."""
+"""Number of inputs that are printed."""
 QUICK_CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 QUICK_FRAMES = 11
-"""Frames of a screening without --frames."""
+"""Number of frames of a screening without --frames."""
 LEAST_SHOWN = 0.01
-"""Smallest share of a result's variance that is printed."""
+"""1: smallest share of a variance that is printed."""
 TERMS = 2
 """Regressors per input: its value and its square. By chance alone each explains a share 1/n of the
 variance of n samples."""
 NOTABLE_FAILED = 0.05
-"""Share of failed samples above which the bands are cut off at one end."""
+"""1: share of failed samples of a frame above which a line warns of the bands."""
 
 
 def add_uncertainty(commands: Any) -> None:
     """Add `uncertainty` to the command line."""
-    command = commands.add_parser("uncertainty", help="bands beside every result of a scene")
+    command = commands.add_parser(
+        "uncertainty", help="bands of all results of a scene from uncertain inputs"
+    )
     add_scene_options(command)
-    command.add_argument("--samples", type=int, default=256, metavar="N", help="default 256")
-    command.add_argument("--workers", type=int, default=1, metavar="N", help="processes; default 1")
-    command.add_argument("--dask", metavar="ADDRESS|local", help="have a Dask cluster compute")
-    command.add_argument("--method", default="lhs", metavar="lhs|sobol", help="default lhs")
     command.add_argument(
-        "--indices", action="store_true", help="Sobol' indices too: N (d + 2) samples of d inputs"
+        "--samples", type=int, default=256, metavar="N", help="number of samples; default 256"
     )
     command.add_argument(
-        "--screen", action="store_true", help="one input at a time, seconds; nothing is written"
+        "--workers", type=int, default=1, metavar="N", help="number of processes; default 1"
+    )
+    command.add_argument("--dask", metavar="ADDRESS|local", help="compute on a Dask cluster")
+    command.add_argument(
+        "--method", default="lhs", metavar="lhs|sobol", help="sampling; default lhs"
+    )
+    command.add_argument(
+        "--indices",
+        action="store_true",
+        help="also Sobol' indices, with N (d + 2) samples of d inputs",
+    )
+    command.add_argument(
+        "--screen",
+        action="store_true",
+        help="vary one input at a time; takes seconds, writes nothing",
     )
     command.add_argument(
         "--force", action="store_true", help="write into a folder that is not tkamb's"
@@ -79,7 +91,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
 
 
 def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    """Print the tornado of one input at a time; quick unless the command line says otherwise."""
+    """Print the effect of one input at a time, with few frames unless the options say otherwise."""
     from tqdm import tqdm
 
     from tkamb.io.scene import load_scene
@@ -120,7 +132,7 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
 
 def headline(uncertainty: "Uncertainty") -> list[str]:
-    """Return the peak's band and the inputs with the largest influence, in lines of text."""
+    """Return the band of the peak force and the most influential inputs, in lines of text."""
     from numpy import isfinite, nanargmax
 
     from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of

@@ -21,18 +21,18 @@ def add_view(commands: Any) -> None:
         type=Path,
         nargs="+",
         metavar="SCENE|RESULTS",
-        help="scene.toml or a folder that `tkamb run` wrote; several: side by side",
+        help="scene.toml or a folder that `tkamb run` wrote; several are shown side by side",
     )
     view.add_argument(
         "--contact",
         action="append",
         default=[],
         metavar="NAME",
-        help="contact model of a scene; several: side by side",
+        help="contact model of a scene; several are shown side by side",
     )
-    view.add_argument("--frame", type=int, default=0, metavar="K", help="shown first")
+    view.add_argument("--frame", type=int, default=0, metavar="K", help="first frame that is shown")
     view.add_argument("--camera", default="oblique", metavar="NAME", help=", ".join(CAMERAS))
-    view.add_argument("--lattice", action="store_true", help="draw the lattice too")
+    view.add_argument("--lattice", action="store_true", help="draw the lattice, too")
     view.add_argument("--html", type=Path, metavar="F", help="write one file instead of a window")
     view.add_argument("--png", type=Path, metavar="F", help="write a picture of the frame")
     for kind in ("gif", "mp4"):
@@ -42,7 +42,9 @@ def add_view(commands: Any) -> None:
     view.add_argument(
         "--force", action="store_true", help="write over files that tkamb did not write"
     )
-    view.add_argument("--port", type=int, default=0, help="of the live window; default: any free")
+    view.add_argument(
+        "--port", type=int, default=0, help="port of the window; default: any free port"
+    )
     view.set_defaults(command=_view)
 
 
@@ -136,7 +138,7 @@ def add_live(commands: Any) -> None:
     """Add `live` to the command line."""
     live = commands.add_parser(
         "live",
-        help="turn and press a knee by hand; contact is computed as sliders move",
+        help="move and press a knee by sliders in a window",
     )
     live.add_argument(
         "path",
@@ -144,10 +146,16 @@ def add_live(commands: Any) -> None:
         metavar="SCENE|RESULTS",
         help="scene.toml or a folder that `tkamb run` wrote",
     )
-    live.add_argument("--frame", type=int, default=0, metavar="K", help="recorded frame at first")
+    live.add_argument(
+        "--frame", type=int, default=0, metavar="K", help="first recorded frame that is shown"
+    )
     live.add_argument("--contact", metavar="NAME", help="contact model, instead of the scene's")
-    live.add_argument("--out", type=Path, metavar="DIR", help="for kept scenes; default: out/live")
-    live.add_argument("--port", type=int, default=0, help="of the window; default: any free")
+    live.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for saved scenes; default: out/live"
+    )
+    live.add_argument(
+        "--port", type=int, default=0, help="port of the window; default: any free port"
+    )
     live.set_defaults(command=_live)
 
 

@@ -1,4 +1,4 @@
-"""`tkamb wear`: arguments in, exit status out."""
+"""`tkamb wear`: its arguments, and what it prints."""
 
 import argparse
 import math
@@ -26,17 +26,28 @@ def add_wear(commands: Any) -> None:
         "--simulator",
         type=Path,
         metavar="PROFILE",
-        help="CSV of load and displacements or forces per cent of the cycle, "
+        help="CSV with load and displacements or forces over per cent of the cycle, "
         "instead of the scene's motion",
     )
     wear.add_argument(
-        "--springs", type=Path, metavar="F", help="the simulator's springs (.toml): force control"
+        "--springs",
+        type=Path,
+        metavar="F",
+        help="springs of the simulator (.toml), for force control",
     )
     wear.add_argument(
-        "--cycles", type=_count, default=CYCLES, metavar="N", help=f"default {CYCLES:.0e}"
+        "--cycles",
+        type=_count,
+        default=CYCLES,
+        metavar="N",
+        help=f"number of cycles; default {CYCLES:.0e}",
     )
     wear.add_argument(
-        "--updates", type=int, default=UPDATES, metavar="M", help="of the geometry; default 10"
+        "--updates",
+        type=int,
+        default=UPDATES,
+        metavar="M",
+        help="number of updates of the geometry; default 10",
     )
     wear.add_argument("--law", metavar="NAME", help="wear law; default: the material's own")
     wear.add_argument(
@@ -47,11 +58,14 @@ def add_wear(commands: Any) -> None:
     wear.add_argument(
         "--close",
         metavar="HOW",
-        help="how recorded frames become a cycle: interpolate (from the last frame to the first; "
+        help="closing of a recording to a cycle: interpolate (from the last frame to the first; "
         "default), there-and-back, or 'as recorded'",
     )
     wear.add_argument(
-        "--wear-factor", type=float, metavar="K", help="mm3/(N m), instead of the material's"
+        "--wear-factor",
+        type=float,
+        metavar="K",
+        help="wear factor, mm3/(N m), instead of the material's",
     )
     wear.add_argument("--contact", metavar="NAME", help="contact model, instead of the scene's")
     wear.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
@@ -60,20 +74,26 @@ def add_wear(commands: Any) -> None:
         type=int,
         default=FRAMES,
         metavar="N",
-        help="at most N of a recording, the last among them; a simulator's rows are all kept, and "
-        "N is the fewest; default 40",
+        help="largest number of frames of a recording, with the last one, or least number of rows "
+        "of a simulator; default 40",
     )
     wear.add_argument(
-        "--period", type=float, default=1.0, metavar="S", help="of a simulator's cycle; for creep"
+        "--period",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="period of a simulator's cycle, s, for creep",
     )
     wear.add_argument(
         "--samples",
         type=int,
         metavar="N",
-        help="for bands; default: 32 where the scene has [uncertainty], else 0, for none",
+        help="samples for bands; default: 32 if the scene has [uncertainty], else 0",
     )
     add_set(wear)
-    wear.add_argument("--workers", type=int, default=1, metavar="N", help="processes for samples")
+    wear.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="number of processes for the samples"
+    )
     wear.add_argument("--out", type=Path, metavar="DIR", help="output folder")
     wear.add_argument(
         "--force", action="store_true", help="write into a folder that is not tkamb's"

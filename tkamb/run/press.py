@@ -21,11 +21,12 @@ from tkamb.files import read_text
 from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings, RestoreRule
 from tkamb.geometry.adjustment import adjust as adjusted
 from tkamb.geometry.closest import ClosestPointQuery
-from tkamb.geometry.condyles import condyle_split
+from tkamb.geometry.condyles import condyle_split, orientation
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import MIRROR, Array, Index, mirrored_pose
 from tkamb.geometry.frames import pose as pose_matrix
 from tkamb.geometry.memory import peak_rss
+from tkamb.geometry.surface import Surface
 from tkamb.io import CONTACT_MODEL
 from tkamb.io.given_material import (
     material_as_json,
@@ -47,6 +48,15 @@ class PressLimitSettings:
     max_turn: float = 30.0 * DEGREE
     """rad; largest turn of the femoral component about the vertical without a remark. Chosen: no
     knee turns farther. Beyond it, medial and lateral do not lie over those of the insert."""
+    upside_down: tuple[float, float] = (170.0 * DEGREE, 250.0 * DEGREE)
+    """rad; range of the flexion, as the component's shape shows it, in which its bone side faces
+    the insert. Chosen: no knee flexes beyond 160 deg, and the shape shows it within 10 deg."""
+    min_flexion: float = -60.0 * DEGREE
+    """rad; below this flexion the flange, not the condyles, faces the insert: a remark. Chosen: no
+    knee extends as far."""
+    max_tilt: float = 45.0 * DEGREE
+    """rad; largest angle of the component's medial-lateral axis from the horizontal. Chosen: no
+    knee tilts as far."""
 
 
 PRESS_LIMITS = PressLimitSettings()
@@ -184,15 +194,45 @@ class PressReport:
 
 def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
     """Return what makes the words medial and lateral doubtful."""
+    stands = orientation(pair.femoral, pose)
+    remarks = []
+    if stands is not None and stands.flexion < PRESS_LIMITS.min_flexion:
+        remarks.append(
+            "the flange of the femoral component, not its condyles, faces the insert: check the "
+            "axes and the pose"
+        )
+    elif stands is not None and stands.forward < 0.0 < pose[2, 2]:
+        remarks.append(
+            "the flange of the femoral component points backward on the insert: check the axes"
+        )
     if pair.split is None:
-        return ["the femoral component has one condyle: its contact is called medial"]
+        return [
+            *remarks,
+            "the femoral component has one condyle: its contact is called medial",
+        ]
     turn = abs(math.atan2(pose[0, 2], pose[2, 2]))
     if turn <= PRESS_LIMITS.max_turn:
-        return []
+        return remarks
     return [
+        *remarks,
         f"the pose turns the femoral component by {turn / DEGREE:.0f} deg on the insert: medial "
-        "and lateral name its own condyles, wherever they lie on the insert"
+        "and lateral name its own condyles, wherever they lie on the insert",
     ]
+
+
+def _check_orientation(femoral: Surface, pose: Array, path: str | Path) -> None:
+    """Raise an InputError for a femoral component whose condyles cannot face the insert."""
+    stands = orientation(femoral, pose)
+    if stands is None:
+        return
+    lowest, highest = PRESS_LIMITS.upside_down
+    if stands.tilt > PRESS_LIMITS.max_tilt:
+        fault = "the femoral component lies on its side: its bone side does not open upward"
+    elif lowest < stands.flexion % (2 * math.pi) < highest:
+        fault = "the femoral component stands upside down: its bone side faces the insert"
+    else:
+        return
+    raise InputError(fault, path, "check the axes of both meshes, and the pose")
 
 
 def _adjustment(adjustment: Adjustment) -> dict[str, Any]:
@@ -371,7 +411,17 @@ def load_pair(
         raise InputError(f"'{side}' is no side", "side", "give right or left")
     if bearing not in ("fixed", "mobile"):
         raise InputError(f"'{bearing}' is no bearing", "bearing", "give fixed or mobile")
-    in_frame = insert_placement(insert_surface, rotation)
+    try:
+        in_frame = insert_placement(insert_surface, rotation)
+    except InputError as error:
+        if orientation(insert_surface, np.eye(4)) is None:
+            raise
+        raise InputError(
+            "has the shape of a femoral component, not of an insert",
+            insert,
+            "give the femoral component first, then the insert",
+        ) from error
+    _check_orientation(femoral_surface, in_frame @ femoral_pose, femoral)
     pair = ContactPair(
         femoral_surface, insert_surface.moved(in_frame), named_material(material), bearing
     )

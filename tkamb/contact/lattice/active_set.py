@@ -6,8 +6,9 @@ Find pressures and approach with, for every candidate node,
 
 and, when the load is given, -cᵀ lambda = load; when it is not, D is given. A is the symmetric
 positive definite compliance along the normals, c the normals' y. Primal-dual active set
-(Hintermueller, Ito & Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558); when
-the set starts to cycle, only the worst node changes.
+(Hintermueller, Ito & Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558). Once a
+set comes a second time, only the worst node changes. The search ends without having converged
+after twice as many sets as there are candidates.
 """
 
 from dataclasses import dataclass
@@ -16,11 +17,6 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from tkamb.geometry.frames import Array, Mask
-
-MOST_SETS = 200
-"""Sets tried before the search gives up."""
-PATIENCE = 12
-"""Sets after which only the worst node changes at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +68,10 @@ def solve_contact(
         leave = active & (force < -1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300))
         join = ~active & (opening < -1e-15)
         done, sets = not (leave.any() or join.any()), sets + 1
-        if done or sets >= MOST_SETS:
+        if done or sets > 2 * len(active):
             return ContactForces(np.maximum(force, 0), opening, depth, active, sets, done)
         key = active.tobytes()
-        careful = careful or key in seen or sets > PATIENCE
+        careful = careful or key in seen
         seen.add(key)
         if not careful:
             active = (active & ~leave) | join

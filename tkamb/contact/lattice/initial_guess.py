@@ -21,6 +21,7 @@ class LatticeStart(WarmStart):
         moved: (c, 3) m, displacement of the contact nodes that were candidates, else 0.
         depth: m, how far the femoral component went below the lowest contact node.
         region: outside of which h is zero, or None.
+        softening: s, see `Residual`.
     """
 
     problem: ContactProblem
@@ -28,6 +29,7 @@ class LatticeStart(WarmStart):
     moved: Array
     depth: float
     region: Region | None
+    softening: float = 1.0
 
 
 def lattice_start(state: LatticeState, start: Guess | None) -> LatticeStart | None:
@@ -49,6 +51,7 @@ class InitialGuess:
         moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
         reach: m, every node with a smaller vertical gap is a candidate.
         region: outside of which h is zero, or None.
+        softening: s of an earlier solution, see `Residual`.
         offset: (m, 3) m, displacement of the candidates of a linear material that no contact
             force made, or None.
         region_only: the residual of the region is enough, that of the whole solid is not measured.
@@ -63,12 +66,13 @@ class InitialGuess:
     reach: float = np.inf
     region: Region | None = None
     offset: Array | None = None
+    softening: float = 1.0
     region_only: bool = False
 
     @property
     def cold(self) -> "InitialGuess":
         """The same without what an earlier solution left."""
-        return replace(self, loads=None, moved=None, region=None, region_only=False)
+        return replace(self, loads=None, moved=None, region=None, softening=1.0, region_only=False)
 
 
 def initial_guess(
@@ -102,7 +106,7 @@ def initial_guess(
         return guess
     return replace(
         guess, loads=start.loads, moved=start.moved[nodes], region=start.region,
-        region_only=region_only,
+        region_only=region_only, softening=start.softening,
     )  # fmt: skip
 
 

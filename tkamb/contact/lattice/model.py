@@ -376,7 +376,7 @@ def _start_after(
     moved[solution.candidates] = solution.displacement
     return LatticeStart(
         state.pair, place.pose, state.points, place.pressure, place.gap,
-        state.problem, solution.loads, moved, depth, solution.region,
+        state.problem, solution.loads, moved, depth, solution.region, solution.softening,
     )  # fmt: skip
 
 

@@ -25,13 +25,6 @@ from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.contact.lattice.solid import Solid
 from tkamb.geometry.frames import Array, Mask
 
-NEAR = 0.05
-"""Relative residual from which on a region is chosen: a contact far off still grows."""
-LAST_GAP = 4.0
-"""Times the gap tolerance: gap that the last pass may leave, the model's own `tolerance`."""
-OUTSIDE = 0.8
-"""Share of the force tolerance that may stay outside of the region: the rounding of the factor."""
-
 
 @dataclass(frozen=True)
 class Residual:
@@ -66,11 +59,10 @@ class Residual:
         work = abs(float(np.vdot(outside, field))) / max(float(np.vdot(force, moved)), 1e-300)
         return cls(float(np.linalg.norm(outside)) / size, softening * work)
 
-    def within(self, settings: LatticeSolverSettings, last: bool = False) -> bool:
-        """Say whether all are within their tolerances; NaN is not. The last pass allows more."""
-        gap = (LAST_GAP if last else 1.0) * settings.gap_tolerance
+    def within(self, settings: LatticeSolverSettings) -> bool:
+        """Return whether all are within their tolerances; NaN is not."""
         balanced = self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
-        return balanced and self.gap <= gap
+        return balanced and self.gap <= settings.gap_tolerance
 
     @property
     def reported(self) -> float:
@@ -86,7 +78,7 @@ class LinearBalance:
         moved: (m, 3) m, theirs in all.
     """
 
-    residual, field, loads, region = Residual(0.0), None, None, None
+    residual, field, loads, region, softening = Residual(0.0), None, None, None, 1.0
 
     def __init__(self, offset: Array) -> None:
         self.offset = offset
@@ -126,7 +118,7 @@ class NonlinearBalance:
         self._constant = np.zeros_like(problem.solid.nodes)
         self._rounding = np.zeros((len(guess.candidates), 3))
         self._differences: list[tuple[Array, Array]] = []
-        self._softening, self.residual = 1.0, Residual(np.inf, np.inf)
+        self.softening, self.residual = guess.softening, Residual(np.inf, np.inf)
         self._take(self._constant if guess.loads is None else guess.loads)
 
     def _take(self, h: Array) -> None:
@@ -174,7 +166,7 @@ class NonlinearBalance:
             rest = np.setdiff1d(every, self._region.fronts.fronts, assume_unique=True)
             operator.factor.backward(self._x, operator.factor.shared(rest))
         self.field = operator.nodal(self._x)
-        internal, self._shares, self._softening = forces_of(solid, self.field)
+        internal, self._shares, self.softening = forces_of(solid, self.field)
         outside = -internal
         outside[self._candidates] += self._force
         self.loads, self._measured = self._h + outside, True
@@ -188,18 +180,19 @@ class NonlinearBalance:
         for loads in (outside, self.loads):
             loads.ravel()[self._problem.held_unknowns] = 0.0
         last, self._size = self.residual, float(np.linalg.norm(self._force))
-        new = Residual.of(outside, self.field, self._force, self.moved, self._softening)
+        new = Residual.of(outside, self.field, self._force, self.moved, self.softening)
         # The work changes its sign from time to time: it has not fallen more than the force.
         fall = min(new.force / max(last.force, 1e-300), 1.0) if np.isfinite(last.force) else 0.0
         self.residual = replace(new, work=max(new.work, fall * last.work if fall else 0.0))
 
     def advance(self) -> None:
-        """Take the next loads h: h + r, accelerated."""
+        """Take the next loads h: h + s r, accelerated."""
         if self._measured:
             self._choose_region()
         nodes = self._region.nodes
-        h, asked = self._h[nodes].ravel(), self.loads[nodes].ravel()
-        self._differences.append((asked, asked - h))
+        h = self._h[nodes].ravel()
+        step = self.softening * (self.loads[nodes].ravel() - h)
+        self._differences.append((h + step, step))
         del self._differences[: -self._settings.anderson_depth - 1]
         following = np.zeros_like(self._h)
         following[nodes] = accelerated(self._differences).reshape(-1, 3)
@@ -207,10 +200,10 @@ class NonlinearBalance:
 
     def _choose_region(self) -> None:
         """Choose the elements that count, and hold constant what the others ask for."""
-        most = OUTSIDE * self._settings.force_tolerance * self._size
+        most = self._settings.force_tolerance * self._size
         if self._region.whole or self._beyond(self._region, self.loads - self._h) > most:
             region = self.region
-            if self.residual.force > NEAR or self._beyond(region, self.loads) > most:
+            if self._beyond(region, self.loads) > most:
                 region = self._problem.everywhere
             if not (region.whole and self._region.whole):  # earlier iterates do not apply
                 self._differences = []

@@ -26,12 +26,12 @@ class LatticeSolverSettings:
     """1: largest distance of an active node from the femoral surface (penetration of the others),
     relative to the largest displacement of an active node. Smaller: more passes where the femoral
     normal turns quickly. Larger: fewer passes, peaks at such places less accurate: at a rim a peak
-    is off by up to three times the gap. The last pass accepts four times as much."""
+    is off by up to three times the gap."""
     max_passes: int = 40
-    """Passes after which the iteration stops, converged or not; knees take 1 to 8. Smaller: presses
-    that converge slowly stop earlier, and take the slow full Newton iteration or end as not
-    converged. Larger: more of them converge; a press that cannot converge takes longer. Presses
-    that converge earlier do not change."""
+    """Passes, and steps of the full Newton iteration, after which each stops; knees take 1 to 8
+    passes. Smaller: presses that converge slowly stop earlier, and take the slow full Newton
+    iteration or end as not converged. Larger: more of them converge; a press that cannot converge
+    takes longer. Presses that converge earlier do not change."""
     anderson_depth: int = 6
     """Differences that Anderson's method keeps. Smaller: more passes of a softened contact. Larger:
     fewer passes, more memory."""

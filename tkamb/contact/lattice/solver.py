@@ -14,23 +14,25 @@ pass of the iteration is a modified Newton step with the factorised linear stiff
 2. Contact: a primal-dual active set on the condensed compliance of the candidate nodes, K⁻¹ at
    those nodes, with the displacement K⁻¹ h of the nonlinear loads h as offset (`active_set.py`).
 3. Displacement: K u = f + h. Residual: r = f - f_int(u) (`nonlinear_balance.py`).
-4. Next loads: h + r, accelerated by Anderson's method.
+4. Next loads: h + s r, accelerated by Anderson's method. The softening s is the ratio of secant
+   and tangent stiffness along u, so that K/s stands for the tangent stiffness.
 
-Passes look at the region of the elements that have softened. When the residual there is within
+Passes evaluate the region of the elements that have softened. When the residual there is within
 the tolerances, the residual of the whole solid is measured at u: r from the law of every element,
-without any factor; the gap at the displaced nodes, with rays fired anew. These stop the
-iteration, and these are reported:
+without any factor; the gap at the displaced nodes, with new rays. The iteration has converged when
 
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
-    |gamma| / max |u| <= gap_tolerance        of active nodes, and overlap of the others
+    |gamma| / max |u| <= gap_tolerance        for active nodes, and for the overlap of the others
 
-The last pass (`max_passes`, or a residual force above `DIVERGED`) stops it in any case. It counts
-as converged with a gap of up to force_tolerance. The work of the residual estimates the relative
-error of the approach: for an error du = e u, r = e K_T u. The load and lambda >= 0 hold to rounding
-in every pass. When no pass gets there, full Newton iteration goes on (`solve_by_newton`). It is the
-reference, too: every step refactorises the tangent stiffness and solves the contact on its own
-compliance, so that it shares nothing with the accelerated iteration but the contact conditions.
+and the active set has stopped changing. The result reports these residuals. The work of the
+residual estimates the relative error of the approach: an error du = e u leaves r = e K_T u. The
+load and lambda >= 0 hold to rounding in every pass.
+
+After `max_passes` the iteration stops. If it began with the loads h of an earlier solution, it
+begins again without them. If it does not converge either, `solve_by_newton` continues. That full
+Newton iteration is the reference, too: every step factorises the tangent stiffness and solves the
+contact on its own compliance. Both share the contact conditions alone.
 """
 
 from dataclasses import dataclass, replace
@@ -52,15 +54,6 @@ from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, Index, Mask
 
-MOST_STEPS = 30
-"""Steps of full Newton iteration after which it stops."""
-DIVERGED = 10.0
-"""Relative residual force at which the iteration is given up."""
-STAGNATION_RATIO = 0.7
-"""The planes are damped when a gap changes its sign and falls by less than to this share."""
-LEAST_DAMPING = 0.125
-"""Smallest share of the way that the planes follow the nodes."""
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -76,6 +69,7 @@ class Solution:
         passes: how many.
         residual: of the whole solid.
         region: the elements with which a next solution may begin, or None.
+        softening: s, with which a next solution may begin.
     """
 
     candidates: Index
@@ -87,6 +81,7 @@ class Solution:
     passes: int
     residual: Residual
     region: Region | None = None
+    softening: float = 1.0
 
     @property
     def converged(self) -> bool:
@@ -116,22 +111,22 @@ def solve(
         forces, moved = solve_pass(guess.response, balance.offset, points, planes, load, active)
         active = forces.active
         balance.displace(forces.force[:, None] * planes.normals, moved)
-        if guess.loads is not None and not (active.any() and balance.residual.force < DIVERGED):
-            # What a heavier contact left behind holds the nodes down: begin without it.
-            return solve(problem, pose, load, guess.cold, settings)
         residual = replace(balance.residual, gap=sliding.follow(moved, forces))
-        last = passes == settings.max_passes or not residual.force < DIVERGED
+        last = passes == settings.max_passes or not np.isfinite(residual.force)
+        if guess.loads is not None and (last or not active.any()):
+            # The loads of another contact may hold the nodes down: begin without them.
+            return solve(problem, pose, load, guess.cold, settings)
         if last or residual.within(settings):
             if last or not guess.region_only:
                 balance.measure()
             gap = sliding.gap(balance.moved, forces) if balance.moved is not moved else residual.gap
             residual = replace(balance.residual, gap=gap)
-            within = residual.within(settings, last)
+            within = residual.within(settings)
             if last or within:
                 forces = replace(forces, converged=within and forces.converged)
                 return Solution(
                     guess.candidates, forces, planes, balance.moved, balance.field,
-                    balance.loads, passes, residual, balance.region,
+                    balance.loads, passes, residual, balance.region, balance.softening,
                 )  # fmt: skip
         balance.advance()
 
@@ -184,7 +179,7 @@ class SlidingNodes:
     ) -> None:
         self._problem, self._points, self._pose = problem, points, pose
         self._fired, self.planes = points + moved, planes
-        self._share, self._last, self._gap = 1.0, np.inf, np.zeros(len(points))
+        self._share, self._gap = 1.0, np.zeros(len(points))
         if moved.any():
             self.planes = self._at(self._fired)
 
@@ -198,9 +193,9 @@ class SlidingNodes:
         missed = self._relative_gap(there, moved, forces)
         gap = there.gap(positions) + forces.approach * there.normal_y
         gap = np.where(forces.active, gap, 0.0)
-        if missed > STAGNATION_RATIO * self._last and float(gap @ self._gap) < 0:
-            self._share = max(self._share / 2, LEAST_DAMPING)
-        self._last, self._gap = missed, gap
+        if float(gap @ self._gap) < -0.5 * float(self._gap @ self._gap):
+            self._share /= 2
+        self._gap = gap
         self._fired = self._fired + self._share * (positions - self._fired)
         self.planes = there if self._share == 1.0 else self._at(self._fired)
         return missed
@@ -237,7 +232,7 @@ def solve_by_newton(
         pose: (4, 4) pose_femoral_in_insert.
         load: N along -y, or None.
         guess: candidates and first active set; its compliance is not used.
-        settings: tolerances; the number of passes is not used.
+        settings: tolerances and largest number of steps.
         field: (n, 3) m, where to start; at rest by default.
 
     Raises:
@@ -248,8 +243,9 @@ def solve_by_newton(
     u = np.zeros_like(solid.nodes) if field is None else field
     active, step, before, free = guess.active, 1.0, np.inf, ~problem.held.reshape(-1, 3)
     sliding = SlidingNodes(problem, points, u[nodes], pose, guess.planes)
-    for steps in range(1, MOST_STEPS + 1):
-        planes, last = sliding.planes, steps == MOST_STEPS
+    within, steps = False, 0
+    while steps < settings.max_passes and not within:
+        planes, steps = sliding.planes, steps + 1
         u_full, forces = _step(problem, nodes, points, u, planes, load, active)
         u, active = u + step * (u_full - u), forces.active
         gap, force = sliding.follow(u[nodes], forces), forces.force[:, None] * planes.normals
@@ -259,9 +255,7 @@ def solve_by_newton(
         residual = replace(Residual.of(free * outside, u, force, u[nodes], softening), gap=gap)
         if not np.isfinite(residual.force):
             raise ComputationError("Newton's iteration left the range of numbers")
-        within = residual.within(settings, last)
-        if within or last:
-            break
+        within = residual.within(settings)
         step, before = 0.5 if residual.force > 2 * before else 1.0, residual.force
     forces = replace(forces, converged=within and forces.converged)
     h = free * solid.scatter.sum(shares)

@@ -33,15 +33,16 @@ Element = ElementTree.Element
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """An OpenSim document: where it lies, and what its <defaults> say for each class.
+    """An OpenSim document, with the default values of its classes.
 
-    OpenSim omits values that equal the defaults, so that a missing element is looked up there.
+    OpenSim does not write values that equal the defaults. A missing value is therefore looked up in
+    the defaults.
 
     Args:
         path: the file.
-        defaults: class -> the element that holds its default values.
-        partial: whether what cannot be read is collected in `unread` instead of being refused.
-        unread: elements that could not be read, and why.
+        defaults: class -> the element with its default values.
+        partial: whether an element that cannot be read is added to `unread` instead of refused.
+        unread: elements that could not be read, each with the reason.
     """
 
     path: Path
@@ -51,7 +52,7 @@ class Document:
 
     @contextmanager
     def reading(self, element: Element) -> Iterator[None]:
-        """Read one element; where that fails in a partial reading, it is left out and recorded."""
+        """Run a block that reads an element; in a partial reading its error goes to `unread`."""
         try:
             yield
         except InputError as error:
@@ -60,11 +61,11 @@ class Document:
             self.unread.append((element, str(error)))
 
     def where(self, element: Element) -> str:
-        """Return the file and the element for a message."""
+        """Return words for messages: the file, and the class and name of an element."""
         return f"{self.path}: {element.tag} '{element.get('name', '')}'"
 
     def find(self, element: Element, *tags: str) -> Element | None:
-        """Return the first child with one of these tags, here or in the defaults."""
+        """Return the first child with one of these tags, in the element or in the defaults."""
         for source in (element, self.defaults.get(element.tag)):
             for tag in tags if source is not None else ():
                 result = source.find(tag)  # type: ignore[union-attr]
@@ -73,10 +74,10 @@ class Document:
         return None
 
     def text(self, element: Element, *tags: str, default: str | None = None) -> str:
-        """Return the text of a child.
+        """Return the text of the first child with one of these tags.
 
         Raises:
-            InputError: there is none and no default.
+            InputError: there is no text and no default.
         """
         result = self.find(element, *tags)
         text = "" if result is None else (result.text or "").strip()
@@ -85,20 +86,20 @@ class Document:
         raise InputError(f"has no <{tags[0]}>", self.where(element))
 
     def socket(self, element: Element, name: str, *old_tags: str, default: str = "") -> str:
-        """Return what a socket is connected to, as any version since 2.3 writes it.
+        """Return the path or name of the object that a socket of an element is connected to.
 
-        Version 4 has <socket_NAME>, documents 30508 to 30515 <connector_NAME_connectee_name> or
-        <socket_NAME_connectee_name>, those before <connectors> with a <connectee_name> for each,
-        and version 3 a tag of its own.
+        The tag depends on the version of the file. Version 4: <socket_NAME>. 30508 to 30515:
+        <connector_NAME_connectee_name> or <socket_NAME_connectee_name>. Before 30508:
+        <connectors> with a <connectee_name> for each. Version 3: a tag for each kind of socket.
 
         Args:
-            element: whose socket it is.
-            name: of the socket, such as "parent_frame".
-            old_tags: what version 3 calls it.
-            default: what is returned where it is connected to nothing; "" refuses that.
+            element: the element with the socket.
+            name: name of the socket, such as "parent_frame".
+            old_tags: its tags in version 3.
+            default: returned where the socket is not connected; "": that is an error.
 
         Raises:
-            InputError: there is none and no default.
+            InputError: the socket is not connected, and there is no default.
         """
         for holder in element.findall("connectors/*"):
             if holder.get("name") == name:
@@ -116,10 +117,10 @@ class Document:
     def numbers(
         self, element: Element, *tags: str, count: int | None = None, default: str | None = None
     ) -> Array:
-        """Return the numbers (count,) of a child; several may be in brackets, or between commas.
+        """Return the numbers (count,) of a child; brackets and commas are allowed.
 
         Raises:
-            InputError: missing, not numbers, not finite or not as many.
+            InputError: they are missing, are not finite numbers, or are not `count`.
         """
         text = self.text(element, *tags, default=default)
         try:
@@ -134,12 +135,12 @@ class Document:
         return values
 
     def number(self, element: Element, *tags: str, default: float | None = None) -> float:
-        """Return the one number of a child."""
+        """Return the number of a child."""
         written = None if default is None else repr(default)
         return float(self.numbers(element, *tags, count=1, default=written)[0])
 
     def flag(self, element: Element, tag: str, default: bool) -> bool:
-        """Return a child's true or false."""
+        """Return whether the text of a child is "true"."""
         text = self.text(element, tag, default=str(default)).lower()
         if text not in ("true", "false"):
             raise InputError(
@@ -167,7 +168,7 @@ class Document:
         """Return the function that an element describes.
 
         Raises:
-            InputError: a function class that is not read, or a malformed one.
+            InputError: a class of function that is not read, or a malformed function.
         """
         match element.tag:
             case "Constant":
@@ -194,7 +195,7 @@ class Document:
         )
 
     def held_function(self, element: Element, tag: str) -> Function | None:
-        """Return the function in <tag>, or the one that stands beside it with that name."""
+        """Return the function in <tag>, or a child function named `tag`; None without either."""
         holder = self.find(element, tag)
         if holder is not None and len(holder):
             return self.function(holder[0])
@@ -215,8 +216,8 @@ class Document:
 def _number_words(text: str, count: int | None) -> list[str]:
     """Return the words of a list of numbers.
 
-    OpenSim's own reader takes `(0 1 0)`, `~[0,1,0]` and `0, 1, 0` for three numbers too. Commas
-    separate only where there is one between each two: else they may be decimal.
+    Like OpenSim's reader, it also accepts `(0 1 0)`, `~[0,1,0]` and `0, 1, 0` for three numbers.
+    Commas separate numbers only if their count fits; otherwise they may be decimal commas.
     """
     if count is None or count < 2:
         return text.split()
@@ -232,13 +233,13 @@ class DocumentSettings:
     """Limits of reading an OpenSim file."""
 
     max_nested_files: int = 5
-    """Files that name files in turn; OpenSim's own models nest one deep."""
+    """Depth of files that name further files; OpenSim's own models have a depth of one."""
 
 
 DOCUMENT = DocumentSettings()
 
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
-"""Sets of which tkamb reads only the names; their file may be absent."""
+"""Sets of which tkamb reads only the names; their files may be absent."""
 
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[0-9]+|#x[0-9a-fA-F]+);)")
 _COMMENT = re.compile(r"<!--(.*?)-->", re.S)
@@ -248,13 +249,13 @@ _END = re.compile(r"</OpenSimDocument\s*>")
 
 
 def open_document(path: Path) -> tuple[Element, list[str]]:
-    """Return the root of an OpenSim file with its included files, and notices.
+    """Return the root of an OpenSim file with the files that it names, and notices.
 
     Args:
         path: the file.
 
     Raises:
-        InputError: it, or a file that it names and that is needed, cannot be read.
+        InputError: the file, or a needed file that it names, cannot be read.
     """
     notices: list[str] = []
     root = _read(path, notices)
@@ -264,7 +265,7 @@ def open_document(path: Path) -> tuple[Element, list[str]]:
 
 
 def _read(path: Path, notices: list[str]) -> Element:
-    """Return the root of one file, read strictly, and if that fails as OpenSim reads it."""
+    """Return the root of one file: of strict XML, or after repairs where OpenSim is lenient."""
     content = read_bytes(path, what=WHAT)
     try:
         return parse_xml(content, path, what=WHAT)
@@ -275,13 +276,13 @@ def _read(path: Path, notices: list[str]) -> Element:
         try:
             root = parse_xml(text.encode("utf-8"), path, what=WHAT)
         except InputError:
-            raise error from None  # the place in the file as it is
+            raise error from None  # this error has the line number of the unchanged file
     notices.append(f"{path.name} is not strict XML ({', '.join(mended)}), read as OpenSim reads it")
     return root
 
 
 def _lenient(content: bytes) -> tuple[str, list[str]]:
-    """Return the text as strict XML without its declaration, and what was done to it."""
+    """Return the text as strict XML without its declaration, and words on each repair."""
     mended = []
     try:
         text = content.decode("utf-8-sig")
@@ -311,7 +312,7 @@ def _lenient(content: bytes) -> tuple[str, list[str]]:
 
 
 def _include(element: Element, path: Path, opened: tuple[Path, ...], notices: list[str]) -> None:
-    """Replace every element that names a file by what the file holds, in place."""
+    """Replace every element that names a file by the content of that file, in place."""
     while (name := element.attrib.pop("file", "").strip()) and name.lower() != "unassigned":
         path, opened = _replace(element, name, path, opened, notices)
     for child in element:
@@ -321,27 +322,27 @@ def _include(element: Element, path: Path, opened: tuple[Path, ...], notices: li
 def _replace(
     element: Element, name: str, path: Path, opened: tuple[Path, ...], notices: list[str]
 ) -> tuple[Path, tuple[Path, ...]]:
-    """Take over one element from its file; return that file and all that lead to it."""
+    """Fill an element from the file that it names; return that file and the files opened so far."""
     where = f"{path}: {element.tag} file='{name}'"
     other = path.parent / name.replace("\\", "/")
     if not other.is_file() and element.tag in NOT_NEEDED:
-        notices.append(f"{element.tag} left out: its file {name} is not there")
+        notices.append(f"{element.tag} is left out: its file {name} does not exist")
         return path, opened
     if other.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
-        raise InputError("names a file that leads back to it", where)
+        raise InputError("names a file that names it in turn, or nests files too deep", where)
     if not other.exists():
         raise InputError(
-            f"names a file that is not there ({other})", where, "put it beside the model"
+            f"names a file that does not exist ({other})", where, "put it beside the model"
         )
     root = _read(other, notices)
     target = root
     if root.tag == "OpenSimDocument":
         of_tag = [child for child in root if child.tag == element.tag]
         if not of_tag:
-            raise InputError(f"names a file that holds no <{element.tag}> ({other})", where)
+            raise InputError(f"names a file without a <{element.tag}> ({other})", where)
         target = of_tag[0]
     if target.tag != element.tag:
-        raise InputError(f"names a file that holds no <{element.tag}> but <{target.tag}>", where)
+        raise InputError(f"names a file with a <{target.tag}> instead of a <{element.tag}>", where)
     for source in (target, root):
         _apply_defaults(target, source.find("defaults"))
     element[:] = [child for child in target if child.tag != "defaults"]
@@ -353,7 +354,7 @@ def _replace(
 
 
 def _apply_defaults(target: Element, defaults: Element | None) -> None:
-    """Write a file's own defaults into its elements; they do not apply to other files."""
+    """Write a file's defaults into its own elements, because they do not apply to other files."""
     by_tag = {} if defaults is None else {entry.tag: entry for entry in defaults}
     inside = set() if defaults is None else set(defaults.iter())
     for element in [e for e in target.iter() if e.tag in by_tag and e not in inside]:

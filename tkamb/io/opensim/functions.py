@@ -1,6 +1,6 @@
-"""OpenSim's functions of one variable: values, slopes and curvatures.
+"""OpenSim's functions of one variable, with their first and second derivatives.
 
-Every function takes an array of any shape and returns one of the same shape.
+Every function takes an array of any shape and returns an array of the same shape.
 
 Reference: Forsythe, Malcolm & Moler, Computer Methods for Mathematical Computations (1977),
 chapter 4, for the spline's end conditions.
@@ -56,7 +56,7 @@ class Polynomial:
     """f(x) = c_0 xⁿ + … + c_n.
 
     Args:
-        coefficients: (n+1,), of the highest power first.
+        coefficients: (n+1,), beginning with the coefficient of the highest power.
     """
 
     coefficients: Array
@@ -75,10 +75,10 @@ class Polynomial:
 
 
 class Piecewise:
-    """A piecewise polynomial, continued beyond its ends along the tangents there.
+    """A piecewise polynomial that is linear beyond its ends, with the slopes there.
 
     Args:
-        pieces: polynomials between the knots.
+        pieces: the polynomials between the knots.
     """
 
     def __init__(self, pieces: PPoly) -> None:
@@ -121,16 +121,16 @@ class Scaled:
 
 
 def piecewise_linear(x: Array, y: Array) -> Piecewise:
-    """Return straight lines through the points (n,), n at least 2, x increasing."""
+    """Return the polyline through n >= 2 points x, y (n,), x increasing."""
     return Piecewise(PPoly(np.stack([np.diff(y) / np.diff(x), y[:-1]]), x))
 
 
 def simm_spline(x: Array, y: Array) -> Piecewise:
-    """Return SIMM's cubic spline through the points (n,), n at least 2, x increasing.
+    """Return SIMM's cubic spline through n >= 2 points x, y (n,), x increasing.
 
-    Its third derivative in the first interval is that of the cubic through the first four
-    points, and likewise at the last; with three points it is zero there, with two the
-    spline is a straight line. (A natural spline has no curvature at its ends instead.)
+    Its third derivative in the first interval is that of the cubic through the first four points;
+    in the last interval likewise with the last four. With three points it is zero, with two points
+    the spline is a straight line. A natural spline would have zero curvature at its ends instead.
     """
     if len(x) == 2:
         return piecewise_linear(x, y)
@@ -142,7 +142,7 @@ def simm_spline(x: Array, y: Array) -> Piecewise:
 
 
 def _third_difference(x: Array, y: Array) -> float:
-    """Return the divided difference of four points: a sixth of their cubic's f'''."""
+    """Return the third divided difference of four points: f'''/6 of the cubic through them."""
     for order in (1, 2, 3):
         y = np.diff(y) / (x[order:] - x[:-order])
     return float(y[0])

@@ -32,17 +32,16 @@ from tkamb.geometry.frames import Array
 
 @dataclass(frozen=True)
 class PlaneStringSettings:
-    """Initial guesses of a string around an ellipsoid or torus, in planes through its end
-    points."""
+    """Initial guesses of a string around an ellipsoid, in planes through its end points."""
 
     runge_kutta_steps: int = 6
-    """Runge-Kutta steps along a geodesic of an initial guess. Chosen: they give an initial guess
-    only."""
+    """Number of Runge-Kutta steps along a geodesic. Chosen: the
+    rule (DOP853) has order eight, so that few steps suffice."""
     rival_share: float = 0.1
-    """Share of its arc by which a plane string may be longer than the shortest and is still tried.
-    Chosen: it may lead to the shortest geodesic."""
+    """Share (1) of its arc by which a second plane string may exceed the shortest and is still
+    tried. Chosen: it may lead to the shortest geodesic."""
     planes: int = 24
-    """Planes through both points that are tried. Chosen: one every 7.5 deg of half a turn."""
+    """Number of half planes through both points that are tried. Chosen: one every 15 deg."""
 
 
 PLANE_STRING = PlaneStringSettings()
@@ -57,23 +56,24 @@ _FINE = (
 _FINE_WEIGHTS = _WEIGHTS / PLANE_STRING.runge_kutta_steps
 _NODES, _COARSE_WEIGHTS = np.polynomial.legendre.leggauss(6)
 _COARSE, _ENDS = _NODES, np.array([-1.0, 1.0])
-"""Places on an arc, -1 to 1: for its length in each step, for its whole, and its ends."""
+"""Places on an arc, -1 to 1: Gauss points for its whole length (`_FINE`: for its steps), and its
+ends."""
 
 
 def planar_starts(
     p: Array, q: Array, axes: Array, half: Array | None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the shortest plane strings, and the next shortest that stand apart from them.
+    """Return the shortest plane strings, and the shortest of the other local minima.
 
     Args:
-        p: (f, 3) start, in the space where the ellipsoid is the unit sphere.
-        q: (f, 3) end, likewise.
-        axes: (3,) m.
+        p: (f, 3) starts, in coordinates in which the ellipsoid is the unit sphere.
+        q: (f, 3) ends, likewise.
+        axes: (3,) m, semi-axes.
         half: as in `shortest_strings`.
 
     Returns:
-        Where they meet the ellipsoid (f, 2, 3), in that space; (f, 2, STEPS) m, their lengths
-        on it in steps of equal angle; (f,) whether the second may turn out the shorter.
+        (f, 2, 3): the points where they meet the sphere. (f, 2, s) m: their lengths on the
+        ellipsoid in s steps of equal angle. (f,): whether the second may lead to a shorter string.
     """
     planes = _Planes.through(p, q)
     points = planes.points(_ENDS)
@@ -100,15 +100,15 @@ def planar_starts(
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """Half planes k through the line from p to q, and the circles they cut out of a unit sphere.
+    """k half planes through each line from p to q, and the circles that they cut from the sphere.
 
     Args:
         along: (f, 1, 3) direction of the line.
-        outward: (f, k, 3) direction across it.
-        centre: (f, k, 3) of the circle.
-        radius: (f, k) of the circle.
-        ends: (2, f, k) rad, where the taut string in the plane meets and leaves the circle,
-            counted from outward to along.
+        outward: (f, k, 3) direction in the half plane, normal to the line.
+        centre: (f, k, 3) centre of the circle.
+        radius: (f, k) radius of the circle.
+        ends: (2, f, k) rad, angles from `outward` towards `along` at which the taut string in the
+            plane meets and leaves the circle.
     """
 
     along: Array
@@ -119,11 +119,11 @@ class _Planes:
 
     @classmethod
     def through(cls, p: Array, q: Array) -> "_Planes":
-        """Return planes at equal angles through lines from p to q (f, 3)."""
+        """Return half planes at equal angles through the lines from p to q (f, 3)."""
         along = unit(q - p)
         middle = p - dot(p, along)[:, None] * along
         offset = np.linalg.norm(middle, axis=1)
-        # Any direction across will do where the line passes through the centre.
+        # Where the line passes through the centre, any normal direction will do.
         spare = np.eye(3)[np.abs(along).argmin(axis=1)]
         spare = spare - dot(spare, along)[:, None] * along
         first = unit(np.where(offset[:, None] > 1e-9, middle, spare))
@@ -141,7 +141,7 @@ class _Planes:
         return cls(along[:, None], outward, centre, radius, np.stack(ends))
 
     def chosen(self, rows: NDArray[np.int64], planes: NDArray[np.int64]) -> "_Planes":
-        """Return some planes of each line."""
+        """Return the chosen planes of each line."""
         return _Planes(
             self.along,
             self.outward[rows, planes],
@@ -173,18 +173,18 @@ class _Planes:
         return size[..., None] * np.sqrt(np.maximum(squared, 0.0))
 
     def _angles(self, places: Array) -> Array:
-        """Return the angles (f, k, n), rad, of places (n,)."""
+        """Return the angles (f, k, n) rad at places (n,) of the arcs."""
         middle, half = 0.5 * (self.ends[0] + self.ends[1]), 0.5 * (self.ends[1] - self.ends[0])
         return middle[..., None] + half[..., None] * places
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the products of vectors (..., 3) one by one."""
+    """Return the dot products (...) of vectors (..., 3)."""
     return np.asarray((a * b).sum(axis=-1))
 
 
 def unit(vectors: Array) -> Array:
-    """Return vectors (..., 3) made unit vectors."""
+    """Return vectors (..., 3) scaled to unit length."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
@@ -193,14 +193,13 @@ class GeodesicSettings:
     """The Newton iteration for a geodesic between two points."""
 
     max_iterations: int = 30
-    """Newton steps, after which a string without convergence fails. Chosen: strings that converge
-    need fewer."""
+    """Largest number of Newton steps. Chosen: strings that converge need fewer."""
     tolerance: float = 1e-11
-    """rad; error of the direction in which the string arrives. Chosen: far below what moves a point
-    of contact."""
+    """rad; largest error of the string's direction at its end. Chosen: it moves no touching point
+    noticeably."""
     overshoot_below: float = 0.05
-    """rad: if the error is smaller than this, a string that arrives backwards has overshot. Chosen:
-    farther away the derivative may turn its sign."""
+    """rad; with a smaller error, a string whose end lies behind it has overshot and is shortened.
+    Chosen: with larger errors the derivative may have the other sign."""
 
 
 GEODESIC = GeodesicSettings()
@@ -211,11 +210,11 @@ class Strings:
     """Strings over an ellipsoid, in its frame.
 
     Args:
-        entry: (f, 3) m, where they meet it.
-        exit: (f, 3) m, where they leave it.
-        arc_m: (f,) length on it.
-        length_m: (f,) whole length.
-        converged: (f,) whether they are taut.
+        entry: (f, 3) m, points where they meet it.
+        exit: (f, 3) m, points where they leave it.
+        arc_m: (f,) lengths on it.
+        length_m: (f,) whole lengths.
+        converged: (f,) whether the iteration has converged, so that they are taut.
     """
 
     entry: Array
@@ -226,16 +225,16 @@ class Strings:
 
 
 def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None = None) -> Strings:
-    """Return the shortest strings around an ellipsoid that the straight line would cut.
+    """Return the shortest strings around an ellipsoid.
 
     Args:
-        start: (f, 3) m, outside.
-        end: (f, 3) m, outside; the segment between them passes through the ellipsoid.
+        start: (f, 3) m, points outside the ellipsoid.
+        end: (f, 3) m, points outside; the segment from start to end passes through the ellipsoid.
         axes: (3,) m, semi-axes.
-        half: (3,) direction of the half on which the string must touch; None: either.
+        half: (3,) direction of the half on which the string must touch; None: either half.
 
     Returns:
-        Strings; where none is taut on that half they have not converged.
+        The strings. One without a taut string on that half is marked as not converged.
     """
     count = len(start)
     contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)
@@ -259,7 +258,15 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
 
 
 def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) -> Strings:
-    """Return the strings that Newton's method finds from a contour point and a length."""
+    """Return the strings that Newton's method finds from initial guesses.
+
+    Args:
+        start: (f, 3) m.
+        end: (f, 3) m.
+        axes: (3,) m, semi-axes.
+        contour: (f, 3) initial points on the contour, in coordinates of the unit sphere.
+        pieces: (f, s) m, initial lengths of the s steps along the geodesic.
+    """
     p = start / axes
     squared = (p**2).sum(axis=1, keepdims=True)
     hub = p / squared
@@ -305,7 +312,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """Geodesics from the contour of `start`, and how far they miss `end`."""
+    """Geodesics that begin on the contour of `start`, and their error at `end`."""
 
     start: Array
     end: Array
@@ -315,9 +322,16 @@ class _Shot:
     sideways: Array
 
     def fire(self, angle: Array, pieces: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Return residuals (f, 2), their derivatives (f, 2, 2), entries and exits (f, 3).
+        """Return the errors of geodesics and their derivatives.
 
-        Last how far ahead `end` lies (f,) m: where that is negative, the string would turn back.
+        Args:
+            angle: (f,) rad, angle along the contour.
+            pieces: (f, s) m, lengths of the steps along the geodesic.
+
+        Returns:
+            Residuals (f, 2); their derivatives (f, 2, 2) by angle and length; entry and exit
+            (f, 3) m; distance (f,) m of `end` ahead of the exit. If that is negative, the string
+            would turn back.
         """
         cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
         entry = self.axes * (self.hub + cosine * self.radial + sine * self.sideways)
@@ -349,13 +363,13 @@ class _Shot:
         return residual, jacobian, entry, leave, reach[:, 0] * dot(rest, direction)
 
     def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
-        """Return the rate (f, 3) of the unit normal where a point moves with a velocity."""
+        """Return the rate (f, 3) of the unit normal at a point with a velocity (f, 3)."""
         bent = velocity / self.axes**2
         return (bent - dot(bent, normal)[:, None] * normal) / slope[:, None]
 
 
 def _normal(points: Array, axes: Array) -> tuple[Array, Array]:
-    """Return outward unit normals (f, 3) and the length (f,) of x/a²."""
+    """Return outward unit normals (f, 3), and the lengths (f,) of the gradients x/a²."""
     gradient = points / axes**2
     slope = np.linalg.norm(gradient, axis=1)
     return gradient / slope[:, None], slope
@@ -365,14 +379,14 @@ def _normal(points: Array, axes: Array) -> tuple[Array, Array]:
 def _follow_geodesics(
     states: Array, pieces: Array, axes: Array, weights: Array, last_weights: Array
 ) -> None:
-    """Carry states (f, 8) = (x, v, j, j') along to the ends of their geodesics.
+    """Integrate geodesics and their Jacobi fields, in place, by an explicit Runge-Kutta rule.
 
     Args:
-        states: at the starts; written.
-        pieces: (f, STEPS) m, lengths of the steps of a Runge-Kutta rule.
-        axes: (3,) m.
-        weights: (s, s) of the rule's stages before each stage.
-        last_weights: (s,) of all stages in a step.
+        states: (f, 8) = (x, v, j, j') at the starts; overwritten by those at the ends.
+        pieces: (f, s) m, lengths of the steps.
+        axes: (3,) m, semi-axes.
+        weights: (k, k) weights of the earlier stages in each of the k stages.
+        last_weights: (k,) weights of the stages in a step.
     """
     count = len(last_weights)
     stages, point, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)

@@ -1,14 +1,14 @@
-"""Where an OpenSim model's bodies are, and how points move with its coordinates.
+"""Poses of an OpenSim model's bodies, and derivatives of points by its coordinates.
 
-Everything is computed for many coordinate sets at once: q has shape (..., n), in the order of
-`model.coordinates`. With J the twist of a body per unit of each coordinate, in ground and at
-ground's origin (angular above linear velocity), a point p of it moves with
+All functions take many coordinate sets at once: q has shape (..., n), in the order of
+`model.coordinates`. Let J be the twist of a body per unit of each coordinate, in ground and at
+ground's origin (angular above linear velocity). Then a point p of the body has the derivative
 
     ∂p/∂q = J_linear + J_angular × p.
 
-A joint adds to its outboard body's twist one column per axis: for a rotation by u(q) about
-the line through c along d, (d, c × d) du/dq; for a translation (0, d) du/dq; with the sign
-turned where the joint is passed backwards.
+The outboard body of a joint has the twist of its inboard body and, for each axis of the joint, a
+term: (d, c × d) du/dq for a rotation by u(q) about the line through c along d, and (0, d) du/dq for
+a translation. The term has the other sign in a joint that the chain passes backwards.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,13 +25,13 @@ from tkamb.io.opensim.model import GROUND, JointAxis, OpenSimModel
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Bodies in ground at coordinate sets of leading shape (...).
+    """Poses and twists of bodies in ground, for coordinate sets of leading shape (...).
 
     Args:
-        bodies: names, ground first.
-        poses: (..., b, 4, 4) of each body in ground.
-        twists: (..., b, 6, n) twist at ground's origin per unit of each coordinate.
-        axes: (..., a, 6) twist of child against parent frame per unit of each joint axis.
+        bodies: name of each body -> its index; ground is first.
+        poses: (..., b, 4, 4) pose of each body in ground.
+        twists: (..., b, 6, n) twist of each body at ground's origin, per unit of each coordinate.
+        axes: (..., a, 6) twist of child against parent frame, per unit of motion along each axis.
     """
 
     bodies: dict[str, int]
@@ -40,11 +40,11 @@ class Motion:
     axes: Array
 
     def points(self, bodies: Sequence[str], locations: ArrayLike) -> tuple[Array, Array]:
-        """Return points of bodies in ground and their Jacobian.
+        """Return positions of points in ground and their derivatives.
 
         Args:
-            bodies: m names.
-            locations: (m, 3) or (..., m, 3) m, in the bodies.
+            bodies: names of the m points' bodies.
+            locations: (m, 3) or (..., m, 3) m, the points in their bodies.
 
         Returns:
             Positions (..., m, 3) m, and their derivatives (..., m, 3, n) by the coordinates.
@@ -57,12 +57,12 @@ class Motion:
 
 
 def velocities(twists: Array, positions: Array) -> Array:
-    """Return ∂p/∂q (..., 3, n) of points (..., 3) that move with twists (..., 6, n)."""
+    """Return ∂p/∂q (..., 3, n) of points (..., 3) m of bodies with the twists (..., 6, n)."""
     return twists[..., 3:, :] + np.cross(twists[..., :3, :], positions[..., None], axis=-2)
 
 
 class Kinematics:
-    """The chain of an OpenSim model, prepared for many evaluations.
+    """The kinematic chain of an OpenSim model, prepared for many evaluations.
 
     Args:
         model: the model.
@@ -73,7 +73,7 @@ class Kinematics:
         self.coordinates = {name: k for k, name in enumerate(model.coordinates)}
         self.bodies = {name: k for k, name in enumerate((GROUND, *model.bodies))}
         self._axes = [a for j in model.joints for a in (*j.rotations, *j.translations)]
-        # What a linear function needs is one product for all axes; the rest is added after.
+        # One product evaluates the linear functions of all axes; the others follow one by one.
         self._gradients = np.zeros((len(self._axes), len(self.coordinates)))
         self._offsets = np.zeros(len(self._axes))
         self._curved: list[tuple[int, int, JointAxis]] = []
@@ -112,7 +112,7 @@ class Kinematics:
         self._signed_gradients = self._signs[:, None] * self._gradients
 
     def vector(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return coordinates (..., n); a mapping fills in what it names over the defaults.
+        """Return coordinates (..., n); those that a mapping does not name are at their defaults.
 
         Raises:
             InputError: an unknown coordinate or a wrong number of them.
@@ -132,7 +132,7 @@ class Kinematics:
         return values
 
     def coupled(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return the coordinates (..., n) with those that follow others set from them."""
+        """Return the coordinates (..., n) with dependent ones set by their couplers."""
         values = self.vector(q).copy()
         for coupler in self.model.couplers:
             independent = values[..., self.coordinates[coupler.independent]]
@@ -140,9 +140,9 @@ class Kinematics:
         return values
 
     def coupling(self, q: ArrayLike) -> Array:
-        """Return ∂q/∂q (..., n, n): one coordinate's own change, and that of what follows it.
+        """Return the derivatives (..., n, n) of all coordinates by the independent ones.
 
-        The column of a coordinate that follows another is zero, because it is not independent.
+        The column of a dependent coordinate is zero.
         """
         values = self.vector(q)
         result = np.broadcast_to(np.eye(values.shape[-1]), (*values.shape, values.shape[-1])).copy()
@@ -174,14 +174,14 @@ class Kinematics:
         return Motion(self.bodies, poses, twists, axis_twists)
 
     def joint_twists(self, q: Array) -> tuple[Array, Array]:
-        """Return poses of all bodies, and what each coordinate does to its own joint alone.
+        """Return poses of all bodies, and the twist of each coordinate's joint.
 
         Args:
-            q: (..., n) coordinates.
+            q: (..., n) coordinates, rad and m.
 
         Returns:
-            Poses (..., b, 4, 4) in ground; twists (..., n, 6) in ground, at its origin, of all
-            that hangs on the coordinate's joint, per unit of it (zero without a joint).
+            Poses (..., b, 4, 4) in ground. Twists (..., n, 6) at ground's origin of the bodies
+            beyond the coordinate's joint, per unit of the coordinate, without couplers.
         """
         poses, axes = self._chain(self.axis_values(q))
         twists = self._signed_gradients.T @ axes
@@ -198,14 +198,14 @@ class Kinematics:
         return values
 
     def axis_slopes(self, q: Array) -> Array:
-        """Return du/dq (..., a, n)."""
+        """Return the derivatives du/dq (..., a, n) of the angles and translations of all axes."""
         slopes = np.broadcast_to(self._gradients, (*q.shape[:-1], *self._gradients.shape)).copy()
         for k, c, axis in self._curved:
             slopes[..., k, c] = axis.function.slope(q[..., c])
         return slopes
 
     def axis_rates(self, q: Array, rates: Array, accelerations: Array) -> tuple[Array, Array]:
-        """Return du/dt and d²u/dt² (..., a) from the coordinates' own (..., n)."""
+        """Return du/dt and d²u/dt² (..., a) from coordinates and their derivatives (..., n)."""
         slopes = self.axis_slopes(q)
         speeds = (slopes @ rates[..., None])[..., 0]
         second = (slopes @ accelerations[..., None])[..., 0]
@@ -214,10 +214,10 @@ class Kinematics:
         return speeds, second
 
     def _chain(self, values: Array) -> tuple[Array, Array]:
-        """Return body poses (..., b, 4, 4) and each axis's twist in ground (..., a, 6).
+        """Return body poses (..., b, 4, 4), and the twist in ground (..., a, 6) of each axis.
 
-        What a joint does is computed for all joints at once; only its place in the chain is
-        found joint by joint, from ground outwards.
+        The motions within all joints are computed at once, the poses of the bodies one by one from
+        ground outwards.
         """
         moved, before = self._joint_poses(values)
         steps = np.where(self._backwards, inverse(moved), moved)
@@ -238,18 +238,19 @@ class Kinematics:
         return poses, twists
 
     def _axis_frames(self, moved: Array) -> Array:
-        """Return the frames (..., j, 4, 4) in which joints' axes stand, in the inboard bodies.
+        """Return the poses (..., j, 4, 4) of the joints' parent frames in the inboard bodies.
 
-        The frame on the parent; where the joint is passed backwards that is the outer one.
+        In a joint that the chain passes backwards, the parent frame belongs to the outboard body.
         """
         return np.asarray(
             np.where(self._backwards, self._inboard_frames @ inverse(moved), self._inboard_frames)
         )
 
     def _joint_poses(self, values: Array) -> tuple[Array, Array]:
-        """Return child frames in parent frames (..., j, 4, 4), axes in parent frames (..., a, 3).
+        """Return poses of child frames (..., j, 4, 4) and axes (..., a, 3) in the parent frames.
 
-        A joint's rotations by u follow each other, each I + sin u K + (1 - cos u) K².
+        A rotation by u is I + sin u K + (1 - cos u) K² (Rodrigues), with K the cross-product matrix
+        of its axis.
         """
         sine = np.sin(values)[..., None, None]
         versine = 2.0 * np.sin(0.5 * values)[..., None, None] ** 2
@@ -257,7 +258,9 @@ class Kinematics:
         shape = values.shape[:-1]
         rotation = np.broadcast_to(np.eye(3), (*shape, len(self._ends), 3, 3)).copy()
         before = np.broadcast_to(self._directions, (*shape, *self._directions.shape)).copy()
-        for axes in self._ranks:  # first rotations of all joints, then second, then third
+        for (
+            axes
+        ) in self._ranks:  # the first rotations of all joints, then the second, then the third
             owners = self._owner[axes]
             here = rotation[..., owners, :, :]
             before[..., axes, :] = (here @ self._directions[axes][..., None])[..., 0]
@@ -267,7 +270,7 @@ class Kinematics:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return a × b of (..., 3): numpy's own takes three times as long."""
+    """Return a × b of large arrays (..., 3), in a third of the time of `np.cross`."""
     x, y, z = np.moveaxis(a, -1, 0)
     u, v, w = np.moveaxis(b, -1, 0)
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)

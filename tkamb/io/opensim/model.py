@@ -16,7 +16,7 @@ from tkamb.io.opensim.functions import Function
 
 @dataclass(frozen=True, eq=False)
 class PathPoint:
-    """A point (3,) m of a body that a path passes through."""
+    """A point of a path, fixed to a body at `location` (3,) m."""
 
     name: str
     body: str
@@ -25,7 +25,7 @@ class PathPoint:
 
 @dataclass(frozen=True, eq=False)
 class ConditionalPathPoint(PathPoint):
-    """A path point that counts while a coordinate lies within a range."""
+    """A path point that is active while a coordinate (rad or m) lies within a range."""
 
     coordinate: str
     range: tuple[float, float]
@@ -38,8 +38,8 @@ class MovingPathPoint:
     Args:
         name: the point's name.
         body: body in whose frame it moves.
-        coordinates: of x, y and z; None: the function's value at zero holds throughout.
-        functions: of x, y and z.
+        coordinates: coordinate of x, y and z; None: the function is evaluated at zero.
+        functions: function (m) of x, y and z.
     """
 
     name: str
@@ -54,17 +54,17 @@ Shape = Literal["cylinder", "sphere", "ellipsoid", "torus"]
 
 @dataclass(frozen=True, eq=False)
 class WrapObject:
-    """A surface that paths pass around, fixed to a body.
+    """A surface fixed to a body, around which paths wrap.
 
     Args:
         name: the object's name.
-        body: body that carries it.
+        body: name of the body.
         shape: "cylinder" (along its z), "sphere", "ellipsoid" or "torus" (about its z).
-        pose: (4, 4) its frame in the body.
+        pose: (4, 4) pose_object_in_body.
         dimensions: m. Cylinder: radius, length; sphere: radius; ellipsoid: semi-axes x, y, z;
             torus: radius of the centre line, radius of the tube.
-        quadrant: axis 0, 1 or 2 and sign ±1 of the half on which paths must lie; None: either.
-        active: whether paths wrap it.
+        quadrant: axis (0, 1 or 2) and sign (±1) of the half on which paths must lie; None: either.
+        active: whether paths wrap around it.
     """
 
     name: str
@@ -78,13 +78,13 @@ class WrapObject:
 
 @dataclass(frozen=True)
 class PathWrap:
-    """A wrap object as one path uses it.
+    """The use of a wrap object by one path.
 
     Args:
-        wrap_object: the wrap object's name.
-        first: index of the first path point of the range within which it may be wrapped.
-        last: index of the last one.
-        method: "hybrid", "midpoint" or "axial": how OpenSim places an ellipsoid's path.
+        wrap_object: name of the wrap object.
+        first: index of the path point at which the range with wrapping begins.
+        last: index of the path point at which it ends.
+        method: OpenSim's method for an ellipsoid: "hybrid", "midpoint" or "axial".
     """
 
     wrap_object: str
@@ -95,7 +95,7 @@ class PathWrap:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Path of a muscle or ligament: points in order, and wrap objects."""
+    """The path of a muscle or ligament: points in order, and the wrap objects that it uses."""
 
     points: tuple[AnyPathPoint, ...]
     wraps: tuple[PathWrap, ...]
@@ -103,18 +103,18 @@ class Path:
 
 @dataclass(frozen=True, eq=False)
 class OpenSimMuscle:
-    """A muscle with the four numbers all of OpenSim's classes share.
+    """A muscle, with the parameters that all of OpenSim's muscle classes share.
 
     Args:
         name: the muscle's name.
         kind: the file's class, such as "Thelen2003Muscle".
         path: its path.
-        max_isometric_force_N: maximal isometric force.
+        max_isometric_force_N: maximum isometric force.
         optimal_fibre_length_m: fibre length at that force.
-        tendon_slack_length_m: tendon's length without load.
-        pennation_rad: pennation at the optimal fibre length.
+        tendon_slack_length_m: tendon slack length.
+        pennation_rad: pennation angle at the optimal fibre length.
         max_contraction_velocity: optimal fibre lengths per second.
-        enabled: whether the file lets it act.
+        enabled: whether the muscle is switched on in the file.
     """
 
     name: str
@@ -132,20 +132,20 @@ class OpenSimMuscle:
 class OpenSimLigament:
     """A ligament, by one of two laws.
 
-    Blankevoort1991Ligament has `stiffness_N` (N per strain) and `transition_strain`;
-    Ligament has `force_length`, N per `scale_N` against length over slack length.
+    A Blankevoort1991Ligament has `stiffness_N`, `transition_strain` and `damping_s`. A Ligament has
+    the force `scale_N` times `force_length` of its length over its slack length.
 
     Args:
         name: the ligament's name.
         kind: "Ligament" or "Blankevoort1991Ligament".
         path: its path.
-        slack_length_m: length at which it begins to pull.
-        stiffness_N: N per unit strain in the linear part; None for "Ligament".
-        transition_strain: where the toe ends and the linear part begins; None for "Ligament".
+        slack_length_m: greatest length without force.
+        stiffness_N: force (N) per unit strain in the linear region; None for "Ligament".
+        transition_strain: strain (1) at the end of the toe region; None for "Ligament".
         damping_s: damping coefficient; None for "Ligament".
-        force_length: normalised force over normalised length; None for "Blankevoort…".
-        scale_N: what the normalised force is multiplied by; None for "Blankevoort…".
-        enabled: whether the file lets it act.
+        force_length: normalised force over normalised length; None for the other kind.
+        scale_N: factor (N) of the normalised force; None for the other kind.
+        enabled: whether the ligament is switched on in the file.
     """
 
     name: str
@@ -170,7 +170,7 @@ class Body:
     Args:
         name: the body's name.
         mass_kg: mass.
-        centre: (3,) m, centre of mass.
+        centre: (3,) m, centre of mass in the body's frame.
         inertia: (3, 3) kg·m² about the centre of mass.
     """
 
@@ -186,12 +186,12 @@ class Coordinate:
 
     Args:
         name: the coordinate's name.
-        joint: the joint it belongs to.
-        rotational: whether it is an angle (files "in degrees" hold it in degrees).
-        default: its default value.
+        joint: name of its joint.
+        rotational: whether it is an angle; a file "in degrees" then has it in degrees.
+        default: default value.
         range: smallest and largest value.
-        clamped: whether OpenSim keeps it within the range.
-        locked: whether OpenSim keeps it at its default.
+        clamped: whether OpenSim restricts it to the range.
+        locked: whether OpenSim fixes it at its default.
     """
 
     name: str
@@ -205,11 +205,11 @@ class Coordinate:
 
 @dataclass(frozen=True, eq=False)
 class JointAxis:
-    """One axis of a joint, moved by a function of one coordinate.
+    """One axis of a joint, with the motion along it as a function of one coordinate.
 
     Args:
         direction: (3,) unit vector.
-        coordinate: the coordinate's name; None: the function's value at zero holds throughout.
+        coordinate: the coordinate's name; None: the function is evaluated at zero.
         function: coordinate -> angle (rad) or translation (m) along the axis.
     """
 
@@ -220,22 +220,22 @@ class JointAxis:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Any OpenSim joint: three successive rotations, then translations in the parent frame.
+    """Any OpenSim joint: translations in the parent frame, then up to three successive rotations.
 
-    The child frame stands in the parent frame with R = R_1 R_2 R_3 (each about its own axis,
-    carried by those before) and t = Σ u_i a_i.
+    The pose of the child frame in the parent frame has the rotation R = R_1 R_2 R_3, each about its
+    own axis, and the translation t = Σ u_i a_i.
 
     Args:
         name: the joint's name.
         kind: the file's class, such as "PinJoint".
-        parent: body that carries the parent frame.
-        child: body that carries the child frame.
-        pose_parent_frame: (4, 4) parent frame in the parent body.
-        pose_child_frame: (4, 4) child frame in the child body.
+        parent: body of the parent frame.
+        child: body of the child frame.
+        pose_parent_frame: (4, 4) pose of the parent frame in the parent body.
+        pose_child_frame: (4, 4) pose of the child frame in the child body.
         rotations: up to three axes.
         translations: up to three axes.
-        backwards: whether the way out from ground leads from child to parent.
-        unread: why its motion could not be read, so that it holds its bodies still; "" if it was.
+        backwards: whether the child body is nearer to ground than the parent body.
+        unread: why its motion could not be read; it is then welded. "": it was read.
     """
 
     name: str
@@ -251,18 +251,18 @@ class Joint:
 
     @property
     def inboard(self) -> str:
-        """Body on the side of ground."""
+        """The body nearer to ground."""
         return self.child if self.backwards else self.parent
 
     @property
     def outboard(self) -> str:
-        """Body that the joint carries, seen from ground."""
+        """The body farther from ground."""
         return self.parent if self.backwards else self.child
 
 
 @dataclass(frozen=True, eq=False)
 class CoordinateCoupler:
-    """dependent = function(independent), m and rad; those not enforced are not kept."""
+    """An enforced constraint dependent = function(independent) between coordinates, rad and m."""
 
     name: str
     dependent: str
@@ -272,7 +272,7 @@ class CoordinateCoupler:
 
 @dataclass(frozen=True, eq=False)
 class ConstantDistance:
-    """Two points (3,) of two bodies that stay `distance` (m) apart."""
+    """A constraint that keeps two points (3,) m of two bodies at `distance` (m) from each other."""
 
     name: str
     bodies: tuple[str, str]
@@ -283,7 +283,7 @@ class ConstantDistance:
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A marker at a point (3,) m of a body; `fixed` where scaling must not move it."""
+    """A marker at `location` (3,) m of a body; scaling must not move it if it is `fixed`."""
 
     name: str
     body: str
@@ -293,13 +293,13 @@ class Marker:
 
 @dataclass(frozen=True)
 class Unread:
-    """Something in the file that could not be read.
+    """An element of the file that could not be read.
 
     Args:
         kind: the file's class.
-        name: its name.
-        reason: the refusal, one line.
-        concerns: bodies and coordinates that it names.
+        name: name of the element.
+        reason: one line that says why.
+        concerns: names of the bodies and coordinates in it.
     """
 
     kind: str
@@ -309,29 +309,30 @@ class Unread:
 
     @property
     def constrains(self) -> bool:
-        """Whether it holds bodies or coordinates together: a joint or a constraint."""
+        """Whether the element is a joint or a constraint."""
         return self.kind.endswith(("Joint", "Constraint"))
 
 
 @dataclass(frozen=True, eq=False)
 class OpenSimModel:
-    """An OpenSim model as read.
+    """An OpenSim model.
 
     Args:
         name: the model's name.
         gravity: (3,) m/s² in ground.
-        bodies: by name, ground not among them.
-        joints: from ground outwards.
-        coordinates: in the file's order, which is that of every vector q.
-        couplers: coordinates that follow others, each after those that it follows.
-        constant_distances: points kept apart.
-        markers: by name.
-        muscles: by name.
-        ligaments: by name.
-        wrap_objects: by name.
-        offset_frames: offset frames of bodies: name -> body and pose (4, 4) in it.
-        left_out: "class 'name'" of everything in the file that was not taken over.
-        unread: elements that a partial reading could not read; they are an error if needed.
+        bodies: name -> body, without ground.
+        joints: the joints, ordered from ground outwards.
+        coordinates: name -> coordinate, in the file's order. Every vector q has this order.
+        couplers: couplers of coordinates, ordered so that an independent coordinate is set before
+            those that depend on it.
+        constant_distances: constraints on the distance of two points.
+        markers: name -> marker.
+        muscles: name -> muscle.
+        ligaments: name -> ligament.
+        wrap_objects: name -> wrap object.
+        offset_frames: name of an offset frame -> its body, and its pose (4, 4) in that body.
+        left_out: "class 'name'" of each element of the file that has no counterpart here.
+        unread: elements that a partial reading could not read.
         notices: lines on how the file was read.
     """
 
@@ -353,5 +354,5 @@ class OpenSimModel:
 
     @property
     def mass_kg(self) -> float:
-        """Sum of the bodies' masses."""
+        """Mass of the whole model."""
         return sum(body.mass_kg for body in self.bodies.values())

@@ -35,14 +35,14 @@ def inverse_dynamics(
 ) -> Array:
     """Return the generalised forces τ (f, n), N·m and N, one for each coordinate.
 
-    Constraints and couplers play no part: each coordinate is taken as it is given.
+    Constraints and couplers are not considered: every coordinate counts as independent.
 
     Args:
-        kinematics: of the model.
+        kinematics: the chain of the model.
         q: (f, n) coordinates, rad and m.
-        rates: (f, n) their rates.
+        rates: (f, n) their first derivatives by time.
         accelerations: (f, n) their second derivatives by time.
-        wrenches: body -> (f, 6) moment (N·m) above force (N) on it, in ground at ground's
+        wrenches: body -> (f, 6) moment (N·m) above force (N) on the body, in ground at ground's
             origin, such as the ground reaction on a foot.
     """
     motion = kinematics.motion(q)
@@ -58,16 +58,16 @@ def required_wrenches(
     accelerations: Array,
     wrenches: Mapping[str, Array] | None = None,
 ) -> Array:
-    """Return what else must act on each body (f, b, 6), beside gravity and the given wrenches.
+    """Return the further wrench (f, b, 6) on each body, beside gravity and the given wrenches.
 
-    Moment (N·m) above force (N), in ground at ground's origin; zero for ground. Over the bodies
-    beyond a joint, this sums up to what muscles, ligaments and the joint itself exert on them.
+    It is the moment (N·m) above the force (N), in ground at ground's origin; zero for ground. Its
+    sum over the bodies beyond a joint is the wrench of muscles, ligaments and the joint on them.
 
     Args:
-        kinematics: of the model.
-        motion: at q.
+        kinematics: the chain of the model.
+        motion: poses and twists at q.
         q: (f, n) coordinates.
-        rates: (f, n) their rates.
+        rates: (f, n) their first derivatives by time.
         accelerations: (f, n) their second derivatives by time.
         wrenches: body -> (f, 6), as in `inverse_dynamics`.
     """
@@ -94,7 +94,7 @@ def required_wrenches(
 def _accelerations(
     kinematics: Kinematics, motion: Motion, twists: Array, q: Array, rates: Array, second: Array
 ) -> Array:
-    """Return the rate (f, b, 6) of each body's twist."""
+    """Return the time derivative (f, b, 6) of each body's twist."""
     result = np.zeros_like(twists)
     speeds, axis_accelerations = kinematics.axis_rates(q, rates, second)
     first = 0
@@ -116,7 +116,7 @@ def _accelerations(
 
 
 def _cross(twist: Array, axis: Array) -> Array:
-    """Return the cross product (f, 6) of twists: the rate of an axis carried along."""
+    """Return the cross product (f, 6) of twists: the rate of an axis that moves with a twist."""
     omega, speed = twist[:, :3], twist[:, 3:]
     linear = np.cross(omega, axis[:, 3:]) + np.cross(speed, axis[:, :3])
     return np.hstack([np.cross(omega, axis[:, :3]), linear])
@@ -124,14 +124,14 @@ def _cross(twist: Array, axis: Array) -> Array:
 
 @dataclass(frozen=True)
 class AngleUnitSettings:
-    """How angles in degrees are told from angles in radians."""
+    """Limits to distinguish angles in degrees from angles in radians."""
 
     max_radians: float = 6.5
     """rad: largest joint angle that can be in radians. Chosen: a joint never exceeds a whole turn,
     6.28; in degrees the number is larger in most movements."""
     min_rotation_deg: float = 0.2
-    """deg; a joint that rotates by less in a whole recording stands still, in either unit. Chosen:
-    noise of a recording is of this size."""
+    """deg; a joint that rotates by less in a whole recording does not move, in either unit. Chosen:
+    the noise of a recording has this size."""
     max_angle: float = 2.0 * np.pi
     """rad; no joint of a leg rotates further. Chosen: a whole turn."""
 
@@ -141,13 +141,13 @@ ANGLE_UNIT = AngleUnitSettings()
 
 @dataclass(frozen=True, eq=False)
 class CoordinateMotion:
-    """Coordinates in the model's order, rad and m.
+    """Coordinates over time, in the model's order.
 
     Args:
         time: (f,) s.
-        q: (f, n).
-        rates: (f, n) per s.
-        accelerations: (f, n) per s².
+        q: (f, n) coordinates, rad and m.
+        rates: (f, n) their first derivatives, per s.
+        accelerations: (f, n) their second derivatives, per s².
     """
 
     time: Array
@@ -157,16 +157,18 @@ class CoordinateMotion:
 
 
 def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tuple[str, ...]]:
-    """Return coordinates (f, n) rad and m, and those that a `.mot` or `.sto` does not hold.
-
-    Those are at their defaults.
+    """Return recorded coordinates, and the names of those that the table lacks.
 
     Args:
-        kinematics: of the model.
-        recorded: with a column per coordinate, named as in the model or by its path.
+        kinematics: the chain of the model.
+        recorded: table (`.mot`, `.sto`) with a column for each coordinate, named as in the model or
+            by its path.
+
+    Returns:
+        Coordinates (f, n), rad and m; those that the table lacks are at their defaults.
 
     Raises:
-        InputError: angles of unknown or impossible unit, or a gap.
+        InputError: the unit of angles is unknown or impossible, or a column has a gap.
     """
     model = kinematics.model
     q = np.tile(kinematics.vector({}), (recorded.rows, 1))
@@ -181,9 +183,9 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
 
 
 def _column_of(name: str, recorded: Table) -> str | None:
-    """Return the column of a coordinate's value: its name, or its path in a states file.
+    """Return the column of a coordinate's value, by its name or by its path in a states file.
 
-    There `/jointset/knee/flexion/value` stands beside `/jointset/knee/flexion/speed`.
+    A states file has `/jointset/knee/flexion/value` and `/jointset/knee/flexion/speed`.
     """
     paths = [column.split("/") for column in recorded.columns]
     readings = (
@@ -199,10 +201,10 @@ def _column_of(name: str, recorded: Table) -> str | None:
 
 
 def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
-    """Return radians per unit of the angles, as the file's header says.
+    """Return radians per unit of the angles, from the file's header.
 
     Raises:
-        InputError: it does not, or their size contradicts it.
+        InputError: the header does not state the unit, or the angles contradict it.
     """
     largest = max(float(np.abs(values).max()) for values in angles.values())
     worst = max(angles, key=lambda name: np.abs(angles[name]).max())
@@ -224,12 +226,12 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
 
 
 def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str, ...]:
-    """Return lines on the unit of the angles where their size contradicts it.
+    """Return a remark if the angles are too small for their stated unit.
 
     Args:
-        kinematics: of the model.
-        recorded: the file.
-        q: (f, n) coordinates that were read from it, rad and m.
+        kinematics: the chain of the model.
+        recorded: the table.
+        q: (f, n) coordinates from the table, rad and m.
     """
     coordinates = kinematics.model.coordinates
     own = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
@@ -251,17 +253,18 @@ def coordinate_motion(
     at: Array | None = None,
     name: str = "motion",
 ) -> CoordinateMotion:
-    """Low-pass filter coordinates and differentiate them twice; followers follow exactly.
+    """Low-pass filter coordinates and differentiate them twice.
 
-    A coordinate c = f(q) that a coupler moves has c' = f' q' and c'' = f' q'' + f'' q'².
+    Dependent coordinates are computed from their couplers: c = f(q) has c' = f' q' and
+    c'' = f' q'' + f'' q'².
 
     Args:
-        kinematics: of the model.
+        kinematics: the chain of the model.
         time: (m,) s.
-        q: (m, n) coordinates; those that follow others are not looked at.
-        cutoff_Hz: as in `differentiate_coordinates`, which states the errors too.
-        at: (f,) s, where they are wanted; default: at `time`.
-        name: what to call the data in messages.
+        q: (m, n) coordinates, rad and m; those of dependent coordinates are ignored.
+        cutoff_Hz: as in `differentiate_coordinates`, which also states the errors.
+        at: (f,) s, times of the result; None: `time`.
+        name: name of the data in messages.
     """
     values, rates, second = differentiate_coordinates(time, q, cutoff_Hz, at, name=name)
     for coupler in kinematics.model.couplers:

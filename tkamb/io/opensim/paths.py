@@ -34,13 +34,13 @@ from tkamb.io.opensim.wrapping import WrappedStrings, strings_over
 
 @dataclass(frozen=True, eq=False)
 class StraightParts:
-    """Straight parts of paths from one body to another, p of them.
+    """The p straight parts of paths that lead from one body to another.
 
     Args:
-        frame: (p,) coordinate set, counted as if they were flat.
-        line: (p,) muscle or ligament.
-        bodies: (p, 2) where a part begins and ends, in the order of the path.
-        ends: (p, 2, 3) m, in ground.
+        frame: (p,) index of the coordinate set, in flattened order.
+        line: (p,) index of the muscle or ligament.
+        bodies: (p, 2) index of the body at the beginning and at the end of the part.
+        ends: (p, 2, 3) m, beginning and end of the part in ground.
     """
 
     frame: Index
@@ -49,14 +49,14 @@ class StraightParts:
     ends: Array
 
     def chosen(self, which: Index) -> "StraightParts":
-        """Return some of the parts."""
+        """Return the chosen parts."""
         return StraightParts(
             self.frame[which], self.line[which], self.bodies[which], self.ends[which]
         )
 
     @classmethod
     def joined(cls, several: Sequence["StraightParts"]) -> "StraightParts":
-        """Return the parts of several in one."""
+        """Return all parts of several objects in one object."""
         return cls(
             np.concatenate([parts.frame for parts in several]),
             np.concatenate([parts.line for parts in several]),
@@ -66,7 +66,7 @@ class StraightParts:
 
 
 class Tension:
-    """Strings of unit tension on points and bodies; see `LineSet` for what they belong to.
+    """Forces of strings of unit tension on path points and bodies, summed part by part.
 
     Args:
         points: (f, k, 3) m, path points in ground.
@@ -161,10 +161,10 @@ class PathSettings:
     """How the paths of muscles and ligaments are evaluated."""
 
     condition_tolerance: float = 1e-5
-    """rad or m; OpenSim widens the range of a conditional point by as much."""
+    """rad or m; margin of the range of a conditional path point, as in OpenSim."""
     block_frames: int = 256
-    """Frames that are evaluated in one call. Chosen: keeps arrays to some tens of megabytes and
-    changes no result."""
+    """Number of frames that are evaluated in one call. Chosen: it limits arrays to some tens of
+    megabytes and changes no result."""
 
 
 PATH = PathSettings()
@@ -172,10 +172,10 @@ PATH = PathSettings()
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Taut paths at coordinate sets of leading shape (...).
+    """Lengths and moment arms of taut paths, for coordinate sets of leading shape (...).
 
     Args:
-        names: m muscles or ligaments.
+        names: names of the m muscles or ligaments.
         lengths_m: (..., m); NaN where no taut string was found.
         moment_arms: (..., m, n) -dL/dq, m per rad or per m, coordinates in the model's order.
     """
@@ -187,13 +187,13 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Pulls(Lines):
-    """Taut paths, and what unit tension in them does to g groups of bodies.
+    """Taut paths, and the wrenches of unit tension in them on g groups of bodies.
 
     Args:
-        wrenches: (..., m, g, 6) moment above force, N per N and N·m per N, on each group, in
-            ground at ground's origin.
-        crossings: straight parts from one group to another; `bodies` holds groups, -1 for
-            bodies of no group.
+        wrenches: (..., m, g, 6) moment (N·m per N) above force (N per N) on each group, in ground
+            at ground's origin.
+        crossings: straight parts from one group to another. Their `bodies` are indices of groups,
+            -1 for bodies of no group.
     """
 
     wrenches: Array
@@ -204,11 +204,11 @@ class LineSet:
     """Muscles and ligaments of an OpenSim model, prepared for many poses.
 
     Args:
-        kinematics: of the model.
-        names: which of its muscles and ligaments; None: all muscles.
+        kinematics: the chain of the model.
+        names: names of its muscles and ligaments; None: all muscles.
 
     Raises:
-        InputError: a name that is neither.
+        InputError: the model has no muscle or ligament of a name.
     """
 
     def __init__(self, kinematics: Kinematics, names: Iterable[str] | None = None) -> None:
@@ -238,11 +238,11 @@ class LineSet:
         return Lines(self.names, length, arm)
 
     def pulls(self, q: Mapping[str, float] | ArrayLike, groups: Sequence[Collection[str]]) -> Pulls:
-        """Return lengths, moment arms, wrenches on groups of bodies and where paths cross.
+        """Return lengths, moment arms, wrenches on groups of bodies, and crossings between groups.
 
         Args:
-            q: (..., n) coordinates.
-            groups: names of the bodies that move together, g times.
+            q: (..., n) coordinates, rad and m.
+            groups: names of the bodies in each of the g groups.
         """
         q = self.kinematics.vector(q)
         group = np.full(len(self.kinematics.bodies), -1)
@@ -263,18 +263,18 @@ class LineSet:
         return Pulls(self.names, length, arm, wrench, StraightParts.joined(parts))
 
     def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
-        """Yield (first, q (f, n)) of a few frames at a time."""
+        """Yield blocks of frames: index of the first frame, and coordinates (f, n)."""
         flat = q.reshape(-1, q.shape[-1])
         for first in range(0, len(flat), PATH.block_frames):
             yield first, flat[first : first + PATH.block_frames]
 
     def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
-        """Return chunks (f, m, ...) put together again, with the leading shape of q."""
+        """Return blocks (f, m, ...) joined to arrays with the leading shape of q."""
         whole = [np.concatenate(parts) for parts in columns]
         return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in whole]
 
     def _measure(self, q: Array) -> tuple[Array, Array, Tension]:
-        """Return lengths (f, m), moment arms (f, m, n) and tensions at q (f, n)."""
+        """Return lengths (f, m), moment arms (f, m, n) and forces at coordinates q (f, n)."""
         motion = self.kinematics.motion(q)
         locations, rates = self._own_motion(q)
         poses = motion.poses[:, self._body]
@@ -320,7 +320,7 @@ class LineSet:
         return locations, rates
 
     def _followers(self, q: Array) -> Index:
-        """Return the next active point (f, k) of each active one on its path; -1: none."""
+        """Return the index (f, k) of the active point that follows each active point; -1: none."""
         follower = np.full((len(q), len(self._points)), -1)
         ends = set(self._last.tolist())
         upcoming = np.full(len(q), -1)

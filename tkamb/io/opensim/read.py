@@ -1,9 +1,9 @@
-"""An .osim file read into an OpenSimModel; OpenSim itself is not needed.
+"""An .osim file read into an `OpenSimModel`, without OpenSim.
 
-Both layouts are read: that of OpenSim 4 (sockets, offset frames, sets of joints) and the older
-one (joints nested in their bodies), and sets in separate files. An element that cannot be read is
-refused by name or, in a partial reading, listed in `unread`. Forces and other elements that are not
-used here are listed in `left_out`.
+tkamb reads the layout of OpenSim 4 (sockets, offset frames, sets of joints), the older layout
+(joints nested in their bodies), and sets in separate files. An element that cannot be read is an
+error or, in a partial reading, listed in `unread`. Elements without a counterpart here, such as
+contact forces, are listed in `left_out`.
 """
 
 from collections.abc import Mapping
@@ -39,12 +39,12 @@ UNITS = {
 
 @dataclass(frozen=True)
 class ModelReadSettings:
-    """Which OpenSim models are read, and how."""
+    """Limits on the OpenSim models that are read."""
 
     oldest_version: int = 20302
-    """Version number of OpenSim 2.3.2; older files use other names."""
+    """Oldest version of a file: that of OpenSim 2.3.2. Older files use other names."""
     massless_below: float = 2e-14
-    """kg: a lighter body has no inertia, as in OpenSim's Body::getInertia."""
+    """kg; a lighter body has no inertia, as in OpenSim's Body::getInertia."""
 
 
 MODEL_READ = ModelReadSettings()
@@ -55,12 +55,13 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
 
     Args:
         path: the file.
-        partial: list joints, constraints, forces, wrap objects and markers that cannot be read
-            in `unread` instead of refusing the file. A joint of which only the motion cannot be
-            read holds its bodies still.
+        partial: whether joints, constraints, forces, wrap objects and markers that cannot be read
+            are listed in `unread`, instead of an error. A joint is welded if only its motion
+            cannot be read.
 
     Raises:
-        InputError: no such file, no OpenSim model, or something in it that cannot be read.
+        InputError: the file does not exist, is not an OpenSim model, or has an element that cannot
+            be read.
     """
     path = Path(path)
     root, notices = open_document(path)
@@ -105,7 +106,7 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
 def _concerns(
     element: Element, frames: Frames, coordinates: Mapping[str, Coordinate]
 ) -> frozenset[str]:
-    """Return bodies and coordinates that are named anywhere in an element."""
+    """Return the names of bodies and coordinates that occur in an element."""
     texts = [part for e in element.iter() for part in ((e.text or ""), e.get("name", ""))]
     words = {word for text in texts for word in text.replace("/", " ").split()}
     named = {word for word in words if word in frames.bodies or word in coordinates}
@@ -118,7 +119,11 @@ def _concerns(
 
 
 def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element]:
-    """Return the document and its <Model>, of a version that can be read."""
+    """Return the document and its <Model>.
+
+    Raises:
+        InputError: it is no OpenSim model, too old, or in other units than metres and newtons.
+    """
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
         raise InputError(f"is not an OpenSim model: its root is <{root.tag}>", path)
@@ -166,7 +171,7 @@ def _bodies(document: Document, model: Element) -> dict[str, Body]:
 
 
 def _inertia(document: Document, element: Element) -> Array:
-    """Return the (3, 3) inertia about the mass centre, from either layout."""
+    """Return the inertia (3, 3) kg·m² about the centre of mass, from either layout."""
     if document.find(element, "inertia") is not None:
         xx, yy, zz, xy, xz, yz = document.numbers(element, "inertia", count=6)
     else:
@@ -207,21 +212,21 @@ def _constraints(
 def _check_follower(
     document: Document, element: Element, new: CoordinateCoupler, others: list[CoordinateCoupler]
 ) -> None:
-    """Raise where a coordinate would follow two, or, over others, itself."""
+    """Raise if a coordinate would depend on two coordinates or, through couplers, on itself."""
     leads = {coupler.dependent: coupler.independent for coupler in others}
     if new.dependent in leads:
         raise InputError(
-            f"lets '{new.dependent}' follow a second coordinate", document.where(element)
+            f"makes '{new.dependent}' depend on a second coordinate", document.where(element)
         )
     above: str | None = new.independent
     while above is not None and above != new.dependent:
         above = leads.get(above)
     if above is not None:
-        raise InputError(f"lets '{new.dependent}' follow itself", document.where(element))
+        raise InputError(f"makes '{new.dependent}' depend on itself", document.where(element))
 
 
 def _followers_last(couplers: list[CoordinateCoupler]) -> tuple[CoordinateCoupler, ...]:
-    """Return the couplers such that each stands after the one that moves its independent."""
+    """Return the couplers in an order that sets each independent coordinate before it is used."""
     ordered: list[CoordinateCoupler] = []
     waiting = list(couplers)
     while waiting:

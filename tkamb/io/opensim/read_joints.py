@@ -1,4 +1,4 @@
-"""Frames and joints of an OpenSim document, and the order in which joints lead out from ground."""
+"""Frames and joints of an OpenSim document, and the order of the joints from ground outwards."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from tkamb.io.opensim.model import GROUND, Coordinate, Joint, JointAxis
 X, Y, Z = np.eye(3)
 
 FRAMES = ("PhysicalOffsetFrame", "StationDefinedFrame")
-"""Frames that hang on a body or on another frame."""
+"""Classes of frames that are fixed to a body or to another frame."""
 
 STANDARD_JOINTS: dict[str, tuple[tuple[Array, ...], tuple[Array, ...]]] = {
     "WeldJoint": ((), ()),
@@ -27,26 +27,26 @@ STANDARD_JOINTS: dict[str, tuple[tuple[Array, ...], tuple[Array, ...]]] = {
     "GimbalJoint": ((X, Y, Z), ()),
     "FreeJoint": ((X, Y, Z), (X, Y, Z)),
 }
-"""Rotation and translation axes, one coordinate each, in this order."""
+"""Class of a joint -> its axes of rotation and of translation, each with its own coordinate."""
 
 
 def offset_pose(rotation_xyz: Array, translation: Array) -> Array:
-    """Return the pose (4, 4) with body-fixed x, y, z rotations (rad) and a translation (m)."""
+    """Return the pose (4, 4) of intrinsic x, y, z rotations (3,) rad and a translation (3,) m."""
     return pose(Rotation.from_euler("XYZ", rotation_xyz).as_matrix(), translation)
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Bodies and the offset frames that hang on them.
+    """Bodies and the offset frames that are fixed to them.
 
-    A frame's name is only unique within its owner: the same name may stand in several joints
-    with different values. Frames are therefore kept by owner and name.
+    A frame's name is unique only within its owner: several joints may have frames of the same name
+    with different values. Frames are therefore stored by owner and name.
 
     Args:
-        document: for messages.
-        bodies: names of the bodies, ground among them.
-        offsets: (owner, frame) -> the frame's own parent and pose in it.
-        unread: frame -> why it could not be read.
+        document: the document, for messages.
+        bodies: names of the bodies, including ground.
+        offsets: (owner, frame) -> the frame's parent, and its pose (4, 4) in the parent.
+        unread: name of a frame -> why it could not be read.
     """
 
     document: Document
@@ -75,12 +75,12 @@ class Frames:
         return cls(document, frozenset(bodies), offsets, unread)
 
     def resolve(self, user: Element, socket: str, owner: str = "") -> tuple[str, Array]:
-        """Return the body a socket leads to, and the pose (4, 4) of its frame in that body.
+        """Return the body of a socket's frame, and the pose (4, 4) of that frame in the body.
 
         Args:
-            user: whose socket it is, for messages.
+            user: the element with the socket, for messages.
             socket: "/bodyset/tibia", "tibia", "tibia_offset", "/jointset/knee/tibia_offset" …
-            owner: joint whose own frames go first.
+            owner: joint whose frames are searched first.
 
         Raises:
             InputError: no such frame.
@@ -88,7 +88,7 @@ class Frames:
         steps = [step for step in socket.split("/") if step not in ("", ".", "..")]
         in_body = np.eye(4)
         for _ in range(len(self.offsets) + 1):
-            name = steps[-1] if steps else owner  # ".." is who holds the frame
+            name = steps[-1] if steps else owner  # ".." is the owner of the frame
             above = steps[-2] if len(steps) > 1 else owner
             key = (above, name) if (above, name) in self.offsets else ("", name)
             if key not in self.offsets:
@@ -104,13 +104,13 @@ class Frames:
         raise InputError(f"names a frame '{socket}' that is not there", self.document.where(user))
 
     def point(self, user: Element, socket: str, location: Array) -> tuple[str, Array]:
-        """Return the body a socket leads to, and a point (3,) of the socket's frame in it."""
+        """Return the body of a socket's frame, and a point (3,) m of that frame in the body."""
         body, in_body = self.resolve(user, socket)
         return body, transform(in_body, location)
 
 
 def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
-    """Yield every frame in another one with the body, joint or frame that holds it."""
+    """Yield the name of the owning body, joint or frame, and the element, of every frame."""
     for child in element:
         if child.tag in FRAMES:
             yield owner, child
@@ -119,7 +119,7 @@ def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
 
 
 def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
-    """Return name -> stations and markers of that name, wherever they stand."""
+    """Return name -> all stations and markers of that name in the model."""
     result: dict[str, list[Element]] = {}
     for element in model.iter():
         if element.tag in ("Station", "Marker"):
@@ -130,14 +130,14 @@ def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
 def _station_defined(
     document: Document, element: Element, owner: str, stations: Mapping[str, list[Element]]
 ) -> tuple[str, Array]:
-    """Return the parent of a frame that four stations define, and its pose (4, 4) there.
+    """Return the parent of a frame that four stations define, and its pose (4, 4) in the parent.
 
-    With the points a, b, c: e1 along b - a, e2 along (b - a) × (c - a), e3 = e1 × e2. The frame's
-    axis `ab_axis` lies along e1, `ab_x_ac_axis` along e2, and the third completes them (OpenSim's
-    StationDefinedFrame, https://opensim-org.github.io).
+    With the points a, b, c: e1 along b - a, e2 along (b - a) × (c - a). The frame's axis `ab_axis`
+    has the direction of e1, `ab_x_ac_axis` that of e2, and the third axis completes a right-handed
+    frame (OpenSim's StationDefinedFrame, https://opensim-org.github.io).
 
     Raises:
-        InputError: no such station, stations in different frames, or points on a line.
+        InputError: no such station, stations in different frames, or collinear points.
     """
     where, points, parents = document.where(element), [], set()
     for name in ("point_a", "point_b", "point_c", "origin_point"):
@@ -145,7 +145,7 @@ def _station_defined(
         known_frames = stations.get(socket.rstrip("/").split("/")[-1], [])
         own = [s for s in known_frames if s in element.iter()] or known_frames
         if len(own) != 1:
-            raise InputError(f"names a station '{socket}' that is there {len(own)} times", where)
+            raise InputError(f"names a station '{socket}', of which there are {len(own)}", where)
         points.append(document.numbers(own[0], "location", count=3))
         parents.add(document.socket(own[0], "parent_frame", "body", default=".."))
     if len(parents) != 1:
@@ -164,7 +164,7 @@ def _station_defined(
         basis[:, axis] = sign * vector / np.linalg.norm(vector)
         named.append(axis)
     if named[0] == named[1]:
-        raise InputError("has its two axes along one", where)
+        raise InputError("gives both axes the same direction", where)
     third = 3 - sum(named)
     basis[:, third] = np.cross(basis[:, (third + 1) % 3], basis[:, (third + 2) % 3])
     parent = parents.pop()
@@ -177,7 +177,7 @@ def read_joints(
     """Return the joints and coordinates in the file's order.
 
     Raises:
-        InputError: a joint that is not read or does not make sense.
+        InputError: a joint is of a class that is not read, or is malformed.
     """
     joints: list[Joint] = []
     coordinates: dict[str, Coordinate] = {}
@@ -195,7 +195,7 @@ def read_joints(
 def _joint(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[Joint, dict[str, Coordinate]]:
-    """Return a joint and its coordinates; a partial reading locks a joint that it cannot read."""
+    """Return a joint and its coordinates; in a partial reading, welded if its motion is unread."""
     (parent, in_parent), (body, in_child) = _joint_frames(document, element, frames, child)
     entries = [*document.objects(element, "CoordinateSet"), *element.findall("coordinates/*")]
     names = [document.name(entry) for entry in entries]
@@ -212,15 +212,14 @@ def _joint(
         coordinate = _coordinate(document, entry, name, axes[0])
         if coordinate.name in own:
             raise InputError("is there twice", document.where(entry), "rename one")
-        still = (
-            coordinate.name not in coordinates
-        )  # it moves nothing, so that no motion can change it
+        # A coordinate without an axis moves nothing, so that no motion can change it.
+        still = coordinate.name not in coordinates
         own[coordinate.name] = replace(coordinate, locked=True) if still else coordinate
     return Joint(name, element.tag, parent, body, in_parent, in_child, *axes, unread=unread), own
 
 
 def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Element, str | None]]:
-    """Yield each joint; in the old layout with the body that it stands in, its child."""
+    """Yield each joint with the name of its child body in the old layout, else with None."""
     for element in document.objects(model, "JointSet"):
         yield element, None
     for body in document.objects(model, "BodySet"):
@@ -231,7 +230,7 @@ def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Elemen
 def _joint_frames(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[tuple[str, Array], tuple[str, Array]]:
-    """Return (body, pose of the joint's frame in it) for parent and child."""
+    """Return the body and the pose (4, 4) of the joint's frame in it, for parent and child."""
     if child is None:
         name = document.name(element)
         sockets = (document.socket(element, f"{end}_frame") for end in ("parent", "child"))
@@ -271,7 +270,7 @@ def _standard_axes(
 def _custom_axes(
     document: Document, element: Element, names: list[str]
 ) -> tuple[tuple[JointAxis, ...], tuple[JointAxis, ...]]:
-    """Return the axes of a <SpatialTransform>, those that never move anything left out."""
+    """Return the axes of a <SpatialTransform>, without those that have no effect."""
     kinds: dict[str, list[JointAxis]] = {"rotation": [], "translation": []}
     transform_element = document.find(element, "SpatialTransform")
     if transform_element is None:
@@ -317,20 +316,20 @@ def _coordinate(
 
 
 def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
-    """Say whether a coordinate is a rotation's own angle; one that only drives it is not."""
+    """Return whether a coordinate is the angle of a rotation, and not only its function's input."""
     function = axis.function
     straight = isinstance(function, Linear) and abs(function.gradient) == 1.0
     return axis.coordinate == coordinate and straight
 
 
 def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
-    """Return the joints in an order that leads outwards from ground, each with its direction.
+    """Return the joints in order from ground outwards, with `backwards` set.
 
-    In a partial reading a joint that closes a loop is left out, and a body that nothing joins to
-    ground stands still in it, held by a joint that is marked as unread.
+    In a partial reading, a joint that closes a loop is left out. A body without a chain of joints
+    to ground is welded to ground by a joint that is marked as unread.
 
     Raises:
-        InputError: a loop, or a body that no chain of joints joins to ground.
+        InputError: the joints form a loop, or a body has no chain of joints to ground.
     """
     path = document.path
     reached, waiting, ordered = {GROUND}, list(joints), []
@@ -362,7 +361,7 @@ def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> 
 def _hold_still(
     document: Document, body: str, reason: str, ordered: list[Joint], hint: str | None = None
 ) -> None:
-    """Weld a body to ground in a partial reading, and record why; else raise."""
+    """Weld a body to ground in a partial reading, and record the reason; otherwise raise."""
     weld = Element("WeldJoint", {"name": f"{body} held still"})
     weld.text = body
     with document.reading(weld):

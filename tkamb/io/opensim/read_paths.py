@@ -35,7 +35,7 @@ MUSCLES = (
     "DeGrooteFregly2016Muscle",
     "RigidTendonMuscle",
 )
-"""They differ in their curves; path, force, lengths and pennation have the same names."""
+"""Classes of muscles. They differ in their curves; the parameters that are read are the same."""
 
 SHAPES: dict[str, tuple[Shape, tuple[str, ...]]] = {
     "WrapCylinder": ("cylinder", ("radius", "length")),
@@ -48,10 +48,10 @@ METHODS = ("hybrid", "midpoint", "axial")
 
 
 def read_wrap_objects(document: Document, model: Element) -> dict[str, WrapObject]:
-    """Return the wrap objects of all bodies; of two with one name the first, as in OpenSim.
+    """Return name -> wrap object of all bodies; if two have one name, the first, as in OpenSim.
 
     Raises:
-        InputError: a shape that is not read, a dimension that is not positive.
+        InputError: a shape that is not read, or a dimension that is not positive.
     """
     result: dict[str, WrapObject] = {}
     ground = [] if (element := model.find("Ground")) is None else [element]
@@ -106,7 +106,7 @@ def read_forces(
     """Return muscles, ligaments, and "class 'name'" of the forces left out.
 
     Raises:
-        InputError: a kind of muscle that is not read, or something wrong in a path.
+        InputError: a class of muscle or ligament that is not read, or an error in a path.
     """
     muscles: dict[str, OpenSimMuscle] = {}
     ligaments: dict[str, OpenSimLigament] = {}
@@ -201,7 +201,7 @@ class _PathReader:
         """Return the path of a force.
 
         Raises:
-            InputError: fewer than two points, or something in it that cannot be read.
+            InputError: the path has fewer than two points, or an element that cannot be read.
         """
         document = self.document
         geometry = document.find(element, "GeometryPath")
@@ -213,7 +213,9 @@ class _PathReader:
             raise InputError("has fewer than two path points", document.where(element))
         wraps = []
         for entry in document.objects(geometry, "PathWrapSet"):
-            with document.reading(element):  # on failure, the line without its wrap objects
+            with document.reading(
+                element
+            ):  # in a partial reading, the path then has no such wrap object
                 wraps.append(self._wrap(element, entry, len(points)))
         return Path(points, tuple(wraps))
 
@@ -251,7 +253,7 @@ class _PathReader:
         return MovingPathPoint(entry.get("name", ""), body, tuple(coordinates), tuple(functions))
 
     def _coordinate(self, entry: Element, name: str, *, where: str) -> str | None:
-        """Return the name of the coordinate that a socket leads to, None if it is empty."""
+        """Return the name of the coordinate of a socket; None if the socket is empty."""
         socket = self.document.socket(entry, name, name, default=" ").strip()
         name = socket.split("/")[-1]
         if name and name not in self.coordinates:
@@ -269,7 +271,7 @@ class _PathReader:
             raise InputError(f"names a wrap object '{name}' that is not there", where)
         if method not in METHODS:
             raise InputError(f"has a method '{method}' that is not read", where)
-        # In the file points count from 1; what is below 1 stands for the first or last point.
+        # The file counts points from 1; a smaller number means the first or the last point.
         begin = 0 if first < 1 else int(first) - 1
         end = count - 1 if last < 1 else int(last) - 1
         if not begin < end < count:

@@ -37,14 +37,14 @@ from tkamb.io.opensim.model import WrapObject
 
 @dataclass(frozen=True)
 class WrapSettings:
-    """How a string is laid around a single wrap object."""
+    """Wrapping of a string around a single wrap object."""
 
     ring_places: int = 48
-    """Places around a torus's ring that are tried for where the string presses against it. Chosen:
-    one every 7.5 deg."""
+    """Number of places on a torus's ring that are tried in the search for the string's place.
+    Chosen: one every 7.5 deg."""
     ellipsoid_clearance: float = 1e-3
-    """Share of its size by which an ellipsoid keeps clear of a point that moves into it. Chosen:
-    above rounding, and without effect on a muscle's length."""
+    """Share (1) of its size: gap between a shrunken ellipsoid and the point that moves into it.
+    Chosen: above rounding, and without effect on a muscle's length."""
 
 
 WRAP = WrapSettings()
@@ -52,13 +52,13 @@ WRAP = WrapSettings()
 
 @dataclass(frozen=True, eq=False)
 class WrapTouch:
-    """Where strings (f) touch an object.
+    """Touching points of f strings on a wrap object, in its frame.
 
     Args:
-        touches: (f,) whether they do; the rest holds for these alone.
-        entry: (f, 3) m, where they meet it, in its frame.
-        exit: (f, 3) m, where they leave it.
-        arc_m: (f,) length on it.
+        touches: (f,) whether a string touches; the other values hold only for strings that do.
+        entry: (f, 3) m, point where the string meets the object.
+        exit: (f, 3) m, point where it leaves.
+        arc_m: (f,) length on the object.
         push: (f, 2, 3) force of a shrinking object on start and end, per unit tension.
     """
 
@@ -70,12 +70,12 @@ class WrapTouch:
 
 
 def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> WrapTouch:
-    """Return where strings touch a wrap object, in its frame.
+    """Return the touching points of strings on a wrap object.
 
     Args:
         wrap: the object.
-        start: (f, 3) m.
-        end: (f, 3) m.
+        start: (f, 3) m, in the object's frame.
+        end: (f, 3) m, in the object's frame.
         moves: (f, 2) whether start and end are path points of another body than the object's.
     """
     if wrap.shape == "cylinder":
@@ -92,12 +92,12 @@ def _no_push(start: Array) -> Array:
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
-    """Return distance and angle (f,) of points (f, 2) of a plane."""
+    """Return distance (f,) m and angle (f,) rad of points (f, 3) m from the z axis."""
     return np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
 
 
 def _wrapped(angles: Array) -> Array:
-    """Return angles within ±pi."""
+    """Return angles shifted into ±pi."""
     return np.asarray(angles - 2.0 * np.pi * np.round(angles / (2.0 * np.pi)))
 
 
@@ -107,13 +107,13 @@ def _around(
     """Return a taut string around a circle.
 
     Args:
-        distances: (f,) m, of start and end from the centre.
-        sweep: (f,) rad, signed, from start to end about the centre, on the side it passes.
-        radius: m.
+        distances: (f,) m, distances of start and end from the centre.
+        sweep: (f,) rad, signed angle about the centre from start to end, on the string's side.
+        radius: radius (m).
 
     Returns:
-        Signed turn (f,) on the circle, 0 where it does not touch; angle (f,) from the start to
-        where it meets the circle; lengths (f,) of the straight parts.
+        Signed angle (f,) rad on the circle, 0 where the string does not touch; angle (f,) rad from
+        the start to the touching point; lengths (f,) m of both straight parts.
     """
     first, second = (np.sqrt(np.maximum(d**2 - radius**2, 0.0)) for d in distances)
     away = np.arctan2(first, radius), np.arctan2(second, radius)
@@ -125,12 +125,12 @@ def _around(
 def _cylinder(
     start: Array, end: Array, radius: float, length: float, quadrant: tuple[int, int] | None
 ) -> WrapTouch:
-    """Return strings around a cylinder along z; none where they touch beyond both its ends."""
+    """Return strings around a cylinder along z; one that passes beyond its ends does not touch."""
     (near, angle), (far, last) = _polar(start), _polar(end)
     if quadrant is None or quadrant[0] == 2:
         sweep = _wrapped(last - angle)
     else:
-        # Counted from the half's middle: a string never crosses the middle of the other half.
+        # Angles are relative to the middle of the half: no string crosses the other half's middle.
         axis, sign = quadrant
         middle = 0.5 * np.pi * axis + (np.pi if sign < 0 else 0.0)
         sweep = _wrapped(last - middle) - _wrapped(angle - middle)
@@ -148,9 +148,9 @@ def _cylinder(
 
 
 def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> WrapTouch:
-    """Return strings around a sphere: in the plane of both ends and its centre.
+    """Return strings around a sphere, each in the plane of its ends and the centre.
 
-    A string that must pass on one half goes the long way round if that is where it leads,
+    With a prescribed half, a string takes the long way round if only that way passes on the half,
     unless both its ends lie on that half.
     """
     near, far = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
@@ -175,15 +175,15 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
 
 
 def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
-    """Return strings through a torus about z, pressed against the inside of its ring.
+    """Return strings through a torus about z, in contact with the inside of its ring.
 
-    The ring is taken as a cylinder along its tangent at the place that it is pressed most:
-    where the string is longest, so that its place does not enter dL/dq.
+    The ring is replaced by a cylinder along its tangent at one place: the place at which the string
+    is longest. There the length is stationary, so that the place does not enter dL/dq.
     """
     rows = np.arange(len(start))
 
     def at(places: Array) -> tuple[WrapTouch, Array, Array]:
-        """Return touches, lengths and frames with the ring taken straight at angles (f,)."""
+        """Return touching points, lengths (f,) m and frames of cylinders at angles (f,) rad."""
         inward = -np.column_stack([np.cos(places), np.sin(places), np.zeros_like(places)])
         up = np.broadcast_to([0.0, 0.0, 1.0], inward.shape)
         frame = np.stack([inward, up, np.cross(inward, up)], axis=1)
@@ -213,7 +213,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
 def _ellipsoid(
     start: Array, end: Array, axes: Array, quadrant: tuple[int, int] | None, moves: Mask
 ) -> WrapTouch:
-    """Return strings around an ellipsoid: geodesics where the straight line would cut it."""
+    """Return strings around an ellipsoid: geodesics, if the straight line would cut it."""
     p, q = start / axes, end / axes
     depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
     size = np.where(moves, depth / (1.0 + WRAP.ellipsoid_clearance), 1.0).min(axis=1)
@@ -243,17 +243,17 @@ def _ellipsoid(
 
 @dataclass(frozen=True)
 class StringSettings:
-    """The shortest string over several wrap objects, object by object."""
+    """Iteration for the taut string over several wrap objects."""
 
     max_sweeps: int = 100
-    """Sweeps over all objects, after which a string without convergence is reported as failed.
+    """Largest number of sweeps over all objects; a string that has not converged by then fails.
     Chosen: strings that converge need fewer."""
     max_extrapolation: float = 10.0
-    """Largest extrapolation, as a multiple of the last step. Chosen: two sweeps do not predict
-    farther."""
+    """Largest extrapolation, as a multiple of the last step. Chosen: two sweeps do not support
+    more."""
     tolerance: float = 1e-10
-    """m; a string has converged when the last sweep moves no touching point by more. Chosen: far
-    below what changes a muscle's length."""
+    """m; a string has converged when a sweep moves no coordinate of a touching point by more.
+    Chosen: far below what changes a muscle's length."""
 
 
 STRING = StringSettings()
@@ -261,14 +261,14 @@ STRING = StringSettings()
 
 @dataclass(frozen=True, eq=False)
 class WrappedStrings:
-    """Strings (f) over w objects.
+    """f strings over w objects.
 
     Args:
-        order: (f, w) the objects each touches, from its start to its end; -1 where no more.
-        entry: (f, w, 3) m, where it meets object w.
-        exit: (f, w, 3) m, where it leaves object w.
-        arc_m: (f, w) its length on object w; NaN where no taut string was found.
-        push: (f, w, 2, 3) force of a shrinking object w on the two ends, per unit tension.
+        order: (f, w) indices of the objects that a string touches, from start to end, then -1.
+        entry: (f, w, 3) m, point where the string meets an object.
+        exit: (f, w, 3) m, point where it leaves the object.
+        arc_m: (f, w) length on the object; NaN where the iteration has not converged.
+        push: (f, w, 2, 3) force of a shrinking object on start and end, per unit tension.
     """
 
     order: Index
@@ -286,13 +286,13 @@ def strings_over(
     allowed: Mask,
     moves: Mask,
 ) -> WrappedStrings:
-    """Return the taut strings from start to end (f, 3) over the objects that lie in the way.
+    """Return the taut strings between points, over the objects in their way.
 
     Args:
         wraps: w objects, in the order in which they are tried.
-        poses: (f, w, 4, 4) of the objects, in the frame of the points.
-        start: (f, 3) m.
-        end: (f, 3) m.
+        poses: (f, w, 4, 4) poses of the objects in the frame of the points.
+        start: (f, 3) m, first points.
+        end: (f, 3) m, last points.
         allowed: (f, w) whether a string may touch an object.
         moves: (f, w, 2) whether the start and the end belong to another body than object w.
     """
@@ -320,9 +320,9 @@ def strings_over(
 
 
 def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array) -> Array:
-    """Return the extrapolated step (f, 6w) from the last two sweeps (Aitken, Anderson).
+    """Return the extrapolation (f, 6w) m from the last two sweeps (Aitken, Anderson).
 
-    Zero before there are two sweeps over the same objects, or if it is too large.
+    It is zero before two sweeps over the same objects, and where it would be too large.
     """
     change = residual - last_residual
     squared = np.maximum((change**2).sum(axis=1), 1e-300)
@@ -333,7 +333,7 @@ def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array
 
 
 class _Strings:
-    """Current state of the strings, object by object; see `strings_over` for the arguments."""
+    """State of the iteration of `strings_over`, which describes the arguments."""
 
     def __init__(
         self, wraps: Sequence[WrapObject], poses: Array, start: Array, end: Array, moves: Mask
@@ -350,16 +350,16 @@ class _Strings:
         return WrappedStrings(self.order, self.entry, self.exit, self.arc, self.push)
 
     def places(self) -> Array:
-        """Return the touching points in one row (f, 6w) a string."""
+        """Return the touching points (f, 6w) m, one row for each string."""
         return np.concatenate([self.entry, self.exit], axis=2).reshape(len(self.start), -1)
 
     def place(self, places: Array) -> None:
-        """Set the touching points from one row (f, 6w) a string."""
+        """Set the touching points from rows (f, 6w) m."""
         both = places.reshape(*self.order.shape, 6)
         self.entry, self.exit = both[..., :3].copy(), both[..., 3:].copy()
 
     def sweep(self, rows: Index, allowed: Mask) -> None:
-        """Lay some strings again over each allowed object (f, w), one after the other."""
+        """Update the touching points of some strings on each allowed object (f, w) in turn."""
         for w in range(len(self.wraps)):
             self.remove(w, rows)
             self.insert(w, rows[allowed[rows, w]])
@@ -371,7 +371,7 @@ class _Strings:
         self.order[rows] = np.take_along_axis(kept, closed, axis=1)
 
     def insert(self, w: int, free: Index) -> None:
-        """Lay some strings over object w in the first of their straight parts that meets it."""
+        """Wrap some strings around object w, in the first straight part that meets it."""
         for gap in range(len(self.wraps)):
             free = free[(self.order[free] >= 0).sum(axis=1) >= gap]
             if not len(free):
@@ -400,5 +400,5 @@ class _Strings:
 
 
 def _moved(poses: Array, points: Array) -> Array:
-    """Return points (f, 3) moved each by its own pose (f, 4, 4)."""
+    """Return points (f, 3), each transformed by its own pose (f, 4, 4)."""
     return np.einsum("fij,fj->fi", poses[:, :3, :3], points) + poses[:, :3, 3]
