@@ -43,19 +43,19 @@ class Recording:
 
     Args:
         path: the file.
-        rate_Hz: of the markers.
+        rate_Hz: frames per second of the markers.
         first_frame: number of the first frame, counted from zero.
-        labels: (m) of the markers, as in the file; those without are `marker 7`.
+        labels: (m) names of the markers as in the file; `marker 7` for a marker without one.
         points: (n, m, 3) m; gaps are NaN. In the file's unit while `length_unit` is None.
-        residual: (n, m) m, of the markers' reconstruction; NaN in gaps.
-        length_unit: of the markers, m, or None where the file's word is not understood.
+        residual: (n, m) m, residual of the markers' reconstruction; NaN in gaps.
+        length_unit: "m"; None where the file's word for the unit is not understood.
         analog_rate_Hz: samples per second of the channels.
-        channels: name -> (k,) of those channels that belong to no plate, EMG among them.
+        channels: name -> (k,) samples of each channel that belongs to no plate, like EMG.
         channel_units: name -> unit, as in the file.
         plates: the force plates that could be read, in the file's order.
         faults: "markers", "channels" or "plate 2" -> what is wrong with it.
-        equal_channels: names that stand for several channels.
-        notices: remarks on what was read otherwise than stated.
+        equal_channels: names that several channels share.
+        notices: remarks on values that were read otherwise than the file states.
         length_word: the file's own word for its unit of length.
     """
 
@@ -77,24 +77,24 @@ class Recording:
 
     @property
     def time(self) -> Array:
-        """(n,) s, of the frames."""
+        """Times (n,) s of the frames."""
         return (self.first_frame + np.arange(len(self.points))) / self.rate_Hz
 
     @property
     def analog_time(self) -> Array:
-        """(k,) s, of the channels and plates, on the same clock."""
+        """Times (k,) s of the samples of channels and plates, on the clock of the frames."""
         ratio = round(self.analog_rate_Hz / self.rate_Hz)
         count = len(self.points) * ratio
         return (self.first_frame * ratio + np.arange(count)) / self.analog_rate_Hz
 
     @property
     def unread_plates(self) -> dict[int, InputError]:
-        """Number of each plate that could not be read -> why."""
+        """Number of each plate that could not be read -> its error."""
         return {int(k[6:]): error for k, error in self.faults.items() if k.startswith("plate ")}
 
     @property
     def all_notices(self) -> tuple[str, ...]:
-        """Remarks on the file and its plates, and what of it could not be read."""
+        """Remarks on the file and its plates, and on parts that could not be read."""
         own = [notice for plate in self.plates for notice in plate.notices]
         parts: dict[str, list[str]] = {}
         for part, error in self.faults.items():
@@ -106,7 +106,7 @@ class Recording:
         """Return a plate by its number.
 
         Raises:
-            InputError: there is none of that number, or it cannot be read.
+            InputError: there is no plate of that number, or it cannot be read.
         """
         for plate in self.plates:
             if plate.number == number:
@@ -146,11 +146,11 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
     Args:
         path: the file.
-        units: what unit words mean that the file lacks or writes in a way of its own.
+        units: units that the file does not state or writes in an unknown way.
 
     Raises:
-        InputError: no such file, not a regular one, not C3D or cut short, frames of no rate, or
-            header and parameters that contradict each other.
+        InputError: no such file, not a regular file, not C3D, cut short, no valid frame rate, or
+            header and parameters contradict each other.
     """
     path = Path(path)
     try:
@@ -162,7 +162,7 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
 @lru_cache(maxsize=2)
 def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
-    """Read the file as it was at `changed`; cached, because several parts of a run need it."""
+    """Read a file that was last changed at `changed`, ns; cached for several uses in a run."""
     with np.errstate(all="ignore"):  # damaged numbers overflow; they are gaps below
         file = parse_c3d(read_bytes(path, FILE_LIMITS.table_bytes), path)
         return _Reader(path, file, units).recording()
@@ -170,7 +170,7 @@ def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """The parts of a recording, each by itself; what fails is kept in `faults`."""
+    """Reads each part of a recording separately; `faults` has the error of each failed part."""
 
     path: Path
     file: C3dFile
@@ -215,7 +215,7 @@ class _Reader:
         )
 
     def _rate(self) -> float:
-        """Return frames per second: POINT:RATE, or the header's."""
+        """Return frames per second from POINT:RATE, else from the header."""
         stated = self._parameters.number("POINT:RATE")
         rates = [stated, self.file.header.rate_Hz]
         for rate in rates:
@@ -224,7 +224,7 @@ class _Reader:
         raise InputError(f"markers have a rate of {rates[0] or 0:g} Hz", self.path, EXPORT)
 
     def _labels(self) -> tuple[tuple[str, ...], list[str]]:
-        """Return a label per marker, and those that stand twice."""
+        """Return a label per marker, and the labels of several markers."""
         count = self.file.points.shape[1]
         stated = self._parameters.texts("POINT:LABELS")[:count]
         stated += [""] * (count - len(stated))

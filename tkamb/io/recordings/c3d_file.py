@@ -1,7 +1,7 @@
 """The container of a C3D file: header, parameters, and the numbers of its frames.
 
-Everything is read with bounds from one block of bytes, so that a damaged file ends in one
-message. Nothing here knows what a marker or a force plate is; `tkamb.io.recordings.c3d` does.
+Every read is checked against the size of the file, so that a damaged file gives one message.
+The meaning of markers, channels and force plates is in `tkamb.io.recordings.c3d`.
 
 A file begins with a header of 512 bytes. Its parameter section is a chain of records: a group,
 or a parameter with type, dimensions and values. Its data section holds frame after frame: four
@@ -28,7 +28,7 @@ LARGEST_16_BIT = 65535
 """The largest frame number that the header can hold; longer recordings state theirs in TRIAL."""
 EXPORT = "export the trial again as C3D"
 MOST_DIMENSIONS = 7
-"""Of a parameter, by the format."""
+"""Largest number of dimensions of a parameter, by the format."""
 _KEY = 0x50
 _DEC, _MIPS, _INTEL = 85, 86, 84
 _SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}
@@ -37,12 +37,12 @@ _SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}
 
 @dataclass(frozen=True)
 class Header:
-    """What the first block says.
+    """The header, in the first block.
 
     Args:
-        markers: per frame.
+        markers: number of markers.
         analog: analog values per frame.
-        samples: analog samples per channel and frame.
+        samples: analog samples of a channel per frame.
         first: number of the first frame, from 1.
         last: number of the last frame.
         scale: units per integer; negative: the data are floats.
@@ -61,7 +61,7 @@ class Header:
 
     @property
     def channels(self) -> int:
-        """Analog channels."""
+        """Number of analog channels."""
         return self.analog // self.samples if self.analog else 0
 
 
@@ -73,7 +73,7 @@ class Parameters:
         path: the file, for messages.
         values: "GROUP:NAME" -> array of numbers (the first index runs fastest in the file), or
             list of texts.
-        damaged: names of parameters whose record does not hold what it states.
+        damaged: names of the parameters with a record shorter than its dimensions state.
     """
 
     path: Path
@@ -81,40 +81,40 @@ class Parameters:
     damaged: set[str] = field(default_factory=set)
 
     def get(self, name: str) -> Any:
-        """Return the values of "GROUP:NAME"; None without.
+        """Return the values of "GROUP:NAME"; None if the file has no such parameter.
 
         Raises:
-            InputError: the parameter is there, but damaged.
+            InputError: the parameter is damaged.
         """
         if name in self.damaged:
             raise InputError(f"has a damaged parameter {name}", self.path, EXPORT)
         return self.values.get(name)
 
     def number(self, name: str) -> float | None:
-        """Return the first number of a parameter; None without any."""
+        """Return the first number of a parameter; None if it has none."""
         value = self.get(name)
         if value is None or isinstance(value, list) or not value.size:
             return None
         return float(value.ravel(order="F")[0])
 
     def numbers(self, name: str) -> Array | None:
-        """Return the numbers of a parameter, in the shape that it states; None without any."""
+        """Return the numbers of a parameter, in the shape that it states; None if it has none."""
         value = self.get(name)
         return None if value is None or isinstance(value, list) else np.asarray(value, float)
 
     def integers(self, name: str) -> list[int]:
-        """Return whole numbers without sign, as counts are; empty without any."""
+        """Return whole numbers of a parameter, read as unsigned; empty if it has none."""
         value = self.numbers(name)
         result: list[float] = [] if value is None else value.ravel(order="F").tolist()
         return [int(v) & 0xFFFF if -32768 <= v < 0 else int(v) for v in result if math.isfinite(v)]
 
     def series(self, name: str) -> Array:
-        """Return NAME, NAME2, ... in one row: each holds at most 255 values."""
+        """Return the values (n,) of NAME, NAME2, ..., each of which holds at most 255."""
         parts = [self.numbers(key) for key in self._numbered(name)]
         return np.concatenate([np.empty(0), *(p.ravel(order="F") for p in parts if p is not None)])
 
     def texts(self, name: str) -> list[str]:
-        """Return NAME, NAME2, ... in one list, stripped."""
+        """Return the stripped texts of NAME, NAME2, ... in one list."""
         result: list[str] = []
         for key in self._numbered(name):
             value = self.get(key)

@@ -58,7 +58,7 @@ class PlateSettings:
     """N; force from which the centre of pressure of a plate is checked. Chosen: with less it is a
     quotient of small numbers."""
     beside: float = 0.2
-    """1: share of the plate's half width by which the centre of pressure may lie outside the
+    """Share of the plate's half width by which the centre of pressure may lie outside the
     corners. Chosen: errors of a loaded plate are smaller."""
 
 
@@ -67,20 +67,20 @@ SETTINGS = PlateSettings()
 
 @dataclass(frozen=True, eq=False)
 class PlateRecord:
-    """What a file says of one plate.
+    """One plate as the file describes it.
 
     Args:
-        number: of the plate, from 1.
-        kind: its type, 1 to 5.
-        corners: (4, 3) m.
+        number: number of the plate, from 1.
+        kind: type of the plate, 1 to 5.
+        corners: (4, 3) m, corners of the surface.
         origin: (3,) m, the file's ORIGIN.
-        names: of the channels.
-        signals: (c, k) in the file's units.
-        units: of the channels, as in the file.
-        calibration: (6, c), types 4 and 5: channels to force and moment; None without.
-        force_unit: of calibrated forces.
-        metres_per_unit: of the file's length unit.
-        zero: samples in which the file says that nobody stands on the plate; None: none.
+        names: names of the channels.
+        signals: (c, k) samples of the channels, in the file's units.
+        units: units of the channels, as in the file.
+        calibration: (6, c), types 4 and 5: channels to force and moment; None: no matrix.
+        force_unit: unit of the calibrated forces.
+        metres_per_unit: metres per unit of length of the file.
+        zero: samples that the file states as unloaded; None: it states none.
         given: units that the user states.
         where: file and plate, for messages.
     """
@@ -105,12 +105,12 @@ class ForcePlate:
     """One plate, in the axes of the file.
 
     Args:
-        number: as the file counts, from 1.
+        number: number in the file, from 1.
         channels: names of its channels.
-        corners: (4, 3) m, of the surface.
-        force: (k, 3) N, on the foot; NaN where the file has no number.
+        corners: (4, 3) m, corners of the surface.
+        force: (k, 3) N, on the foot; NaN where the file has no value.
         moment: (k, 3) N·m, on the foot, about the centre of the surface.
-        notices: remarks on how it was read.
+        notices: remarks on how the plate was read.
     """
 
     number: int
@@ -122,7 +122,7 @@ class ForcePlate:
 
     @property
     def centre(self) -> Array:
-        """(3,) m, of the surface."""
+        """Centre (3,) m of the surface."""
         return np.asarray(self.corners.mean(axis=0))
 
     @property
@@ -135,8 +135,8 @@ def force_plate(record: PlateRecord) -> ForcePlate:
     """Return the wrench that a plate measured.
 
     Raises:
-        InputError: a type or unit that is not read, too few channels, no surface or no
-            calibration.
+        InputError: an unknown type or unit, too few channels, corners that span no surface, or no
+            calibration matrix.
     """
     kind, where = record.kind, record.where
     if kind not in CHANNELS:
@@ -156,7 +156,7 @@ def force_plate(record: PlateRecord) -> ForcePlate:
     if record.zero is not None:
         level = record.signals[:, record.zero].mean(axis=1)
         if kind == 1:
-            level[3:5] = 0.0  # a place has no baseline
+            level[3:5] = 0.0  # the point of the force has no baseline
         what = _loaded_in_zero(record, force)
         if what:
             notices += (what,)
@@ -169,7 +169,7 @@ def force_plate(record: PlateRecord) -> ForcePlate:
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
-    """Return why the frames of ZERO cannot be a baseline; empty if they can."""
+    """Return the reason not to subtract the frames of ZERO as a baseline; empty: none."""
     assert record.zero is not None
     vertical = force[:, 2]
     window = vertical[record.zero]
@@ -192,7 +192,7 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
     matrix = record.calibration
     stated = _stated_scales(record) if record.kind == 4 else None
     if matrix is None and stated is not None:
-        matrix = np.eye(6)  # channels that state force and moment are calibrated
+        matrix = np.eye(6)  # channels in units of force and moment are calibrated already
     if matrix is None or matrix.shape != (6, len(record.signals)):
         what = f"is of type {record.kind} without CAL_MATRIX"
         raise InputError(what, record.where, "export it with the matrix")
@@ -219,7 +219,7 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
 
 
 def _on_plate(corners: Array, force: Array, moment: Array) -> bool:
-    """Return whether the centre of pressure lies on the plate while that is loaded."""
+    """Return whether the centre of pressure of the loaded plate lies on its surface."""
     loaded = np.abs(force[:, 2]) > SETTINGS.loaded_N
     if not loaded.any():
         return True
@@ -342,10 +342,10 @@ PLATE_LOAD = PlateLoadSettings()
 
 
 def around_load(force: Array, time: Array) -> np.ndarray:
-    """Return (k,) whether a plate is loaded, or was or will be within the margin.
+    """Return whether each sample (k,) is loaded, or within the margin of a loaded one.
 
     Args:
-        force: (k,) N, size of the force on the plate.
+        force: (k,) N, magnitude of the force on the plate.
         time: (k,) s.
     """
     forces = np.sort(force[np.isfinite(force)])
@@ -369,7 +369,7 @@ def around_load(force: Array, time: Array) -> np.ndarray:
 
 
 def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
-    """Return the median (N) of a plate's vertical force while nobody stands on it; else zero."""
+    """Return the median (N) of the vertical force of the unloaded plate; zero if never unloaded."""
     free = vertical[~on & np.isfinite(vertical)]
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     return float(np.median(free)) if len(free) * step >= PLATE_LOAD.unloaded_s else 0.0

@@ -31,12 +31,12 @@ GAIT = GaitSettings()
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """What a foot's force plates show of gait.
+    """Stances of a foot from its force plates.
 
     Args:
         stances: (n, 2) s, foot strike and toe-off of each stance; NaN where the recording begins or
             ends within the stance, or has no force there.
-        recorded: s, first and last sample.
+        recorded: s, times of the first and the last sample.
     """
 
     stances: Array
@@ -44,16 +44,16 @@ class Gait:
 
     @property
     def foot_strikes(self) -> list[float]:
-        """Return the times (s) of the strikes that were recorded."""
+        """Times (s) of the recorded foot strikes."""
         return [float(time) for time in self.stances[:, 0] if np.isfinite(time)]
 
     @property
     def toe_offs(self) -> list[float]:
-        """Return the times (s) of the toe-offs that were recorded."""
+        """Times (s) of the recorded toe-offs."""
         return [float(time) for time in self.stances[:, 1] if np.isfinite(time)]
 
     def spans(self) -> list[tuple[float, float]]:
-        """Return the stances (s), cut at the ends of the recording."""
+        """Return start and end (s) of each stance within the recording."""
         start, end = self.recorded
         return [
             (float(np.nan_to_num(on, nan=start)), float(np.nan_to_num(off, nan=end)))
@@ -61,9 +61,9 @@ class Gait:
         ]
 
     def cycle(self, start: float, end: float) -> tuple[float, float] | None:
-        """Return the cycle (s) between two strikes that holds most of start to end, s.
+        """Return the cycle (s) between two strikes that overlaps most with `start` to `end`, s.
 
-        None where no two strikes follow each other.
+        None if no cycle overlaps.
         """
         strikes = self.foot_strikes
         cycles = list(pairwise(strikes))
@@ -81,7 +81,7 @@ def find_gait(time: Array, vertical: Array) -> Gait:
         vertical: (k,) N, upward ground reaction of the foot, unfiltered.
     """
     on = vertical >= GAIT.contact_force_N
-    for state in (False, True):  # gaps within a stance first, then contacts that are noise
+    for state in (False, True):  # first short gaps in a stance, then short contacts
         for first, last in uninterrupted_runs(on == state):
             inside = first > 0 and last < len(on) - 1
             if inside and time[last] - time[first] < GAIT.shortest_phase_s:
@@ -112,7 +112,7 @@ def uninterrupted_runs(chosen: Mask) -> list[tuple[int, int]]:
 
 
 def _crossing(time: Array, vertical: Array, after: int) -> float:
-    """Return when the force crosses the threshold between a sample and the one before."""
+    """Return the time (s) at which the force crosses the threshold before sample `after`."""
     low, high = vertical[after - 1], vertical[after]
     share = (GAIT.contact_force_N - low) / (high - low) if high != low else 1.0
     share = float(np.clip(share, 0.0, 1.0))
@@ -127,7 +127,7 @@ class Cycle:
         start: s.
         period: s.
         offset_percent: per cent of the cycle at `start`.
-        closed: 0 and 100 % were recorded and agree.
+        closed: whether 0 and 100 % were recorded and agree.
     """
 
     start: float
@@ -143,20 +143,21 @@ class Cycle:
         offset_percent: float,
         path: Path,
     ) -> "Cycle":
-        """Return the scene's cycle.
+        """Return the cycle of the scene.
 
-        It is closed if 100 % was recorded too and no coordinate differs there from 0 % by
-        more than its largest step between neighbouring samples.
+        It is closed if it was recorded to 100 % and the coordinates at 100 % and 0 % differ by
+        no more than their largest step between neighbouring samples.
 
         Args:
-            percent: (n,) the recorded per cents.
+            percent: (n,) recorded per cent of the cycle.
             knee: (n, 6) knee coordinates there.
-            interval: s, on which the cycle lies.
+            interval: s, start and end of the cycle.
             offset_percent: per cent of the cycle at the interval's start.
-            path: of the file, for messages.
+            path: the file, for messages.
 
         Raises:
-            InputError: not per cent, not an interval, or an offset into an open cycle.
+            InputError: values that are not per cent, an interval that does not rise, or an
+                offset in a cycle that is not closed.
         """
         start, end = interval
         if not start < end:
@@ -179,7 +180,7 @@ class Cycle:
         return Cycle(start, end - start, offset_percent, closed)
 
     def seconds(self, percent: Array) -> Array:
-        """Return the times of per cents, not wrapped into the interval."""
+        """Return times (n,) s of per cent (n,), possibly outside the interval."""
         return self.start + (percent - self.offset_percent) / 100.0 * self.period
 
     def percent(self, time: Array) -> Array:
@@ -187,7 +188,7 @@ class Cycle:
         return self.offset_percent + (time - self.start) / self.period * 100.0
 
     def frames(self, sampled: Array, count: int | None) -> Array:
-        """Return the times of the frames: evenly `count`, or those recorded."""
+        """Return the times of the frames: `count` evenly spaced ones, or the recorded ones."""
         if not self.closed:
             return np.linspace(sampled[0], sampled[-1], count) if count else sampled
         if count:
@@ -198,7 +199,7 @@ class Cycle:
         return self.start + np.append(np.unique(np.round(turn, 12)), self.period)
 
     def wrapped(self, at: Array, sampled: Array) -> Array:
-        """Return times inside the recorded cycle, whole periods away from `at`."""
+        """Return times inside the recorded cycle that differ from `at` by whole periods."""
         if not self.closed or not self.offset_percent:
             return np.clip(at, sampled[0], sampled[-1])
         return np.clip(sampled[0] + np.mod(at - sampled[0], self.period), sampled[0], sampled[-1])

@@ -58,16 +58,17 @@ LARGEST = {"force": (20000.0, "N"), "moment": (1000.0, "N·m")}
 """Largest values that are accepted. Force: twice that on a triple jumper's foot. Moment: many times
 any free moment; moments about a plate's own origin are smaller, too."""
 ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
-"""Of a component's own peak, of the whole force's, and m: as near to its neighbours' curve as the
-larger of the forces, or as the last, no sample is odd."""
+"""Smallest deviations of an odd sample from its neighbours' curve: as a share of the component's
+peak, as a share of the whole force's peak (the larger of the two holds), and in m for a point."""
 ODD_SHARE_LEFT = 0.1
-"""Of the force of an odd sample: a spike of which the low-pass leaves less moves no result by
-more than 0.5 % of the peak. One sample of 76 N at 1200 Hz leaves 0.8 N at 6 Hz."""
+"""Share of the smallest odd force deviation: a spike of which the low-pass leaves less is not
+reported. It changes no result by more than 0.5 % of the peak. One sample of 76 N at 1200 Hz leaves
+0.8 N at 6 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundReaction:
-    """Force on the foot in the laboratory (x forward, y up, z right), a right foot's.
+    """Force on a right foot in the laboratory (x forward, y up, z right).
 
     Args:
         force: (f, 3) N.
@@ -76,8 +77,8 @@ class GroundReaction:
         loaded: (f,) whether the vertical force is at or above `unloaded_N`.
         odd: recorded samples around the frames that lie off their neighbours' curve.
         level_assumed: whether the plate's height is assumed to be 0, because no column states it.
-        drift: number of a plate -> N, its reading while nobody stands on it, if that is large.
-        notices: remarks on what of the file was used.
+        drift: number of a plate -> N, its large vertical reading while nobody stands on it.
+        notices: remarks on the parts of the file that were used.
         gait: stances that the recording shows; None where there is no recording.
     """
 
@@ -94,16 +95,16 @@ class GroundReaction:
 
 @dataclass(frozen=True, eq=False)
 class RecordedReaction:
-    """What a file holds of a foot's ground reaction, in the laboratory.
+    """A foot's ground reaction as a file has it, in the laboratory.
 
     Args:
         time: (k,) s.
         force: (k, 3) N.
         point: (k, 3) m.
         moment: (k, 3) N·m about that point.
-        level_assumed: no column says the plate's height.
+        level_assumed: whether no column states the plate's height.
         drift: as in `GroundReaction`.
-        notices: as there.
+        notices: as in `GroundReaction`.
     """
 
     time: Array
@@ -124,9 +125,9 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
     """Return the ground reaction at the frames of the knee's motion.
 
     Args:
-        source: what to read, and how.
+        source: the scene's [ground_reaction].
         time: (f,) s of the frames, on the file's clock.
-        side: of the knee; a left foot is mirrored.
+        side: side of the knee; a left foot is mirrored.
 
     Raises:
         InputError: file or columns cannot be used, do not cover `time`, the force is not
@@ -173,9 +174,9 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
 
 
 def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
-    """Return times (k,) s, wrench (k, 6) N and N·m, and level (m) of a table's force.
+    """Return times (k,) s, wrench on the foot (k, 6) N and N·m, and plate level (m) of a table.
 
-    The wrench is that on the foot, in the laboratory and about its origin.
+    The wrench is in the laboratory and about its origin.
 
     Raises:
         InputError: columns that cannot be used, or a force that is not mainly upwards.
@@ -190,9 +191,9 @@ def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
 
 
 def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> tuple[Array, Array]:
-    """Return the points, interpolated while unloaded, and those of the moments, each (k, 3) m.
+    """Return the points with interpolation while unloaded, and the moments' points, each (k, 3) m.
 
-    A row with a full moment states it about its own point, wherever that is.
+    A row with a horizontal moment states the moment about the recorded point of that row.
     """
     held = _hold_point(recorded.time, recorded.point, loaded, path)
     aside = np.abs(recorded.moment[:, [0, 2]]) > GROUND_REACTION.moment_tolerance
@@ -220,10 +221,10 @@ def _units(source: GroundReactionTable) -> GivenUnits:
 def _complete_part(
     recorded: RecordedReaction, time: Array, source: GroundReactionTable
 ) -> RecordedReaction:
-    """Return the samples around the frames up to the next that is not a number.
+    """Return the longest part around the frames without a value that is not a number.
 
     Raises:
-        InputError: one among the frames.
+        InputError: there is such a value among the frames.
     """
     values = np.concatenate([recorded.force, recorded.moment], axis=1)
     gaps: NDArray[np.bool_] = np.asarray(~np.isfinite(values).all(axis=1))
@@ -248,7 +249,7 @@ def _complete_part(
 
 
 def _read_table(source: GroundReactionTable) -> RecordedReaction:
-    """Return what a table holds; one without the points' heights has them at zero."""
+    """Return the reaction of a table; the points' height is zero if no column states it."""
     if source.surface_mm:
         raise InputError(
             "is for plates of a .c3d: a table states its points itself",
@@ -276,10 +277,10 @@ def _odd_samples(
     loaded: np.ndarray,
     cutoff: Cutoff,
 ) -> tuple[OddSample, ...]:
-    """Return the odd samples of force and recorded point (n, 3), where the plate stays loaded.
+    """Return the odd samples of force and recorded point (n, 3) while the plate is loaded.
 
-    A force that the low-pass (`cutoff`, Hz) makes small is left out: a filter spreads one sample
-    over the time of 1 / (2 cutoff).
+    The low-pass (`cutoff`, Hz) spreads one sample over the time 1 / (2 cutoff). Odd forces that
+    are small after it are not returned.
     """
     if not loaded.any():
         return ()
@@ -287,7 +288,7 @@ def _odd_samples(
     left = 1.0 if cutoff == "none" else min(1.0, 2.0 * cutoff * spacing)
     peaks = np.abs(force).max(axis=0)
     floors = np.maximum(ODD_FORCE * peaks, LEAST_ODD_FORCE * peaks.max())
-    inside = loaded.copy()  # at least two samples from foot strike and toe-off
+    inside = loaded.copy()  # two samples after foot strike and before toe-off do not count
     for shift in (1, 2):
         inside[shift:] &= loaded[:-shift]
         inside[:-shift] &= loaded[shift:]
@@ -323,7 +324,7 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
 
 
 def _upright_point(source: GroundReactionTable) -> str:
-    """Return the role of the centre of pressure's height: a plate need not record its own."""
+    """Return the role of the centre of pressure's height, whose column may be missing."""
     return f"point_{'xyz'.index(source.laboratory_axes.split(',')[1][-1]) + 1}"
 
 

@@ -5,10 +5,10 @@ chain's markers x_m(q),
 
     min_q  sum_m w_m |x_m(q) - p_m|²
 
-by Gauss-Newton with Levenberg's damping and analytic Jacobians, and by Newton's method near
-the solution where the chain brings the residuals' curvature. Frames are independent of each
-other and solved all at once: every array has the frames as its first axis. Bounds are not
-imposed, so that a coordinate outside its range shows.
+is solved by Gauss-Newton steps with Levenberg's damping and analytic Jacobians. Near the solution
+Newton's method is used if the chain gives the curvature of the residuals. Frames are independent
+and solved all at once: every array has the frames as its first axis. No bounds are imposed, so
+that a coordinate outside its range is visible.
 
 Reference: Lu & O'Connor, J Biomech 32:129 (1999), doi:10.1016/S0021-9290(98)00158-4.
 """
@@ -49,7 +49,7 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """The least squares of f frames, linearised at their states.
+    """The least-squares problems of f frames, linearised at their states.
 
     Args:
         cost: (f,) m², sum of weighted squared distances.
@@ -104,11 +104,11 @@ class ChainFit(Generic[State]):
     """A chain fitted to markers.
 
     Args:
-        state: where it stands.
-        rms: (f,) m, over the markers that were seen; NaN where none was.
-        distance: (f, m) m, of each marker; NaN where missing.
+        state: the fitted state.
+        rms: (f,) m, root mean square distance of the visible markers; NaN without any.
+        distance: (f, m) m, distance of each marker; NaN for a missing one.
         solved: (f,) whether the last step was below `INVERSE_KINEMATICS.step_tolerance`.
-        steps: of the iteration.
+        steps: number of iterations.
     """
 
     state: State
@@ -126,8 +126,8 @@ def fit_chain(
     Args:
         chain: the chain.
         measured: (f, m, 3) m, gaps NaN.
-        weights: (m,) of the squared distances.
-        start: where the iteration begins.
+        weights: (m,) weights of the squared distances.
+        start: initial guess.
     """
     visible = np.isfinite(measured).all(axis=2)
     target, each = np.nan_to_num(measured), np.where(visible, weights, 0.0)
@@ -165,9 +165,9 @@ def fit_chain(
 
 
 def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -> Array:
-    """Return the damped steps (f, n) of some frames: Newton's where `near`, else Gauss-Newton's.
+    """Return the damped steps (f, n): Newton's where `near` (f,), else Gauss-Newton's.
 
-    A Newton step that would not descend is replaced.
+    A Newton step that does not reduce the cost is replaced by a Gauss-Newton step.
     """
     matrix, right = equations.matrix, equations.right
     diagonal = np.einsum("fii->fi", matrix)
@@ -210,12 +210,12 @@ class Segment:
 
     Args:
         name: "shank" and "thigh" are the knee's; others are joined to one of them by a ball joint.
-        labels: (m) of its markers.
+        labels: (m) labels of its markers.
         points: (m, 3) m, the markers in its frame.
-        weights: (m,) of their squared distances.
-        joined_to: the segment that carries it; empty for shank and thigh.
-        joint: (3,) m, the ball joint in that segment's frame.
-        centre: (3,) m, the same in its own.
+        weights: (m,) weights of their squared distances.
+        joined_to: the segment that a ball joint connects it to; empty for shank and thigh.
+        joint: (3,) m, the ball joint in the frame of `joined_to`.
+        centre: (3,) m, the ball joint in its own frame.
     """
 
     name: str
@@ -233,9 +233,9 @@ class LegState:
 
     Args:
         shank: (f, 4, 4) pose_shank_in_world.
-        knee: (f, 6) knee coordinates of the thigh, of which a hinge changes flexion alone.
+        knee: (f, 6) knee coordinates of the thigh; a hinge changes flexion only.
         thigh: (f, 4, 4) pose_thigh_in_world.
-        turns: segment -> (f, 3, 3), its rotation in the segment that carries it.
+        turns: neighbour -> (f, 3, 3), its rotation in the segment that it is joined to.
     """
 
     shank: Array
@@ -247,13 +247,13 @@ class LegState:
 class LegChain:
     """Shank and thigh joined by the knee, and neighbours joined by ball joints.
 
-    Freedoms, in order: shank (translation, rotation about its origin; world axes), knee
-    (flexion of a hinge, or translation and rotation of a free thigh), three of each ball joint.
+    Degrees of freedom, in order: shank (translation, rotation about its origin; world axes), knee
+    (flexion of a hinge, or translation and rotation of a free thigh), three per ball joint.
 
     Args:
         segments: "shank" and "thigh", and their neighbours.
         pose_insert_in_shank: (4, 4), the frame of the knee coordinates.
-        free: whether the knee has six freedoms; else flexion alone.
+        free: whether the knee has six degrees of freedom; else it has flexion only.
     """
 
     def __init__(
@@ -277,7 +277,7 @@ class LegChain:
         return poses
 
     def start(self, fitted: dict[str, Array], neutral: Array) -> LegState:
-        """Return a state to begin with, from the segments' own fits.
+        """Return an initial guess from the fits of the single segments.
 
         Args:
             fitted: segment -> (f, 4, 4), NaN where it could not be fitted.
@@ -335,7 +335,7 @@ class LegChain:
         return np.concatenate(places, axis=1), np.concatenate(blocks, axis=1)
 
     def _add_knee(self, block: Array, x: Array, name: str, state: LegState) -> None:
-        """Add the freedoms of shank and knee to the Jacobian of markers x of a chain's end."""
+        """Add the columns of shank and knee to the Jacobian of the markers x (f, m, 3)."""
         if name == "thigh" and self.free:
             block[..., 6:9] = np.eye(3)
             block[..., 9:12] = -skew(x - state.thigh[:, None, :3, 3])
@@ -386,7 +386,7 @@ def _carry(poses: Array, step: Array) -> Array:
 
 
 def _fill_gaps(poses: Array) -> Array:
-    """Return the poses with those that are missing taken from the frame before (or after)."""
+    """Return the poses; a missing one is that of the frame before, or of the first known."""
     finite = np.flatnonzero(np.isfinite(poses[:, 0, 3]))
     if not len(finite):
         return np.tile(np.eye(4), (len(poses), 1, 1))

@@ -1,4 +1,4 @@
-"""From the axes of a file to the laboratory: x forward, y up, z to the subject's right."""
+"""Columns of a file in the laboratory: x forward, y up, z to the subject's right; SI."""
 
 from pathlib import Path
 
@@ -41,7 +41,11 @@ def check_roles(columns: dict[str, str], roles: tuple[str, ...], path: Path, tab
 
 
 def angle_scale(table: Table, angle_unit: str | None) -> float:
-    """Return radians per unit of angle, unless the file's own header contradicts the scene."""
+    """Return radians per unit of angle.
+
+    Raises:
+        InputError: the file's header contradicts the scene.
+    """
     if table.in_degrees is not None and table.in_degrees != (angle_unit == "deg"):
         stated = "degrees" if table.in_degrees else "radians"
         raise InputError(
@@ -63,7 +67,7 @@ def poses_of_columns(
     """Return the poses (n, 4, 4) of columns rotation_1..3 and translation_1..3, m.
 
     Raises:
-        InputError: missing column, a gap, or a sequence that repeats an axis at once.
+        InputError: missing column, a gap, or a sequence with the same axis twice in a row.
     """
     angles, places = (
         np.stack(

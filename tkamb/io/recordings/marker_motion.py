@@ -2,13 +2,13 @@
 
 The same markers are fitted in two ways. Both are computed, and one of them is used:
 
-- segments: shank and thigh are each fitted rigidly, by themselves. The joint between them may
-  come apart, and the distance shows how far the skin has moved.
-- chain: shank, knee, thigh and their neighbours are fitted at once, held together by their
-  joints. Nothing comes apart; the skin's movement is spread over the segments instead.
+- segments: shank and thigh are fitted rigidly and separately. Their joint centres may differ,
+  and the distance shows the movement of the skin.
+- chain: shank, knee, thigh and their neighbours are fitted at once, connected by joints. The
+  movement of the skin is distributed over the segments.
 
-The distance of the knee centre of the thigh's markers from that of the shank's markers measures
-the disagreement: it acts on the knee's moments as a lever of that length.
+The knee centre by the thigh's markers and that by the shank's markers are some distance apart. This
+distance is a lever arm that changes the moments of the knee.
 """
 
 from dataclasses import dataclass
@@ -61,15 +61,16 @@ class MarkerKinematics:
     """Kinematics of a leg from skin markers, as a right leg, SI.
 
     Args:
-        time: (n,) s, frames that `method` could place without a break.
+        time: (n,) s, the frames that `method` can fit, without a gap.
         method: the fit that is used.
         tibia: (n, 4, 4) pose_tibia_in_laboratory by this fit.
         coordinates: (n, 6) knee coordinates by this fit.
         flexion: method -> (n,) rad; NaN where the segments could not be fitted.
-        rms: method -> (n,) m, of the markers: those of shank and thigh, or all of the chain.
-        centre_distance: (n,) m, between the knee centre of the shank's and of the thigh's
-            markers, each segment fitted by itself.
-        missing: (n,) how many markers of shank and thigh are not seen.
+        rms: method -> (n,) m, root mean square distance of the markers of shank and thigh, or of
+            all markers of the chain.
+        centre_distance: (n,) m, distance between the knee centres by the shank's and by the
+            thigh's markers, with separate fits.
+        missing: (n,) number of missing markers of shank and thigh.
     """
 
     time: Array
@@ -82,7 +83,7 @@ class MarkerKinematics:
     missing: np.ndarray
 
     def at(self, values: Array, time: Array) -> Array:
-        """Return values (n,) at other times, between frames linearly."""
+        """Return values (n,) of the frames at other times, s, by linear interpolation."""
         return np.asarray(np.interp(time, self.time, values))
 
     def shank_motion(self, cutoff_Hz: Cutoff, time: Array, name: str) -> BodyMotion:
@@ -100,13 +101,13 @@ def load_marker_motion(
     """Return knee and shank of a recording's markers.
 
     Args:
-        source: what to read, with its markers.
-        side: of the knee; a left leg is mirrored, laboratory and all.
-        pose_insert_in_tibia: (4, 4), of the (mirrored) patient.
+        source: the scene's [motion], with markers.
+        side: side of the knee; a left leg and its laboratory are mirrored.
+        pose_insert_in_tibia: (4, 4) m, of the patient, mirrored for a left knee.
 
     Raises:
-        InputError: file, labels or markers cannot be used, markers that fit nowhere, or a gap
-            in the interval.
+        InputError: file, labels or markers cannot be used, the fit is poor or does not converge,
+            or a gap in the interval.
     """
     assert source.markers is not None
     recorded = read_table(source.file, source.format)
@@ -141,7 +142,7 @@ def both_fits(
     neutral: Array,
     recorded: Table,
 ) -> tuple[dict[str, tuple[Array, Array]], ChainFit[LegState]]:
-    """Return each segment's own fit (poses and rms), and that of the chain."""
+    """Return segment -> separate fit (poses (n, 4, 4) m, rms (n,) m), and the fit of the chain."""
     fits = {s.name: fit_seen(measured[s.name], s.points, s.weights, s.name) for s in segments}
     _check_fits({name: fit[1] for name, fit in fits.items()}, recorded)
     _check_joints(segments, {name: fit[0] for name, fit in fits.items()}, recorded)
@@ -157,7 +158,7 @@ def leg_segments(
     """Return the segments, and segment -> its markers (n, m, 3) m, laboratory, gaps NaN.
 
     Raises:
-        InputError: a marker that the recording does not hold.
+        InputError: the recording lacks a marker.
     """
     scale = recorded.unit_scale(length_unit, "length_unit")
     rotation = laboratory_rotation(markers.laboratory_axes, recorded.path)
@@ -185,7 +186,7 @@ def leg_segments(
 
 
 def neutral_coordinates(markers: MarkersTable, side: str) -> Array:
-    """Return the knee coordinates (6,), m and rad, that a hinge keeps; flexion is zero."""
+    """Return the constant knee coordinates (6,), m and rad, of a hinge, with zero flexion."""
     ap, si, ml = np.array(markers.neutral_mm) * MILLIMETRE
     axial, adduction = np.array(markers.neutral_deg) * DEGREE
     return np.array([ap, si, -ml if side == "left" else ml, axial, adduction, 0.0])
@@ -209,7 +210,7 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
 
 
 def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Table) -> None:
-    """Raise where a segment's markers put its joint far from where its neighbour has it."""
+    """Raise where the joint by a segment's markers is far from that by its neighbour's."""
     for own in segments:
         if own.joint is None or own.centre is None:
             continue
@@ -234,7 +235,7 @@ def _compare_readings(
     measured: dict[str, Array],
     neutral: Array,
 ) -> MarkerKinematics:
-    """Return both fits, (shank, thigh) in the laboratory, in the frames of the one in use."""
+    """Return the result from both fits, (shank, thigh), in the frames of the method in use."""
     assert source.markers is not None
     used = source.markers.method
     knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
@@ -262,7 +263,7 @@ def _joint_rms(fits: dict[str, tuple[Array, Array]], measured: dict[str, Array])
 
 
 def _knee(insert: Array, femur: Array) -> Array:
-    """Return knee coordinates (n, 6) of frames that are known, NaN elsewhere."""
+    """Return knee coordinates (n, 6) from poses (n, 4, 4); NaN where a pose is NaN."""
     finite = np.isfinite(insert[:, 0, 3]) & np.isfinite(femur[:, 0, 3])
     result = np.full((len(insert), 6), np.nan)
     if finite.any():
@@ -273,9 +274,9 @@ def _knee(insert: Array, femur: Array) -> Array:
 def _run(
     time: Array, missing: np.ndarray, interval: tuple[float, float] | None, recorded: Table
 ) -> slice:
-    """Return the longest run of frames around the interval in which none is lost.
+    """Return the longest run of frames around the interval without a missing frame.
 
-    Without an interval that is all from the first to the last frame.
+    Without an interval it must be the whole recording.
     """
     start, end = interval or (time[0], time[-1])
     if start < time[0] - 1e-9 or end > time[-1] + 1e-9:

@@ -1,6 +1,6 @@
-"""Skin markers: found by their labels, and rigid fits of bodies to them.
+"""Skin markers by their labels, and rigid fits of bodies to them.
 
-The same marker is `R.Thigh.Superior`, `RThighSuperior`, `JW:RThighSuperior`.
+`R.Thigh.Superior`, `RThighSuperior` and `JW:RThighSuperior` are labels of the same marker.
 """
 
 from collections.abc import Iterable
@@ -35,10 +35,10 @@ def plain_label(label: str) -> str:
 
 
 def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str]:
-    """Return name -> the recording's label, for the names that it holds.
+    """Return name -> label in the recording, for each name that is found.
 
-    An exact label comes first, then one that is the same when both are plain. A plain label
-    that stands twice in the recording (two subjects) matches nothing.
+    An equal label is preferred to a label with the same `plain_label`. A plain label that two
+    markers share (two subjects) matches nothing.
     """
     labels = list(labels)
     plain: dict[str, list[str]] = {}
@@ -55,10 +55,10 @@ def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str
 def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) -> Array:
     """Return the markers (n, m, 3), m, in the file's axes; gaps are NaN.
 
-    A marker is found by its label, whatever prefix, dots and underscores that carries.
+    Labels are matched as in `matched_labels`.
 
     Raises:
-        InputError: a marker is not in the file; the message lists the nearest names.
+        InputError: a marker is not in the file; the message lists similar names.
     """
     labels = [column[:-2] for column in table.columns if column.endswith("_x")]
     matched = matched_labels(names, labels)
@@ -70,7 +70,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
 
 
 def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
-    """Return the shank's markers and joint centres, measured and in the tibia link.
+    """Return the shank's markers and joint centres as measured and in the tibia link.
 
     A joint centre comes from a rigid fit of the neighbouring segment's markers.
 
@@ -78,7 +78,7 @@ def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
         Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.
 
     Raises:
-        InputError: no unit, unknown markers, or a neighbour's markers that do not fit.
+        InputError: no unit, a missing marker, or a poor fit of the neighbour's markers.
     """
     scale = recorded.unit_scale(source.length_unit, "length_unit")
     points = [marker_trajectories(recorded, [name], scale) for name in source.markers_mm]
@@ -94,7 +94,7 @@ def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
 
 
 def check_fit(residual: Array, what: str, recorded: Table) -> None:
-    """Raise InputError if a fit is so poor that markers or units must be wrong."""
+    """Raise InputError if the median residual shows wrong markers or units."""
     finite = residual[np.isfinite(residual)]
     if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
         raise InputError(
@@ -105,7 +105,7 @@ def check_fit(residual: Array, what: str, recorded: Table) -> None:
 
 
 def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple[Array, Array]:
-    """Return the poses that carry the reference markers closest to the measured ones.
+    """Return the poses that bring the reference markers closest to the measured ones.
 
     Least squares over rotations (Kabsch): with H = sum (r - r_mean)(p - p_mean)^T = U S V^T
     the rotation is V diag(1, 1, det(V U^T)) U^T.
@@ -113,7 +113,7 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
     Args:
         points: (n, m, 3) m, measured; frames with a gap give NaN.
         reference: (m, 3) m, the same markers in the body's frame.
-        name: of the body, for the message.
+        name: name of the body, for the message.
 
     Returns:
         pose_body_in_world (n, 4, 4) and the root mean square distance (n,), m, between
@@ -138,19 +138,19 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
 
 
 def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tuple[Array, Array]:
-    """Return the weighted rigid fit of the markers that are seen, frame by frame.
+    """Return the weighted rigid fit of the visible markers, frame by frame.
 
-    As `fit_rigid`, with weights and with gaps: a frame needs three markers that span a
-    triangle, others give NaN.
+    As `fit_rigid`, with weights and gaps. A frame without three visible markers that span a
+    triangle gives NaN.
 
     Args:
         points: (n, m, 3) m, gaps NaN.
         reference: (m, 3) m.
-        weights: (m,) of the squared distances.
-        name: of the body, for the message.
+        weights: (m,) weights of the squared distances.
+        name: name of the body, for the message.
 
     Returns:
-        pose_body_in_world (n, 4, 4), and root mean square distance (n,) m of those seen.
+        pose_body_in_world (n, 4, 4), and root mean square distance (n,) m of visible markers.
 
     Raises:
         InputError: the reference markers fix no orientation.

@@ -42,12 +42,12 @@ FORCE_SAMPLES = ForceSampleSettings()
 
 @dataclass(frozen=True, eq=False)
 class MeasuredForce:
-    """Axial forces on the insert, compression positive.
+    """Measured axial forces on the insert; compression is positive.
 
     Args:
         path: the file.
         time: (n,) s, on the clock of the motion.
-        force: total, medial, lateral, as far as known -> (n,) N; gaps are NaN.
+        force: "total", "medial", "lateral", if known -> (n,) N; gaps are NaN.
     """
 
     path: Path
@@ -55,9 +55,10 @@ class MeasuredForce:
     force: dict[str, Array]
 
     def at(self, time: Array) -> dict[str, Array]:
-        """Return the forces (f,) N at some times, linear between neighbouring samples.
+        """Return the forces (f,) N at other times, by linear interpolation.
 
-        NaN outside the measurement, beside a gap, and between samples that are too far apart.
+        They are NaN outside the measurement, beside a gap, and between samples that are farther
+        apart than `max_gap`.
 
         Args:
             time: (f,) s.
@@ -73,11 +74,11 @@ class MeasuredForce:
 
 
 def load_measured_force(source: MeasuredTable, time: Array) -> MeasuredForce:
-    """Read what was measured.
+    """Read the measured forces.
 
     Args:
-        source: file, columns, unit, clock.
-        time: (f,) s, of the motion; the two must overlap.
+        source: the scene's [measured].
+        time: (f,) s, times of the motion, which must overlap with the measurement.
 
     Raises:
         InputError: no such file or column, or nothing measured during the motion.
@@ -158,12 +159,12 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
     """Read EMG and return its envelopes.
 
     Args:
-        source: file, channels, filters.
-        motion: (f,) s, times of the motion; the two must overlap.
+        source: the scene's [muscles.emg].
+        motion: (f,) s, times of the motion, which must overlap with the recording.
 
     Raises:
         InputError: no such file or channel, nothing measured during the motion, a gap, uneven
-            samples, a cut-off that they do not carry, too short a recording, a channel without
+            samples, a cut-off above half the rate, too short a recording, or a channel without
             signal.
     """
     time, signals = _signals(source)
@@ -199,9 +200,9 @@ def envelope(
 
     Args:
         signal: (n,) evenly sampled.
-        rate_Hz: of the samples.
-        cutoff_Hz: of the low-pass after rectifying.
-        high_pass_Hz: of the high-pass before; "none" only subtracts the mean.
+        rate_Hz: sampling rate.
+        cutoff_Hz: cut-off of the low-pass after rectifying.
+        high_pass_Hz: cut-off of the high-pass before; "none" only subtracts the mean.
 
     Raises:
         InputError: a gap, a cut-off at or above half the rate, or a signal shorter than a
@@ -223,9 +224,9 @@ def envelope(
 
 
 def _low_passed(signal: Array, cutoff: float) -> Array:
-    """Return a signal (n,) low-passed at a cut-off, periods per sample.
+    """Return a signal (n,) low-passed at a cut-off, periods per sample, by its spectrum.
 
-    By its spectrum: scipy.signal, which filters sample by sample, takes 0.3 s to import.
+    scipy.signal would take 0.3 s to import.
     """
     mirrored = np.concatenate([signal, signal[-2:0:-1]])
     ratio = np.tan(np.pi * np.fft.rfftfreq(len(mirrored))) / np.tan(np.pi * cutoff)

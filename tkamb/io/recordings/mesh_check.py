@@ -1,4 +1,4 @@
-"""The health of a mesh file: content, repairs on loading, and guesses of unit and axes."""
+"""Check of a mesh file: content, repairs on loading, and guesses of unit and axes."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -49,7 +49,7 @@ class Hole:
 
 @dataclass(frozen=True)
 class FlatSide:
-    """A large flat: the mesh axis it faces, its share of the whole area, its tilt."""
+    """A large flat side: the mesh axis that it faces, its share of the area, its tilt."""
 
     faces: str
     area_share: float
@@ -75,25 +75,25 @@ class Part:
 
 @dataclass(frozen=True)
 class MeshHealth:
-    """What a mesh file holds. Lengths are in the file's own units.
+    """Content of a mesh file. Lengths are in the file's units.
 
     Args:
-        file: its path.
-        triangles: as in the file.
-        vertices: after equal corners are merged.
-        extents: along the mesh's x, y and z.
-        components: connected parts.
-        bodies: the separate bodies once small defects are mended, the largest skin first; a
-            void belongs to the body around it.
-        watertight: whether the mesh is closed as it is.
-        closed_after_repair: whether it is closed once small defects are mended.
-        repairs: what loading would mend.
+        file: path of the file.
+        triangles: number of triangles in the file.
+        vertices: number of vertices after equal corners are merged.
+        extents: lengths along the mesh's x, y and z.
+        components: number of connected parts.
+        bodies: the separate bodies after small defects are repaired, with the largest surface
+            first; a void belongs to the body around it.
+        watertight: whether the mesh in the file is closed.
+        closed_after_repair: whether it is closed after small defects are repaired.
+        repairs: the repairs that loading would make.
         holes: loops of open edges in the file, widest first.
-        remaining_holes: those that loading would leave.
-        forks: vertices at which three or more sheets meet in an edge.
+        remaining_holes: holes that loading would not close.
+        forks: number of vertices at which three or more sheets meet in an edge.
         one_sided: whether there is no consistent winding.
-        units: units in which the size fits a part of a knee; a guess.
-        flats: the largest flats; the first is the likely bottom of an insert; a guess.
+        units: units in which the size is that of a part of a knee; a guess.
+        flats: the largest flat sides; the first is likely the bottom of an insert; a guess.
     """
 
     file: str
@@ -113,7 +113,7 @@ class MeshHealth:
     flats: tuple[FlatSide, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain data."""
+        """Return all fields as plain data."""
         return asdict(self)
 
     def lines(self) -> list[str]:
@@ -197,7 +197,7 @@ class MeshHealth:
 
 
 def check_mesh(path: str | Path) -> MeshHealth:
-    """Return the health of a mesh file. Nothing that is guessed here is ever applied.
+    """Return the content and defects of a mesh file. Loading does not use the guesses.
 
     Raises:
         InputError: no such file, not a mesh, no triangles, or NaN.
@@ -227,10 +227,10 @@ def check_mesh(path: str | Path) -> MeshHealth:
 
 
 def mended_mesh(path: str | Path) -> tuple[Repair, float]:
-    """Return a mesh as loading would mend it, in metres by a guessed unit, and that unit in m.
+    """Return a mesh as loading would repair it, in m, and the guessed metres per unit.
 
     Raises:
-        InputError: as `check_mesh`.
+        InputError: as for `check_mesh`.
     """
     vertices, faces = read_triangles(path)
     scale = _measure(vertices, faces)[2]
@@ -238,7 +238,7 @@ def mended_mesh(path: str | Path) -> tuple[Repair, float]:
 
 
 def _measure(vertices: Array, faces: Indices) -> tuple[Array, list[str], float]:
-    """Return the extents, the units that make it a part of a knee, and a unit in m."""
+    """Return the extents (3,), the units of plausible size, and the guessed metres per unit."""
     extents = np.ptp(vertices[faces.reshape(-1)], axis=0)
     longest = float(extents.max())
     units = plausible_units(longest) or plausible_units(longest, BONE_SIZE)

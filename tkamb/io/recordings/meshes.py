@@ -1,4 +1,4 @@
-"""Mesh files into surfaces: SI units, anatomical axes, mended with a notice or refused."""
+"""Surfaces from mesh files: SI units, anatomical axes, small defects repaired with a notice."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ from tkamb.units import LENGTH, MILLIMETRE
 Indices = NDArray[np.int64]
 
 IMPLANT_SIZE = (0.010, 0.250)
-"""m; least and greatest length of a part of a knee implant."""
+"""m; accepted lengths of a part of a knee implant."""
 BONE_SIZE = (0.010, 0.650)
-"""m; least and greatest length of a bone at the knee, whole or in part."""
+"""m; accepted lengths of a bone at the knee, whole or in part."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class MeshFileSettings:
 MESH_FILE = MeshFileSettings()
 
 USUAL_SIZE = (0.040, 0.120)
-"""m; length of usual components, partial ones included."""
+"""m; range of the lengths of usual components, also of partial knees."""
 
 
 _log = logging.getLogger("tkamb")
@@ -99,24 +99,24 @@ def load_surface(
 ) -> Surface:
     """Read an STL, OBJ, PLY or VTP file as a surface in anatomical axes and metres.
 
-    Mended with one warning on the logger "tkamb": duplicate, degenerate and wrongly wound
-    faces, loose vertices, cracks and small holes (`tkamb.geometry.repair`).
+    Duplicate, degenerate and wrongly wound faces, loose vertices, cracks and small holes are
+    repaired (`tkamb.geometry.repair`), with one warning on the logger "tkamb".
 
     Args:
         path: the file.
         unit: its unit of length, "m", "cm", "mm" or "inch".
         axes: its axes that point anterior, superior and to the right.
-        name: what to call the part in messages.
+        name: name of the part, for messages.
         closed: whether the surface must enclose a volume.
-        size: m, least and greatest plausible length; another one means a wrong unit.
+        size: m, smallest and largest plausible length; a length outside means a wrong unit.
 
     Returns:
         The surface about the mesh's own origin: x anterior, y superior, z right, m.
 
     Raises:
-        InputError: no such file, no mesh, no triangles, NaN, a size that no knee part has,
-            not a surface, or open where it must be closed; a part of an implant that is an
-            open sheet or, where it must be closed, several separate bodies.
+        InputError: no such file, no mesh, no triangles, NaN, an implausible size, not a surface,
+            or not closed although `closed`. Also a part of an implant that is an open sheet or
+            several separate bodies.
     """
     rotation = axes_rotation(axes)
     if unit not in LENGTH:
@@ -144,9 +144,9 @@ def load_surface(
 
 
 def mirrored(surface: Surface) -> Surface:
-    """Return the mirror image in the sagittal plane (z to -z), normals still outward.
+    """Return the mirror image in the sagittal plane (z to -z), with outward normals.
 
-    It turns a part of a left knee, in anatomical axes, into that of a right one.
+    A part of a left knee, in anatomical axes, becomes a part of a right knee.
     """
     vertices, faces = surface.vertices @ MIRROR + 0.0, surface.faces[:, ::-1].copy()
     return Surface(vertices, faces, surface.name, surface.merged)
@@ -186,16 +186,16 @@ def _read_mesh(path: Path) -> tuple[Array, Indices]:
         return _read_by_trimesh(path)
     except InputError:
         raise
-    except ImportError:  # an STL that is not binary goes to the reader of text, which is extra
+    except ImportError:  # an optional package that trimesh needs for this format is missing
         raise InputError("cannot be read as a mesh (cut short, or text)", path, _FORMATS) from None
-    except Exception as error:  # readers of many formats: each raises what it likes
+    except Exception as error:  # the readers of the formats raise errors of many types
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"cannot be read as a mesh ({reason})", path, _FORMATS) from None
 
 
 def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
     """Return vertices and triangles of a text STL file, or of another format."""
-    import trimesh  # a quarter of a second, which the usual mesh need not wait for
+    import trimesh  # takes 0.25 s, which a usual mesh does not need
 
     mesh = trimesh.load(path, force="mesh", process=False)
     if not isinstance(mesh, trimesh.Trimesh):
@@ -245,7 +245,7 @@ def _opposite(names: list[str]) -> str:
 
 
 def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
-    """Return the part without a wall inside it, and a wall that has to stay; both get notices."""
+    """Return the part without its inner wall, and a wall that cannot be removed, with notices."""
     wall = find_inner_wall(mended.vertices, mended.faces)
     if wall is None:
         return mended, None
@@ -261,9 +261,9 @@ def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | 
 def _check_part(
     mended: Repair, path: str | Path, name: str, right: Array, wall: InnerWall | None
 ) -> None:
-    """Refuse an open sheet, such as a contact surface, and several bodies in one file.
+    """Raise where a part is an open sheet, like a contact surface, or several bodies.
 
-    Bodies that touch or overlap, on the two sides of a wall, are one.
+    Bodies that touch or overlap at an inner wall count as one.
     """
     extent = float(np.ptp(mended.vertices, axis=0).max())
     if mended.holes and mended.holes[0].width > MESH_FILE.sheet_opening * extent:
@@ -293,10 +293,10 @@ def _check_part(
 
 
 def _two_condyles(bodies: list[Body], right: Array) -> bool:
-    """Say whether there are two bodies of like size, one beside the other (`right`, a unit axis).
+    """Return whether the bodies are two of similar size, side by side along `right` (3,).
 
-    So are the components of a bicompartmental knee; a tray or an insert lies below, a pair
-    from both legs further apart than either is wide.
+    This is true of the two components of a bicompartmental knee. A tray or an insert lies below
+    its neighbour; parts of both legs are farther apart than their widths.
     """
     if len(bodies) != 2:
         return False
@@ -330,7 +330,7 @@ def _check_size(
 
 
 def _check_knee_width(surface: Surface, path: str | Path) -> None:
-    """Refuse a component with two condyles that no person's knee is small enough for."""
+    """Raise where a component with two condyles is smaller than any person's knee."""
     extents = np.ptp(surface.bounds, axis=0)
     if extents.max() < MESH_FILE.min_size and condyle_split(surface) is not None:
         raise InputError(

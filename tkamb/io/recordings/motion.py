@@ -60,9 +60,9 @@ class PatellaMotionSettings:
 PATELLA_MOTION = PatellaMotionSettings()
 
 FASTEST = {"turn": 100.0, "move": 10.0}
-"""rad/s and m/s: five times the fastest kick, and more than the noise of a recording."""
+"""rad/s and m/s: five times the speed of the fastest kick, above the noise of a recording."""
 ODD = {"turn": 0.5 * DEGREE, "move": 0.5 * MILLIMETRE}
-"""Error of fluoroscopy: a sample that is nearer than this to its neighbours' curve is not odd."""
+"""rad and m: error of fluoroscopy. A sample that is nearer to its neighbours' curve is not odd."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +82,10 @@ class KneeMotion:
         patella_velocity: (f, 3) its first derivative.
         patella_acceleration: (f, 3) its second derivative.
         cycle_percent: (f,) per cent of the cycle, if the motion is one.
-        closed_cycle: the cycle's ends agree, so it was filtered as periodic.
-        unrecorded: coordinates without a column, zero here.
+        closed_cycle: whether the cycle's ends agree; it was then filtered as periodic.
+        unrecorded: coordinates without a column; they are zero.
         odd: samples off their neighbours' curve.
-        markers: what it was read from, if from skin markers.
+        markers: kinematics by skin markers, if the motion is from these.
     """
 
     time: Array
@@ -119,13 +119,13 @@ def load_motion(
     insert mesh, T_femur_in_insert = T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
 
     Args:
-        source: what to read, and how.
-        side: the knee's side; a left one is mirrored.
+        source: the scene's [motion].
+        side: side of the knee; a left knee is mirrored.
         pose_insert_mesh_in_insert: (4, 4) m; the file's axes into the insert frame, whose
             z points to the subject's right on both sides (not mirrored).
         pose_femoral_mesh_in_femur: (4, 4) m; likewise for the femur link.
-        released: knee coordinates that will be solved for: they need no column.
-        pose_insert_in_tibia: (4, 4), for markers; of the (mirrored) patient.
+        released: knee coordinates that will be solved; they need no column.
+        pose_insert_in_tibia: (4, 4) m, needed for markers; mirrored for a left knee.
 
     Raises:
         InputError: file, columns, times, filter or cycle cannot be used.
@@ -162,7 +162,7 @@ def load_motion(
 def _from_markers(
     source: MotionTable, side: Side, insert: Array, released: Sequence[str]
 ) -> KneeMotion:
-    """Return the motion that skin markers give: the coordinates that are taken from them."""
+    """Return the motion with the coordinates that [motion.markers] takes from skin markers."""
     from tkamb.io.recordings.marker_motion import load_marker_motion
 
     assert source.markers is not None
@@ -186,7 +186,11 @@ def _from_markers(
 def _find_unrecorded(
     recorded: Table, source: MotionTable, released: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return the coordinates without a column, all of which must be released."""
+    """Return the coordinates without a column.
+
+    Raises:
+        InputError: such a coordinate is not released.
+    """
     missing = [
         role
         for role in KNEE_COORDINATES
@@ -246,7 +250,7 @@ def _turn_signs(recorded: Table, source: MotionTable) -> Table:
 
 
 def _bending_role(recorded: Table, source: MotionTable) -> str:
-    """Return the role whose sign is that of flexion: of a pose, the rotation of widest range."""
+    """Return the role that shows flexion; for a pose, the rotation with the largest range."""
     if source.interpretation != "pose":
         return "flexion"
 
@@ -293,7 +297,7 @@ def _check_patella(patella: Array, path: Path) -> None:
 
 
 def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
-    """Return the odd samples of the coordinates (n, 6 or 9), none of which steps too fast."""
+    """Return the odd samples of the coordinates (n, 6 or 9); raise for a step that is too fast."""
     odd: list[OddSample] = []
     for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
         moves = name.rsplit("_")[-1] in ("ap", "si", "ml")

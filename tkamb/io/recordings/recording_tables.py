@@ -27,27 +27,27 @@ Side = Literal["right", "left"]
 
 
 class PatientTable(SceneTable):
-    """Who it is. The URDF holds the chain ankle-tibia-femur-patella."""
+    """The patient. The URDF holds the chain ankle-tibia-femur-patella."""
 
     urdf: Path
     side: Side = Field(description="the knee that is modelled")
-    # From a child of six with a tumour prosthesis to the heaviest patients operated on.
+    # From a six-year-old child with a tumour prosthesis to the heaviest patients.
     mass_kg: Annotated[Number, within(20, 300, "give it in kilograms")] = Field(
         description="body mass, 20 to 300; forces in BW are relative to it"
     )
     sex: Literal["male", "female"] | None = Field(
         None, description="only for segments without <inertial>: picks the de Leva table"
     )
-    # The same child to the tallest adults but a few.
+    # From the same child to very tall adults.
     height_mm: Annotated[
         Number | None, within(1000, 2300, "give the standing height in millimetres")
     ] = Field(None, description="body height, 1000 to 2300")
     scale: Annotated[Number, within(0.7, 1.4, "1 is the patient as recorded")] = Field(
         1.0,
         description=(
-            "makes of the patient a synthetic one of the same shape: lengths, implants and knee "
-            "translations times this, masses and ground reaction times its cube; mass_kg and "
-            "height_mm stay those of the patient as recorded"
+            "scale factor of a synthetic patient of the same shape: lengths, implants and knee "
+            "translations are multiplied by it, masses and ground reaction by its cube; mass_kg "
+            "and height_mm are those of the recorded patient"
         ),
     )
 
@@ -62,13 +62,15 @@ class MarkerSegmentTable(SceneTable):
         "neighbour's own frame",
     )
     weights: dict[str, float] = Field(
-        default_factory=dict, description="of the squared distances, where not 1"
+        default_factory=dict, description="marker -> weight of its squared distance; default 1"
     )
     joined_to: Literal["shank", "thigh"] | None = Field(
-        None, description="a neighbour's: the segment that it hangs on by a ball joint"
+        None, description="for a neighbour: the segment that a ball joint connects it to"
     )
     joint_mm: Vector | None = Field(None, description="the ball joint in that segment's link")
-    centre_mm: Vector | None = Field(None, description="the same in the neighbour's own frame")
+    centre_mm: Vector | None = Field(
+        None, description="the ball joint in the neighbour's own frame"
+    )
 
     @model_validator(mode="after")
     def _hangs_somewhere(self) -> Self:
@@ -168,8 +170,7 @@ class MotionTable(SceneTable):
     signs_turned: tuple[str, ...] = Field(
         (),
         description=(
-            "roles whose columns are read with the other sign: states another reading of a file "
-            "whose signs are in doubt"
+            "roles whose columns are multiplied by -1, for a file with the opposite sign convention"
         ),
     )
     angle_unit: AngleUnit | None = Field(None, description="of the file; markers need none")
@@ -193,10 +194,10 @@ class MotionTable(SceneTable):
         None,
         ge=2,
         le=100_000,
-        description="resample to so many frames; default: as recorded. The recording is filtered "
-        "at its own samples first; what is found at the frames (a solved patella, roll-slip, "
-        "the first guess of coordinates that nobody recorded) is filtered there, so that these "
-        "must be more than twice cutoff_Hz a second",
+        description="number of frames to resample to; default: as recorded. The recording is "
+        "filtered at its own samples first. Computed motions (a solved patella, roll-slip, the "
+        "initial guess of unrecorded coordinates) are filtered at the frames, so that there must "
+        "be more than 2 cutoff_Hz frames per second",
     )
 
     @model_validator(mode="after")
@@ -216,10 +217,10 @@ class MotionTable(SceneTable):
 
 
 class JointCentreTable(SceneTable):
-    """A joint centre known from the neighbouring segment's markers: one more shank marker.
+    """A joint centre from the neighbouring segment's markers, used as one more shank marker.
 
-    For shanks with fewer than three markers: the ankle centre is carried by the markers of
-    the foot, the knee centre by those of the thigh.
+    For shanks with fewer than three markers: the foot's markers give the ankle centre, the
+    thigh's markers the knee centre.
     """
 
     name: str
@@ -232,7 +233,7 @@ class JointCentreTable(SceneTable):
 
 
 class TibiaTable(SceneTable):
-    """How the shank stands in the laboratory (x forward, y up, z right).
+    """The pose of the shank in the laboratory (x forward, y up, z right).
 
     One of: `sagittal` (a forward lean about z over a fixed ankle), `pose` (columns of a
     file that place the tibia link), `markers` (rigid fit of shank markers).
@@ -266,7 +267,7 @@ class TibiaTable(SceneTable):
         default_factory=dict, description="markers: name -> position in the tibia link"
     )
     joint_centre: tuple[JointCentreTable, ...] = Field(
-        (), description="markers: joint centres that neighbouring segments carry"
+        (), description="markers: joint centres from the markers of neighbouring segments"
     )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
@@ -290,8 +291,8 @@ class GroundReactionTable(SceneTable):
     format: TableFormat | None = Field(None, description=FORMAT)
     plates: tuple[int, ...] = Field(
         (),
-        description="of a .c3d: the plates that the foot stood on, in turn or at once, from 1; "
-        "their wrenches are summed",
+        description="of a .c3d: numbers (from 1) of the plates that the foot stood on, one after "
+        "the other or at once; their wrenches are summed",
     )
     columns: dict[str, str] = Field(
         default_factory=dict,
@@ -307,34 +308,36 @@ class GroundReactionTable(SceneTable):
     )
     force_unit: str | None = Field(
         None,
-        description="of a .c3d: what its force channels are in (N, kN), where they state no unit "
-        "or one that is not understood",
+        description="of a .c3d: unit of its force channels (N, kN), if the file states none or an "
+        "unknown one",
     )
     moment_unit: str | None = Field(
-        None, description="of a .c3d: what its moment channels are in (Nm, Nmm, Ncm), likewise"
+        None, description="of a .c3d: unit of its moment channels (Nm, Nmm, Ncm), likewise"
     )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
     )
     force: Literal["on the foot", "on the plate"] = Field(
         "on the foot",
-        description="what the file's force acts on: 'on the plate' turns the signs of force and "
-        "free moment (Newton's third law), which no choice of axes does; the centre of pressure "
-        "stays",
+        description="what the file's force acts on. 'on the plate' reverses the signs of force and "
+        "free moment (Newton's third law), but not of the centre of pressure. Axes cannot do this",
     )
     applied: Literal["cop", "ankle"] = Field(
         "cop", description="'ankle' applies the force alone at the ankle centre (Sharma 2008)"
     )
     cutoff_Hz: Number | Literal["none"]
     unloaded_N: Number = Field(
-        20.0, gt=0, le=200, description="below this vertical force the centre of pressure is held"
+        20.0,
+        gt=0,
+        le=200,
+        description="vertical force below which the centre of pressure is interpolated",
     )
     surface_mm: Number = Field(
         0.0,
         ge=0,
         le=3000,
-        description="of a .c3d: height above the plates of what the foot stands on, a step say; "
-        "the wrench stays as measured, the centre of pressure is given on that level",
+        description="of a .c3d: height above the plates of the surface under the foot, a step for "
+        "example. The centre of pressure is computed at this height from the measured wrench",
     )
 
     @property
@@ -355,7 +358,7 @@ class MeasuredTable(SceneTable):
     )
     unit: Literal["N", "kN", "lbf"] = Field(description="of the forces")
     offset_s: Number = Field(
-        description="added to the file's clock it is that of [motion]; 0 where they are one"
+        description="time of [motion] minus time of the file; 0 for a common clock"
     )
 
     @model_validator(mode="after")
@@ -373,7 +376,7 @@ Positive = Annotated[Number, Field(gt=0)]
 
 
 class EmgTable(SceneTable):
-    """Surface EMG: envelopes to compare the activations with, or to guide them.
+    """Surface EMG: envelopes that are compared with the activations, or constrain them.
 
     An envelope is the rectified signal, low-passed without phase shift, over its normalising
     value.
@@ -383,28 +386,28 @@ class EmgTable(SceneTable):
     time: str = Field("time", description="of a table: the column of times, s")
     offset_s: Number = Field(
         0.0,
-        description="added to the file's clock it is that of [motion]; an electromechanical delay "
-        "may be added to it",
+        description="time of [motion] minus time of the file; may include an "
+        "electromechanical delay",
     )
     channels: dict[str, tuple[str, ...]] = Field(
-        description="channel -> muscles of the model that it stands for"
+        description="channel -> muscles of the model that it records"
     )
     high_pass_Hz: Positive | Literal["none"] = Field(
-        description="before it is rectified, against movement of the electrodes"
+        description="cut-off of the high-pass before rectifying, against movement of the electrodes"
     )
-    cutoff_Hz: Positive = Field(description="low-pass of the rectified signal")
+    cutoff_Hz: Positive = Field(description="cut-off of the low-pass of the rectified signal")
     normalised_by: Literal["recording"] | dict[str, Positive] = Field(
         "recording",
         description="the envelope's largest value in the file, or channel -> value in its unit",
     )
     use: Literal["report", "target", "bounds"] = Field(
         "report",
-        description="report: agreement with the activations, nothing else; target: adds "
-        "weight (a - e)^2 to the cost; bounds: a within e - width and e + width",
+        description="report: only reports the agreement with the activations; target: adds "
+        "weight (a - e)^2 to the cost; bounds: keeps a between e - width and e + width",
     )
-    weight: Positive | None = Field(None, description="of use = 'target'")
+    weight: Positive | None = Field(None, description="with use = 'target': weight in the cost")
     width: Annotated[Number, Field(gt=0, le=1)] | None = Field(
-        None, description="of use = 'bounds', as an activation"
+        None, description="with use = 'bounds': half width, as an activation"
     )
 
     @model_validator(mode="after")

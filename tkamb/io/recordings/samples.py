@@ -1,8 +1,8 @@
-"""Impossible samples, and samples that do not fit their neighbours: mostly typing mistakes.
+"""Implausible samples, and samples that do not fit their neighbours, like typing mistakes.
 
 A sample is odd where it lies off the cubic through its two neighbours on either side by more
-than `floor` and by many times more than the samples around it. Noise of any level is not odd,
-because the limit is a multiple of the neighbourhood's median, which one sample cannot change.
+than `floor` and by many times more than the samples around it. Noise of any level is not odd:
+the limit is a multiple of the median deviation around it, which one sample hardly changes.
 """
 
 from dataclasses import dataclass
@@ -39,11 +39,11 @@ class OddSample:
     """A sample off its neighbours' curve.
 
     Args:
-        path: of the file.
+        path: the file.
         what: the quantity, like "flexion".
-        time: s.
-        away: by how much, in `unit`.
-        unit: for the reader.
+        time: s, time of the sample.
+        away: distance from the curve, in `unit`.
+        unit: unit of `away`, like "mm".
     """
 
     path: Path
@@ -59,13 +59,13 @@ def odd_samples(
     """Return the odd samples of one quantity.
 
     Args:
-        path: of the file, for the reader.
-        what: the quantity, for the reader.
+        path: the file, for messages.
+        what: the quantity, for messages.
         time: (n,) s, rising.
         values: (n,) SI.
-        floor: SI; what is nearer to the curve is never odd.
+        floor: SI; a sample that is nearer to the curve is not odd.
         scale: SI per `unit`.
-        unit: for the reader.
+        unit: unit of the distance in messages.
     """
     if len(time) < 6:
         return ()
@@ -79,7 +79,7 @@ def odd_samples(
 
 
 def neighbours_curve(time: Array, values: Array) -> Array:
-    """Return at each sample the cubic (n,) through the four nearest others, at most two a side."""
+    """Return at each sample the cubic (n,) through its four nearest neighbours (two per side)."""
     n = len(time)
     first = np.clip(np.arange(n) - 2, 0, n - 5)
     others = first[:, None] + np.arange(5)
@@ -102,7 +102,7 @@ def _usual(away: Array) -> Array:
 
 
 def check_spacing(path: Path, time: Array) -> None:
-    """Raise an InputError where the samples at (n,) s are too far apart to be a movement."""
+    """Raise an InputError where samples at times (n,) s are too far apart for a movement."""
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if spacing > SAMPLE.max_step:
         raise InputError(
@@ -116,10 +116,10 @@ def check_overlap(path: Path, clock: Array, time: Array, table: str) -> None:
     """Raise an InputError if nothing was measured during the motion.
 
     Args:
-        path: of the file.
-        clock: (n,) s, of its samples on the motion's clock.
-        time: (f,) s, of the motion.
-        table: of the scene that names the file, like "[measured]".
+        path: the file.
+        clock: (n,) s, times of its samples on the motion's clock.
+        time: (f,) s, times of the motion.
+        table: the scene's table that names the file, like "[measured]".
     """
     if clock[-1] < time[0] or clock[0] > time[-1]:
         raise InputError(
@@ -152,7 +152,7 @@ def check_range(
 ) -> None:
     """Raise an InputError where values (n,) leave `limits`, all in `unit`.
 
-    `what` begins with the part of the body that does it, like "knee: flexion".
+    `what` is the part of the body and the quantity, like "knee: flexion".
     """
     low, high = limits
     outside: NDArray[np.bool_] = ~((values >= low) & (values <= high))

@@ -34,13 +34,13 @@ TABLE_VALUE = TableValueSettings()
 
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
-"""Plain decimal: Python alone also reads 1_000 and the digits of other scripts."""
+"""A plain decimal number; Python's float also accepts 1_000 and digits of other scripts."""
 _OF_NUMBERS = "0123456789+-.eE "
 """Characters of plain decimal numbers."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
 STATED_DEGREES = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
-"""What a storage file may say after `inDegrees=`."""
+"""Words that a storage file may have after `inDegrees=`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,10 @@ class Table:
     Args:
         path: the file.
         columns: name -> (n,) values. A marker M of `.trc` or `.c3d` has columns M_x, M_y, M_z.
-        length_unit: the unit that the file itself states (`.trc`, `.c3d`), else None.
-        in_degrees: what the file itself states about angles (`.sto`, `.mot`), else None.
-        equal: names that stand for several columns; none of these is in `columns`.
-        notices: remarks on what was read otherwise than stated, or not at all.
+        length_unit: unit of length that the file states (`.trc`, `.c3d`), else None.
+        in_degrees: whether angles are in degrees, if the file states it (`.sto`, `.mot`).
+        equal: names that several columns share; none of these columns is in `columns`.
+        notices: remarks on parts that were not read, or otherwise than the file states.
         unit_word: the file's own word for its unit of length, understood or not.
         unit_given: whether the user states the unit of length, because the file does not.
     """
@@ -76,7 +76,7 @@ class Table:
         """Return one column.
 
         Raises:
-            InputError: no such column, or several of that name; the message lists the nearest.
+            InputError: no such column (the message lists similar names), or several of that name.
         """
         if name in self.equal:
             raise InputError(f"has two columns named '{name}'", self.path, "rename one")
@@ -86,7 +86,7 @@ class Table:
         return self.columns[name]
 
     def complete_column(self, name: str) -> Array:
-        """Return one column that has no gap.
+        """Return one column, in which every value must be finite.
 
         Raises:
             InputError: no such column, or a value that is missing or not finite.
@@ -124,11 +124,11 @@ class Table:
         """Return metres per unit of length of this file.
 
         Args:
-            length_unit: the scene's word, or None to trust the file's own header.
+            length_unit: unit that the scene states; None: the file's header states it.
             key: the scene's key, for the message.
 
         Raises:
-            InputError: neither states a unit, or they contradict each other.
+            InputError: neither scene nor file states a unit, or they contradict each other.
         """
         unit = length_unit or self.length_unit
         if unit not in LENGTH:
@@ -163,10 +163,10 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
 
 def with_unit(table: Table, length_unit: str | None) -> Table:
-    """Return a table with a unit of length that it may lack.
+    """Return a table with the given unit of length.
 
     Raises:
-        InputError: the file states another one.
+        InputError: the file states another unit.
     """
     if length_unit is None:
         return table
@@ -180,10 +180,13 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file that is no larger than a table may be.
+    """Return the lines of a text file.
 
-    UTF-8, UTF-16 where the file begins with its mark, and else Latin-1: older programs write
-    remarks and names so, and numbers are the same in it.
+    The encoding is UTF-16 if the file begins with its mark, else UTF-8. A file that is neither is
+    read as Latin-1, which older programs write.
+
+    Raises:
+        InputError: no such file, or larger than a table may be.
     """
     content = read_bytes(path, FILE_LIMITS.table_bytes)
     try:
@@ -195,9 +198,10 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_csv(path: Path) -> Table:
-    """Comma-separated: one header row; empty lines and lines that begin with # are skipped.
+    """Read comma-separated values with one header row.
 
-    Empty cells behind the last name are left out: some programs end every line with a comma.
+    Empty lines and lines that begin with # are skipped. So are empty cells behind the last named
+    column, because some programs end every line with a comma.
     """
     lines = read_lines(path)
     rows = [
@@ -221,7 +225,7 @@ def read_csv(path: Path) -> Table:
 
 
 def read_storage(path: Path) -> Table:
-    """OpenSim storage: `key=value` lines to `endheader`, column names, rows."""
+    """Read an OpenSim storage file: `key=value` lines to `endheader`, column names, rows."""
     lines = read_lines(path)
     ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
     if not ends:
@@ -256,10 +260,10 @@ def _row_notices(stated: str | None, rows: int) -> tuple[str, ...]:
 
 
 def read_trc(path: Path) -> Table:
-    """Markers. A marker at exactly (0, 0, 0), an empty cell and NaN are gaps.
+    """Read markers of a `.trc` file.
 
-    Cells end at tabs, or at blanks where a line has no tabs. Columns without a label are
-    `marker 7`.
+    A marker at exactly (0, 0, 0), an empty cell and NaN are gaps. Tabs separate the cells, or
+    blanks in a line without tabs. Markers without a label get names like `marker 7`.
     """
     lines = read_lines(path)
     if len(lines) < 6 or not lines[0].startswith("PathFileType"):
@@ -298,7 +302,7 @@ def read_trc(path: Path) -> Table:
 
 
 def _trc_cells(line: str) -> list[str]:
-    """Return the cells of a line: between tabs, where an empty one is a gap, or blanks."""
+    """Return the cells of a line, separated by tabs or, in a line without tabs, by blanks."""
     if "\t" not in line.strip():
         return line.split()
     cells = [cell.strip() for cell in line.split("\t")]
@@ -315,9 +319,9 @@ def _filled(cells: list[str]) -> int:
 def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
     """Return a label per marker, empty where the header has none.
 
-    The line of labels has one every three cells. Some programs write blanks for tabs; then the
-    labels in turn are the markers', if there are as many as markers. `usual` is how many cells
-    a row has.
+    The line of labels has a label every three cells. Some programs write blanks in place of tabs;
+    the labels are then taken in order, if there are as many as markers. `usual` is the usual
+    number of cells in a row.
     """
     count = max(len(axes.split()) // 3, math.ceil((usual - 2) / 3))
     cells = [cell.strip() for cell in names.split("\t")][2:]
@@ -340,15 +344,16 @@ def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
 
 
 def _trc_unit(header: dict[str, str], path: Path) -> str | None:
-    """Return the length unit that a .trc states, as m, cm or mm; None for none of these."""
+    """Return the unit of length that a .trc states, like "mm"; None for an unknown unit."""
     scale = metres(header.get("Units", ""))
     return next((name for name, value in LENGTH.items() if value == scale), None)
 
 
 def read_c3d_markers(path: Path) -> Table:
-    """Markers of a C3D file on the recording's own clock, m.
+    """Return the markers of a C3D file on the recording's clock, in m.
 
-    In the file's own numbers, without a unit, where its word for the unit is not understood.
+    If the file's word for the unit is not understood, the numbers are as in the file, without a
+    unit.
     """
     from tkamb.io.recordings.c3d import read_c3d
 
@@ -372,9 +377,9 @@ def read_c3d_markers(path: Path) -> Table:
 
 
 def _exact_time(time: Array, frame: Array, rate: str) -> Array:
-    """Return the camera's even time if the column is that, rounded; else the column.
+    """Return evenly spaced times if they agree with the time column when rounded; else the column.
 
-    The even time is the one that fits the rounded column best.
+    The spacing follows from the rate, Hz; the offset is the best fit to the column.
     """
     try:
         period = 1.0 / float(rate)
@@ -388,7 +393,7 @@ def _exact_time(time: Array, frame: Array, rate: str) -> Array:
 def _columns(
     path: Path, names: list[str], rows: list[tuple[int, list[str]]]
 ) -> tuple[dict[str, Array], tuple[str, ...]]:
-    """Return name -> values (n,), and the names that stand for several columns."""
+    """Return name -> values (n,), and the names that several columns share."""
     if not rows:
         raise InputError("has no data rows", path)
     counts = Counter(names)
@@ -408,7 +413,7 @@ def _of_equal(names: tuple[str, ...]) -> tuple[str, ...]:
 
 def _row(cells: list[str], path: Path, line: int) -> list[float]:
     if not "".join(cells).strip(_OF_NUMBERS):
-        # The whole row at once is faster; a cell that is not a number gets its message below.
+        # Converting the whole row at once is faster. A cell that fails gets its message below.
         with contextlib.suppress(ValueError):
             numbers = [float(cell) for cell in cells]
             if max(numbers) <= TABLE_VALUE.max_value and min(numbers) >= -TABLE_VALUE.max_value:
@@ -436,7 +441,7 @@ def _number(cell: str, path: Path, line: int) -> float:
 
 
 def _why_uneven(cells: list[str], names: list[str]) -> str:
-    """Return what may make a row longer or shorter than the header."""
+    """Return a hint on the likely cause of a row that is longer or shorter than the header."""
     if len(cells) < len(names):
         return "add the missing cell or comma"
     # A decimal comma cuts every number in two: integers only, and rows about twice as long.
@@ -453,4 +458,4 @@ READERS: dict[str, Callable[[Path], Table]] = {
     "trc": read_trc,
     "c3d": read_c3d_markers,
 }
-"""Suffix, which is the format's name in a scene -> its reader. A new format is a row here."""
+"""Name of a format, which is its suffix -> reader. A new format is a new row here."""

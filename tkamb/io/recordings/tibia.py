@@ -1,7 +1,7 @@
-"""How the shank stands in the laboratory: a sagittal lean, poses, or shank markers.
+"""The pose of the shank in the laboratory: from a sagittal lean, poses, or shank markers.
 
 The laboratory is x forward, y up, z to the subject's right. The tibia link's origin is the
-ankle centre. A left shank is mirrored here, so that the mechanics see a right one.
+ankle centre. A left shank is mirrored to a right one.
 """
 
 from dataclasses import dataclass
@@ -50,10 +50,9 @@ class TibiaPoseSettings:
 TIBIA_POSE = TibiaPoseSettings()
 
 FASTEST_TURN, FASTEST_MOVE = 100.0, 30.0
-"""rad/s and m/s: twice the fastest sprinter's and kicker's shank."""
+"""rad/s and m/s: twice the speed of the shank of the fastest sprinters and kickers."""
 ODD_TURN, ODD_MOVE = 0.5 * DEGREE, 3.0 * MILLIMETRE
-"""A sample that is nearer than this to its neighbours' curve is not odd: the noise of skin
-markers."""
+"""rad and m: noise of skin markers. A sample that is nearer to its neighbours' curve is not odd."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +64,7 @@ class BodyMotion:
         pose: (f, 4, 4) pose_tibia_in_laboratory, m.
         velocity: (f, 6) spatial velocity in the body's axes at its origin, linear (m/s)
             then angular (rad/s): Pinocchio's free flyer.
-        acceleration: (f, 6) its rate, component by component.
+        acceleration: (f, 6) time derivative of each component of `velocity`.
         residual: (f,) m, root mean square distance of the marker fit before filtering; None
             if the pose was not fitted.
         odd: samples around the frames that lie off their neighbours' curve.
@@ -82,14 +81,14 @@ class BodyMotion:
 def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
     """Return the tibia's motion at the frames of the knee's motion.
 
-    The whole record is filtered and then evaluated, so that a record longer than the
-    interval has no end effect in it.
+    The whole recording is filtered before it is evaluated at the frames. A recording that is
+    longer than the interval therefore has no end effect inside it.
 
     Args:
-        source: what to read, and how.
+        source: the scene's [tibia].
         time: (f,) s of the frames, on the file's clock.
-        side: of the knee.
-        cutoff_Hz: the motion's cut-off, which holds unless the source has its own.
+        side: side of the knee.
+        cutoff_Hz: cut-off of the motion, used if `source` states none.
 
     Raises:
         InputError: file, columns or markers cannot be used, or do not cover `time`.

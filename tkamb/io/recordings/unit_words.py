@@ -1,7 +1,7 @@
-"""Unit words as recordings write them: `N`, `nt`, `Newtons`, `N-mm`, `NMM`, `mete`, `Millimeters`.
+"""Unit words in recordings, like `N`, `nt`, `Newtons`, `N-mm`, `NMM`, `mete`, `Millimeters`.
 
-Case, blanks, dots, hyphens and asterisks do not matter. A word is a unit only if it is in the
-lists below; any other is refused where the quantity is needed, never guessed.
+Case, blanks, dots, hyphens and asterisks are ignored. Only the words listed here are units. A
+reader raises an error for another word when it needs the quantity; no unit is guessed.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ LENGTH_WORDS = {
     **dict.fromkeys(("in", "inch", "inches"), LENGTH["inch"]),
     **dict.fromkeys(("ft", "foot", "feet"), 12 * LENGTH["inch"]),
 }
-"""Metres per unit. Four letters alone are what some programs leave of a longer word."""
+"""Metres per unit. Some programs shorten a word to four letters."""
 FORCE_WORDS = {
     **dict.fromkeys(("n", "nt", "newt", "newton", "newtons"), 1.0),
     **dict.fromkeys(("dan", "decanewton", "decanewtons"), 10.0),
@@ -30,14 +30,14 @@ FORCE_WORDS = {
 }
 """Newtons per unit."""
 LENGTH_FIRST = ("in", "inch", "ft", "foot")
-"""Lengths that may stand before the force, as in `in-lb`; `mN` would be a millinewton."""
+"""Units of length that may precede the force, as in `in-lb`. `mN` is a millinewton."""
 
 _SEPARATORS = str.maketrans("", "", " .*-·⋅_\x00\t")
 
 
 @dataclass(frozen=True)
 class GivenUnits:
-    """Units that the user states for words of a recording that are missing or not understood.
+    """Units that the user states because the recording lacks them or writes unknown words.
 
     Args:
         length: of markers and plates, like mm; None: the recording says.

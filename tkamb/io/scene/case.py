@@ -1,4 +1,4 @@
-"""A case: the scene with its files read, in SI, as a right knee. Only what the scene asks for."""
+"""A case: a scene and the content of its files, in SI, as a right knee."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -36,25 +36,25 @@ logger = logging.getLogger("tkamb")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """The input of a run. Parts that the scene does not have are None.
+    """The input of a run. Parts that are not in the scene are None.
 
     Args:
-        scene: the scene, as its file has it.
-        chain: the patient in Pinocchio.
+        scene: the scene of the file.
+        chain: kinematic chain of the patient.
         motion: knee (and recorded patella) coordinates per frame.
-        tibia: the shank in the laboratory; None: upright and at rest.
+        tibia: the shank in the laboratory; None: it is upright and does not move.
         ground: ground reaction in the laboratory.
         femoral: femoral component in the femur link's frame.
-        insert: insert in the insert frame; without its post where that has a contact of its own.
+        insert: insert in the insert frame, without its post if that is a separate surface.
         patella: patellar button in the patella link's frame.
-        ligaments: the bundles, generic ones among them; slack lengths where the scene has them.
+        ligaments: the bundles, also generic ones; slack length NaN if the scene has none.
         muscles: the muscles.
         patellar_ligament: the patellar ligament.
-        measured: what an instrumented implant measured.
+        measured: forces that an instrumented implant measured.
         emg: envelopes of the muscles' surface EMG.
-        post: the insert's post, insert frame, where the scene asks for its contact.
-        insert_placement: (4, 4) of the insert's mesh, in anatomical axes about its own origin and
-        not mirrored, in the insert frame; None if not needed.
+        post: the insert's post in the insert frame, if the scene has [contact] post.
+        insert_placement: (4, 4) m, pose in the insert frame of the insert's mesh in anatomical
+            axes, about its own origin and not mirrored; None if not needed.
     """
 
     scene: Scene
@@ -81,16 +81,16 @@ class Case:
         return condyle_split(self.femoral) if self.femoral else None
 
     def rates(self, time: Array, places: Array) -> tuple[Array, Array, Array]:
-        """Return places of the patella (n, 3) filtered as the recording is, and derivatives."""
+        """Return filtered coordinates of the patella (n, 3), as recorded ones, and derivatives."""
         cutoff = self.scene.motion.cutoff_Hz
         check_frames(self.motion.time, cutoff, self.scene.motion.frames)
         return differentiate_coordinates(time, places, cutoff, name="places of the patella")
 
     @property
     def gait_cycle_s(self) -> tuple[float, float] | None:
-        """Return 0 and 100 % of the gait cycle (s), as the scene gives or the plates show it.
+        """Times of 0 and 100 % of the gait cycle (s), from the scene or else the force plates.
 
-        None where neither does, or where the motion's own clock is per cent of a cycle.
+        None if neither states them, or if the motion's time column is per cent of a cycle.
         """
         if self.motion.cycle_percent is not None:
             return None
@@ -190,7 +190,7 @@ def load_case(scene: Scene) -> Case:
     """
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
-    # Tables before meshes, which take longer: a mistake in a table is reported at once.
+    # Tables are read before meshes, which take longer, so that their errors come at once.
     parts = ImplantParts(scene) if scene.motion.interpretation == "pose" else None
     try:
         motion, tibia, ground = _recordings(scene, scene.motion, chain, parts)

@@ -1,4 +1,4 @@
-"""Motions that are partly computed: seated on the insert, or rolling and slipping over it."""
+"""Partly computed motions: the femur placed on the insert, or rolling and slipping over it."""
 
 from dataclasses import replace
 
@@ -19,13 +19,13 @@ def seated_motion(
 ) -> KneeMotion:
     """Return the motion with an initial guess of the coordinates that were not recorded.
 
-    Rotations stay at zero. AP and ML bring the mean of the condyles' lowest points over the
-    insert's origin, SI brings the femur down to first touch, all at the other coordinates.
-    The search for the released coordinates begins there in each frame. Their rates, which enter
+    Unrecorded rotations are zero. Unrecorded AP and ML put the mean of the condyles' lowest points
+    over the insert's origin; unrecorded SI lowers the femur to first touch. The solution for the
+    released coordinates starts there in each frame. Velocities and accelerations, which enter
     inertia and the direction of sliding, are those of this guess.
 
     Args:
-        motion: as recorded; `motion.unrecorded` names what is missing.
+        motion: as recorded; `motion.unrecorded` names the missing coordinates.
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
         cutoff: Hz, low-pass of the differentiation.
@@ -60,16 +60,14 @@ def rolling_motion(
 ) -> KneeMotion:
     """Return the motion with its AP and SI coordinates replaced by those of roll and slip.
 
-    SI brings the femur down to first touch, of one condyle; rotations and ML stay. The two
-    new coordinates are differentiated like recorded ones; they are no closed cycle even
-    where the recorded ones are.
+    SI lowers the femur to first touch of one condyle. Rotations and ML do not change. The two new
+    coordinates are filtered and differentiated like recorded ones, but never as a closed cycle.
 
     Args:
         motion: as recorded and filtered.
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
-        slip_share: 1: the mean slip of the condyles that the recorded motion has;
-            0: pure rolling.
+        slip_share: share of the condyles' mean slip in the recorded motion; 0 is pure rolling.
         cutoff: Hz, low-pass of the differentiation.
 
     Raises:
@@ -90,7 +88,7 @@ def rolling_motion(
 
 
 def _first_lost(places: Array, time: Array) -> float | None:
-    """Return the first time (s) at which coordinates (f, 6) are not known."""
+    """Return the first time (s) at which a coordinate (f, 6) is NaN; None without any."""
     missing = np.flatnonzero(~np.isfinite(places).all(axis=1))
     return float(time[missing[0]]) if len(missing) else None
 
@@ -98,7 +96,7 @@ def _first_lost(places: Array, time: Array) -> float | None:
 def _with_coordinates(
     motion: KneeMotion, places: Array, columns: list[int], cutoff: Cutoff
 ) -> KneeMotion:
-    """Return the motion with some columns of other coordinates (f, 6), differentiated."""
+    """Return the motion with `columns` replaced by those of `places` (f, 6), differentiated."""
     values = (motion.coordinates.copy(), motion.velocity.copy(), motion.acceleration.copy())
     result = differentiate_coordinates(motion.time, places[:, columns], cutoff)
     for value, new in zip(values, result, strict=True):

@@ -29,7 +29,14 @@ NAN = float("nan")
 
 
 class ImplantParts:
-    """The implant's surfaces in their own frames, and where their meshes' axes lie."""
+    """The implant's surfaces in the frames of their links, and the poses of their meshes.
+
+    Only the parts that the scene needs are read; the others are None.
+
+    Args:
+        scene: the scene.
+        insert_alone: whether only the insert is read.
+    """
 
     def __init__(self, scene: Scene, insert_alone: bool = False) -> None:
         implant, self._left = scene.implant, scene.patient.side == "left"
@@ -58,7 +65,7 @@ class ImplantParts:
                 from tkamb.geometry.post import divide_insert
 
                 self.insert, self.post = divide_insert(self.insert)
-        elif implant.insert and scene.muscles is not None:  # where the model's insert lies
+        elif implant.insert and scene.muscles is not None:  # its placement is needed
             self._place_insert(scene)
         if insert_alone:
             return
@@ -74,7 +81,7 @@ class ImplantParts:
             self.patella, _ = self._place("patellar button", implant.patella)
 
     def _place_insert(self, scene: Scene) -> "Surface":
-        """Read the insert, store its mesh's place in the insert frame, and return it there."""
+        """Return the insert in the insert frame, and store the pose of its mesh."""
         from tkamb.geometry.flat_bottom import insert_placement
         from tkamb.io.recordings.meshes import axes_rotation, load_surface
 
@@ -96,7 +103,7 @@ class ImplantParts:
         return self._right(surface.moved(placement))
 
     def _could_be_insert(self, table: FemoralImplantTable) -> bool:
-        """Say whether the mesh that the scene calls femoral has an insert's flat bottom."""
+        """Return whether the mesh of [implant.femoral] has the flat bottom of an insert."""
         from tkamb.geometry.flat_bottom import insert_placement
         from tkamb.io.recordings.meshes import axes_rotation, load_surface
 
@@ -127,7 +134,7 @@ class ImplantParts:
 
 
 def muscle_tables(scene: Scene) -> tuple[MuscleTable, ...]:
-    """Return the scene's [[muscle]] tables, the short form [quadriceps] written out as one."""
+    """Return the scene's [[muscle]] tables, with [quadriceps] as one more of them."""
     short = scene.quadriceps
     if short is None:
         return scene.muscle
@@ -144,8 +151,8 @@ def read_muscles(scene: Scene, chain: Chain) -> "tuple[Muscle, ...]":
     """Return the muscles.
 
     Raises:
-        InputError: they cannot be balanced (`tkamb.knee.muscles.check_muscles`), or a bone's mesh
-            cannot be read.
+        InputError: equilibrium cannot determine their forces (`tkamb.knee.muscles.check_muscles`),
+            or a bone's mesh cannot be read.
     """
     from tkamb.knee.muscles import Muscle, check_muscles
 

@@ -1,8 +1,9 @@
 """A case of another size: a synthetic subject of the same shape.
 
-With a factor s of length: lengths, implants and knee translations s, masses and ground reaction
-s³ (the same density), moments of the plate s⁴, inertias s⁵; springs of the same tissue: stiffness
-per length E A / L grows with s, force per strain E A with s². Angles and time stay.
+With a scale factor s, lengths, implants and knee translations are multiplied by s, masses and
+ground reaction by s³ (equal density), moments of the plate by s⁴ and inertias by s⁵. The tissue is
+the same: stiffness per length E A / L is multiplied by s, force per strain E A by s². Angles and
+times do not change.
 """
 
 from dataclasses import replace

@@ -50,8 +50,8 @@ class InsertImplantTable(SceneTable):
     axes: Axes = "+x,+y,+z"
     bearing: Literal["fixed", "mobile"] = Field(
         "fixed",
-        description="mobile: the bottom slides on the tray without friction, by lattices and fe; "
-        "other contact models press it like a fixed one, and the run says so",
+        description="mobile: the bottom slides on the tray without friction. The lattices and fe "
+        "model this; other contact models treat it as fixed, with a notice",
     )
 
 
@@ -91,14 +91,14 @@ class LigamentTable(SceneTable):
     proximal: Attachment
     distal: Attachment
     law: Literal["two-line", "quadratic-toe"]
-    # Ten times a whole cruciate ligament's (Race & Amis 1994: 347 N/mm), and as much a strain.
+    # Upper limits: ten times a whole cruciate ligament (Race & Amis 1994: 347 N/mm).
     stiffness_N_per_mm: Annotated[Number | None, within(0, 5000, "give it in N/mm, not in N/m")] = (
         Field(None, gt=0)
     )
     stiffness_N_per_strain: Annotated[
         Number | None, within(0, 150000, "give it in N per unit strain")
     ] = Field(None, gt=0)
-    # From a capsule's fibre to the superficial MCL's longest with its frame's length to spare.
+    # From a short fibre of the capsule to more than the longest superficial MCL.
     slack_length_mm: Annotated[Number | None, within(3, 300, "give it in millimetres")] = Field(
         None
     )
@@ -128,10 +128,10 @@ class LigamentTable(SceneTable):
 
 
 class GenericLigamentsTable(SceneTable):
-    """A generic set for a patient who has none of their own, scaled to the implant.
+    """A generic set of ligaments, scaled to the implant, for a patient without measured ones.
 
-    Its bundles are nobody's: they are named `generic_...` in the results, and the table of
-    strains shows whether they suit the knee.
+    The results name its bundles `generic_...`. The table of strains shows whether they suit the
+    knee.
     """
 
     ligaments: tuple[Literal["MCL", "LCL", "PCL", "ACL"], ...] = Field(
@@ -145,20 +145,20 @@ class BoneTable(SceneTable):
     mesh: Path
     unit: LengthUnit
     axes: Axes = "+x,+y,+z"
-    link: str = Field(description="link in whose frame the mesh stands")
+    link: str = Field(description="the link whose frame the mesh is in")
 
 
-HALF_THICKNESS = "of the tendon, off the outline"
+HALF_THICKNESS = "distance of the tendon's centre line from the outline"
 BAND = (
-    "wraps the sections within this distance of its sagittal plane: as far as, on average, the "
-    "fibres of a lamina 20 mm wide; wider ones ride on the flanges"
+    "the tendon wraps sections up to this distance from its sagittal plane. 5 mm is the mean "
+    "distance of the fibres of a tendon 20 mm wide"
 )
 
 
 class MuscleWrapTable(SceneTable):
-    """What a muscle wraps: the sagittal outline of the femoral component, and of `bone`.
+    """The sagittal outline that a muscle wraps: that of the femoral component and of `bone`.
 
-    It is the stretch of the path that leaves the femur which passes in front of it.
+    The part of the path that leaves the femur passes in front of this outline.
     """
 
     bone: BoneTable | None = None
@@ -169,23 +169,27 @@ class MuscleWrapTable(SceneTable):
 class MuscleTable(SceneTable):
     """A muscle: a line of action through points of the links.
 
-    One muscle can be balanced by equilibrium alone: it must run from the femur to the patella.
+    Equilibrium determines the force of one muscle only, which must run from the femur to the
+    patella.
     """
 
     name: str = Field(pattern="^[A-Za-z0-9_]+$")
-    group: str = Field("", description="of muscles that are shown together; default: its own")
+    group: str = Field(
+        "",
+        description="group of muscles that are shown together; default: a group of its own",
+    )
     path: tuple[Attachment, ...] = Field(
         min_length=2, description="from the origin, through any via points, to the insertion"
     )
     wrap: MuscleWrapTable | None = Field(None, description="default: straight between the points")
-    # Twice the strongest of the lower limb (soleus and vastus lateralis, some 6 kN).
+    # Upper limit: twice the strongest muscles of the lower limb, about 6 kN.
     force_N: Annotated[Number | None, within(1, 15000, "give it in newtons")] = Field(
-        None, description="maximal isometric force; no bound where it is not given"
+        None, description="maximal isometric force; not given: the force has no upper bound"
     )
 
 
 class QuadricepsTable(SceneTable):
-    """Quadriceps line, the short form of a [[muscle]] named quadriceps of two points.
+    """Quadriceps line: the short form of a [[muscle]] with the name quadriceps and two points.
 
     It runs from the vastus intermedius origin to the patella and wraps the sagittal outline of
     the femoral component, and of `bone` if given.
@@ -203,8 +207,8 @@ class MusclesTable(SceneTable):
     """All muscles of the leg, from the OpenSim model that the URDF was made from.
 
     They share the joint moments of hip, knee, ankle and subtalar joint by static optimisation;
-    those that cross the knee act on it. The quadriceps' force is the knee's own, see
-    docs/muscles.md. Without this table only the quadriceps acts.
+    those that cross the knee act on it. The equilibrium of the knee gives the quadriceps' force,
+    see docs/muscles.md. Without this table only the quadriceps acts.
     """
 
     model: Path = Field(description="the .osim file")
@@ -219,17 +223,19 @@ class MusclesTable(SceneTable):
     )
     reserve_Nm: Annotated[Number, Field(ge=0, le=10000)] | dict[str, Number] = Field(
         10.0,
-        description="the reserve moment that costs as much as one fully active muscle of weight "
-        "1, of every balanced coordinate or of each by name; 0 forbids it",
+        description="reserve moment that costs as much as one fully active muscle of weight 1: one "
+        "number for every balanced coordinate, or coordinate -> number; 0 forbids it",
     )
     least_activation: Number = Field(
         0.0,
         ge=0,
         le=0.2,
-        description="of every muscle: its resting tone, which presses the knee where no load does",
+        description="lower bound of every muscle's activation, its resting tone. It loads the knee "
+        "even where no external load does",
     )
     law: Literal["isometric", "hill"] = Field(
-        "isometric", description="strength: the maximal isometric force, or force-length-velocity"
+        "isometric",
+        description="strength: maximal isometric force, or force-length-velocity relation",
     )
     emg: EmgTable | None = Field(None, description="recorded activity of the muscles")
 
@@ -242,17 +248,17 @@ class PatellarLigamentTable(SceneTable):
 
     proximal: Attachment
     distal: Attachment
-    # Half of the shortest measured one to twice the longest (25 to 65 mm).
+    # Half the shortest measured length to twice the longest (25 to 65 mm).
     length_mm: Annotated[Number | None, within(12, 130, "give it in millimetres")] = Field(
         None, description="its constant length; needed where the patella is solved"
     )
     wrap: Switch = True
     half_thickness_mm: HalfThickness = Field(2.5)
-    band_mm: Band = Field(5.0, description="likewise, of the insert's lip")
+    band_mm: Band = Field(5.0, description="as for a muscle, for the insert's lip")
 
 
 class PatellaTable(SceneTable):
-    """Whether the patella's sagittal motion was recorded or is to be found."""
+    """The patella's sagittal motion: recorded, or solved from equilibrium."""
 
     motion: Literal["recorded", "solved"]
 
@@ -280,8 +286,8 @@ class ContactTable(SceneTable):
     released: tuple[KneeFreedom, ...] = Field(
         (),
         description=(
-            "knee coordinates that find their own equilibrium under contact, ligaments and "
-            "muscle line: adduction, axial_rotation, ap, si, ml (si always does)"
+            "knee coordinates that are solved from the equilibrium of contact, ligaments and "
+            "muscle line: adduction, axial_rotation, ap, si, ml (si is always solved)"
         ),
     )
     post: Switch = Field(
@@ -291,7 +297,7 @@ class ContactTable(SceneTable):
         ),
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description="the model's own, see `tkamb contact list`"
+        default_factory=dict, description="options of the contact model, see `tkamb contact list`"
     )
 
     @model_validator(mode="after")
@@ -300,30 +306,35 @@ class ContactTable(SceneTable):
             raise ValueError("'released' names a coordinate twice")
         if self.released and self.adjust:
             raise ValueError(
-                "'adjust' and 'released' exclude each other: one moves the femur to "
-                "where the other lets it settle"
+                "'adjust' and 'released' exclude each other: both "
+                "move the femur, by different rules"
             )
         return self
 
 
 class MaterialTable(SceneTable):
-    """What the insert is made of: elastic constants and a stress-strain curve.
+    """The insert's material: elastic constants and a stress-strain curve.
 
-    True stress against true strain, the same in tension and compression. `base` takes a built-in
-    material and changes what is given; without it the material is given whole.
+    The curve is true stress against true strain, equal in tension and compression. With `base`
+    the keys change a built-in material; without it they must define the whole material.
     """
 
     base: str | None = Field(None, description="name of a built-in material")
     name: str | None = Field(
-        None, description="what to call it in results; default: 'own', or the base's with 'changed'"
+        None,
+        description="its name in the results; default: 'own', or the base's name with 'changed'",
     )
     # From a gel to ceramics; UHMWPE has 0.4 to 1.5 GPa.
     young_modulus_MPa: Annotated[Number | None, within(0.1, 500000, "give it in megapascals")] = (
-        Field(None, description="slope of the curve at the origin; a table's own by default")
+        Field(
+            None,
+            description="slope of the curve at the origin; default for a table: its own slope",
+        )
     )
     poisson_ratio: Annotated[Number | None, Field(ge=0, lt=0.5)] = None
     yield_stress_MPa: Annotated[Number | None, Field(ge=1, le=200)] = Field(
-        None, description="instead of [output] yield_stress_MPa: tells overloaded area"
+        None,
+        description="instead of [output] yield_stress_MPa: pressure above it counts as overload",
     )
     law: Literal["linear", "ramberg-osgood", "tabulated"] | None = Field(
         None, description="the curve; default: the base's, or linear"
@@ -335,33 +346,34 @@ class MaterialTable(SceneTable):
         None, description="ramberg-osgood: s0"
     )
     exponent: Annotated[Number | None, Field(ge=1)] = Field(None, description="ramberg-osgood: n")
-    strain: tuple[Number, ...] = Field((), description="tabulated: true strains, rising from 0")
+    strain: tuple[Number, ...] = Field((), description="tabulated: true strains, increasing from 0")
     stress_MPa: tuple[Number, ...] = Field(
-        (), description="tabulated: true stresses, from 0, not falling"
+        (), description="tabulated: true stresses, from 0, never decreasing"
     )
-    sources: tuple[str, ...] = Field((), description="who measured what; printed in results")
+    sources: tuple[str, ...] = Field(
+        (), description="references of the measured values; printed in the results"
+    )
 
 
 class WearTable(SceneTable):
-    """What `tkamb wear` does with the scene; its options go before these keys. A run reads none."""
+    """Settings of `tkamb wear`; options of the command override them. `tkamb run` ignores them."""
 
     close: Closing = Field(
         DEFAULT_CLOSING,
-        description="how recorded frames become a cycle: 'interpolate' leads from the last frame "
-        "to the first, 'there-and-back' goes the same way back, 'as recorded' takes the frames "
-        "alone",
+        description="how recorded frames become a cycle: 'interpolate' adds frames from the last "
+        "to the first, 'there-and-back' adds the same frames in reverse, 'as recorded' adds none",
     )
     material: str | None = Field(
         None, description="a wear material's name, or a material file (.toml) beside the scene"
     )
     law: str | None = Field(None, description="a wear law; default: the material's own")
     wear_factor_mm3_per_Nm: Annotated[Number | None, Field(ge=0, le=1e-3)] = Field(
-        None, description="instead of the material's"
+        None, description="instead of the material's wear factor"
     )
 
 
 class OutputTable(SceneTable):
-    """What is written and how it is read."""
+    """The results folder and the report."""
 
     directory: Path | None = None
     yield_stress_MPa: Number = Field(21.0, ge=1, le=200)
@@ -370,16 +382,17 @@ class OutputTable(SceneTable):
     )
     cycle_s: tuple[Number, Number] | None = Field(
         None,
-        description="s, 0 and 100 % of the gait cycle; default: two foot strikes of "
-        "[ground_reaction], where it shows them",
+        description="s, times of 0 and 100 % of the gait cycle; default: two foot strikes of "
+        "[ground_reaction], if it has them",
     )
     activity: Activity | None = Field(
-        None, description="the report draws what instrumented knees measured in it"
+        None,
+        description="the report draws forces that instrumented knees measured in this activity",
     )
     notes: list[str] = Field(default_factory=list, description="printed in the report")
     answers: dict[str, str] = Field(
         default_factory=dict,
-        description="words of a question -> its answer: a note then, and no flag",
+        description="words of a question -> the answer; an answered question becomes a note",
     )
 
     @model_validator(mode="after")
