@@ -12,7 +12,7 @@ from scenes import MODEL
 from tkamb.cli import main
 from tkamb.commands.check import check_html
 from tkamb.io.starter import lay_out
-from tkamb.run.muscles import static_optimisation
+from tkamb.run.muscles import sharing as static_optimisation
 from tkamb.show.check.inventory import _listed
 from tkamb.show.check.leg_picture import draw_leg, leg_frame, shown_frames
 from tkamb.show.check.scene_check import _missing, check_scene

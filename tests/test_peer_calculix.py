@@ -16,8 +16,8 @@ from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.run.decks.calculix import Deck
-from tkamb.run.decks.problem import press_problem
+from tkamb.run.decks import Deck
+from tkamb.run.frame_press import press_problem
 from tkamb.studies import peer
 from tkamb.studies.bodies import balls, block, dishes
 from tkamb.studies.calculix import PeerRun, run_calculix

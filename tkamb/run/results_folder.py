@@ -23,7 +23,7 @@ from tkamb.files import (
     write_synced,
 )
 from tkamb.io.claim import claimed_directory, settle
-from tkamb.run.plug_ins import CONTACT_CODE, contact_code
+from tkamb.run.identity import CONTACT_CODE, contact_code
 from tkamb.run.results import Results, csv_text, read_bands, read_csv
 from tkamb.run.summary_check import check_summary
 
@@ -121,7 +121,7 @@ def write_results(
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
     Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
-    for this run's. The shards of the run (`tkamb.run.shards`) are no longer needed and are removed.
+    for this run's. The shards of the run (`tkamb.run.recorder`) are removed.
 
     Args:
         results: what to write.
@@ -133,8 +133,8 @@ def write_results(
     Raises:
         InputError: the folder cannot be claimed (`tkamb.io.claim`) or written.
     """
-    from tkamb.run.pages import page
-    from tkamb.run.shards import remove_shards
+    from tkamb.run.recorder import remove_shards
+    from tkamb.run.results import page
 
     if BANDS_NAME not in (more or {}):
         results = replace(

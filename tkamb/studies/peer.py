@@ -23,8 +23,8 @@ from tkamb.contact.pair import ContactPair, PreparedContact
 from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
-from tkamb.run.decks.calculix import ELEMENT, Deck
-from tkamb.run.decks.problem import PressProblem, press_problem
+from tkamb.run.decks import ELEMENT, Deck
+from tkamb.run.frame_press import PressProblem, press_problem
 from tkamb.studies.calculix import CALCULIX, PeerRun, run_calculix
 from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import Measure

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.registry import contact_names
-from tkamb.run.decks.calculix import ELEMENT
-from tkamb.run.plug_ins import contact_code
+from tkamb.run.decks import ELEMENT
+from tkamb.run.identity import contact_code
 from tkamb.studies.calculix import find_program
 from tkamb.studies.cases import StudyCase, case_names, study_case
 from tkamb.studies.kept_rows import KeptRows, row_key

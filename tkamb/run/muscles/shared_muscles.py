@@ -22,8 +22,7 @@ from tkamb.knee.crossing import (
     yielding_flexion_row,
 )
 from tkamb.knee.equations import KneeGeometry, KneeLoads, solve_knee, unsolved
-from tkamb.run.muscles.knee_trial import KneeTrial
-from tkamb.run.muscles.recording import LegRecording, group_names, load_knee_trial
+from tkamb.run.muscles.knee_trial import KneeTrial, LegRecording, group_names, load_knee_trial
 from tkamb.run.muscles.sharing import EmgGuide, Sharing
 from tkamb.units import MILLIMETRE
 

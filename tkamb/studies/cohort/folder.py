@@ -12,7 +12,7 @@ import numpy as np
 from tkamb.errors import not_installed
 from tkamb.files import replaced_together, sha256_of, write_rows, write_synced
 from tkamb.run.columns import ordered_names
-from tkamb.run.pages import page
+from tkamb.run.results import page
 from tkamb.studies.cohort.outcome import Outcome
 from tkamb.studies.cohort.plan import GROUP_AXES, Cohort, CohortRun
 from tkamb.studies.cohort.statistics import group_rows, groups_of

@@ -16,8 +16,8 @@ from tkamb.io.scene.case import Case, load_case
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recorded import predicted_columns
+from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import STATISTICS_LIMITS, Results
-from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import chosen_frames, simulate
 from tkamb.run.workers import PoolOptions, Progress, Task, WorkerPool
 from tkamb.studies.uncertainty.bands import (

@@ -12,8 +12,8 @@ import numpy as np
 from tkamb import code_identity
 from tkamb.errors import InputError
 from tkamb.files import FILE_LIMITS, read_bytes, replaced_file
-from tkamb.run.plug_ins import foreign_code
-from tkamb.run.shards import UNREADABLE
+from tkamb.run.identity import foreign_code
+from tkamb.run.recorder import UNREADABLE
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase, WearState
 

@@ -11,8 +11,8 @@ from tkamb.errors import InputError
 from tkamb.io.scene import Scene
 from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.recorder import Shards
 from tkamb.run.results import Results
-from tkamb.run.shards import Shards
 from tkamb.run.workers import PoolOptions
 from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
 from tkamb.studies.wear.kept import keep_state, kept_state, wear_identity
