@@ -21,7 +21,7 @@ import threading
 import time as clock
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,17 +32,22 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.files import read_bytes, read_json, replaced_file, replaced_together, write_text
 from tkamb.geometry.frames import Array
-from tkamb.run.results_folder import MAPS_NAME, REPORT_NAME, SUMMARY_NAME, put_numbers, read_results
+from tkamb.run.results_folder import (
+    FOLDER,
+    IDENTITY_NAME,
+    MAPS_NAME,
+    REPORT_NAME,
+    SUMMARY_NAME,
+    put_numbers,
+    read_results,
+    remove_shards,
+)
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps, MapWriter
     from tkamb.run.results import Results
 
 
-FOLDER = ".frames"
-IDENTITY_NAME = "run.json"
-OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
-"""What the folder holds, and all that is ever removed from it."""
 LARGEST = 2e9
 """Bytes of a frame; a map of 100,000 points has 5 MB."""
 
@@ -182,18 +187,6 @@ def check_same_run(
             directory,
             "give the same scene and options, or leave out --resume to begin again",
         )
-
-
-def remove_shards(directory: Path, name: str = FOLDER) -> None:
-    """Remove the finished frames, and first the file that says which run they belong to."""
-    folder = directory / name
-    if folder.is_symlink():
-        return
-    for name in OWN_NAMES:
-        for path in folder.glob(name):
-            path.unlink(missing_ok=True)
-    with suppress(OSError):  # not there, or somebody else's things are in it
-        folder.rmdir()
 
 
 MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)

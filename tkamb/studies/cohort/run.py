@@ -12,7 +12,8 @@ from tkamb.errors import InputError
 from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.identity import CONTACT_CODE, contact_code
-from tkamb.run.recorder import Shards, remove_shards
+from tkamb.run.recorder import Shards
+from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.cohort.folder import write_cohort
 from tkamb.studies.cohort.outcome import CohortWorker, Outcome
