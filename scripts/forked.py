@@ -17,7 +17,6 @@ NEEDED = (
     "tkamb.cli",
     "tkamb.run.simulation",
     "tkamb.run.contact_side",
-    "tkamb.run.recall",
     "tkamb.run.maps",
     "tkamb.contact.lattice.model",
     "tkamb.contact.foundation",
@@ -55,7 +54,7 @@ def import_all(report: bool = True) -> None:
 def prepare_once() -> None:
     """Make runs of equal scenes share prepared knees and contact models, but no initial guesses."""
     from tkamb.run import simulation
-    from tkamb.run.frames import FrameSolver
+    from tkamb.run.simulation import FrameSolver
 
     solvers: dict[str, FrameSolver] = {}
 

@@ -17,8 +17,8 @@ from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.adjustment import split_sensitivity, split_tangent
-from tkamb.run.agreement import contradictions
 from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.status import contradictions
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards
 from tkamb.studies.cases import change_recording

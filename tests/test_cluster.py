@@ -15,7 +15,7 @@ import pytest
 from test_uncertainty import SCENE, bodies_alone
 from tkamb.cli import main
 from tkamb.errors import ComputationError, InputError
-from tkamb.run import cluster
+from tkamb.run import workers as cluster
 from tkamb.run.workers import PoolOptions, Task
 from tkamb.studies.uncertainty.run import estimate_uncertainty
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from plane_leg import muscle
-from tkamb.run.muscles.hill import (
+from tkamb.run.muscles.leg import (
     active_force_length,
     force_velocity,
     passive_force_length,

@@ -13,8 +13,7 @@ from tkamb.io.importing.links import find_links
 from tkamb.io.opensim.motion import CoordinateMotion
 from tkamb.io.recordings.meshes import axes_rotation, load_surface
 from tkamb.run.muscles import Sharing
-from tkamb.run.muscles.knee_trial import knee_trial
-from tkamb.run.muscles.recording import LegRecording, load_knee_trial
+from tkamb.run.muscles.knee_trial import LegRecording, knee_trial, load_knee_trial
 from tkamb.run.muscles.trial import trial_problems
 from tkamb.show.storage import write_storage
 

@@ -18,7 +18,7 @@ from tkamb.contact.result import ContactStatus
 from tkamb.geometry.frames import knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.frames import FrameSolver
+from tkamb.run.simulation import FrameSolver
 
 MODELS = Path(__file__).parents[1] / "models"
 DATA = Path(__file__).parents[2] / "shared" / "data"

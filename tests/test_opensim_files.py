@@ -19,7 +19,7 @@ from tkamb.io.opensim.model import OpenSimModel
 from tkamb.io.opensim.motion import read_coordinates
 from tkamb.io.opensim.read import read_osim
 from tkamb.io.recordings.tables import read_table
-from tkamb.run.summary import files_hash
+from tkamb.run.identity import files_hash
 from tkamb.show.storage import write_storage
 
 NEW = OWN["new_layout"].read_text(encoding="utf-8")

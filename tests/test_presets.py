@@ -15,7 +15,7 @@ from tkamb.errors import InputError
 from tkamb.io.presets import PRESETS, Preset, find_preset
 from tkamb.io.scene import with_preset
 from tkamb.io.scene.case import load_case
-from tkamb.run.rerun import case_of_results, run_again
+from tkamb.run.identity import case_of_results, run_again
 from tkamb.run.results_folder import read_results
 from tkamb.show.report import report_html
 

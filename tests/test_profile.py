@@ -4,7 +4,7 @@ import json
 
 from scenes import write_scene
 from tkamb.cli import main
-from tkamb.run.profiling import Profile
+from tkamb.run.timing import Profile
 
 
 def profiled(folder, drop, capsys, *options):

@@ -17,10 +17,9 @@ from scenes import fast_scene, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.run.maps import read_maps
-from tkamb.run.recorder import interrupt_later
+from tkamb.run.recorder import Shard, Shards, interrupt_later
 from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
-from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import simulate
 
 ROOT = Path(__file__).parents[1]

@@ -14,8 +14,8 @@ from tkamb.knee.balance import BalanceStatus
 from tkamb.knee.equations import unsolved
 from tkamb.knee.load import total_wrench
 from tkamb.knee.released_forces import SCALE, external_wrench
-from tkamb.run.frames import FrameSolver
 from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.simulation import FrameSolver
 
 ROOT = Path(__file__).parents[1]
 BEND = ROOT / "models" / "deep_knee_bend" / "scene.toml"

@@ -3,7 +3,7 @@
 import io
 import re
 
-from tkamb.run.stages import Stages
+from tkamb.run.timing import Stages
 
 
 class Terminal(io.StringIO):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from tkamb.errors import ComputationError
-from tkamb.run.muscles.static_optimisation import LoadSharing, kkt_residual, share_load
+from tkamb.run.muscles.sharing import LoadSharing, kkt_residual, share_load
 
 FREE = np.inf
 

@@ -14,8 +14,8 @@ from tkamb.errors import InputError
 from tkamb.io.claim import settle
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
+from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results_folder import BANDS_NAME, UNCERTAINTY_NAMES, write_results
-from tkamb.run.shards import Shard, Shards
 from tkamb.run.simulation import simulate
 from tkamb.studies.uncertainty.bands import (
     band_columns,

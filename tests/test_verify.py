@@ -9,8 +9,8 @@ import pytest
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results_folder import read_results
-from tkamb.run.shards import Shard, Shards
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_other_code_is_a_note(run, capfd, monkeypatch):
 
 
 def test_other_code_is_not_resumed(run, capfd, monkeypatch):
-    monkeypatch.setattr("tkamb.run.summary.code_identity", lambda: "other")
+    monkeypatch.setattr("tkamb.run.identity.code_identity", lambda: "other")
     scene, out = run
     given = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
     assert main(given) == 2

@@ -14,7 +14,7 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
 from tkamb.io.scene.uncertainty import UncertaintyTable
-from tkamb.run.shards import Shards
+from tkamb.run.recorder import Shards
 from tkamb.run.workers import PoolOptions
 from tkamb.studies.uncertainty.inputs import Draw, VariedInput
 from tkamb.studies.wear.bands import Sampling, check_samples, moved_case, varied_wear_inputs

@@ -132,14 +132,14 @@ def _add_scene(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from tkamb.run.profiling import Profile, profile_lines
+    from tkamb.run.timing import Profile, profile_lines
 
     profile = Profile() if options.profile else None
     from tkamb.io.claim import claimed_directory
     from tkamb.run.results_folder import write_results
     from tkamb.run.simulation import simulate
-    from tkamb.run.stages import Stages
     from tkamb.run.status import FAILED
+    from tkamb.run.timing import Stages
     from tkamb.show.axis import horizontal_axis
     from tkamb.show.headline import cards
 

@@ -60,7 +60,7 @@ MODULES = {
     "tkamb.designs.touch": "tkamb.studies.designs.design",
     "tkamb.guard": "tkamb.run.guard",
     "tkamb.known_errors": "tkamb.run.known_errors",
-    "tkamb.plug_ins": "tkamb.run.plug_ins",
+    "tkamb.plug_ins": "tkamb.run.identity",
     "tkamb.equilibrium.contact_side": "tkamb.run.contact_side",
     "tkamb.equilibrium.known": "tkamb.run.read_scene",
     "tkamb.equilibrium.mechanics": "tkamb.run.mechanics",

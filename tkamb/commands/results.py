@@ -99,7 +99,7 @@ def _export_deck(options: argparse.Namespace) -> int:
     from tkamb.contact.registry import MAP_GRID
     from tkamb.files import write_text
     from tkamb.io.claim import check_output_file
-    from tkamb.run.decks.frame import SUFFIX, frame_press
+    from tkamb.run.frame_press import SUFFIX, frame_press
 
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")

@@ -7,32 +7,40 @@
   the equations, and this is repeated until load and centres of pressure no longer change.
 - `released = [...]`: these coordinates find their own equilibrium under contact, ligaments
   and muscle line (`tkamb.knee.released`); the equations then use the resultants found.
+
+`contact_arrays` returns what a folder keeps of a frame's contact; a resumed run begins from it with
+`recalled`. The lattice's displacements, and the forces from which a released knee begins, are not
+kept: the results differ within the solver's tolerance.
 """
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.model import condyle_wrenches
+from tkamb.contact.model import ProbedContact, condyle_wrenches
 from tkamb.contact.pressing import within_insert
 from tkamb.contact.result import ContactResult, ContactStatus, WarmStart, medial_points
 from tkamb.errors import ComputationError
 from tkamb.geometry.adjustment import Adjustment
-from tkamb.geometry.frames import Array, knee_pose
+from tkamb.geometry.frames import SIDES, Array, knee_pose
 from tkamb.geometry.threads import both
 from tkamb.knee.adjustment import press_adjusted, split_sensitivity, split_tangent
+from tkamb.knee.balance import Balance, BalanceStatus
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import solve_knee, unsolved
 from tkamb.knee.frame_contact import FrameContact, post_contact
 from tkamb.knee.instant import Instant
 from tkamb.run.mechanics import FrameLoads, Mechanics
+from tkamb.run.recorder import CONTACT_PLACES
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
+    from tkamb.knee.equations import KneeGeometry
     from tkamb.knee.released import KneeEquilibrium
+
 
 NAN = float("nan")
 
@@ -316,3 +324,81 @@ def _points(body: FrameLoads) -> dict[str, Array]:
 def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
     """Return the farthest (m) that a contact point has moved."""
     return max(float(np.linalg.norm(after[side] - before[side])) for side in after)
+
+
+RESULT_ARRAYS = ("pose", "pressure", "gap", "nodal_force")
+"""What the map of a run and the start of a resumed one need of a result."""
+
+
+def contact_arrays(
+    contact: FrameContact | None, geometry: "KneeGeometry"
+) -> dict[str, Array] | None:
+    """Return the arrays to keep of a frame's contact, by name; None without a result.
+
+    Args:
+        contact: of the frame.
+        geometry: what the equations worked on.
+    """
+    if contact is None or contact.result is None:
+        return None
+    result, knee = contact.result, contact.equilibrium
+    arrays = {name: np.asarray(getattr(result, name), float) for name in RESULT_ARRAYS}
+    points, normals = np.full((2, 3, 3), np.nan)
+    for side, condyle in geometry.condyles.items():
+        points[SIDES.index(side)], normals[SIDES.index(side)] = condyle.point, condyle.normal
+    if geometry.extensor is not None:
+        points[2] = geometry.extensor.contact_point
+        normals[2] = geometry.extensor.contact_normal
+    arrays |= zip(CONTACT_PLACES, (points, normals), strict=True)
+    if knee is not None:
+        arrays["equilibrium_coordinates"] = knee.coordinates
+        arrays["equilibrium_force"] = knee.balance.force
+        arrays["equilibrium_stiffness"] = knee.balance.stiffness
+        if knee.patella is not None:
+            arrays["equilibrium_patella"] = knee.patella.coordinates
+    return arrays
+
+
+def recalled(
+    side: ContactSide, mechanics: Mechanics, frame: int, arrays: Mapping[str, Array] | None
+) -> FrameContact:
+    """Return a frame's warm start from its arrays, in a contact that holds no result."""
+    none = np.zeros(len(side.state.points), bool)
+    if arrays is None:
+        return FrameContact(None, none, None, 0.0, "not recalled", ())
+    knee = _equilibrium(mechanics, frame, arrays) if "equilibrium_coordinates" in arrays else None
+    state = side.state
+    start = WarmStart(state.pair, arrays["pose"], state.points, arrays["pressure"], arrays["gap"])
+    return FrameContact(None, none, None, 0.0, "", (), equilibrium=knee, start=start)
+
+
+def _equilibrium(
+    mechanics: Mechanics, frame: int, arrays: Mapping[str, Array]
+) -> "KneeEquilibrium":
+    from tkamb.knee.released import KneeEquilibrium
+
+    patella = None
+    if mechanics.extensor is not None and "equilibrium_patella" in arrays:
+        state = mechanics.extensor.states[frame]
+        patella = replace(state, coordinates=arrays["equilibrium_patella"])
+    place, nan = arrays["equilibrium_coordinates"], float("nan")
+    return KneeEquilibrium(
+        coordinates=place,
+        geometry=mechanics.geometry(frame, place, patella),
+        patella=patella,
+        contact=ProbedContact({}),
+        balance=Balance(
+            coordinates=place,
+            force=arrays["equilibrium_force"],
+            stiffness=arrays["equilibrium_stiffness"],
+            status=BalanceStatus.OK,
+            steps=0,
+            trials=0,
+            smallest_stiffness=nan,
+            work=(),
+        ),
+        passes=0,
+        trials=0,
+        change=nan,
+        problem="",
+    )

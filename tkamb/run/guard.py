@@ -218,7 +218,7 @@ def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
     reason = " ".join(str(error).split())[:200]
     what = "not enough memory: take a coarser resolution or fewer frames"
     if not isinstance(error, MemoryError):
-        from tkamb.run.plug_ins import raised_in
+        from tkamb.run.identity import raised_in
 
         plug_in, told = raised_in(error), f"{name}{': ' if reason else ''}{reason}"
         what = f"{plug_in} raised {told}" if plug_in else f"this was not foreseen: {told}"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.run.agreement import AGREEMENT
+from tkamb.run.status import AGREEMENT
 from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
 
 if TYPE_CHECKING:

@@ -3,8 +3,9 @@
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,29 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from tkamb.run.maps import ContactMaps
+
+
+PAGES = {
+    "cohort": "tkamb.show.cohort_report:cohort_html",
+    "headline": "tkamb.show.report:headline_html",
+    "plots": "tkamb.show.plots:plot",
+    "report": "tkamb.show.report:report_html",
+}
+
+
+def page(name: str) -> Callable[..., Any]:
+    """Return the function that makes a page.
+
+    Args:
+        name: one of `PAGES`.
+
+    Raises:
+        KeyError: no such page.
+    """
+    module, _, function = PAGES[name].partition(":")
+    function_of_module: Callable[..., Any] = getattr(import_module(module), function)
+    return function_of_module
+
 
 PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
 """Ending of a column of bands.csv -> per cent of the samples below it."""
@@ -150,14 +174,12 @@ class Results:
         Raises:
             InputError: a plot or an axis that does not exist.
         """
-        from tkamb.run.pages import page
 
         figure: Figure = page("plots")(self, names, axis)
         return figure
 
     def _repr_html_(self) -> str:
         """Return the report's headline numbers, for notebooks."""
-        from tkamb.run.pages import page
 
         return str(page("headline")(self))
 

@@ -5,6 +5,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from tkamb.files import (
     write_synced,
 )
 from tkamb.io.claim import claimed_directory, settle
-from tkamb.run.plug_ins import CONTACT_CODE, contact_code
+from tkamb.run.identity import CONTACT_CODE, contact_code
 from tkamb.run.results import Results, csv_text, read_bands, read_csv
 from tkamb.run.summary_check import check_summary
 
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
     from tkamb.show.panels import Panel
 
+FOLDER = ".frames"
+IDENTITY_NAME = "run.json"
+OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
+"""What the folder holds, and all that is ever removed from it."""
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
@@ -123,7 +128,7 @@ def write_results(
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
     Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
-    for this run's. The shards of the run (`tkamb.run.shards`) are no longer needed and are removed.
+    for this run's. The shards of the run (files of single frames) are removed.
 
     Args:
         results: what to write.
@@ -135,8 +140,7 @@ def write_results(
     Raises:
         InputError: the folder cannot be claimed (`tkamb.io.claim`) or written.
     """
-    from tkamb.run.pages import page
-    from tkamb.run.shards import remove_shards
+    from tkamb.run.results import page
 
     if BANDS_NAME not in (more or {}):
         results = replace(
@@ -291,3 +295,15 @@ def _plug_in_note(model: str, code: str) -> list[str]:
     except InputError as error:
         return [f"its code cannot be compared: {error}"]
     return [] if same else [f"computed by another code of the contact model '{model}'"]
+
+
+def remove_shards(directory: Path, name: str = FOLDER) -> None:
+    """Remove the finished frames, and first the file that says which run they belong to."""
+    folder = directory / name
+    if folder.is_symlink():
+        return
+    for name in OWN_NAMES:
+        for path in folder.glob(name):
+            path.unlink(missing_ok=True)
+    with suppress(OSError):  # not there, or somebody else's things are in it
+        folder.rmdir()

@@ -1,28 +1,178 @@
-"""The whole pipeline on one page: scene, body, contact, results."""
+"""`simulate`: read the scene, compute frame after frame, tabulate the results."""
 
+import logging
 import math
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
 from tkamb.io.claim import claimed_directory
 from tkamb.io.scene import Scene, load_scene, with_overrides, with_preset
 from tkamb.io.scene.case import Case, load_case
-from tkamb.run.frames import FRAME_LOOP, ChunkSolver, Finished, FrameSolver, finished_in_order
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.identity import input_hashes, run_identity, scene_hash
 from tkamb.run.metrics import peak_pressure
-from tkamb.run.recorder import FolderRecorder, Recorder, finished_results
+from tkamb.run.plausibility.plausibility import Plausibility
+from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.recorder import FolderRecorder, Recorder, Row, finished_results
 from tkamb.run.results import Results
-from tkamb.run.summary import input_hashes, run_identity, scene_hash, summary_of
-from tkamb.run.tabulate import join_rows
+from tkamb.run.status import frame_status
+from tkamb.run.summary import summary_of
+from tkamb.run.tabulate import frame_row, join_rows
 from tkamb.run.workers import PoolOptions, Task, WorkerPool
 
 if TYPE_CHECKING:
+    from tkamb.knee.frame_contact import FrameContact
+    from tkamb.knee.slip import CondyleSlip
     from tkamb.run.contact_side import ContactSide
+
+
+@dataclass(frozen=True)
+class FrameLoopSettings:
+    """How frames are shared and which contacts are kept as guesses."""
+
+    kept_contacts: int = 20
+    """How many contacts are kept as guesses for the next. Chosen: older ones are farther away than
+    a new search begins."""
+    frames_per_chunk: int = 10
+    """Frames that a worker computes in a row; the first of them has no guess from the one before.
+    Chosen: the same for any number of workers, so that their number changes no answer."""
+
+
+FRAME_LOOP = FrameLoopSettings()
+
+
+Finished = tuple[int, Row, dict[str, Array] | None]
+"""Frame, its row, and its contact's arrays (`contact_arrays`); None without a contact result."""
+
+
+class FrameSolver:
+    """Computes the frames of a case.
+
+    Args:
+        case: the scene with its files read.
+        frames: those that are asked for; None: any may be.
+        slips: those of another solver of this case; they are then not computed again.
+
+    Attributes:
+        mechanics: the body side.
+        slips: side -> rolling and slipping of the recorded motion.
+        before: contacts of the last frames, guesses for the next.
+
+    Raises:
+        InputError: whatever is wrong with the input.
+    """
+
+    def __init__(
+        self, case: Case, frames: range | None = None, slips: "dict[str, CondyleSlip] | None" = None
+    ) -> None:
+        self._case = case
+        self.mechanics = mechanics_of(case)
+        self.plausibility = Plausibility(case, self.mechanics)
+        last = max(frames or range(len(case.motion.time)))
+        if slips is None:  # of the recorded motion: released coordinates make another one
+            released = case.scene.contact and case.scene.contact.released
+            slips = {} if released else self.mechanics.slips(last)
+        self.slips = slips
+        self.before: list[FrameContact] = []
+
+    def solve(self, k: int) -> Finished:
+        """Return frame k."""
+        contact = arrays = None
+        if self.side is None:
+            body = self.mechanics.frame(k)
+        else:
+            from tkamb.run.contact_side import contact_arrays
+
+            body, contact = self.side.frame(k, self.before)
+            self._keep(contact)
+            arrays = contact_arrays(contact, body.geometry)
+        doubts = self.plausibility.flags(k, body)
+        status = frame_status(self._case, k, body, contact, doubts)
+        return k, frame_row(self._case, k, body, contact, self.slips, status), arrays
+
+    def _keep(self, contact: "FrameContact") -> None:
+        """Keep a contact; only the last that was found keeps its warm start, which is large."""
+        if contact.result is not None:
+            self.before = [replace(each, start=None) for each in self.before]
+        self.before.append(contact)
+        del self.before[: -FRAME_LOOP.kept_contacts]
+
+    @cached_property
+    def side(self) -> "ContactSide | None":
+        """The contact side, prepared when it is first asked for; None without [contact]."""
+        if self._case.scene.contact is None:
+            return None
+        return contact_side(self._case, self.mechanics)
+
+
+Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
+"""Successive frames, and the slips of the recorded motion (`FrameSolver`)."""
+
+
+@contextmanager
+def _said_already() -> Iterator[None]:
+    """Print no warnings: the process that hands out the work has printed them already."""
+    log = logging.getLogger("tkamb")
+    usual = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(usual)
+
+
+class ChunkSolver:
+    """The work of a worker process: reads the scene once, and computes chunk after chunk.
+
+    Its contact side waits for the first chunk: by then the process that hands out the work has
+    prepared its own, and has put what takes long into the cache.
+    """
+
+    @_said_already()
+    def __init__(self, scene: Scene) -> None:
+        self._solver = FrameSolver(load_case(scene), slips={})
+
+    @_said_already()
+    def __call__(self, number: int, chunk: Chunk) -> list[Finished]:
+        """Return the frames of a chunk."""
+        frames, self._solver.slips = chunk
+        self._solver.before.clear()
+        return [self._solver.solve(k) for k in frames]
+
+
+def finished_in_order(
+    team: WorkerPool, slips: "dict[str, CondyleSlip]", indices: range, remaining: Sequence[int]
+) -> Iterator[Finished]:
+    """Yield frames over worker processes, in order.
+
+    Args:
+        team: of workers whose task is a `ChunkSolver`.
+        slips: of the recorded motion, see `FrameSolver`.
+        indices: all frames of the run, which make its chunks.
+        remaining: frames that are not computed yet.
+
+    Raises:
+        ComputationError: a worker was killed.
+    """
+    chunks: dict[int, Chunk] = {}
+    for k in remaining:
+        chunks.setdefault(indices.index(k) // FRAME_LOOP.frames_per_chunk, ([], slips))[0].append(k)
+    early: dict[int, list[Finished]] = {}
+    turn = iter(chunks)
+    expected: Any = next(turn, None)
+    for number, frames in team.answers(list(chunks.items())):
+        early[number] = frames
+        while expected in early:
+            yield from early.pop(expected)
+            expected = next(turn, None)
+
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 
@@ -129,7 +279,7 @@ class _Run:
     def prepare(self) -> None:
         """Build both sides of the equilibrium; errors of the input are raised here."""
         if self.case.scene.muscles:
-            from tkamb.run.muscles.static_optimisation import solver_is_installed, solver_missing
+            from tkamb.run.muscles.sharing import solver_is_installed, solver_missing
 
             if not solver_is_installed():  # before minutes of preparation, not at the first frame
                 raise solver_missing()
@@ -208,7 +358,7 @@ class _Run:
         earlier, side = self.recorder.take_earlier(self.indices), self.solver.side
         if side is None or not earlier:
             return
-        from tkamb.run.recall import recalled
+        from tkamb.run.contact_side import recalled
 
         mechanics, last = self.solver.mechanics, list(earlier.items())[-FRAME_LOOP.kept_contacts :]
         self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]

@@ -1,6 +1,5 @@
 """The summary of a run: its inputs, versions, assumptions and largest values."""
 
-import hashlib
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from tkamb import __version__, code_identity
-from tkamb.files import named_files, sha256_of
+from tkamb import __version__
 from tkamb.io.recordings.gait_cycle import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
-from tkamb.io.scene.scene import Scene, scene_files
+from tkamb.io.scene.scene import Scene
 from tkamb.io.scene.tables import ContactTable, MusclesTable
 from tkamb.run.columns import (
     ACTIVATION,
@@ -28,8 +26,8 @@ from tkamb.run.columns import (
     name_in,
 )
 from tkamb.run.discrepancy import discrepancy_summary
+from tkamb.run.identity import scene_hash
 from tkamb.run.known_errors import as_json, known_error, left_out
-from tkamb.run.plug_ins import CONTACT_CODE, contact_code
 from tkamb.run.read_scene import STRAIN_FLEXIONS
 from tkamb.run.recorded import predicted_columns
 from tkamb.run.settings import changed_settings
@@ -208,58 +206,6 @@ def _counts(columns: dict[str, Any]) -> dict[str, Any]:
 def _versions() -> dict[str, str]:
     own = {"python": sys.version.split()[0], "tkamb": __version__}
     return own | {name: version(name) for name in LIBRARIES}
-
-
-def scene_hash(case: Case) -> str:
-    """Return the SHA-256 of the validated scene."""
-    return hashlib.sha256(case.scene.identity_json.encode()).hexdigest()
-
-
-def run_identity(case: Case, frames: range) -> dict[str, Any]:
-    """Return the identity of a run: hashes of scene, files and code, frames and version.
-
-    A contact model of another package adds that package's code.
-    """
-    identity = {
-        "scene": scene_hash(case),
-        "content of a file": files_hash(case),
-        "choice of frames": [frames.start, frames.stop, frames.step],
-        "version of tkamb": __version__,
-        "code of tkamb": code_identity(),
-    }
-    contact = case.scene.contact
-    foreign = None if contact is None else contact_code(contact.model)
-    return identity if foreign is None else identity | {CONTACT_CODE: foreign}
-
-
-def files_hash(case: Case) -> str:
-    """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
-    digest = hashlib.sha256()
-    for path in _files_read(case):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
-    """Return path -> SHA-256 of the scene file, if there is one, its base and what it has read."""
-    paths = [*([] if scene is None else scene_files(scene.absolute())), *_files_read(case)]
-    return {str(path): sha256_of(path) for path in paths}
-
-
-def _files_read(case: Case) -> list[Path]:
-    unread = {"output"} | ({"implant"} if case.femoral is None else set())
-    named = files_in(case.scene.model_dump(exclude=unread))
-    models = [path for path in named if path.suffix.lower() == ".osim"]
-    return [*named, *(other for path in models for other in named_files(path))]
-
-
-def files_in(value: Any) -> list[Path]:
-    """Return the paths of files that are there, in nested dictionaries and lists."""
-    if isinstance(value, Path):
-        return [value] if value.is_file() else []
-    if isinstance(value, dict):
-        value = list(value.values())
-    return [p for item in value for p in files_in(item)] if isinstance(value, list | tuple) else []
 
 
 def not_modelled(case: Case) -> list[str]:

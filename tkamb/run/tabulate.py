@@ -10,7 +10,6 @@ from tkamb.io.recordings.gait_cycle import cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.knee.crossing import condyle_contributions
 from tkamb.knee.equations import dome_sensitivity
-from tkamb.run.agreement import normal_force, share_by_equilibrium, split_determined
 from tkamb.run.columns import (
     ACTIVATION,
     CONTRIBUTIONS,
@@ -21,7 +20,7 @@ from tkamb.run.columns import (
     ligament_column,
 )
 from tkamb.run.mechanics import FrameLoads
-from tkamb.run.status import FAILED
+from tkamb.run.status import FAILED, normal_force, share_by_equilibrium, split_determined
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:

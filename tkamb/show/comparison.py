@@ -11,8 +11,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 from tkamb.run import metrics
 from tkamb.run.columns import KINDS
+from tkamb.run.identity import CONTACT_CODE
 from tkamb.run.metrics import failed
-from tkamb.run.plug_ins import CONTACT_CODE
 from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.show.axis import HorizontalAxis, horizontal_axis

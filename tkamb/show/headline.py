@@ -9,8 +9,8 @@ import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run import metrics
-from tkamb.run.agreement import AGREEMENT
 from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis
 
 if TYPE_CHECKING:

@@ -1,13 +1,12 @@
-"""Muscles of a leg over a whole recording: who pulls how much, and what that does to the bones.
+"""Muscles of a leg over a whole recording: their forces, and what they do to the bones.
 
 - `tkamb.run.muscles.trial`: `solve_trial(model, motion, loads)` returns a `MuscleTrial`.
-- `tkamb.run.muscles.sharing`: options, and the frames' problems.
-- `tkamb.run.muscles.leg`: the coordinates and muscles of a leg.
-- `tkamb.run.muscles.hill`: force–length–velocity and passive curves, rigid tendon.
-- `tkamb.run.muscles.bones`: what the muscles' lines do to femur, patella, tibia and foot.
-- `tkamb.run.muscles.static_optimisation`: one frame's quadratic programme.
+- `tkamb.run.muscles.sharing`: options, problems of the frames, one frame's quadratic programme.
+- `tkamb.run.muscles.leg`: coordinates, muscles and Hill-type strength of a leg.
+- `tkamb.run.muscles.knee_trial`: a leg whose knee is tkamb's, read from files.
+- `tkamb.run.muscles.shared_muscles`: the muscles of a run's knee.
 
-Nothing of this is imported unless it is asked for.
+These modules are imported only when they are asked for.
 """
 
 from tkamb.run.muscles.sharing import Sharing

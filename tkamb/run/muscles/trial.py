@@ -1,16 +1,28 @@
 """Muscle forces of a whole recording by inverse dynamics and static optimisation.
 
 Per frame, with the generalised forces τ of the motion (inertia, gravity, external loads) and the
-moment arms R = -dL/dq of the muscles' lines about the coordinates that are balanced,
+moment arms R = -dL/dq of the muscles' lines about the balanced coordinates,
 
-    τ_c = Σ_i R_ci (a_i F_i + P_i) + r_c,
+    τ_c = Σ_i R_ci (a_i F_i + P_i) + r_c.
 
-F_i a muscle's force at full activation, P_i its passive force, r_c the reserve: what the muscles
-leave to a motor in the joint. Activations and reserves are those of least cost
+F_i is a muscle's force at full activation and P_i its passive force. The reserve r_c is the moment
+that the muscles do not provide. Activations a and reserves minimise
 
     Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
 
-A coordinate that follows another by a coupler adds to τ and R of that one by the chain rule.
+A coordinate that a coupler makes dependent on another adds to τ and R of that other coordinate by
+the chain rule.
+
+A taut muscle line is a chain of straight parts between points on bones and on their wrap objects.
+A part from bone A at p to bone B at q pulls A at p along u = (q - p)/|q - p|, and B at q along -u.
+The line acts on a bone through the straight parts that leave it: these are the effective
+attachments. The virtual work of their wrenches is the moment arm,
+
+    Σ_bones J_boneᵀ w_bone = -dL/dq.
+
+Two parts of these wrenches are in no straight part. A wrap object that yields to a point inside it
+(docs/opensim.md) pushes on its bone. Path points that move within their bone (the quadriceps of
+gait2392) do work that is no wrench on any bone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,17 +36,111 @@ from tkamb.io.importing.anatomy import Leg, find_leg
 from tkamb.io.opensim.kinematics import Kinematics, Motion
 from tkamb.io.opensim.model import OpenSimModel
 from tkamb.io.opensim.motion import CoordinateMotion, required_wrenches
-from tkamb.io.opensim.paths import LineSet, Pulls
-from tkamb.run.muscles.bones import Bones
-from tkamb.run.muscles.hill import rigid_tendon_strength
+from tkamb.io.opensim.paths import LineSet, Pulls, StraightParts
 from tkamb.run.muscles.leg import (
     check_extensors,
     leg_bones,
     leg_coordinates,
     leg_muscles,
     length_twins,
+    rigid_tendon_strength,
 )
 from tkamb.run.muscles.sharing import FrameProblems, Sharing
+
+
+@dataclass(frozen=True, eq=False)
+class Attachments:
+    """Where muscles pull one bone towards another, in the first one's frame.
+
+    Args:
+        points: (f, m, 3) m; NaN where a muscle has no straight part between the two.
+        directions: (f, m, 3) unit vectors of the pull.
+    """
+
+    points: Array
+    directions: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Bones:
+    """The bones of a leg and what acts on them.
+
+    Args:
+        names: b bones, such as femur, patella, tibia, foot.
+        muscles: m names.
+        poses: (f, b, 4, 4) of each bone's first body in ground.
+        pulls: (f, m, b, 6) moment above force of unit tension on each bone, in ground at
+            ground's origin.
+        demand: (f, b, 6) what the motion takes beyond gravity and external loads, likewise, N·m
+            above N; see `required_wrenches`.
+        crossings: straight parts from bone to bone, -1 for bodies of none.
+    """
+
+    names: tuple[str, ...]
+    muscles: tuple[str, ...]
+    poses: Array
+    pulls: Array
+    demand: Array
+    crossings: StraightParts
+
+    def pull_on(self, bones: Sequence[str], seen_from: str) -> Array:
+        """Return the wrench (f, m, 6) of unit tension on some bones taken together.
+
+        Moment (N·m per N) above force (N per N), in the frame of bone `seen_from` about its
+        origin.
+        """
+        total = self.pulls[:, :, [self.index(name) for name in bones]].sum(axis=2)
+        return self._seen(total, seen_from)
+
+    def demand_of(self, bones: Sequence[str], seen_from: str) -> Array:
+        """Return what the motion of some bones takes (f, 6), in the same way."""
+        total = self.demand[:, [self.index(name) for name in bones]].sum(axis=1)
+        return self._seen(total[:, None], seen_from)[:, 0]
+
+    def attachments(self, bone: str, towards: str | None) -> Attachments:
+        """Return where and along what muscles pull a bone towards another.
+
+        A muscle that leads from the one to the other more than once has its last straight part
+        here; its wrench is the sum of all (`pull_on`).
+
+        Args:
+            bone: whose frame, point and pull.
+            towards: the other bone; None: any body that is no bone of the leg, as the pelvis.
+        """
+        here = self.index(bone)
+        there = -1 if towards is None else self.index(towards)
+        points = np.full((len(self.poses), len(self.muscles), 3), np.nan)
+        directions = points.copy()
+        for own, other in ((0, 1), (1, 0)):
+            bodies = self.crossings.bodies
+            part = self.crossings.chosen(
+                np.flatnonzero((bodies[:, own] == here) & (bodies[:, other] == there))
+            )
+            pose = self.poses[part.frame, here]
+            step = part.ends[:, other] - part.ends[:, own]
+            step /= np.linalg.norm(step, axis=1, keepdims=True)
+            arm = part.ends[:, own] - pose[:, :3, 3]
+            where = part.frame, part.line
+            points[where] = np.einsum("pji,pj->pi", pose[:, :3, :3], arm)
+            directions[where] = np.einsum("pji,pj->pi", pose[:, :3, :3], step)
+        return Attachments(points, directions)
+
+    def index(self, name: str) -> int:
+        """Return the place of a bone.
+
+        Raises:
+            InputError: no such bone.
+        """
+        if name not in self.names:
+            raise InputError(f"no bone '{name}'", "muscles", names_near(name, self.names))
+        return self.names.index(name)
+
+    def _seen(self, wrench: Array, bone: str) -> Array:
+        """Return wrenches (f, k, 6) of ground at its origin in a bone's frame about its own."""
+        pose = self.poses[:, self.index(bone)]
+        moment = wrench[..., :3] - np.cross(pose[:, None, :3, 3], wrench[..., 3:])
+        rotation = pose[:, :3, :3]
+        return np.concatenate([moment @ rotation, wrench[..., 3:] @ rotation], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

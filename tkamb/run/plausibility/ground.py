@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.geometry.frames import Array, Mask, knee_pose, transform
 from tkamb.io.scene.case import Case
-from tkamb.run.plausibility.question import Question
+from tkamb.run.plausibility import Question
 from tkamb.units import MILLIMETRE
 
 PEAK_LOAD = (0.4, 4.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.io.scene.case import Case
-from tkamb.run.plausibility.question import Question, some
+from tkamb.run.plausibility import Question, some
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:

@@ -8,6 +8,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.io.scene.case import Case
+from tkamb.run.plausibility import Question, some
 from tkamb.run.plausibility.ground import (
     direction_questions,
     foot_questions,
@@ -15,16 +16,14 @@ from tkamb.run.plausibility.ground import (
     posture_questions,
     step_questions,
 )
-from tkamb.run.plausibility.implant import implant_questions
 from tkamb.run.plausibility.movement import (
     drift_questions,
     marker_questions,
     motion_questions,
     sample_questions,
+    sign_questions,
 )
-from tkamb.run.plausibility.question import Question, some
-from tkamb.run.plausibility.segments import segment_questions
-from tkamb.run.plausibility.signs import sign_questions
+from tkamb.run.plausibility.segments import implant_questions, segment_questions
 
 if TYPE_CHECKING:
     from tkamb.run.mechanics import FrameLoads, Mechanics

@@ -14,14 +14,13 @@ from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.patella import touching_patella
+from tkamb.run.identity import RUN_AGAIN, case_of_results, same_files, scene_hash
 from tkamb.run.mechanics import Mechanics
 from tkamb.run.metrics import map_rows
 from tkamb.run.read_scene import contact_side, mechanics_of
-from tkamb.run.rerun import RUN_AGAIN, case_of_results, same_files
 from tkamb.run.results import Results
 from tkamb.run.results_folder import SUMMARY_NAME, read_results
 from tkamb.run.simulation import simulate
-from tkamb.run.summary import scene_hash
 
 Progress = Callable[[Iterable[int]], Iterable[int]]
 

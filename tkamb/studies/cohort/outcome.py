@@ -12,8 +12,8 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.memory import give_back
 from tkamb.run.columns import KINDS
 from tkamb.run.metrics import lateral_axis_name, map_rows
+from tkamb.run.recorder import Shard
 from tkamb.run.results import Results
-from tkamb.run.shards import Shard
 from tkamb.run.simulation import simulate
 from tkamb.run.status import FAILED
 from tkamb.studies.cohort.plan import CohortRun, CohortWearTable

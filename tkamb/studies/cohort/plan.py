@@ -24,7 +24,7 @@ from tkamb.io.recordings.scene_table import Count, Number, SceneTable
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.toml_text import read_toml
 from tkamb.run.frame_choice import frames_slice
-from tkamb.run.summary import files_in
+from tkamb.run.identity import files_in
 
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])

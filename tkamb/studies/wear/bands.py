@@ -17,8 +17,8 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.guard import interrupt_as_such
+from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import STATISTICS_LIMITS
-from tkamb.run.shards import Shard, Shards
 from tkamb.run.workers import Numbered, PoolOptions, Task
 from tkamb.studies.uncertainty.bands import percentiles
 from tkamb.studies.uncertainty.inputs import Draw, VariedInput

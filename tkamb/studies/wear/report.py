@@ -15,7 +15,7 @@ from tkamb.files import replaced_together, write_rows, write_synced
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
 from tkamb.io.vtk import write_triangles
-from tkamb.run.shards import remove_shards
+from tkamb.run.results_folder import remove_shards
 from tkamb.studies.wear.bands import WearBands
 from tkamb.studies.wear.materials import WearMaterial
 from tkamb.studies.wear.setup import WearSetup

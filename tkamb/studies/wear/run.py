@@ -23,7 +23,9 @@ from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.plug_ins import foreign_code
 from tkamb.run.results import Results
-from tkamb.run.shards import UNREADABLE, Shards
+from tkamb.run.shards import UNREADABLE
+from tkamb.run.shards import Shards
+from tkamb.run.recorder import Shards
 from tkamb.run.workers import PoolOptions
 from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
 from tkamb.studies.wear.laws import WearLaw

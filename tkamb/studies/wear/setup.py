@@ -18,12 +18,11 @@ from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.io.scene.tables import ContactTable, WearTable
 from tkamb.io.scene.uncertainty import UncertaintyTable
+from tkamb.run.identity import files_hash, overrides_of_run, preset_of_run, scene_hash
 from tkamb.run.maps import ContactMaps
-from tkamb.run.rerun import overrides_of_run, preset_of_run
 from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
-from tkamb.run.summary import files_hash, scene_hash
 from tkamb.studies.uncertainty.inputs import uncertainty_of
 from tkamb.studies.wear.engine import ContactEngine
 from tkamb.studies.wear.motion import CycleMotion, check_closing, chosen_frames

@@ -1,27 +1,163 @@
-"""FEBio 4: one contact problem as an .feb file.
+"""Contact problems as input files of CalculiX and FEBio 4, in mm, N and MPa.
 
-The same hexahedra and rigid femoral patch as CalculiX's deck, in mm, N and MPa. The insert is
-FEBio's isotropic elastic (St. Venant-Kirchhoff) solid, in finite deformation: at small strain
-Hooke's law. Contact is sliding-elastic, frictionless, by augmented Lagrangian. The patch begins at
-first touch, where a load would meet no stiffness: it is lowered by the approach that tkamb found,
-and FEBio answers with the force.
+Both decks hold the insert's hexahedra and a rigid patch of the femoral component that moves along
+y only.
+
+CalculiX: contact is node to surface by penalty, so that a node has its pressure times its share of
+the deformed faces around it. The patch is a layer of wedges. It begins at a guessed depth in the
+insert, under the whole load, and CalculiX finds the equilibrium.
+
+FEBio: the insert is an isotropic elastic (St. Venant-Kirchhoff) solid in finite deformation, at
+small strain Hooke's law. Contact is sliding-elastic, frictionless, by augmented Lagrangian. The
+patch begins at first touch, where a load would meet no stiffness. It is lowered by the approach
+that tkamb found, and FEBio returns the force.
 
 Reference: FEBio User Manual 4.0, chapter 3, the input file format.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 import numpy as np
 
 from tkamb.contact.lattice.meshing.cells import FACES
 from tkamb.contact.lattice.meshing.grid import Lattice
-from tkamb.contact.materials import LinearElastic, Material
+from tkamb.contact.materials import LinearElastic, Material, RambergOsgood
+from tkamb.contact.pair import Bearing
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
-from tkamb.run.decks.problem import PressProblem
+from tkamb.geometry.surface import Surface
 from tkamb.units import MEGAPASCAL, MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.run.frame_press import PressProblem
+
+
+@dataclass(frozen=True)
+class CalculixDeckSettings:
+    """Numbers of a deck for CalculiX."""
+
+    penalty: float = 1e5
+    """N/mm³; contact stiffness. Chosen: at 30 MPa surfaces overlap by 0.3 µm."""
+
+
+CALCULIX_DECK = CalculixDeckSettings()
+
+PATCH_THICKNESS = np.array([0.0, 1e-3, 0.0])
+"""m: of the layer of wedges that stands for the rigid femoral component."""
+
+
+ELEMENT = "C3D8I"
+"""Fully integrated with incompatible modes: does not lock as nu nears 0.5 in bending."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deck:
+    """A contact problem for CalculiX.
+
+    Args:
+        lattice: nodes and hexahedra of the insert.
+        patch: the part of the femoral component that can touch, insert frame, where it begins.
+        material: of the insert.
+        bearing: how the bottom is held.
+        load: N, along -y.
+        element: "C3D8" (fully integrated, locks as nu nears 0.5), "C3D8I" (incompatible modes).
+        comments: lines for the reader of the deck.
+    """
+
+    lattice: Lattice
+    patch: Surface
+    material: Material
+    bearing: Bearing
+    load: float
+    element: str = ELEMENT
+    comments: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The input in mm, N and MPa.
+
+        Raises:
+            InputError: the material's law or the bearing is not one of CalculiX's here.
+        """
+        comments = [f"** {line}" for line in self.comments]
+        return "\n".join(
+            [*comments, *self._mesh(), *self._sets(), *self._solids(), *self._step(), ""]
+        )
+
+    @property
+    def _centre(self) -> int:
+        """Number of the node that moves the rigid patch."""
+        return len(self.lattice.nodes) + 2 * len(self.patch.vertices) + 1
+
+    def _mesh(self) -> list[str]:
+        lattice, patch, n = self.lattice, self.patch, len(self.lattice.nodes)
+        places = np.concatenate([lattice.nodes, patch.vertices, patch.vertices + PATCH_THICKNESS])
+        wedges = patch.faces[:, [0, 2, 1]] + n
+        wedges = np.concatenate([wedges, wedges + len(patch.vertices)], axis=1)
+        lines = ["*NODE, NSET=NALL"]
+        for number, (x, y, z) in enumerate(places / MILLIMETRE, 1):
+            lines.append(f"{number},{x:.9e},{y:.9e},{z:.9e}")
+        lines += [f"{self._centre},0.,30.,0.", f"{self._centre + 1},0.,30.,0."]
+        lines += [f"*ELEMENT, TYPE={self.element}, ELSET=INSERT", *_numbered(1, lattice.cells)]
+        lines.append("*ELEMENT, TYPE=C3D6, ELSET=FEMUR")
+        return lines + _numbered(len(lattice.cells) + 1, wedges)
+
+    def _sets(self) -> list[str]:
+        n, m = len(self.lattice.nodes), len(self.patch.vertices)
+        first = len(self.lattice.cells) + 1
+        lines = _set("NBOTTOM", self.lattice.bottom_nodes)
+        lines += _set("NREF", np.array([self._centre - 1])) + _set("NINSERT", np.arange(n))
+        lines += _set("NSLAVE", np.unique(self.lattice.contact_triangles))
+        lines += _set("NFEMUR", np.arange(n, n + 2 * m))
+        lines += ["*SURFACE, NAME=SLAVE, TYPE=NODE", "NSLAVE", "*SURFACE, NAME=MASTER"]
+        return lines + [f"{first + e},S1" for e in range(len(self.patch.faces))]
+
+    def _solids(self) -> list[str]:
+        return [
+            *("*MATERIAL, NAME=INSERT", *_law(self.material)),
+            *("*MATERIAL, NAME=STEEL", "*ELASTIC", "2.1E5,0.3"),
+            "*SOLID SECTION, ELSET=INSERT, MATERIAL=INSERT",
+            "*SOLID SECTION, ELSET=FEMUR, MATERIAL=STEEL",
+            f"*RIGID BODY, NSET=NFEMUR, REF NODE={self._centre}, ROT NODE={self._centre + 1}",
+            *("*SURFACE INTERACTION, NAME=SI", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"),
+            f"{CALCULIX_DECK.penalty},0.001",
+            "*CONTACT PAIR, INTERACTION=SI, TYPE=NODE TO SURFACE",
+            "SLAVE,MASTER",
+        ]
+
+    def _step(self) -> list[str]:
+        if self.bearing != "fixed":
+            raise InputError("can only fix the whole bottom of the insert", "CalculiX's deck")
+        centre, finite = self._centre, "" if self.material.is_linear else ", NLGEOM"
+        return [
+            *("*BOUNDARY", "NBOTTOM,1,3", f"{centre},1,1", f"{centre},3,3", f"{centre + 1},1,3"),
+            *("*STEP, INC=300" + finite, "*STATIC", "1.,1.,1e-7,1."),
+            *("*CLOAD", f"{centre},2,{-self.load}"),
+            *("*NODE PRINT, NSET=NREF, FREQUENCY=1000", "U"),
+            *("*NODE PRINT, NSET=NINSERT, FREQUENCY=1000", "U"),
+            *("*CONTACT PRINT, FREQUENCY=1000", "CSTR", "*END STEP"),
+        ]
+
+
+def _law(material: Material) -> list[str]:
+    modulus, ratio, law = material.young_modulus / MEGAPASCAL, material.poisson_ratio, material.law
+    if isinstance(law, RambergOsgood):
+        stress = law.reference_stress / MEGAPASCAL
+        return ["*DEFORMATION PLASTICITY", f"{modulus},{ratio},{stress},{law.exponent},{law.alpha}"]
+    if isinstance(law, LinearElastic):
+        return ["*ELASTIC", f"{modulus},{ratio}"]
+    raise InputError("has a law that CalculiX does not have", f"material '{material.name}'")
+
+
+def _numbered(first: int, members: Index) -> list[str]:
+    return [f"{i},{','.join(str(v + 1) for v in row)}" for i, row in enumerate(members, first)]
+
+
+def _set(name: str, nodes: Index) -> list[str]:
+    return [f"*NSET, NSET={name}", *(str(v + 1) for v in nodes)]
 
 
 @dataclass(frozen=True)
@@ -39,7 +175,7 @@ FIXED = ("Rx", "Rz", "Ru", "Rv", "Rw")
 """Freedoms that the femoral component does not have: it moves along y alone."""
 
 
-def febio_text(problem: PressProblem, approach: float, comments: Iterable[str] = ()) -> str:
+def febio_text(problem: "PressProblem", approach: float, comments: Iterable[str] = ()) -> str:
     """Return the .feb file of a press.
 
     Args:
@@ -122,7 +258,7 @@ def _materials(root: Element, material: Material) -> None:
     SubElement(femur, "center_of_mass").text = "0,0,0"
 
 
-def _mesh(root: Element, problem: PressProblem) -> None:
+def _mesh(root: Element, problem: "PressProblem") -> None:
     lattice, count = problem.lattice, len(problem.lattice.nodes)
     apart = problem.patch.vertices + np.array([0.0, problem.depth, 0.0])  # at first touch
     mesh = SubElement(root, "Mesh")

@@ -1,1 +1,0 @@
-"""One frame as a contact problem for other programs: CalculiX and FEBio."""

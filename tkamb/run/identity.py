@@ -1,0 +1,238 @@
+"""The identity of a run: hashes of its scene, its files and the code; and the run's case again.
+
+Two runs with the same identity compute the same numbers. The code of another package that computes
+contact or wear is part of the identity, since a changed default in it changes numbers.
+"""
+
+from importlib.metadata import entry_points
+import hashlib
+import json
+import os
+import shlex
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tkamb import __version__, code_identity
+from tkamb.errors import InputError
+from tkamb.files import named_files, sha256_of
+from tkamb.io.scene import Scene, load_scene
+from tkamb.io.scene.case import Case, load_case
+from tkamb.io.scene.scene import scene_files
+
+if TYPE_CHECKING:
+    from tkamb.run.results import Results
+
+
+GROUPS = {"tkamb.contact": "contact model", "tkamb.wear": "wear law"}
+"""Group of entry points -> what a plug-in of that group is."""
+
+
+CONTACT_CODE = "code of the contact model"
+"""Its name in a run's identity."""
+SUFFIXES = (".py", ".so", ".pyd")
+
+
+def contact_code(model: str) -> str | None:
+    """Return the SHA-256 of the package that offers a contact model; None for a built-in one.
+
+    Raises:
+        InputError: no such name, or it cannot be loaded.
+    """
+    from tkamb.contact.registry import BUILT_IN, contact_class  # only where contact is modelled
+
+    return None if model in BUILT_IN else package_code(contact_class(model).__module__)
+
+
+def foreign_code(thing: object) -> str | None:
+    """Return the SHA-256 of the package of an object's class; None for one of tkamb's."""
+    module = type(thing).__module__
+    return None if module.partition(".")[0] == "tkamb" else package_code(module)
+
+
+def package_code(module: str) -> str:
+    """Return the SHA-256 of the package of a module: its source, and what is compiled.
+
+    Args:
+        module: dotted name; a module without a package stands for its one file.
+
+    Raises:
+        ImportError: there is no such package.
+    """
+    spec = find_spec(module.partition(".")[0])
+    if spec is None:
+        raise ImportError(f"no package of module '{module}'")
+    digest = hashlib.sha256()
+    for root in spec.submodule_search_locations or ():
+        for path in sorted(_code_in(Path(root))):
+            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    if spec.submodule_search_locations is None and spec.origin is not None:
+        digest.update(Path(spec.origin).read_bytes())
+    return digest.hexdigest()
+
+
+def _code_in(folder: Path) -> Iterable[Path]:
+    return (path for path in folder.rglob("*") if path.suffix in SUFFIXES and path.is_file())
+
+
+def scene_hash(case: Case) -> str:
+    """Return the SHA-256 of the validated scene."""
+    return hashlib.sha256(case.scene.identity_json.encode()).hexdigest()
+
+
+def run_identity(case: Case, frames: range) -> dict[str, Any]:
+    """Return the identity of a run: hashes of scene, files and code, frames and version.
+
+    A contact model of another package adds that package's code.
+    """
+    identity = {
+        "scene": scene_hash(case),
+        "content of a file": files_hash(case),
+        "choice of frames": [frames.start, frames.stop, frames.step],
+        "version of tkamb": __version__,
+        "code of tkamb": code_identity(),
+    }
+    contact = case.scene.contact
+    foreign = None if contact is None else contact_code(contact.model)
+    return identity if foreign is None else identity | {CONTACT_CODE: foreign}
+
+
+def files_hash(case: Case) -> str:
+    """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
+    digest = hashlib.sha256()
+    for path in _files_read(case):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
+    """Return path -> SHA-256 of the scene file, if there is one, its base and what it has read."""
+    paths = [*([] if scene is None else scene_files(scene.absolute())), *_files_read(case)]
+    return {str(path): sha256_of(path) for path in paths}
+
+
+def _files_read(case: Case) -> list[Path]:
+    unread = {"output"} | ({"implant"} if case.femoral is None else set())
+    named = files_in(case.scene.model_dump(exclude=unread))
+    models = [path for path in named if path.suffix.lower() == ".osim"]
+    return [*named, *(other for path in models for other in named_files(path))]
+
+
+def files_in(value: Any) -> list[Path]:
+    """Return the paths of files that are there, in nested dictionaries and lists."""
+    if isinstance(value, Path):
+        return [value] if value.is_file() else []
+    if isinstance(value, dict):
+        value = list(value.values())
+    return [p for item in value for p in files_in(item)] if isinstance(value, list | tuple) else []
+
+
+RUN_AGAIN = "run it again: tkamb run"
+
+
+def case_of_results(results: "Results") -> Case:
+    """Return the case of results, whose summary names the scene.
+
+    Raises:
+        InputError: the scene is not there, or no longer what was run.
+    """
+    summary = results.summary
+    case, scene = load_case(_scene_of(summary)), summary.get("scene")
+    if scene_hash(case) != summary.get("scene_sha256"):
+        has_overrides = "overrides" in summary
+        what = "has changed since these results were computed"
+        what += "" if has_overrides else ", or was run with --set"
+        raise InputError(what, scene, run_again(summary))
+    if not same_files(case, summary):
+        what = "a mesh or table that it names has changed since these results were computed"
+        raise InputError(what, scene, run_again(summary))
+    return case
+
+
+def overrides_of_run(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return dotted key -> value that the run's scene had in the place of its file's."""
+    return dict(summary.get("overrides") or {})
+
+
+def preset_of_run(summary: Mapping[str, Any]) -> str | None:
+    """Return the name of the preset that was laid over the run's scene, if any."""
+    preset = summary.get("preset") or {}
+    return preset.get("name")
+
+
+def run_again(summary: Mapping[str, Any]) -> str:
+    """Return the command that computes results like these, for a shell."""
+    options = (f"{key}={json.dumps(value)}" for key, value in overrides_of_run(summary).items())
+    preset = preset_of_run(summary)
+    study = [] if preset is None else [f"--as {shlex.quote(preset)}"]
+    changed = (f"--set {shlex.quote(one)}" for one in options)
+    return " ".join([RUN_AGAIN, str(summary["scene"]), *study, *changed])
+
+
+def same_files(case: Case, summary: Mapping[str, Any]) -> bool:
+    """Say whether meshes and tables hold what the run read; a run without a record counts."""
+    result = (summary.get("identity") or {}).get("content of a file")
+    return result is None or result == files_hash(case)
+
+
+def _scene_of(summary: Mapping[str, Any]) -> Scene:
+    """Return the scene of results, with the contact model they were run with."""
+    name = summary.get("scene")
+    if not name:
+        raise InputError("names no scene file", "summary", "give the scene itself to tkamb view")
+    path = Path(name)
+    if not os.path.exists(path):
+        what = "the scene of these results is not there"
+        raise InputError(what, path, "put it back, or run it again")
+    contact = summary.get("contact") or {}
+    used = {f"contact.{key}": value for key, value in contact.items() if value is not None}
+    return load_scene(path, overrides_of_run(summary) | used, preset_of_run(summary))
+
+
+def raised_in(error: BaseException) -> str | None:
+    """Return the plug-in that raised an error, with the line of its code; None: no plug-in did.
+
+    The deepest call of the traceback decides that is of tkamb or of a plug-in: a plug-in may have
+    raised the error by way of NumPy, say.
+    """
+    plug_ins = {
+        point.value.partition(":")[0].partition(".")[0]: f"{kind} '{point.name}'"
+        for group, kind in GROUPS.items()
+        for point in entry_points(group=group)
+    }
+    result, trace = None, error.__traceback__
+    while trace is not None:
+        package = str(trace.tb_frame.f_globals.get("__name__")).partition(".")[0]
+        if package == "tkamb":
+            result = None
+        elif package in plug_ins:
+            file = Path(trace.tb_frame.f_code.co_filename).name
+            result = f"{plug_ins[package]} ({package}, {file}, line {trace.tb_lineno})"
+        trace = trace.tb_next
+    return result
+
+
+def package_code(module: str) -> str:
+    """Return the SHA-256 of the package of a module: its source, and what is compiled.
+
+    Args:
+        module: dotted name; a module without a package stands for its one file.
+
+    Raises:
+        ImportError: there is no such package.
+    """
+    spec = find_spec(module.partition(".")[0])
+    if spec is None:
+        raise ImportError(f"no package of module '{module}'")
+    digest = hashlib.sha256()
+    for root in spec.submodule_search_locations or ():
+        for path in sorted(_code_in(Path(root))):
+            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    if spec.submodule_search_locations is None and spec.origin is not None:
+        digest.update(Path(spec.origin).read_bytes())
+    return digest.hexdigest()
+
+
+def _code_in(folder: Path) -> Iterable[Path]:
+    return (path for path in folder.rglob("*") if path.suffix in SUFFIXES and path.is_file())
