@@ -12,20 +12,9 @@ from scenes import MODEL
 from tkamb.cli import main
 from tkamb.commands.check import check_html
 from tkamb.io.starter import lay_out
-from tkamb.run.muscles import static_optimisation
-from tkamb.show.leg_picture import draw_leg
-from tkamb.show.leg_picture import leg_frame
-from tkamb.show.leg_picture import shown_frames
-from tkamb.show.scene_check import _listed
-from tkamb.show.scene_check import _missing
-from tkamb.show.scene_check import check_scene
 from tkamb.run.muscles import sharing as static_optimisation
-from tkamb.show.check.inventory import _listed
-from tkamb.show.check.leg_picture import draw_leg
-from tkamb.show.check.leg_picture import leg_frame
-from tkamb.show.check.leg_picture import shown_frames
-from tkamb.show.check.scene_check import _missing
-from tkamb.show.check.scene_check import check_scene
+from tkamb.show.leg_picture import draw_leg, leg_frame, shown_frames
+from tkamb.show.scene_check import _listed, _missing, check_scene
 
 
 @pytest.fixture(scope="module")

@@ -16,25 +16,11 @@ from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.run.decks.calculix import Deck
-from tkamb.run.decks.problem import press_problem
-from tkamb.studies import calculix as peer
-from tkamb.studies.calculix import PeerRun
-from tkamb.studies.calculix import measure_by_calculix
-from tkamb.studies.calculix import press_by_calculix
-from tkamb.studies.calculix import run_calculix
-from tkamb.studies.cases import balls
-from tkamb.studies.cases import block
-from tkamb.studies.cases import dishes
-from tkamb.studies.cases import study_case
 from tkamb.run.decks import Deck
 from tkamb.run.frame_press import press_problem
-from tkamb.studies import peer
-from tkamb.studies.bodies import balls
-from tkamb.studies.bodies import block
-from tkamb.studies.bodies import dishes
-from tkamb.studies.peer import measure_by_calculix
-from tkamb.studies.peer import press_by_calculix
+from tkamb.studies import calculix as peer
+from tkamb.studies.calculix import PeerRun, measure_by_calculix, press_by_calculix, run_calculix
+from tkamb.studies.cases import balls, block, dishes, study_case
 from tkamb.studies.references import read_references
 from tkamb.studies.tradeoff import run_peer
 

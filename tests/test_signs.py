@@ -16,12 +16,8 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.ligaments import check_collateral_sides
 from tkamb.run.plausibility.ground import direction_questions, foot_questions, load_questions
-from tkamb.run.plausibility.movement import motion_questions
-from tkamb.run.plausibility.movement import sample_questions
-from tkamb.run.plausibility.signs import sign_questions
+from tkamb.run.plausibility.movement import motion_questions, sample_questions, sign_questions
 from tkamb.show.scene_check import check_scene
-from tkamb.run.plausibility.movement import sign_questions
-from tkamb.show.check.scene_check import check_scene
 
 needs_dm = pytest.mark.skipif(not DATA.is_dir(), reason="subject DM's files are not there")
 

@@ -36,10 +36,8 @@ def add_check(commands: Any) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     from tkamb.io.claim import check_output_file
-    from tkamb.run.stages import Stages
-    from tkamb.show.scene_check import check_scene
     from tkamb.run.timing import Stages
-    from tkamb.show.check.scene_check import check_scene
+    from tkamb.show.scene_check import check_scene
 
     if options.out and options.out.suffix.lower() not in PICTURES:
         hint = f"name it like check{PICTURES[0]}"

@@ -4,12 +4,12 @@ Two runs with the same identity compute the same numbers. The code of another pa
 contact or wear is part of the identity, since a changed default in it changes numbers.
 """
 
-from importlib.metadata import entry_points
 import hashlib
 import json
 import os
 import shlex
 from collections.abc import Iterable, Mapping
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -211,28 +211,3 @@ def raised_in(error: BaseException) -> str | None:
             result = f"{plug_ins[package]} ({package}, {file}, line {trace.tb_lineno})"
         trace = trace.tb_next
     return result
-
-
-def package_code(module: str) -> str:
-    """Return the SHA-256 of the package of a module: its source, and what is compiled.
-
-    Args:
-        module: dotted name; a module without a package stands for its one file.
-
-    Raises:
-        ImportError: there is no such package.
-    """
-    spec = find_spec(module.partition(".")[0])
-    if spec is None:
-        raise ImportError(f"no package of module '{module}'")
-    digest = hashlib.sha256()
-    for root in spec.submodule_search_locations or ():
-        for path in sorted(_code_in(Path(root))):
-            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    if spec.submodule_search_locations is None and spec.origin is not None:
-        digest.update(Path(spec.origin).read_bytes())
-    return digest.hexdigest()
-
-
-def _code_in(folder: Path) -> Iterable[Path]:
-    return (path for path in folder.rglob("*") if path.suffix in SUFFIXES and path.is_file())

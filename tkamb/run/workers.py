@@ -160,11 +160,11 @@ def answer(packed: bytes, number: int, job: Any) -> Any:
         job: its content.
     """
     with _one_at_a_time:
-        return _prepared(packed)(number, job)
+        return _unpacked(packed)(number, job)
 
 
 @lru_cache(maxsize=1)
-def _prepared(packed: bytes) -> Callable[[int, Any], Any]:
+def _unpacked(packed: bytes) -> Callable[[int, Any], Any]:
     make, arguments = pickle.loads(packed)
     prepared: Callable[[int, Any], Any] = make(*arguments)
     return prepared

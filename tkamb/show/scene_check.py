@@ -347,7 +347,7 @@ def _missing(case: Case) -> tuple[str, ...]:
     """Return the packages that a run of the case needs and that are not installed."""
     if not case.scene.muscles:
         return ()
-    from tkamb.run.muscles.static_optimisation import solver_is_installed, solver_missing
+    from tkamb.run.muscles.sharing import solver_is_installed, solver_missing
 
     return () if solver_is_installed() else (str(solver_missing()),)
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from tkamb.geometry.frames import Mask
 from tkamb.run import metrics
-from tkamb.run.agreement import AGREEMENT
 from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.run.status import AGREEMENT
 from tkamb.show.headline import PRESSURE_AND_AREA
 
 if TYPE_CHECKING:

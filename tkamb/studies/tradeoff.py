@@ -17,12 +17,9 @@ import numpy as np
 
 from tkamb.contact.registry import contact_names
 from tkamb.errors import InputError
-from tkamb.run.decks.calculix import ELEMENT
-from tkamb.run.plug_ins import contact_code
-from tkamb.studies.calculix import find_program
-from tkamb.studies.calculix import measure_by_calculix
 from tkamb.run.decks import ELEMENT
 from tkamb.run.identity import contact_code
+from tkamb.studies.calculix import find_program, measure_by_calculix
 from tkamb.studies.cases import StudyCase, case_names, study_case
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.measures import Job, Measure, errors, map_error, measure_apart, raster_of

@@ -20,18 +20,8 @@ from tkamb.knee.crossing import (
     flexion_row,
     yielding_flexion_row,
 )
-from tkamb.knee.equations import KneeGeometry
-from tkamb.knee.equations import SolvedLoads
-from tkamb.knee.equations import solve_knee
-from tkamb.knee.equations import unsolved
-from tkamb.run.muscles.knee_trial import KneeTrial
-from tkamb.run.muscles.recording import LegRecording
-from tkamb.run.muscles.recording import group_names
-from tkamb.run.muscles.recording import load_knee_trial
-from tkamb.knee.equations import KneeLoads
-from tkamb.run.muscles.knee_trial import LegRecording
-from tkamb.run.muscles.knee_trial import group_names
-from tkamb.run.muscles.knee_trial import load_knee_trial
+from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
+from tkamb.run.muscles.knee_trial import KneeTrial, LegRecording, group_names, load_knee_trial
 from tkamb.run.muscles.sharing import EmgGuide, Sharing
 from tkamb.units import MILLIMETRE
 

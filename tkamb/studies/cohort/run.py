@@ -22,14 +22,9 @@ from tkamb.files import replaced_together, sha256_of, write_rows, write_synced
 from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.run.columns import ordered_names
 from tkamb.run.guard import interrupt_as_such
-from tkamb.run.pages import page
-from tkamb.run.plug_ins import CONTACT_CODE
-from tkamb.run.plug_ins import contact_code
-from tkamb.run.shards import Shards
-from tkamb.run.shards import remove_shards
-from tkamb.run.identity import CONTACT_CODE
-from tkamb.run.identity import contact_code
+from tkamb.run.identity import CONTACT_CODE, contact_code
 from tkamb.run.recorder import Shards
+from tkamb.run.results import page
 from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.cohort.outcome import CohortWorker, Outcome

@@ -25,13 +25,13 @@ from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recorded import predicted_columns
 from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import STATISTICS_LIMITS, Results
-from tkamb.run.results_folder import BANDS_NAME
-from tkamb.run.results_folder import INDICES_NAME
-from tkamb.run.results_folder import SAMPLES_NAME
-from tkamb.run.results_folder import TORNADO_NAME
-from tkamb.run.results_folder import write_results
-from tkamb.run.shards import Shard
-from tkamb.run.shards import Shards
+from tkamb.run.results_folder import (
+    BANDS_NAME,
+    INDICES_NAME,
+    SAMPLES_NAME,
+    TORNADO_NAME,
+    write_results,
+)
 from tkamb.run.simulation import chosen_frames, simulate
 from tkamb.run.workers import PoolOptions, Progress, Task, WorkerPool
 from tkamb.studies.uncertainty.bands import (

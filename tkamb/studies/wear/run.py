@@ -21,11 +21,9 @@ from tkamb.files import FILE_LIMITS, read_bytes, replaced_file
 from tkamb.io.scene import Scene
 from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
-from tkamb.run.plug_ins import foreign_code
+from tkamb.run.identity import foreign_code
+from tkamb.run.recorder import UNREADABLE, Shards
 from tkamb.run.results import Results
-from tkamb.run.shards import UNREADABLE
-from tkamb.run.shards import Shards
-from tkamb.run.recorder import Shards
 from tkamb.run.workers import PoolOptions
 from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
 from tkamb.studies.wear.laws import WearLaw
