@@ -17,7 +17,7 @@ from tkamb.io.recordings.vtp import read_vtp, read_vtp_values
 from tkamb.io.vtk import write_triangles
 from tkamb.run.results_folder import read_results
 from tkamb.show.report import report_html
-from tkamb.show.sections import OTHER, wear_section
+from tkamb.show.sections import OTHER_WEAR, wear_section
 from tkamb.show.view.drawing import INSERT, rgb, wear_colours, wear_scale
 from tkamb.show.view.payload import pack
 from tkamb.show.view.run import open_run
@@ -126,7 +126,7 @@ def test_wear_of_another_scene_is_not_shown_and_that_is_said(worn):
     others = [WEAR | {"scene_sha256": [s], "files_sha256": f} for s, f in OTHERS]
     for content in (WEAR, *others, []):
         (folder / "wear.json").write_text(json.dumps(content), encoding="utf-8")
-        assert wear_section(worn) == {"other": OTHER}
+        assert wear_section(worn) == {"other": OTHER_WEAR}
         assert worn_insert(worn, "right") == ()
     (folder / "wear.json").write_text("{", encoding="utf-8")
     with pytest.raises(InputError, match=r"wear\.json"):
@@ -141,7 +141,7 @@ def test_wear_of_other_frames_of_the_run_is_not_shown(worn):
     content = json.loads(path.read_text(encoding="utf-8"))
     for frames, there in (([0, 101, 1], True), ([20, 101, 40], False), (None, True)):
         path.write_text(json.dumps(content | {"run_frames": frames}), encoding="utf-8")
-        assert (wear_section(worn) != {"other": OTHER}) == there
+        assert (wear_section(worn) != {"other": OTHER_WEAR}) == there
         assert bool(worn_insert(worn, "right")) == there
 
 
@@ -200,4 +200,4 @@ def test_a_damaged_wear_json_is_one_line(worn, damage):
 def test_wear_that_names_no_scene_is_not_shown(worn):
     path = worn.directory / "wear.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"scene_sha256": 5}))
-    assert wear_section(worn) == {"other": OTHER}
+    assert wear_section(worn) == {"other": OTHER_WEAR}
