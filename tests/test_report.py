@@ -211,7 +211,7 @@ def test_the_post_s_force_and_pressure_are_told_beside_the_condyles(bend):
         return card.value, card.detail
 
     assert title not in {card.title for card in cards(bend, axis)}
-    assert told() == ("none", "cam and post stay apart")
+    assert told() == ("none", "cam and post are not in contact")
     force[80], pressure[80] = 0.5 * metrics.body_weight(bend), 32.9
     value, detail = told()
     assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9\u00a0MPa" in detail
