@@ -4,9 +4,11 @@ import gzip
 import json
 import shutil
 import struct
+import time
 import urllib.error
 import urllib.request
 from dataclasses import asdict, replace
+from threading import Event
 
 import numpy as np
 import pytest
@@ -18,8 +20,8 @@ from scenes import MODEL, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError, TkambError
 from tkamb.io.scene.case import load_case
-from tkamb.show.view.bench import BenchRequest, Placement
-from tkamb.show.view.live import LiveKnee
+from tkamb.show.view.bench import BENCH_LIMIT, BenchRequest, Placement
+from tkamb.show.view.live import LiveKnee, setting
 from tkamb.show.view.live_window import LiveWindow, bench_of_knee
 from tkamb.show.view.show import serve_in_background
 from tkamb.studies.designs.design import DESIGN_FILE, FEMORAL_MESH, INSERT_MESH, load_design
@@ -304,6 +306,41 @@ def test_what_nobody_foresaw_of_a_preparation_is_said_to_the_page(knee, monkeypa
     request = replace(states(knee)["pressed"], resolution_mm=7.0)
     with pytest.raises(TkambError, match="not foreseen: ZeroDivisionError"):
         list(iter(lambda: knee.preparing(request), ""))
+
+
+def test_only_few_models_are_prepared_at_a_time_and_the_oldest_are_dropped(monkeypatch):
+    """A setting that the page has left before a thread was free is never prepared."""
+    own = LiveKnee(load_case(tkamb.load_scene(MODEL / "scene.toml")))
+    go_on, begun = Event(), []
+
+    def slow(request):
+        begun.append(request.resolution_mm)
+        assert go_on.wait(60.0)
+        own._sides[setting(request)] = None
+        with own._counting:
+            own._forget()
+
+    monkeypatch.setattr(own, "_side", slow)
+    requests = [replace(own.recorded(60), resolution_mm=1.0 + 0.1 * k) for k in range(12)]
+    for request in requests:
+        assert own.preparing(request)
+    assert len(own._threads) == BENCH_LIMIT.most_threads == len(begun)
+    assert "then" in own.preparing(requests[-1])
+    go_on.set()
+    for request in requests[2:]:
+        while own.preparing(request):
+            time.sleep(0.005)
+    assert not own._threads
+    assert [*own._sides] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
+
+
+def test_an_insert_is_dropped_with_the_last_model_that_needs_it(knee):
+    own = LiveKnee(knee.case)
+    own._cases = dict.fromkeys((8.0, 9.0))
+    own._known = dict.fromkeys((8.0, 9.0))
+    own._sides = {("foundation", 2.0, 9.0): None}
+    own._forget()
+    assert [*own._cases] == [*own._known] == [9.0]
 
 
 def test_a_scene_without_contact_is_refused(tmp_path, capfd):

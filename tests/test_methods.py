@@ -3,6 +3,7 @@
 import json
 
 import pytest
+import trimesh
 
 import tkamb
 from scenes import MODEL
@@ -39,6 +40,21 @@ def test_the_paragraph_needs_only_the_folder(run, capsys):
     ):
         assert words in text
     assert f"tkamb {tkamb.__version__}" in text
+
+
+def test_the_paragraph_has_thickness_meshes_tolerance_and_rate(run):
+    """The numbers are those of the files: insert.stl, and motion.csv with 101 rows in 4 s."""
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    text = " ".join(methods(summary).sentences)
+    assert "recorded at 25 Hz" in text
+    insert = trimesh.load_mesh(MODEL / "insert.stl")
+    assert f"{len(insert.faces)} triangles for the insert" in text
+    low, high = summary["measures"]["insert_thickness_mm"]
+    assert 0.3 * insert.extents.min() < low <= high < insert.extents.min()
+    assert "mm thick" in text
+    assert "relative tolerance of 1e-06" in text
+    del summary["measures"]
+    assert "triangles for" not in " ".join(methods(summary).sentences)
 
 
 @pytest.mark.parametrize(

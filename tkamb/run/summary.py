@@ -98,6 +98,7 @@ def summary_of(
         summary["reserves"] = reserves(columns)
         summary["saturated_muscles"] = saturated_muscles(columns)
     summary["peaks_BW"] = peaks(columns, case.body_weight)
+    summary["measures"] = measures(case, columns)
     if scene.contact or scene.muscles:
         summary["discrepancy"] = discrepancy_summary(summary)
     if case.measured is not None or case.emg is not None:
@@ -123,6 +124,65 @@ def summary_of(
         start = time[0] - percent[0] * slope
         summary["cycle_percent_s"] = [start, start + 100.0 * slope]
     return summary | _gait(case)
+
+
+def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
+    """Return numbers that a Methods section needs and that no table of the scene holds.
+
+    They are the sampling rate of the recorded motion, the triangles of each mesh with the median of
+    their longest edges, the least and largest thickness of the insert below the centres of pressure
+    of the frames, and the tolerances of the contact solver. A number that is not known is left out.
+    """
+    time = case.motion.time
+    result: dict[str, Any] = {}
+    if len(time) > 1:
+        result["recording_rate_Hz"] = (len(time) - 1) / float(time[-1] - time[0])
+    surfaces = {"femoral": case.femoral, "insert": case.insert, "patella": case.patella}
+    result["meshes"] = {
+        name: {
+            "triangles": len(surface.faces),
+            "edge_mm": float(np.median(surface.longest_edges)) / MILLIMETRE,
+        }
+        for name, surface in surfaces.items()
+        if surface is not None
+    }
+    if case.scene.contact is not None:
+        result |= _thickness(case, columns) | {"tolerances": _tolerances(case.scene.contact)}
+    return result
+
+
+def _thickness(case: Case, columns: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Return the range of the insert's thickness below the centres of pressure, mm."""
+    assert case.insert is not None
+    sides = [
+        np.stack([columns[f"{side}_cop_ap_mm"], columns[f"{side}_cop_ml_mm"]], axis=1)
+        for side in ("medial", "lateral")
+    ]
+    places = np.concatenate(sides).astype(float) * MILLIMETRE
+    places = places[np.isfinite(places).all(axis=1)]
+    high = 2.0 * float(case.insert.bounds[1, 1]) + MILLIMETRE
+    start = np.column_stack([places[:, 0], np.full(len(places), high), places[:, 1]])
+    down = case.insert.rays.first(start, np.array([0.0, -1.0, 0.0]))[0]
+    thickness = high - down[np.isfinite(down)]  # the bottom lies at y = 0 of the insert frame
+    if not len(thickness):
+        return {}
+    return {"insert_thickness_mm": [float(f(thickness)) / MILLIMETRE for f in (np.min, np.max)]}
+
+
+def _tolerances(table: ContactTable) -> dict[str, float]:
+    """Return the relative tolerances of a contact model's solver, as far as they are known."""
+    from tkamb.contact.lattice.settings import LatticeSolverSettings
+    from tkamb.contact.pressing import PRESS
+    from tkamb.contact.registry import contact_model
+
+    settings = getattr(
+        contact_model(table.model, table.resolution_mm, **table.options), "settings", None
+    )
+    if table.model.startswith("foundation"):
+        return {"load": PRESS.load_tolerance}
+    if table.model == "lattice-source" or not isinstance(settings, LatticeSolverSettings):
+        return {}
+    return {"force": settings.force_tolerance, "gap": settings.gap_tolerance}
 
 
 def _gait(case: Case) -> dict[str, Any]:

@@ -211,6 +211,12 @@ SUMMARY = optional(
         "questions": TEXTS,
         "scene_tables": TABLES,
         "changed_settings": {ANY_KEY: "any"},
+        "measures": {
+            "recording_rate_Hz?": "number",
+            "meshes": {ANY_KEY: {"triangles": "count", "edge_mm": "number"}},
+            "insert_thickness_mm?": ["number", "number"],
+            "tolerances?": {ANY_KEY: "number"},
+        },
         "ligament_strain": {"flexion_deg": ["number"], "strain": {ANY_KEY: [KNOWN]}},
         "first_wrapping_flexion_deg": "number",
         "muscle_groups": {ANY_KEY: TEXTS},

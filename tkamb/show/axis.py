@@ -24,7 +24,7 @@ class HorizontalAxis:
     Args:
         kind: "flexion", "cycle" or "time".
         values: (f,) deg, per cent or s.
-        stances: begin and end of each stance on the axis; empty on an axis of flexion.
+        stances: begin and end of each stance on the axis; empty if the axis is flexion.
     """
 
     kind: str

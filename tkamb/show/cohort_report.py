@@ -245,8 +245,8 @@ def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figur
 
     Args:
         groups: the legend's name -> group.
-        name: of the column.
-        highest: of all plots beside each other, so that they have one scale.
+        name: name of the column.
+        highest: top of the vertical axis, shared by plots beside each other, unit of the column.
     """
     with settings():
         figure = new_figure(5.4, 3.1)

@@ -137,7 +137,7 @@ class Run:
 
     Args:
         label: short and unlike the others'.
-        folder: where it was read from.
+        folder: folder of the results.
         results: what it holds.
         axis: on which it is drawn.
         pairing: the places of the first run's frames in it; None: they are not unique.
@@ -158,11 +158,12 @@ class Difference:
         run: label of the run.
         column: name, with its unit.
         max_abs: largest absolute difference.
-        percent: that, of the first run's largest absolute value; NaN where it is zero.
-        at_frame: of the first run, where it is.
+        percent: largest difference, % of the largest absolute value of the first run; NaN if that
+            value is zero.
+        at_frame: frame of the first run with the largest difference.
         at: the place of that frame, deg, per cent or s.
         rms: root mean square of the differences.
-        mean: of the differences, signed.
+        mean: mean of the signed differences.
         frames: how many were compared.
     """
 
@@ -183,9 +184,9 @@ class Comparison:
 
     Args:
         runs: at least two.
-        kind: of the axis: "flexion", "cycle" or "time".
+        kind: kind of the axis: "flexion", "cycle" or "time".
         notes: differences of the runs' settings, and what could not be compared, a sentence each.
-        differences: of every run but the first, column by column.
+        differences: one per column of each run after the first.
     """
 
     runs: tuple[Run, ...]
@@ -355,20 +356,16 @@ def _frames_note(first: Run, run: Run) -> list[str]:
     if run.pairing is None:
         return [
             *notes,
-            f"{run.label}: not compared with {first.label}: its frames are others, and the "
-            f"{run.axis.kind} does not rise or fall throughout, so that places on the axis are not "
-            "unique; try --axis time or cycle.",
+            f"{run.label}: not compared with {first.label}, because it has other frames and its "
+            f"{run.axis.kind} does not rise or fall throughout. Try --axis time or cycle.",
         ]
     without = int((run.pairing.lower < 0).sum())
     if without:
-        notes.append(
-            f"{run.label}: {without} frames of {first.label} have no matching frame in it."
-        )
+        notes.append(f"{run.label}: {without} frames of {first.label} have no matching frame here.")
     if not run.pairing.exact:
         notes.append(
-            f"{run.label}: its frames differ from those of {first.label}; it is interpolated "
-            f"between "
-            "neighbouring frames."
+            f"{run.label}: its frames differ from the frames of {first.label}. Its values are "
+            "interpolated between neighbouring frames."
         )
     return notes
 

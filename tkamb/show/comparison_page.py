@@ -48,9 +48,9 @@ class Quantity:
     """Quantity of one picture.
 
     Args:
-        title: what it is.
-        unit: of the values.
-        values: (f,) of a run.
+        title: name of the quantity.
+        unit: unit of the values.
+        values: function of the results of a run that returns (f,) values.
     """
 
     title: str

@@ -42,9 +42,10 @@ class HeadlineSettings:
 HEADLINE = HeadlineSettings()
 
 OTHER_ERRORS = (
-    "; that is the error of the contact model alone; load, pose, shape and material add their own"
+    "; this is the error of the contact model alone: errors of load, pose, shape and material add "
+    "to it"
 )
-"""Added to a known error, which is not the error of the result."""
+"""Text after a known error, which is less than the error of the result."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -53,10 +54,10 @@ class Card:
     """One headline number.
 
     Args:
-        title: what it is.
+        title: name of the number.
         value: the number with its unit.
-        detail: where it occurs and what it means.
-        warning: whether it is highlighted as a warning.
+        detail: place in the motion, and meaning of the number.
+        warning: True: the card is highlighted as a warning.
     """
 
     title: str
@@ -119,7 +120,7 @@ def peak_words(peak: Mapping[str, Any]) -> str:
     """Return a peak force with its bands in words, body weights.
 
     Args:
-        peak: of the summary's `peaks_BW` or of its uncertainty's, which has bands.
+        peak: one entry of `peaks_BW` of the summary, or of its uncertainty, which has bands.
     """
     if peak.get("p05") is None:
         return f"{peak['nominal']:.2f}"
@@ -130,13 +131,13 @@ def peak_words(peak: Mapping[str, Any]) -> str:
 
 
 def peaks_of(summary: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return force -> its peak, with bands where inputs were varied."""
+    """Return name of a force -> its peak, with bands if inputs were varied."""
     varied = (summary.get("uncertainty") or {}).get("peaks_BW")
     return varied or summary.get("peaks_BW") or {}
 
 
 def peak_legend(peaks: Mapping[str, Any]) -> str:
-    """Return in words the meaning of the brackets of `peak_words`."""
+    """Return the meaning of the brackets in `peak_words`."""
     if not any(one.get("p05") is not None for one in peaks.values()):
         return "with the inputs as given; `tkamb uncertainty` computes their uncertainty"
     words = "median of the samples (5 to 95 % by the inputs"
@@ -157,13 +158,15 @@ def _peaks(results: "Results") -> Card | None:
         bands += [f"{name} {band.removesuffix(')').replace('; ', ' and ')}"] if band else []
     value = ", ".join(values) + " BW"
     detail = peak_legend(peaks) + (": " + ", ".join(bands) if bands else "")
-    detail += "; each at its own frame of the largest value"
-    detail += "; total along the insert's axis, as an instrumented tray measures it"
+    detail += "; each force at the frame of its own maximum"
+    detail += (
+        "; the total is the component along the insert's axis, as an instrumented tray measures it"
+    )
     return Card("Peak total, medial and lateral force", value, detail)
 
 
 def _discrepancy(results: "Results") -> Card | None:
-    """Return the method's error in measured knees, if this knee was not measured."""
+    """Return the error of the method in measured knees; None if this knee was measured."""
     words = (results.summary.get("discrepancy") or {}).get("words")
     if not words or results.summary.get("measured"):
         return None
@@ -172,7 +175,7 @@ def _discrepancy(results: "Results") -> Card | None:
 
 
 def muscle_limits(results: "Results") -> Card | None:
-    """Return what the hip's reserves carry, and which muscles pull as hard as they can."""
+    """Return the card of the hip's reserve moments and of the saturated muscles."""
     reserves = results.summary.get("reserves") or {}
     saturated = results.summary.get("saturated_muscles") or {}
     if not reserves:
@@ -288,7 +291,7 @@ def _shares(results: "Results") -> Card | None:
     apart = int((metrics.shares_apart(results) > AGREEMENT.share_difference).sum())
     rest += [f"both estimates disagree in {apart} frame{'s' * (apart > 1)}"] if apart else []
     rest += _adduction(results, unknown)
-    detail = "; ".join([f"by {first}, the rest lateral", *rest])
+    detail = "; ".join([f"by {first}, the remainder is lateral", *rest])
     return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))
 
 
@@ -325,7 +328,7 @@ def _above_yield(results: "Results", first: str) -> str:
     """Return how much of each condyle's area exceeds the yield stress, in words.
 
     Args:
-        results: of a run.
+        results: results of a run.
         first: side that is named first, the one whose pressure stands beside it.
     """
     stress = results.summary.get("yield_stress_MPa")
@@ -348,7 +351,7 @@ def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
     if result is None:
         return None
     if result.value <= 0:
-        return Card("Peak force on the post", "none", "cam and post stay apart")
+        return Card("Peak force on the post", "none", "cam and post are not in contact")
     pressure = metrics.peak(results, "post_peak_pressure_MPa")
     detail = f"{result.value:.0f} N {_where(results, axis, result.frame)}"
     if pressure is not None:
@@ -369,22 +372,21 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
     value = result.value / metrics.body_weight(results)
     ligament = _range(metrics.tension_ratio(results, "patellar_ligament_N"), "", 2)
     patella = _range(metrics.tension_ratio(results, "patellofemoral_N"), "", 2)
-    detail = (
-        f"{_where(results, axis, result.frame)}; over the quadriceps: patellar ligament (PL/Q) "
-    )
-    detail += f"{ligament}, patellofemoral force (PF/Q) {patella}"
+    detail = f"{_where(results, axis, result.frame)}; ratios to the quadriceps: patellar ligament "
+    detail += f"(PL/Q) {ligament}, patellofemoral force (PF/Q) {patella}"
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
         detail += (
-            "; it does not wrap the femur"
+            "; the quadriceps does not wrap the femur"
             if first is None
-            else f"; it {_wraps_from(results, first)}"
+            else f"; the quadriceps {_wraps_from(results, first)}"
         )
     slope = results.columns.get("quadriceps_per_dome_mm_N")
     if slope is not None and np.isfinite(slope[result.frame]) and result.value > 0:
         percent = 100 * abs(slope[result.frame]) / result.value
         detail += (
-            f"; changes by {percent:.1f} % if the button sits 1 mm higher or lower on the patella"
+            f"; the tension changes by {percent:.1f} % if the button sits 1 mm higher or lower "
+            "on the patella"
         )
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 
@@ -406,7 +408,9 @@ def _residuals(results: "Results") -> Card | None:
     if {"ap", "ml", "axial_rotation"} <= set(released) and np.nanmax(
         share
     ) < HEADLINE.residual_percent:
-        at_rest = "AP, ML and axial rotation are released: what they need is part of the solution"
+        at_rest = (
+            "AP, ML and axial rotation are released: equilibrium holds along these coordinates"
+        )
         return Card("Residual force", "none", at_rest)
     middle = f"{np.nanmedian(share):.1f} %"
     detail = f"median over the frames, at most {np.nanmax(share):.1f} %, of the SI contact force"
@@ -414,11 +418,12 @@ def _residuals(results: "Results") -> Card | None:
     if np.isfinite(change).any():
         largest = np.nanmax(change)
         detail += (
-            f"; if it acted 10 mm higher or lower, the total would change by ≤ {largest:.1f} %"
+            f"; if the residual acted 10 mm higher or lower, the total would change by at most "
+            f"{largest:.1f} %"
         )
     axial = np.abs(results["residual_axial_Nm"])
     if np.isfinite(axial).any():
-        detail += f"; and a residual axial moment of up to {np.nanmax(axial):.1f}\u00a0N·m"
+        detail += f"; the residual axial moment is at most {np.nanmax(axial):.1f}\u00a0N·m"
     return Card(
         "Residual force",
         middle,
@@ -434,7 +439,7 @@ def _frames(results: "Results") -> Card:
     if failed or flagged:
         words = [f"{failed} failed (no numbers)"] if failed else []
         words += [f"{flagged} to be read with care"] if flagged else []
-        detail = "; ".join(words) + ": the reasons are in the report's table and in column status"
+        detail = "; ".join(words) + ": the report's table and the column status give the reasons"
     else:
         detail = "none failed, none flagged"
     return Card("Frames computed", value, detail, bool(failed or flagged))

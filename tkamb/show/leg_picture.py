@@ -63,7 +63,7 @@ class LegFrame:
     """The leg at one frame in the laboratory, m.
 
     Args:
-        frame: of the motion.
+        frame: frame of the motion.
         joints: (3, 3) hip, knee, ankle; the knee is the insert frame's origin.
         bodies: the implant's surfaces with their colours.
         lines: (n, 3) ligaments and tendons, with their colours and the ligaments' names.

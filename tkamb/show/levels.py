@@ -122,7 +122,7 @@ class PageGrid:
 
         Args:
             values: (..., n), one or more fields.
-            every: which rows and columns: all, every second ...
+            every: step between the rows and columns that are returned; 1: all.
         """
         over, corners, weights = self._hits
         chosen = np.zeros(over.shape, bool)

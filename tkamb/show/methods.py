@@ -126,7 +126,7 @@ def methods(summary: Mapping[str, Any]) -> Methods:
     """Return the Methods paragraph of a run.
 
     Args:
-        summary: of `results.summary` or summary.json.
+        summary: `results.summary`, or the content of summary.json.
 
     Raises:
         InputError: the summary has no `scene_tables`, as before version 0.2.0.
@@ -196,6 +196,9 @@ def _motion(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[s
             else "a chain of segments was fitted to all markers by least squares (Lu 1999)"
         )
         yield f"For that {way}; weights: {_weights(markers)}."
+    rate = (summary.get("measures") or {}).get("recording_rate_Hz")
+    if rate is not None:
+        yield f"It was recorded at {rate:.4g} Hz."
     yield f"The coordinates were {_filter_words(motion['cutoff_Hz'])}."
     if motion.get("motion") == "roll-slip":
         yield (
@@ -345,6 +348,7 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
     material = summary.get("material") or {}
     yield f"Femorotibial contact was {words}; points lay {contact['resolution_mm']:g} mm apart."
     yield _material_words(contact, material)
+    yield from _mesh_words(summary.get("measures") or {})
     insert = (tables.get("implant") or {}).get("insert") or {}
     if "bearing" in insert:
         yield f"The bearing was {insert['bearing']}."
@@ -373,6 +377,37 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
         )
     elif error:
         yield f"The error of this setting was {error}."
+
+
+MESH_NAMES = {"femoral": "femoral component", "insert": "insert", "patella": "patellar button"}
+
+
+def _mesh_words(measures: Mapping[str, Any]) -> Iterator[str]:
+    """Return sentences on meshes, thickness of the insert and tolerances of the contact solver."""
+    meshes = [
+        f"{one['triangles']} triangles for the {MESH_NAMES.get(name, name)} "
+        f"(median edge {one['edge_mm']:.2g} mm)"
+        for name, one in (measures.get("meshes") or {}).items()
+    ]
+    if meshes:
+        yield f"The surface meshes had {', '.join(meshes)}; an edge is the longest of a triangle."
+    thickness = measures.get("insert_thickness_mm")
+    if thickness:
+        low, high = (f"{one:.1f}" for one in thickness)
+        span = low if low == high else f"{low} to {high}"
+        yield f"Below the centres of pressure the insert was {span} mm thick."
+    tolerances = measures.get("tolerances") or {}
+    if "load" in tolerances:
+        yield (
+            "The contact force agreed with the load to a relative tolerance of "
+            f"{tolerances['load']:g}."
+        )
+    if "gap" in tolerances:
+        yield (
+            "The contact solver stopped at a residual force of at most "
+            f"{tolerances['force']:g} of the contact forces, and a gap or penetration of the "
+            f"contact nodes of at most {tolerances['gap']:g} of their largest displacement."
+        )
 
 
 def _material_words(contact: Mapping[str, Any], material: Mapping[str, Any]) -> str:

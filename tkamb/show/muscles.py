@@ -37,12 +37,11 @@ GROUP_COLOURS = (QUADRICEPS, *LIST, GREY, GREY)
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
 """Contributions beside those of single muscles."""
 HELD = (
-    "Contribution of each load to a force: the load acts alone in the frame's equations, with "
-    "constant "
-    "pose, contact points and normals, direction of friction and lines of action. The "
-    "contributions "
-    "sum up to the force by equilibrium. A moment balances the flexion moment of a single muscle. "
-    "External loads: weight, inertia and ground. Muscles are grouped by the bones that they end on."
+    "Contribution of a load to a force: the force that the equations of the frame give if this "
+    "load acts alone. Pose, contact points, contact normals, direction of friction and lines of "
+    "action stay the same. The sum of all contributions is the force by equilibrium. If a single "
+    "muscle acts, a moment balances its flexion moment. External loads are weight, inertia and "
+    "ground reaction. Muscles are grouped by the bones to which they attach."
 )
 
 
@@ -71,9 +70,9 @@ class Cell:
     """One small plot of activations.
 
     Args:
-        title: the muscle, or the channel of several and how many they are.
-        muscles: whose activations are drawn.
-        envelope: the muscle whose EMG stands behind; None: there is none.
+        title: name of the muscle, or of the EMG channel with its number of muscles.
+        muscles: names of the muscles in the plot.
+        envelope: name of the muscle whose EMG envelope is drawn; None: no EMG.
     """
 
     title: str
@@ -247,7 +246,6 @@ def reserve_words(summary: Mapping[str, Any]) -> str:
         for name, one in result.items()
     ]
     return (
-        "Reserves, which no muscle carries, at most (share of the coordinate's largest moment): "
-        + "; ".join(parts)
-        + "."
+        "Largest reserve moments, which no muscle provides (share of the largest moment of the "
+        "coordinate): " + "; ".join(parts) + "."
     )

@@ -24,9 +24,9 @@ def render(package: str, name: str, **values: Any) -> str:
     """Return the page of a template.
 
     Args:
-        package: whose template it is, "tkamb.show" for example.
-        name: of the file among its assets.
-        values: what the template names; one that is missing is an error.
+        package: package with the template, for example "tkamb.show".
+        name: file name in the folder assets of the package.
+        values: values of the names in the template; a missing value is an error.
     """
     return _environment(package).get_template(name).render(values)
 
@@ -46,8 +46,12 @@ def _environment(package: str) -> Environment:
 
 
 def _unbroken(text: str) -> Markup:
-    """Return HTML in which numbers keep their units and ranges their ends on one line."""
+    """Return HTML in which numbers keep their units and ranges their ends on one line.
+
+    Text between backticks, a command for example, is set as code.
+    """
     html = re.sub(r"(\d) (%|BW|N|MPa|mm)(?!\w)", "\\1\u00a0\\2", str(escape(text)))
+    html = re.sub(r"`([^`]+)`", r"<code>\1</code>", html)
     return Markup(re.sub(r"([\d.]+–[\d.]+)", r'<span class="whole">\1</span>', html))
 
 

@@ -54,15 +54,15 @@ class Line:
     """One curve.
 
     Args:
-        name: unique in its panel; a column's name, or what was made from columns.
-        label: as the legend shows it.
-        values: (f,) in the panel's unit.
-        colour: of the line.
-        dashed: drawn dashed.
-        band: (3, f) p05, p50 and p95 over samples with varied inputs, in the panel's unit; None:
-            there are none.
-        wide_band: (2, f) p05 and p95 by the inputs and the model's discrepancy; None: unknown.
-        behind: drawn broad and pale behind the others, for comparison.
+        name: name of the curve, unique in its panel; often the name of its column.
+        label: name in the legend.
+        values: (f,) values in the unit of the panel.
+        colour: colour of the curve, "#rrggbb".
+        dashed: True: the curve is dashed.
+        band: (3, f) p05, p50 and p95 over the samples with varied inputs, in the unit of the panel;
+            None: no inputs were varied.
+        wide_band: (2, f) p05 and p95 with the discrepancy of the model added; None: unknown.
+        behind: True: the curve is drawn broad and pale behind the other curves.
     """
 
     name: str
@@ -81,17 +81,17 @@ class Panel:
 
     Args:
         name: id of the plot in the page.
-        title: what it shows.
-        unit: of the vertical axis.
-        lines: its curves.
-        note: a sentence under the plot.
-        level: (value, label) of a horizontal reference line.
-        span: (low, high, label) of a shaded range behind the curves.
-        second: (factor, unit) of a second vertical axis on the right.
-        logarithmic: vertical axis.
-        from_zero: the vertical axis holds zero.
-        limits: of the vertical axis, where they are known beforehand.
-        warning: whether the note is highlighted as a warning.
+        title: title of the plot.
+        unit: unit of the vertical axis.
+        lines: curves of the plot.
+        note: text under the plot.
+        level: (value, label) of a horizontal reference line; None: no line.
+        span: (low, high, label) of a shaded range behind the curves; None: no range.
+        second: (factor, unit) of a second vertical axis on the right; None: no second axis.
+        logarithmic: True: the vertical axis is logarithmic.
+        from_zero: True: the vertical axis includes zero.
+        limits: ends of the vertical axis; None: they follow from the curves.
+        warning: True: the note is highlighted as a warning.
     """
 
     name: str
@@ -189,7 +189,7 @@ def _total(results: "Results") -> Panel:
     parts = _components(results, "force", "N", scale)
     lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
     lines += (_measured(results, "total", "measured, axial", BLACK),)
-    note = "On the insert; SI positive in compression. Residuals are not included."
+    note = "Force on the insert. SI is positive in compression. Residuals are not included."
     activity, span = results.summary.get("activity"), None
     if activity in PEAKS_BW:
         result = PEAKS_BW[activity].values()
@@ -206,8 +206,8 @@ def _condyles(results: "Results") -> Panel:
         *(_measured(results, s, f"{s}, measured", colour) for s, colour in SIDE_COLOURS.items()),
     )
     note = (
-        "Deformation: the total load is pressed in at the measured rotation. "
-        "Equilibrium: balance of coronal moments."
+        "Deformation: the contact model carries the total load at the measured rotation. "
+        "Equilibrium: from the balance of coronal moments."
     )
     return Panel("condyles", "Medial and lateral force, two estimates", "BW", lines, note)
 
@@ -228,8 +228,8 @@ def _share(results: "Results") -> Panel:
     if not unknown:
         return panel
     note = (
-        f"By deformation not determined in {unknown} of {len(results)} frames: 0.5 deg of "
-        "adduction moves more than a quarter of the load, or one condyle alone carries it."
+        f"The share by deformation is not determined in {unknown} of {len(results)} frames: "
+        "0.5 deg of adduction moves over a quarter of the load, or one condyle carries all of it."
     )
     return replace(panel, note=note, warning=True)
 
@@ -264,7 +264,8 @@ def _ratios(results: "Results") -> Panel:
         Line("PF/Q", "patellofemoral, PF/Q", patella, PATELLOFEMORAL),
     )
     note = (
-        "PL/Q: tension of the patellar ligament over that of the quadriceps; PF/Q: patellofemoral."
+        "PL/Q: tension of the patellar ligament divided by the tension of the quadriceps. PF/Q: "
+        "patellofemoral force divided by the tension of the quadriceps."
     )
     return Panel("ratios", "Ratios to the quadriceps tension", "force / quadriceps", lines, note)
 
@@ -288,7 +289,7 @@ def centre_panel(results: "Results") -> Panel:
     """Return the anterior positions of the centres of pressure over the motion."""
     lines = _both_sides(results, "cop_ap_mm")
     title = "Anterior position of the centres of pressure"
-    note = "Insert x; zero is the middle of its bottom."
+    note = "Position along the x axis of the insert. Zero is the middle of the insert's bottom."
     return _without_empty_lines(Panel("centres", title, "mm", lines, note))
 
 
@@ -318,7 +319,7 @@ def _post(results: "Results") -> Panel:
         _line(results, "post_force_si_N", "inferior", SUPERIOR, scale=scale),
         _line(results, "post_force_ml_N", right, RIGHT, scale=scale),
     )
-    note = "On the insert, without friction; it is part of the contact force."
+    note = "Force on the insert, without friction. The contact force includes it."
     return Panel("post", "Force of the cam on the post", "BW", lines, note)
 
 
@@ -350,7 +351,11 @@ def _ligaments(results: "Results") -> Panel:
         _bundle(results, bundle, strands, k) for k, (bundle, strands) in enumerate(bundles.items())
     )
     summed = len(bundles) < len(names)
-    note = f"{len(names)} strands; those that differ in a number only are summed." if summed else ""
+    note = (
+        f"{len(names)} strands. Strands whose names differ only in a number are summed."
+        if summed
+        else ""
+    )
     return Panel("ligaments", "Ligament tension", "N", lines, note)
 
 
@@ -381,8 +386,8 @@ def _residuals(results: "Results") -> Panel:
             ),
         )
     note = (
-        "Forces that equilibrium needs beyond the modelled loads; an exact model has none. "
-        "Dashed: change of the total contact force when they act 10 mm higher or lower."
+        "Forces that equilibrium needs in addition to the modelled loads. An exact model has none. "
+        "Dashed: change of the total contact force if the residuals act 10 mm higher or lower."
     )
     return Panel("residuals", "Residual forces", "% of the SI contact force", lines, note)
 
@@ -403,7 +408,7 @@ def _hip_force(results: "Results") -> Panel:
 
 def _hip_moment(results: "Results") -> Panel:
     lines = _components(results, "hip_moment", "Nm")
-    note = "About the named axes, including the effect of muscles across the hip."
+    note = "Moment about the named axes. The effect of muscles across the hip is included."
     return Panel("hip_moment", "Intersegmental moment on the femur at the hip", "N·m", lines, note)
 
 
@@ -414,14 +419,17 @@ def _motion(results: "Results") -> Panel:
     ]
     if results.summary.get("axis", "flexion") != "flexion":
         lines.insert(0, _line(results, "flexion_deg", "flexion", RIGHT))
-    note = "Grood–Suntay; adduction positive in varus, axial rotation when the femur turns out."
+    note = (
+        "Rotations of Grood and Suntay. Adduction is positive in varus. Axial rotation is positive "
+        "if the femur turns outwards."
+    )
     return Panel("motion", "Knee rotations", "deg", tuple(lines), note)
 
 
 def _slip(results: "Results") -> Panel:
     note = (
-        "From the lengths of both paths of contact, without axial rotation alone; condyles of "
-        "equal radius then slip equally."
+        "Slip by the arc lengths on both surfaces. Slip from axial rotation alone is left out. "
+        "Condyles of equal radius slip equally."
     )
     return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"), note)
 
@@ -439,7 +447,7 @@ def _adjustment_effect(results: "Results") -> Panel:
         _line(results, "adjust_force_change_BW", "total force, BW", BLACK),
         _line(results, "adjust_share_change", "medial share (by equilibrium)", GREY, True),
     )
-    note = "Adjusted minus recorded pose. Frames whose total changes by over 0.01 BW are flagged."
+    note = "Adjusted minus recorded pose. A frame is flagged if its total changes by > 0.01 BW."
     return Panel("adjustment_effect", "Effect of the adjustment", "BW or share", lines, note)
 
 

@@ -72,9 +72,9 @@ class Sheet:
     replaced. A plot that `_place_alone` cannot place has a figure of its own.
 
     Args:
-        results: of the run.
-        axis: horizontal, of every plot.
-        width: inches.
+        results: results of the run.
+        axis: horizontal axis of every plot.
+        width: width of the figure, inches.
     """
 
     def __init__(self, results: "Results", axis: HorizontalAxis, width: float = WIDTH) -> None:

@@ -302,10 +302,10 @@ def draw_pressure(
     """Colour the insert with a pressure (n,), in the scale's unit.
 
     Args:
-        axes: with the insert.
-        view: of the insert.
+        axes: axes in which the insert is drawn.
+        view: top view of the insert.
         pressure: (n,).
-        scale: from 0.
+        scale: colour scale that begins at 0, MPa.
         gap: (n,) m; says where between the points the contact ends.
     """
     peak = float(scale.vmax or 1.0)

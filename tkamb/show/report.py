@@ -40,10 +40,10 @@ THIRD = 2 / 3 * WIDTH
 SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
 """In the order in which they stand in the page."""
 COLOURS = (
-    "Lines run in time order. In every plot blue is medial, red lateral, black the total; violet "
-    "is superior–inferior, teal anterior–posterior, olive medial–lateral, and moments and "
-    "rotations have the colour of the axis they turn about. Colours of ligaments and muscles "
-    "differ within one plot."
+    "Lines run in time order. In every plot blue is medial, red is lateral and black is the total. "
+    "Violet is superior–inferior, teal is anterior–posterior and olive is medial–lateral. A moment "
+    "or rotation has the colour of its axis. A colour of ligaments or muscles has a meaning in one "
+    "plot only."
 )
 PROVENANCE = (
     "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
@@ -64,8 +64,8 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
     """Return the report as HTML: vector plots, pictures and style are inside the page.
 
     Args:
-        results: of a run.
-        progress: wraps the plots, a progress bar for example.
+        results: results of a run.
+        progress: function that wraps the plots, for example a progress bar.
     """
     axis = horizontal_axis(results)
     style = asset(PACKAGE, "report.css")
@@ -179,8 +179,8 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
     sentences = [COLOURS]
     if results.bands:
         sentences.append(
-            "Shaded: 5 to 95 % of the samples with varied inputs, dotted: their median; "
-            "full lines: the inputs as given."
+            "Shaded: 5 to 95 % of the samples with varied inputs. Dotted: median of the samples. "
+            "Solid lines: inputs as given."
         )
     if axis.stances:
         words = "Shaded blue-grey: stance, the foot on its force plate"
@@ -189,13 +189,13 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
         sentences.append(f"{words}.")
     if results.band_with_discrepancy("force_total_N") is not None:
         sentences.append(
-            "Paler and wider: 5 to 95 % by the varied inputs and by the model's discrepancy, as "
+            "Paler and wider: 5 to 95 % with the discrepancy of the model added, which was "
             "estimated from measured knees."
         )
     if flagged(results).any():
         sentences.append("Orange ticks at the bottom: frames to be read with care.")
     if failed(results).any():
-        sentences.append("Crosses at the bottom: frames that failed; the lines are broken there.")
+        sentences.append("Crosses at the bottom: frames that failed. The lines have gaps there.")
     return sentences
 
 

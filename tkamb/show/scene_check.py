@@ -48,9 +48,9 @@ class Entry:
     """One part of the scene.
 
     Args:
-        part: what it is, as its table is called.
-        file: where it was read from; None: the scene itself.
-        found: its content.
+        part: name of the part, mostly the name of its table.
+        file: file of the part; None: the scene file.
+        found: content of the part in words.
     """
 
     part: str
@@ -241,7 +241,9 @@ def _span(time: Array) -> str:
 
 def _range(name: str, values: Array, unit: str, digits: int) -> str:
     low, high = float(np.min(values)), float(np.max(values))
-    return f"{name} {low:.{digits}f} to {high:.{digits}f} {unit}"
+    ends = [f"{one:.{digits}f}" for one in (low, high)]
+    ends = [one.removeprefix("-") if float(one) == 0 else one.replace("-", "−") for one in ends]
+    return f"{name} {ends[0]} to {ends[1]} {unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,7 +315,7 @@ def check_scene(
     The contact model is made, but not prepared: a mesh that it cannot use is found by a run.
 
     Args:
-        path: of the scene.
+        path: path of the scene file.
         overrides: dotted key -> value, as `tkamb.load_scene` takes them.
         begin: called with the name of each stage.
 

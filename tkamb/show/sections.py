@@ -40,13 +40,11 @@ from tkamb.files import MEGABYTE, read_bytes, read_json
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-ALWAYS_NOT = (
-    "What another patient, another trial or another day would show: this is one knee in one motion."
-)
+ALWAYS_NOT = "Results of another patient, trial or day: this run has one knee in one motion."
 
 
 def conclusions(results: "Results") -> tuple[list[str], list[str]]:
-    """Return the conclusions that the run supports and those that it does not, a sentence each."""
+    """Return the supported and the unsupported conclusions of a run, one sentence each."""
     sentences = (
         _conclude_force(results),
         _conclude_split(results),
@@ -72,7 +70,8 @@ def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
         parts = [f"{name} {one['rmse_BW']:.2f} BW" for name, one in measured.items()]
         worse = [name for name, one in measured.items() if (one["r_squared"] or 0.0) < 0.0]
         bad += [
-            f"The course of the {name} force: its constant mean would fit the measurement better."
+            f"The course of the {name} force: the mean of the measurement fits better than the "
+            "prediction."
             for name in worse
         ]
         return [
@@ -80,12 +79,16 @@ def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
             f"measurement."
         ], bad
     if results.summary.get("muscle_groups"):
-        bad.append("How the muscles really shared the load: nothing was measured for comparison.")
-        return ["The total force if the muscles share the joint moments as the scene says."], bad
-    bad.append("The effect of hamstrings and gastrocnemius: only the quadriceps is modelled.")
+        bad.append(
+            "The true sharing of the load between muscles: no measurement was given for comparison."
+        )
+        return [
+            "The total force, if the muscles share the joint moments as the scene assumes."
+        ], bad
+    bad.append("The effect of hamstrings and gastrocnemius: the quadriceps is the only muscle.")
     return [
-        "The least force that this motion needs, with the quadriceps alone: co-contraction of "
-        "other muscles raises it."
+        "A lower bound of the contact force: only the quadriceps acts, and co-contraction of other "
+        "muscles would raise the force."
     ], bad
 
 
@@ -106,7 +109,7 @@ def _conclude_split(results: "Results") -> tuple[list[str], list[str]]:
     if unknown.any():
         bad = [
             f"The split by deformation in {_frame_count(unknown)}: half a degree of adduction "
-            "changes it."
+            "changes it strongly."
         ]
     if apart.any():
         bad.append(
@@ -124,11 +127,14 @@ def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
     if error is None:
         return [], ["Pressures and areas: contact is not modelled."]
     bears = [
-        "Whether another design, pose or setting, computed in the same way, has higher pressure."
+        "Whether the pressure rises or falls with another design, pose or setting that is computed "
+        "in the same way."
     ]
     if isinstance(error, str):
         return bears, [f"Pressures and areas as absolute values: their error is {error}."]
-    words = f"{known_error_words(error, PRESSURE_AND_AREA)}; load, pose and shape add their own"
+    words = (
+        f"{known_error_words(error, PRESSURE_AND_AREA)}; errors of load, pose and shape add to it"
+    )
     if is_large(error, PRESSURE_AND_AREA):
         return bears, [f"Pressures and areas as absolute values: {words}."]
     return [f"Pressures and areas of unworn surfaces: {words}.", *bears], []
@@ -136,8 +142,8 @@ def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
 
 def _conclude_certainty(results: "Results") -> tuple[list[str], list[str]]:
     if results.summary.get("uncertainty"):
-        return ["The effect of the varied inputs: the shaded bands."], []
-    return [], ["The uncertainty of these results: no input was varied (use tkamb uncertainty)."]
+        return ["The effect of the varied inputs: see the shaded bands."], []
+    return [], ["The uncertainty of these results: no input was varied. Use `tkamb uncertainty`."]
 
 
 def _frame_count(chosen: Mask) -> str:
@@ -159,8 +165,8 @@ class Table:
     """A table of texts.
 
     Args:
-        headings: of the columns; where they have units, (name, unit).
-        rows: as long as the headings, but for a strain table's first cell, the bundle.
+        headings: one per column, a name or (name, unit).
+        rows: cells of each row; a row of strains begins with one more cell, the name of the bundle.
     """
 
     headings: Sequence[Any]
@@ -168,7 +174,7 @@ class Table:
 
 
 def motion_table(results: "Results", axis: HorizontalAxis) -> Table:
-    """Return the frames nearest to 0, 10, ..., or at even times."""
+    """Return the table of the frames nearest to round flexion angles, or at even times."""
     entries = [entry for entry in _entries(results, axis) if np.isfinite(entry[2]).any()]
     stops = axis.stops(13 if axis.kind == "flexion" else 11)
     return Table(
@@ -178,7 +184,7 @@ def motion_table(results: "Results", axis: HorizontalAxis) -> Table:
 
 
 def strain_table(summary: Mapping[str, Any]) -> Table | None:
-    """Return the ligaments' strains in per cent, which reveal a wrong insertion."""
+    """Return the table of the ligaments' strains, %; a high strain reveals a wrong insertion."""
     result = summary.get("ligament_strain")
     if not result:
         return None
@@ -192,7 +198,7 @@ def strain_table(summary: Mapping[str, Any]) -> Table | None:
 
 
 def flag_rows(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str, str, str]]:
-    """Return the statuses other than "ok": reason, number of frames, frames, and their places."""
+    """Return a row per status other than "ok": reason, number of frames, frames and places."""
     return [
         (reason, str(len(frames)), _stretches(frames), _positions(frames, axis))
         for reason, frames in reasons(results.status).items()
@@ -200,9 +206,9 @@ def flag_rows(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str, 
 
 
 def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
-    """Return reason in plain words -> its frames, failures first.
+    """Return reason in plain words -> frames with this reason, failures first.
 
-    Reasons that differ only in a number are one, with the range of the number.
+    Reasons that differ only in a number become one reason with the range of the number.
     """
     result: dict[str, list[tuple[int, str]]] = {}
     for frame, status in enumerate(statuses):
@@ -219,7 +225,7 @@ def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _with_ranges(variants: Sequence[str]) -> str:
-    """Return one text for texts that differ in their numbers: with the numbers' ranges."""
+    """Return one text with ranges for texts that differ only in their numbers."""
     columns = zip(*(NUMBER.findall(words) for words in variants), strict=True)
     ranges = []
     for numbers in columns:
@@ -310,15 +316,15 @@ WEAR_ROWS = (
 """Label of a number, and its key."""
 FIRST_RATE = "first_volume_mm3_per_Mc"
 OTHER_WEAR = (
-    "The wear.json in this folder belongs to another scene, other frames or other meshes, or does "
-    "not state them; it is not shown."
+    "The wear.json of this folder is not shown: it belongs to another scene, other frames or other "
+    "meshes, or does not name them."
 )
 
 
 def wear_section(results: "Results") -> dict[str, Any] | None:
-    """Return what the section shows; None where the folder holds no wear.
+    """Return the content of the section on wear; None if the folder has no wear.json.
 
-    Wear of another scene or of other frames than the run's is not shown, and that is said.
+    Wear of another scene or of other frames is not shown; the section then says so.
 
     Raises:
         InputError: wear.json or its picture cannot be read.
@@ -368,9 +374,10 @@ def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
 
 
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
-    """Return wear.json beside a run; empty where scene, files or frames are others, None without.
+    """Return the content of wear.json beside a run; None if the folder has no such file.
 
-    Wear of a scene's whole motion, or of a simulator's, holds beside any frames of a run.
+    The content is empty if it belongs to another scene, other files or other frames. Wear of the
+    whole motion of a scene, or of a simulator cycle, belongs to every choice of frames.
 
     Raises:
         InputError: it cannot be read.
@@ -391,7 +398,7 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
 
 
 def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
-    """Return in words the simulation, and its varied inputs."""
+    """Return the settings of the wear simulation and its varied inputs, in words."""
     words = (
         f"Law {wear['law']}, material {wear['material']}, {wear['control']} control, contact "
         f"{wear['contact']} at {wear['resolution_mm']:g} mm, {wear['blocks']} blocks of cycles; "
@@ -409,7 +416,7 @@ def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
 
 
 def _wear_range(wear: dict[str, Any], key: str) -> str:
-    """Return the range that the wear factor alone gives a number."""
+    """Return the range of a number that follows from the range of the wear factor."""
     limits = wear.get(f"{key}_range")
     return "–" if limits is None else f"{_significant(limits[0])} to {_significant(limits[1])}"
 

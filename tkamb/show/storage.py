@@ -23,7 +23,7 @@ def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) ->
     """Write a `.sto` or `.mot` table.
 
     Args:
-        path: the file.
+        path: path of the file.
         columns: name -> (n,) values, "time" (s) first.
         in_degrees: whether the header states degrees.
 
@@ -54,15 +54,15 @@ def write_results_storage(results: "Results", path: Path) -> str:
     """Write the numbers of a run as a storage file.
 
     Columns keep their names, units (`_N`, `_mm`, `_deg`) and order; `time_s` is called `time`.
-    What has no number is `nan`. Instead of the status' words there is `status`: 0 "ok", 1 to be
-    read with care, 2 failed.
+    A missing number is `nan`. The column `status` has numbers instead of words: 0 is "ok", 1 a
+    frame to be read with care, 2 a failed frame.
 
     Args:
-        results: of a run.
-        path: a new file, .sto or .mot.
+        results: results of a run.
+        path: path of a new file, .sto or .mot.
 
     Returns:
-        What was written, in a line.
+        A line that tells how many frames and columns were written.
 
     Raises:
         InputError: another format, a file that exists already, times that do not rise, or no
@@ -88,13 +88,13 @@ def write_results_storage(results: "Results", path: Path) -> str:
 
 
 def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: float) -> None:
-    """Write markers in millimetres; a gap is left empty.
+    """Write markers as a `.trc` file in millimetres; a gap has empty cells.
 
     Args:
-        path: the file.
-        time: (n,) s.
-        markers: label -> (n, 3) m, gaps NaN.
-        rate_Hz: of the recording.
+        path: path of the file.
+        time: (n,) s, times of the rows.
+        markers: label -> (n, 3) m, positions; NaN in gaps.
+        rate_Hz: sampling rate of the recording, Hz.
 
     Raises:
         InputError: no place to write.

@@ -131,7 +131,7 @@ def written(figure: Figure, dpi: int) -> str:
 
     Args:
         figure: not laid out yet; its layout engine does so.
-        dpi: of pictures that are not given point by point.
+        dpi: resolution of pictures that are not given point by point.
     """
     buffer = io.StringIO()
     FigureCanvasSVG(figure)  # a layout measures with it

@@ -72,6 +72,9 @@ class BenchLimitSettings:
     kept_models: int = 8
     """Number of prepared contact models that are kept. Chosen: of a lattice each takes 0.1 to
     0.5 GB."""
+    most_threads: int = 2
+    """Number of contact models that are prepared at the same time. Chosen: the machine goes on
+    answering the coarse model while a slider moves."""
     first_penetration: float = 5e-5
     """m; penetration at which a search for released coordinates begins. Chosen: as in
     `initial_pose.first_penetration`."""
@@ -114,14 +117,14 @@ class BenchRequest:
     Args:
         flexion_deg: Grood and Suntay's, as `adduction_deg` (varus) and `axial_rotation_deg`
             (femur external).
-        ap_mm: of the femoral component in the insert frame, as `ml_mm`.
+        ap_mm: anterior position of the femoral component, insert frame; ml_mm: lateral position.
         load_N: axial, along the tibia, through the insert's origin as recorded.
         femoral: placement of the femoral component on the femur.
         tibial: placement of the insert on the tibia.
         slack_percent: change of all ligaments' slack lengths.
         released: coordinates that find their equilibrium.
         contact: name of the contact model; resolution_mm its spacing.
-        thickness_mm: of the insert at its thinnest, where its design is parametric; None: as it is.
+        thickness_mm: smallest thickness of a parametric insert; None: the insert of the scene.
     """
 
     flexion_deg: float = 0.0
@@ -228,11 +231,11 @@ def _released(values: Any) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What of a case does not change on the bench.
+    """The parts of a case that stay the same on the bench.
 
     Args:
-        case: with [contact]; as a run reads it.
-        ligaments: its ligaments with their slack lengths.
+        case: case of a scene with [contact].
+        ligaments: ligaments of the case with their slack lengths.
     """
 
     case: Case

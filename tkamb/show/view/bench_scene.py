@@ -83,7 +83,7 @@ def write_motion(folder: Path, times: Sequence[float], coordinates: Array, side:
     """Write knee coordinates (f, 6) of a right knee as [motion] of `STILL` reads them.
 
     Args:
-        folder: for motion.csv.
+        folder: folder for motion.csv.
         times: (f,) s.
         coordinates: m and rad.
         side: -1 of a left knee, whose ML axis points the other way; else 1.
@@ -187,7 +187,7 @@ def ligament_table(bundle: "Ligament", side: float) -> dict[str, Any]:
     """Return a bundle as its table of a scene.
 
     Args:
-        bundle: of a right knee, on links of the URDF, with its slack length.
+        bundle: ligament of a right knee with its slack length; its ends are on links of the URDF.
         side: -1 of a left knee, else 1.
     """
 

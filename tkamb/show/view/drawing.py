@@ -154,7 +154,7 @@ class Arrow:
     """A force.
 
     Args:
-        name: as in the legend.
+        name: name in the legend.
         colour: "#rrggbb".
         points: (f, 3) m, where it acts.
         forces: (f, 3) N.
@@ -229,11 +229,11 @@ class Drawing:
     """Everything that is drawn of one run.
 
     Args:
-        title: whose knee and which contact model.
+        title: name of the run and its contact model.
         side: "right" or "left".
         body_weight: N.
         contact: name of the contact model; empty without contact.
-        labels: where in the motion each frame is, "60° of flexion".
+        labels: place of each frame in the motion, for example "60° of flexion".
         times: (f,) s.
         statuses: per frame, "ok" or plain words.
         readings: the numbers of every frame.

@@ -68,8 +68,8 @@ def force_arrows(
     contact force of results.csv.
 
     Args:
-        results: of the same frames.
-        geometries: the frames.
+        results: results of the frames.
+        geometries: geometry of the same frames.
         friction: Coulomb coefficient of the femorotibial contact.
     """
     columns = {

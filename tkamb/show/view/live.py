@@ -35,13 +35,13 @@ logger = logging.getLogger("tkamb")
 
 
 def parametric_insert(case: Case, folder: Path) -> Insert | None:
-    """Return the design of a case's insert; None where its mesh was not made from one.
+    """Return the design of a case's insert; None if its mesh does not come from a design.
 
-    The design is `DESIGN_FILE` beside the mesh. It must give this very mesh, byte for byte.
+    The design is `DESIGN_FILE` beside the mesh. It must reproduce this mesh byte for byte.
 
     Args:
-        case: with [contact].
-        folder: for a mesh to compare with.
+        case: case with [contact].
+        folder: folder for the mesh that is made for the comparison.
     """
     table = case.scene.implant.insert
     assert table is not None
@@ -74,37 +74,38 @@ def with_thickness(case: Case, insert: Insert, thickness_mm: float, folder: Path
     """Return a case with its parametric insert at another thickness.
 
     Args:
-        case: with [contact].
-        insert: its design.
-        thickness_mm: at the thinnest.
-        folder: for the mesh, which must outlive the case.
+        case: case with [contact].
+        insert: design of its insert.
+        thickness_mm: smallest thickness, mm.
+        folder: folder for the mesh; it must exist as long as the case.
     """
     return with_insert(case, write_insert(insert, thickness_mm, folder))
 
 
 Setting = tuple[str, float, float | None]
-"""What a contact model is prepared for: its name, spacing (mm) and the insert's thickness (mm)."""
+"""Setting of a prepared contact model: name, spacing (mm) and thickness of the insert (mm)."""
 
 
 def setting(request: BenchRequest) -> Setting:
-    """Return what a request needs prepared."""
+    """Return the setting of the contact model that a request needs."""
     return request.contact, request.resolution_mm, request.thickness_mm
 
 
 @dataclass(frozen=True, eq=False)
 class LiveAnswer:
-    """What the bench shows of one request.
+    """Answer to one request of the bench.
 
     Args:
-        request: what was computed.
-        numbers: name -> value, units in the names; NaN where there is none.
-        status: "ok", flags in plain words, or why there are no numbers ("failed: ...").
-        pose: (4, 4) pose_femoral_in_insert; NaN where it failed.
-        points: (n, 3) m of the map; triangles (k, 3).
-        pressure: (n,) Pa.
-        gap: (n,) m.
-        ligaments: name -> both ends (2, 3) m in the insert frame.
-        centres: side -> (3,) m, centre of pressure.
+        request: the computed state.
+        numbers: name with unit -> value; NaN if the value is not defined.
+        status: "ok", flags in plain words, or "failed: " and the reason.
+        pose: (4, 4) pose_femoral_in_insert; NaN if the state failed.
+        points: (n, 3) m, points of the pressure map, insert frame.
+        triangles: (k, 3) indices into the points.
+        pressure: (n,) Pa, pressure at the points.
+        gap: (n,) m, distance between the surfaces at the points.
+        ligaments: name -> (2, 3) m, ends of the ligament, insert frame.
+        centres: side -> (3,) m, centre of pressure, insert frame.
     """
 
     request: BenchRequest
@@ -127,15 +128,15 @@ class LiveAnswer:
 class LiveKnee:
     """A knee on the bench; each contact model is prepared once.
 
-    Only the latest request matters: `answer` raises for one that a newer has overtaken.
+    Only the latest request counts: `answer` raises an error for an older request.
 
     Args:
-        case: a scene with [contact], its files read.
-        own: a folder of this session, whose files a saved scene takes along; None: a new one.
-            It is removed with this object.
+        case: case of a scene with [contact].
+        own: folder of this session, removed with this object; a saved scene copies the meshes in
+            it. None: a new folder.
 
     Attributes:
-        design: of a parametric insert; None where its mesh was not made from one.
+        design: design of the insert; None if its mesh does not come from a parametric design.
 
     Raises:
         InputError: the scene has no [contact], or is scaled.
@@ -189,16 +190,17 @@ class LiveKnee:
         )
 
     def overtake(self) -> int:
-        """Make requests before this moment stale; return the number of the next one."""
+        """Cancel all earlier requests; return the number of the next request."""
         with self._counting:
             self._latest += 1
             return self._latest
 
     def preparing(self, request: BenchRequest) -> str:
-        """Return what a request has to wait for, in words; empty where it can be answered.
+        """Return in words what a request waits for; empty if it can be answered now.
 
-        What is not prepared yet is prepared in a thread of its own: a lattice takes seconds, in
-        which other models go on answering.
+        A model that is not prepared yet is prepared in a thread of its own, because a lattice takes
+        seconds; the other models go on answering. If `most_threads` are preparing already, no
+        thread is started: the page asks again, and a setting that it has left is never prepared.
 
         Raises:
             InputError: the model cannot be prepared.
@@ -210,37 +212,43 @@ class LiveKnee:
             if key in self._refused:
                 raise self._refused.pop(key)
             if key not in self._threads:
+                if len(self._threads) >= BENCH_LIMIT.most_threads:
+                    names = " and ".join(f"{name} at {mm:g} mm" for name, mm, _ in self._threads)
+                    return f"preparing {names}, then {request.contact}"
                 thread = Thread(target=self._prepare, args=(request, key), daemon=True)
                 self._threads[key] = thread
                 thread.start()
         return f"preparing {request.contact} at {request.resolution_mm:g} mm"
 
     def _prepare(self, request: BenchRequest, key: Setting) -> None:
+        problem: TkambError | None = None
         try:
             self._side(request)
         except TkambError as error:
-            self._refused[key] = error
-        except Exception as error:  # the last handler of this thread: the page says it
-            self._refused[key] = TkambError(unforeseen_words(error, argparse.Namespace()))
-        finally:
+            problem = error
+        except Exception as error:  # the last handler of this thread: the page shows the error
+            problem = TkambError(unforeseen_words(error, argparse.Namespace()))
+        with self._counting:
             del self._threads[key]
+            if problem is not None:
+                self._refused[key] = problem
 
     def answer(
         self, request: BenchRequest, number: int | None = None, from_rest: bool = False
     ) -> LiveAnswer:
-        """Return what the bench shows.
+        """Return the answer to a request.
 
-        The state before is the initial guess: a lattice's answer differs by it within the solver's
-        tolerance.
+        The previous state is the initial guess. The answer of a lattice depends on it within the
+        tolerance of the solver.
 
         Args:
-            request: the state of the bench.
-            number: from `overtake`; None: whatever comes after, this is wanted.
-            from_rest: without that guess, as `tkamb run` computes its first frame.
+            request: state of the bench.
+            number: number from `overtake`; None: newer requests do not cancel this one.
+            from_rest: True: no initial guess, like the first frame of `tkamb run`.
 
         Raises:
-            TkambError: a newer request came.
-            InputError: no such contact model or spacing.
+            TkambError: a newer request has come.
+            InputError: the contact model or spacing does not exist.
         """
         with self._computing:
             if number is not None and number != self._latest:
@@ -250,14 +258,14 @@ class LiveKnee:
             return self._compute(request)
 
     def save(self, request: BenchRequest, folder: Path) -> Path:
-        """Write a scene that gives the same numbers by `tkamb run`; return its file.
+        """Write a scene for which `tkamb run` gives the same numbers; return its file.
 
         Args:
-            request: what is shown.
-            folder: new or empty.
+            request: state of the bench.
+            folder: new or empty folder.
 
         Raises:
-            InputError: the folder holds something, or cannot be written.
+            InputError: the folder is not empty, or cannot be written.
         """
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError("exists already and is not empty", folder, "give a new folder")
@@ -293,7 +301,7 @@ class LiveKnee:
         return self._cases[thickness_mm]
 
     def _side(self, request: BenchRequest) -> ContactSide:
-        """Return a contact side whose model and prepared state every request shares."""
+        """Return the prepared contact model of a request, shared by all requests of its setting."""
         key, insert = setting(request), request.thickness_mm
         with self._counting:
             side = self._sides.get(key)
@@ -302,14 +310,26 @@ class LiveKnee:
             mechanics = mechanics_of(case, self._known.get(insert), near=True)
             side = contact_side(case, mechanics)
             assert mechanics.knee.contact is not None
-            self._known[insert] = SharedState(mechanics.knee.contact.pair, None, None, range(ROWS))
         with self._counting:
+            if insert not in self._known:
+                pair = side.mechanics.knee.contact.pair
+                self._known[insert] = SharedState(pair, None, None, range(ROWS))
             self._sides.pop(key, None)
-            self._sides[key] = side  # the latest is last
-            for old in [*self._sides][: -BENCH_LIMIT.kept_models]:
-                del self._sides[old]
-                self._before.pop(old, None)
+            self._sides[key] = side  # the one used last is last
+            self._forget()
         return side
+
+    def _forget(self) -> None:
+        """Drop the models that were not used for the longest time, and what only they need."""
+        for old in [*self._sides][: -BENCH_LIMIT.kept_models]:
+            del self._sides[old]
+            self._before.pop(old, None)
+        for old in [*self._refused][: -BENCH_LIMIT.kept_models]:
+            del self._refused[old]
+        needed = {thickness for _, _, thickness in (*self._sides, *self._threads)}
+        for inserts in (self._cases, self._known):
+            for thickness in inserts.keys() - needed:
+                del inserts[thickness]
 
     def _compute(self, request: BenchRequest) -> LiveAnswer:
         prepared = self._side(request)
@@ -361,7 +381,7 @@ class LiveKnee:
         )
 
     def known_error(self, request: BenchRequest) -> Any:
-        """Return how far the chosen contact model is known to be off, or "not measured"."""
+        """Return the known errors of the chosen contact model, or "not measured"."""
         scene = self.case.scene
         assert scene.contact is not None
         if scene.material is not None:
@@ -375,7 +395,7 @@ class LiveKnee:
 def _numbers(
     body: FrameLoads, contact: FrameContact, mechanics: Mechanics, ends: dict[str, Array]
 ) -> dict[str, float]:
-    """Return the numbers that the bench shows; those of results.csv under the same names."""
+    """Return the numbers of the bench, with the names of results.csv where it has them."""
     result = contact.result
     assert result is not None
     numbers = {
@@ -410,7 +430,7 @@ def _numbers(
 
 
 def _without_muscles(case: Case) -> Case:
-    """Return a case of bones, ligaments and contact alone: nothing else is on the bench."""
+    """Return the case without muscles and patella: bones, ligaments and contact remain."""
     chain = Chain(load_urdf(case.scene.patient, False), False)
     update = {"patella": None, "muscles": None, "quadriceps": None, "muscle": ()}
     scene = case.scene.model_copy(update=update)

@@ -58,12 +58,12 @@ SCALES_MPA = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0, 120.0, 200.0, 500.0, 1000.0)
 
 
 class LiveWindow:
-    """A knee on the bench, its page and the folder for what is kept.
+    """A knee on the bench, its page and the folder for saved scenes.
 
     Args:
-        knee: what computes.
-        folder: in which scenes are saved, kept-1, kept-2 and so on.
-        frame: of the recorded motion, shown first.
+        knee: knee on the bench, which computes the answers.
+        folder: folder for saved scenes, which are called kept-1, kept-2 and so on.
+        frame: recorded frame at which the window opens.
 
     Raises:
         InputError: no such frame.
@@ -226,8 +226,8 @@ class LiveWindow:
         assert case.femoral is not None and case.insert is not None
         recorded = knee_pose(case.motion.coordinates[self.frame])[None]
         still = np.eye(4)[None]
-        metal = ("femoral component", "femoral component", case.femoral, METAL, 0.5)
-        ghost = ("recorded femoral component", "recorded pose", case.femoral, RECORDED, 0.25)
+        metal = ("femoral component", "femoral component", case.femoral, METAL, 0.3)
+        ghost = ("recorded femoral component", "recorded pose", case.femoral, RECORDED, 0.12)
         coarse = replace(self.start, contact=COARSE[0], resolution_mm=COARSE[1])
         answer = self.knee.answer(coarse)
         nothing = np.zeros((1, len(answer.points)))
@@ -268,9 +268,9 @@ def open_live(
 
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
-        frame: of the recorded motion, shown first.
+        frame: recorded frame at which the window opens.
         contact: contact model, instead of the scene's.
-        folder: for what is kept; None: out/live.
+        folder: folder for saved scenes; None: out/live.
 
     Raises:
         InputError: nothing to see there, or the scene has no [contact].
@@ -288,9 +288,9 @@ def live(
 
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
-        frame: of the recorded motion, shown first.
+        frame: recorded frame at which the window opens.
         contact: contact model, instead of the scene's.
-        folder: for what is kept; None: out/live.
+        folder: folder for saved scenes; None: out/live.
 
     Returns:
         The server, which answers until `close()`.
@@ -316,7 +316,7 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     """Return a knee on the bench.
 
     Args:
-        knee: with a contact model that has a name.
+        knee: knee with a named contact model.
         q: (nq,) or (f, nq): the poses of the slider "recorded frame".
 
     Raises:

@@ -50,8 +50,8 @@ def check_film(path: Path, option: str) -> None:
     """Refuse a film that cannot be made here, before anything is drawn.
 
     Args:
-        path: of the film, .gif or .mp4.
-        option: that asks for it.
+        path: path of the film, .gif or .mp4.
+        option: command-line option that asks for the film.
 
     Raises:
         InputError: another ending, no browser, or a package of the extra is not installed.
@@ -196,7 +196,7 @@ def page_html(
     Args:
         title: heading.
         packed: the drawings (`tkamb.show.view.payload.pack`); None when a server gives them.
-        frame: shown first.
+        frame: frame at which the page opens.
         view: camera that is chosen first.
         live: contact models that the server can compute; None without a server.
     """

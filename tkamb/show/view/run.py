@@ -66,8 +66,8 @@ class CaseResults:
         """Return the geometry of the equations of a frame.
 
         Args:
-            k: frame.
-            row: of its map; None without one.
+            k: frame of the motion.
+            row: row of its pressure map; None: it has no map.
         """
         maps, mechanics = self.results.maps, self.mechanics
         if maps is None or row is None or mechanics.muscles is not None:
@@ -94,7 +94,7 @@ class Source:
     Args:
         path: a folder that `tkamb run` wrote, or a scene file.
         case: the scene with its files read.
-        results: of the case; None where it has not been run.
+        results: results of the case; None: it has not been run.
         kept: the folder in which a scene's own results were found.
     """
 
@@ -180,7 +180,7 @@ def check_frame(sources: Sequence[Source], frame: int) -> None:
     """Refuse a frame that none of the runs has, before any is run or drawn.
 
     Args:
-        sources: of the runs.
+        sources: sources of the runs.
         frame: row of the results; negative ones count from the end.
 
     Raises:

@@ -70,7 +70,7 @@ class ContactSwitch:
     the step that they are at is done.
 
     Args:
-        run: with [contact].
+        run: case with [contact], and its results.
         peak: MPa, top of the colour scale of the page.
 
     Attributes:

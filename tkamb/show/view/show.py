@@ -30,8 +30,8 @@ class Show:
     """Runs side by side, drawn once.
 
     Args:
-        runs: one or more.
-        frame: shown first.
+        runs: one or more runs.
+        frame: frame at which the page opens.
         camera: one of CAMERAS.
         lattice: whether the contact model's grid is drawn too; the live window draws it when
             its layer is switched on.
@@ -151,8 +151,8 @@ def show(results: "Results", frame: int = 0) -> Show:
     """Return a run to look at and turn around, which notebooks show.
 
     Args:
-        results: of a run.
-        frame: shown first.
+        results: results of a run.
+        frame: frame at which the page opens.
 
     Raises:
         InputError: the scene is not there, or no longer what was run.

@@ -129,8 +129,8 @@ def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
     """Return the insert as `tkamb wear` left it, coloured by depth; nothing without one.
 
     Args:
-        results: of a run, whose folder may hold wear.vtp of the same scene.
-        side: of the knee; the file of a left one is not mirrored, the drawing is.
+        results: results of a run; their folder may have wear.vtp of the same scene.
+        side: side of the knee; the drawing of a left knee is mirrored, its file is not.
 
     Raises:
         InputError: wear.json or wear.vtp cannot be read.
@@ -206,8 +206,8 @@ def floor_and_foot(
 
     Args:
         case: the case.
-        geometries: of the frames.
-        frames: of the motion.
+        geometries: geometry of the frames.
+        frames: frames of the motion.
     """
     table = case.scene.ground_reaction
     if case.ground is None or case.tibia is None or table is None or table.applied == "ankle":

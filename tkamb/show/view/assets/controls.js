@@ -27,7 +27,9 @@ tkamb.look = function (name) {
   const mirrored = tkamb.views[0].side === "left" ? -1 : 1;
   const {viewer} = tkamb;
   const pane = element("pane"), shape = pane.offsetWidth / tkamb.views.length / pane.offsetHeight;
-  const farther = Math.max(1, 0.8 / shape);
+  // The window of one knee without bones shows it from nearer.
+  const near = camera.at ? 1 : tkamb.closeness || 1;
+  const farther = near * Math.max(1, 0.8 / shape);
   viewer.controls.target.set(...at);
   viewer.camera.position.set(
     at[0] + farther * camera.from[0],

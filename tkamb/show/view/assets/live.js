@@ -16,7 +16,7 @@ const SLIDERS = {
     ["ml_mm", "ML, mm", -8, 8, 0.1]],
   soft: [["slack_percent", "slack length, %", -10, 10, 0.1]],
 };
-const TOTALS = [["force_si_N", "force, N", 0], ["medial_share", "medial share, %", 1],
+const TOTALS = [["force_si_N", "contact force, N", 0], ["medial_share", "medial share, %", 1],
   ["approach_mm", "approach, mm", 3]];
 const CONDYLE = [["force_N", "force, N", 0], ["peak_pressure_MPa", "peak, MPa", 1],
   ["mean_pressure_MPa", "mean, MPa", 1], ["area_mm2", "area, mm²", 0],
@@ -405,6 +405,7 @@ tkamb.startLive = async function () {
   colourBar("pressure-bar", data.pressure_scale, data.peak_MPa, 1);
   colourBar("strain-bar", data.strain_scale, 100 * data.strain_limit, 1);
   made("div", `${tkamb.views[0].title} · ${tkamb.views[0].side} knee`, element("titles"));
+  tkamb.closeness = 0.75;
   tkamb.look("oblique");
   tkamb.viewer.set_3d_pane_size();
   tkamb.bench = new Bench(request);

@@ -88,7 +88,7 @@ function addSideNames(viewer, view) {
   const middle = low.map((x, k) => (x + high[k]) / 2);
   const places = {medial: [middle[0], low[1], low[2]], lateral: [middle[0], low[1], high[2]],
     anterior: [high[0], low[1], middle[2]]};
-  const outwards = {medial: [0, 0, -1], lateral: [0, 0, 1], anterior: [1, -0.4, 0]};
+  const outwards = {medial: [0, -0.5, -1], lateral: [0, -0.5, 1], anterior: [1, -0.4, 0]};
   view.names = Object.entries(places).map(([word, place]) => {
     const sprite = wordSprite(word);
     Object.assign(sprite.userData, {place, outwards: outwards[word]});
@@ -98,7 +98,7 @@ function addSideNames(viewer, view) {
 }
 
 // They stay legible from afar, where the whole leg is in sight.
-const NAME = {away: 0.011, width: 0.024, height: 0.006, near: 0.6};
+const NAME = {away: 0.015, width: 0.024, height: 0.006, near: 0.6};
 
 function sizeSideNames(viewer) {
   const distance = viewer.camera.position.distanceTo(viewer.controls.target);
