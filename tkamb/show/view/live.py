@@ -309,11 +309,11 @@ class LiveKnee:
             case = self.bench.case_of(request, like=self._case_with(insert))
             mechanics = mechanics_of(case, self._known.get(insert), near=True)
             side = contact_side(case, mechanics)
-            assert mechanics.knee.contact is not None
         with self._counting:
             if insert not in self._known:
-                pair = side.mechanics.knee.contact.pair
-                self._known[insert] = SharedState(pair, None, None, range(ROWS))
+                contact = side.mechanics.knee.contact
+                assert contact is not None  # the bench has one
+                self._known[insert] = SharedState(contact.pair, None, None, range(ROWS))
             self._sides.pop(key, None)
             self._sides[key] = side  # the one used last is last
             self._forget()
