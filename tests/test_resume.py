@@ -247,13 +247,16 @@ def test_a_torn_shard_counts_as_absent(tmp_path):
         Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.array(["x"])}),
     ],
 )
-def test_a_frame_that_somebody_forged_is_computed_anew(tmp_path, forged):
-    """Its digest is right: it ended a run with an error that nobody foresaw."""
+def test_a_frame_that_somebody_forged_is_refused(tmp_path, forged):
+    """Its digest is right."""
     frames = slice(0, 8)
     stop_after(tmp_path, 3, frames=frames)
     assert (tmp_path / ".frames" / "000002.frame").exists()
     identity = json.loads((tmp_path / ".frames" / "run.json").read_text())
     Shards(tmp_path, identity, resume=True).put(1, forged)
+    with pytest.raises(InputError, match="somebody changed it"):
+        simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
+    (tmp_path / ".frames" / "000001.frame").unlink()
     found = simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
     assert found.summary["resumed_frames"] == 1
     assert np.isfinite(found["force_si_N"]).all()

@@ -210,8 +210,11 @@ def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_
         estimate_uncertainty(scene, **options, directory=folder, progress=broken_off(4))
     assert not (folder / BANDS_NAME).exists()
     identity = json.loads((folder / ".frames" / "run.json").read_text())
-    forged = Shard({}, {"values": np.zeros(2)})  # of right digest: it counts as absent
+    forged = Shard({}, {"values": np.zeros(2)})  # of right digest
     Shards(folder, identity, resume=True).put(1, forged)
+    with pytest.raises(InputError, match="somebody changed it"):
+        estimate_uncertainty(scene, **options, directory=folder, resume=True)
+    (folder / ".frames" / "000001.frame").unlink()
     one = estimate_uncertainty(scene, **options)
     two = estimate_uncertainty(scene, **options, directory=folder, resume=True, workers=2)
     for name, band in one.bands.items():

@@ -25,7 +25,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
@@ -74,6 +74,39 @@ class Shard:
 
     row: Row
     contact: dict[str, Array] | None
+
+
+ANY = -1
+"""A length of an array that may be any."""
+
+
+def have(arrays: Mapping[str, Array], expected: Mapping[str, tuple[str, tuple[int, ...]]]) -> bool:
+    """Return whether arrays have exactly the expected names, kinds and shapes.
+
+    Args:
+        arrays: name -> array.
+        expected: name -> allowed letters of `numpy.dtype.kind`, and the shape with `ANY` for a
+            length that is free.
+    """
+    return arrays.keys() == expected.keys() and all(
+        arrays[name].dtype.kind in kinds
+        and arrays[name].ndim == len(shape)
+        and all(wanted in (ANY, n) for n, wanted in zip(arrays[name].shape, shape, strict=True))
+        for name, (kinds, shape) in expected.items()
+    )
+
+
+def read_arrays(content: bytes) -> dict[str, Array]:
+    """Return the arrays of a .npz file; nothing of it is unpickled.
+
+    Raises:
+        UNREADABLE: the bytes are damaged, or the arrays are larger than `LARGEST`.
+    """
+    with ZipFile(io.BytesIO(content)) as packed:
+        if sum(part.file_size for part in packed.infolist()) > LARGEST:
+            raise ValueError("unpacked, it is too large")
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return dict(arrays)
 
 
 class Shards:
@@ -131,22 +164,37 @@ class Shards:
         with replaced_file(self._path(frame)) as temporary:
             temporary.write_bytes(self._digest(frame, content) + content)
 
-    def get(self, frame: int) -> Shard | None:
-        """Return a frame; None if there is none, or not a whole one of this run."""
+    def get(
+        self, frame: int, is_whole: Callable[[Shard], bool] = lambda shard: True
+    ) -> Shard | None:
+        """Return a frame; None if there is none, or not a whole one of this run.
+
+        Args:
+            frame: its number.
+            is_whole: whether the content has the names, kinds and shapes of a frame of this run.
+
+        Raises:
+            InputError: somebody forged the frame: it has the right SHA-256 and another content.
+        """
+        path = self._path(frame)
         try:
-            packed = read_bytes(self._path(frame), LARGEST)
+            packed = read_bytes(path, LARGEST)
         except InputError:
             return None
         digest, content = packed[:32], packed[32:]
         if self._digest(frame, content) != digest:
             return None
         try:  # the digest finds accidents; who forged a frame has written its digest too
-            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-                row = dict(json.loads(arrays["row"].tobytes()))
-                contact = {name: arrays[name] for name in arrays.files if name != "row"}
+            arrays = read_arrays(content)
+            row = dict(json.loads(arrays.pop("row").tobytes()))
+            shard = Shard(row, arrays or None)
+            whole = is_whole(shard)
         except UNREADABLE:
-            return None
-        return Shard(row, contact or None)
+            whole = False
+        if not whole:
+            what = "holds what no result of this computation holds: somebody changed it"
+            raise InputError(what, path, "remove it, or leave out resume=True to begin again")
+        return shard
 
     def _digest(self, frame: int, content: bytes) -> bytes:
         digest = hashlib.sha256(f"{frame}\n{self._identity}\n".encode())
@@ -305,12 +353,12 @@ class FolderRecorder(Recorder):
         self._map_arguments = (points, triangles, labels)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
-        """See `Recorder`; in order, up to the first gap, or frame that is none of this run's."""
+        """See `Recorder`; in order, up to the first gap."""
         shards = {}
         points = None if self._map_arguments is None else len(self._map_arguments[0])
         for frame in frames if self._shards.resumed else ():
-            shard = self._shards.get(frame)
-            if shard is None or not _is_frame(shard, points):
+            shard = self._shards.get(frame, lambda one: _is_frame(one, points))
+            if shard is None:
                 break
             shards[frame] = shard.contact
             self._record(frame, shard.row, shard.contact)

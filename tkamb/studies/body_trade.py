@@ -46,7 +46,7 @@ class Change:
     """One change of the shipped scene.
 
     Args:
-        keys: of the scene, overridden.
+        keys: key of the scene -> value that replaces the shipped one.
         every: step between the recorded frames that are kept.
     """
 
@@ -88,9 +88,9 @@ class BodyRow:
     """Cost and effect of one change.
 
     Args:
-        name: of the change.
+        name: name of the change.
         status: "ok", or why there is no result.
-        prepare_seconds: of the whole run outside the frames.
+        prepare_seconds: s, time of the run outside its frames.
         frame_seconds: per frame, median.
         changed: column, "peak_force", or derivative of flexion -> largest change over the
             frames, relative to the largest value as shipped.
@@ -112,13 +112,18 @@ def run_body_trade(rows: KeptRows | None = None) -> Iterator[BodyRow]:
     base: _Run | None = None
     for name, change in CHANGES.items():
         key = row_key("body", name, asdict(change))
-        result = rows.get(key) if rows else None
-        if result is None:
+        row = rows.read(key, BodyRow, _is_whole) if rows else None
+        if row is None:
             base = base or _run(CHANGES["as shipped"])
-            result = asdict(_row(name, change, base))
+            row = _row(name, change, base)
             if rows:
-                rows.put(key, result)
-        yield BodyRow(**result)
+                rows.put(key, asdict(row))
+        yield row
+
+
+def _is_whole(row: BodyRow) -> bool:
+    """Return whether a kept row has a known name and every change that the table shows."""
+    return row.name in CHANGES and (row.changed is None or row.changed.keys() == HEADS.keys())
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,15 +1,20 @@
 """Rows of a study, stored one by one as they are measured, so that it can be stopped and resumed.
 
 Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ..., "sha256": ...}.
-The key is the SHA-256 of what was measured and of the code that measured it, "sha256" that of key
-and row; a line cut short by a kill, or changed, counts as absent.
+"key" is the SHA-256 of what was measured and of the code that measured it. "sha256" is that of key
+and row. A line that a kill cut short, or that was changed, counts as absent. A line with the right
+SHA-256 and a row of other fields was forged: it is refused.
 """
 
 import hashlib
 import json
 import threading
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from tkamb import code_identity
 from tkamb.errors import InputError
@@ -18,13 +23,14 @@ from tkamb.files import FILE_LIMITS, read_bytes, write_text
 FILE_NAME = "rows.jsonl"
 
 Row = dict[str, Any]
+T = TypeVar("T")
 
 
 class KeptRows:
     """The rows in a study's folder.
 
     Args:
-        directory: of the study.
+        directory: folder of the study.
         resume: keep what an earlier study left there; else it is removed.
 
     Raises:
@@ -38,8 +44,34 @@ class KeptRows:
         write_text(self.path, "".join(_line(key, row) for key, row in self._rows.items()))
 
     def get(self, key: str) -> Row | None:
-        """Return the row of that key; None if there is none."""
+        """Return the row of that key as it was written; None if there is none."""
         return self._rows.get(key)
+
+    def read(
+        self, key: str, kind: type[T], is_whole: Callable[[T], bool] = lambda row: True
+    ) -> T | None:
+        """Return the row of that key as an object; None if there is none.
+
+        Args:
+            key: see `row_key`.
+            kind: dataclass of the row.
+            is_whole: whether the values of a row are those of a row of this study.
+
+        Raises:
+            InputError: the row has other fields, or values of another kind.
+        """
+        content = self._rows.get(key)
+        if content is None:
+            return None
+        try:
+            row = TypeAdapter(kind).validate_json(json.dumps(content), strict=True)
+        except ValidationError:
+            row = None
+        names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+        if row is None or content.keys() != names or not is_whole(row):
+            what = f"holds a row that is no {kind.__name__} of this study: somebody changed it"
+            raise InputError(what, self.path, "remove the file, or leave out resume=True")
+        return row
 
     def put(self, key: str, row: Row) -> None:
         """Keep a row."""

@@ -8,7 +8,9 @@ a crash or a hang gives a row too. The process uses one thread, so that times ar
 """
 
 import json
+import math
 import os
+import re
 import subprocess
 import sys
 import time as clock
@@ -48,6 +50,18 @@ def quantities(result: ContactResult) -> Quantities:
         for part in PARTS:
             values[f"{side}_{part}"] = 0.0 if condyle is None else float(getattr(condyle, part))
     return values
+
+
+def are_quantities(values: Mapping[str, float]) -> bool:
+    """Return whether values have all names of `quantities`, and are finite."""
+    names = {"approach", *(f"{side}_{part}" for side in SIDES for part in PARTS)}
+    return values.keys() == names and all(map(math.isfinite, values.values()))
+
+
+def is_map(stored: Mapping[str, float]) -> bool:
+    """Return whether a stored raster has places "i j" and finite pressures."""
+    places = all(re.fullmatch(r"-?\d{1,6} -?\d{1,6}", place) for place in stored)
+    return places and all(map(math.isfinite, stored.values()))
 
 
 def errors(values: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
@@ -157,7 +171,7 @@ class Job:
         case: name of the case.
         contact: name of the model.
         resolution_mm: spacing of its map points.
-        options: of the model.
+        options: options of the model.
         scene: a user's scene for the cases that need it.
     """
 
@@ -179,12 +193,12 @@ class Measure:
 
     Args:
         status: "ok" or why not.
-        prepare_seconds: from bodies to a state, nothing taken from disk; median.
+        prepare_seconds: median time of `prepare`, without anything from disk.
         cold_seconds: first press after it; median.
         warm_seconds: press at the next pose, from where the last one ended; median.
         peak_rss_MB: of the process.
-        iterations: of the first press.
-        nodes: that the model solves for.
+        iterations: iterations of the first press.
+        nodes: number of nodes that the model solves for.
         values: approach, forces, pressures, areas.
         map: "i j" -> Pa on a raster of 1 mm.
     """
@@ -198,6 +212,13 @@ class Measure:
     nodes: int = 0
     values: Quantities = field(default_factory=dict)
     map: dict[str, float] = field(default_factory=dict)
+
+
+def is_whole(measure: Measure) -> bool:
+    """Return whether a kept measure has all numbers of its status."""
+    if measure.status != "ok":
+        return not measure.values and not measure.map
+    return are_quantities(measure.values) and is_map(measure.map)
 
 
 def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure:

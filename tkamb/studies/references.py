@@ -38,6 +38,8 @@ from tkamb.studies.cases import Sphere, StudyCase
 from tkamb.studies.measures import (
     Quantities,
     Raster,
+    are_quantities,
+    is_map,
     quantities,
     raster_map,
     raster_of,
@@ -87,7 +89,7 @@ def sphere_on_layer(
         thickness: m, of the layer.
         load: N.
         young_modulus: Pa, of the layer.
-        poisson_ratio: of the layer.
+        poisson_ratio: Poisson's ratio of the layer.
     """
     low, high = 1e-6, 0.5 * thickness + 0.2 * radius
     for _ in range(60):
@@ -163,9 +165,9 @@ class Reference:
     """The converged answer of a case.
 
     Args:
-        hash: of the case.
+        hash: hash of the case.
         values: approach (m), condyles' forces (N), pressures (Pa) and areas (m²).
-        uncertainty: of each, same units.
+        uncertainty: uncertainty of each value, same units.
         grids_mm: cell sizes that went into it.
         solved: what each grid gave: "fe 1 mm" -> values.
         map: "i j" -> Pa, pressure of the finest finite elements on a raster of 1 mm.
@@ -279,6 +281,16 @@ def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
     }
     values |= {name.replace("medial", "lateral"): 0.0 for name in list(values) if "medial" in name}
     return values, {name: REFERENCE.width_effect * value for name, value in values.items()}
+
+
+def is_reference(reference: Reference, case: StudyCase) -> bool:
+    """Return whether a kept reference is one of a case, with all numbers."""
+    values = (reference.values, reference.uncertainty, *reference.solved.values())
+    return (
+        reference.hash == case.hash
+        and all(are_quantities(one) for one in values)
+        and is_map(reference.map)
+    )
 
 
 def read_references(path: Path = STORED) -> dict[str, Reference]:

@@ -102,9 +102,17 @@ def kept_verdicts(
     cases: Sequence[Case], kept: KeptRows, longest: float = STABILITY.longest_seconds
 ) -> list[Verdict]:
     """Return the verdicts that are kept, in the cases' order: those finished before others, too."""
-    rows, stored = (kept.get(_row_key(case, longest)) for case in cases), stored_verdicts()
-    result = [Verdict(**row) for row in rows if row is not None]
-    return [replace(verdict, expected=stored.get(verdict.key)) for verdict in result]
+    rows, stored = [_kept_verdict(kept, case, longest) for case in cases], stored_verdicts()
+    return [replace(row, expected=stored.get(row.key)) for row in rows if row is not None]
+
+
+def _kept_verdict(kept: KeptRows, case: Case, longest: float) -> Verdict | None:
+    """Return the kept verdict on a case; None if there is none."""
+    return kept.read(
+        _row_key(case, longest),
+        Verdict,
+        lambda row: row.kind in KINDS and row.case == case.label,
+    )
 
 
 def _row_key(case: Case, longest: float) -> str:
@@ -131,12 +139,10 @@ class _Judges:
         """Return the verdict on a case, kept or new."""
         if self._kept is None:
             return self._judged_apart(case)
-        key = _row_key(case, self._longest)
-        row = self._kept.get(key)
-        if row is not None:
-            return Verdict(**row)
-        result = self._judged_apart(case)
-        self._kept.put(key, asdict(result))
+        result = _kept_verdict(self._kept, case, self._longest)
+        if result is None:
+            result = self._judged_apart(case)
+            self._kept.put(_row_key(case, self._longest), asdict(result))
         return result
 
     def limit(self, case: Case) -> float:

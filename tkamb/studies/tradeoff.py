@@ -22,11 +22,20 @@ from tkamb.run.identity import contact_code
 from tkamb.studies.calculix import find_program, measure_by_calculix
 from tkamb.studies.cases import StudyCase, case_names, study_case
 from tkamb.studies.kept_rows import KeptRows, row_key
-from tkamb.studies.measures import Job, Measure, errors, map_error, measure_apart, raster_of
+from tkamb.studies.measures import (
+    Job,
+    Measure,
+    errors,
+    is_whole,
+    map_error,
+    measure_apart,
+    raster_of,
+)
 from tkamb.studies.references import (
     STORED,
     Reference,
     compute_reference,
+    is_reference,
     read_references,
     reference_of,
     write_references,
@@ -268,11 +277,18 @@ def run_tradeoff(
         reference = references[job.case]
         code = contact_code(job.contact)
         key = row_key("tradeoff", asdict(job), code, reference.hash, reference.values)
-        result = rows.get(key) if rows else None
-        measured = Measure(**result) if result else measure_apart(job)
-        if rows and not result:
-            rows.put(key, asdict(measured))
+        measured = _measured(rows, key, lambda job=job: measure_apart(job))
         yield compared(job, measured, reference)
+
+
+def _measured(rows: KeptRows | None, key: str, measure: Callable[[], Measure]) -> Measure:
+    """Return the kept measure; measure and keep it where there is none."""
+    result = rows.read(key, Measure, is_whole) if rows else None
+    if result is None:
+        result = measure()
+        if rows:
+            rows.put(key, asdict(result))
+    return result
 
 
 def run_peer(
@@ -284,7 +300,7 @@ def run_peer(
     """Yield CalculiX's rows on the cases that it can do; one that fails is a row too.
 
     Args:
-        cases: that may be pressed.
+        cases: cases that may be pressed.
         references: case name -> converged answer.
         rows: rows of an earlier study, which are not computed again; new ones are added.
         sizes_mm: cell sizes that are wanted.
@@ -299,10 +315,9 @@ def run_peer(
             if size not in PEER_GRIDS_MM.get(case.name, ()):
                 continue
             key = row_key("calculix", case.hash, reference.values, size)
-            result = rows.get(key) if rows else None
-            measured = Measure(**result) if result else measure_by_calculix(case, size)
-            if rows and not result:
-                rows.put(key, asdict(measured))
+            measured = _measured(
+                rows, key, lambda case=case, size=size: measure_by_calculix(case, size)
+            )
             yield compared(Job(case.name, f"calculix {ELEMENT}", size), measured, reference)
 
 
@@ -338,9 +353,9 @@ def _own_reference(
     case: StudyCase, announce: Callable[[str], None], rows: KeptRows | None
 ) -> Reference:
     key = row_key("reference", case.hash)
-    row = rows.get(key) if rows else None
-    if row is not None:
-        return Reference(**row | {"grids_mm": tuple(row["grids_mm"])})
+    kept = rows.read(key, Reference, lambda one: is_reference(one, case)) if rows else None
+    if kept is not None:
+        return kept
     announce(f"reference of case '{case.name}': {case.label}")
     result = compute_reference(case)
     if rows:

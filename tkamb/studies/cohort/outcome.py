@@ -12,7 +12,7 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.memory import give_back
 from tkamb.run.columns import KINDS
 from tkamb.run.metrics import lateral_axis_name, map_rows
-from tkamb.run.recorder import Shard
+from tkamb.run.recorder import ANY, Shard, have
 from tkamb.run.results import Results
 from tkamb.run.simulation import simulate
 from tkamb.run.status import FAILED
@@ -27,7 +27,7 @@ class PressureMap:
     """The pressure on the insert at one frame.
 
     Args:
-        frame: of the run's rows.
+        frame: number of the frame among the run's rows.
         points: (n, 3) m.
         triangles: (k, 3).
         pressure: (n,) Pa.
@@ -50,7 +50,7 @@ class Outcome:
     Args:
         reason: why the run failed as a whole; "" if it did not.
         columns: name -> (f,) numbers of results.csv that the run has, without computing times.
-        status: of each frame.
+        status: status of each frame.
         chosen: its pressure map; None without contact.
         wear: name -> number, "volume_mm3_per_Mc" and others; empty: not asked for, or not found.
         wear_problem: why there is no wear; empty otherwise.
@@ -104,17 +104,54 @@ class Outcome:
                 row["side"],
                 row["lateral"],
             )
-        wear, problem = row.get("wear", {}), row.get("wear_problem", "")
-        return cls(row["reason"], columns, row["status"], chosen, wear, problem)
+        return cls(row["reason"], columns, row["status"], chosen, row["wear"], row["wear_problem"])
+
+
+ROW_KINDS = {"reason": str, "status": list, "wear": dict, "wear_problem": str}
+MAP_KINDS = {"frame": int, "side": str, "lateral": str}
+
+
+def is_outcome(shard: Shard) -> bool:
+    """Return whether a kept shard has the names, kinds and shapes that `Outcome.of` needs."""
+    row, arrays = shard.row, shard.contact or {}
+    has_map = "points" in arrays
+    kinds = ROW_KINDS | (MAP_KINDS if has_map else {})
+    if {name: type(value) for name, value in row.items()} != kinds:
+        return False
+    texts = all(isinstance(status, str) for status in row["status"])
+    wear = all(type(value) in (int, float) for value in row["wear"].values())
+    frames = len(row["status"])
+    expected: dict[str, tuple[str, tuple[int, ...]]] = {
+        name: ("fiub", (frames,)) for name in arrays if name.startswith("column ")
+    }
+    if has_map:
+        points = len(arrays["points"])
+        expected |= {"points": ("f", (points, 3)), "pressure": ("f", (points,))}
+        expected["triangles"] = ("iu", (ANY, 3))
+    if not (texts and wear and have(arrays, expected)):
+        return False
+    if bool(row["reason"]) == bool(expected):  # a run has either a reason or columns
+        return False
+    if expected and not np.isfinite(arrays.get("column time_s", np.nan)).all():
+        return False
+    return not has_map or _is_map(row, arrays)
+
+
+def _is_map(row: Mapping[str, Any], arrays: Mapping[str, Array]) -> bool:
+    triangles, sides = arrays["triangles"], (row["side"], row["lateral"])
+    inside = not len(triangles) or 0 <= triangles.min() <= triangles.max() < len(arrays["points"])
+    known = sides[0] in ("right", "left") and sides[1] in ("lateral", "medial")
+    finite = all(np.isfinite(arrays[name]).all() for name in ("points", "pressure"))
+    return bool(inside and known and finite and 0 <= row["frame"] < len(row["status"]))
 
 
 class CohortWorker:
     """Computes runs of a cohort.
 
     Args:
-        frames: of every trial.
+        frames: frames that are computed of every trial.
         map_flexion: deg, which frame's map is kept; None: that of the largest force.
-        wear: of every run's insert; None: none.
+        wear: settings of the wear that every run computes; None: no wear.
     """
 
     def __init__(

@@ -27,7 +27,7 @@ from tkamb.run.recorder import Shards
 from tkamb.run.results import page
 from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
-from tkamb.studies.cohort.outcome import CohortWorker, Outcome
+from tkamb.studies.cohort.outcome import CohortWorker, Outcome, is_outcome
 from tkamb.studies.cohort.plan import GROUP_AXES, Cohort, CohortRun, load_cohort
 from tkamb.studies.cohort.statistics import group_rows, groups_of
 
@@ -164,8 +164,8 @@ class Part:
     """Which of a cohort's runs a job of a batch queue computes.
 
     Args:
-        index: from 1.
-        count: of jobs.
+        index: number of the part, from 1.
+        count: number of parts.
 
     Raises:
         InputError: there is no such part.
@@ -287,7 +287,7 @@ def _kept(places: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
     result: dict[int, Outcome] = {}
     for shards in places:
         for number in numbers if shards.resumed else ():
-            shard = shards.get(number)
+            shard = shards.get(number, is_outcome)
             if shard is not None:
                 result[number] = Outcome.of(shard)
     return result

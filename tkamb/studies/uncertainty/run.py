@@ -23,7 +23,7 @@ from tkamb.io.scene.case import Case, load_case
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recorded import predicted_columns
-from tkamb.run.recorder import Shard, Shards
+from tkamb.run.recorder import Shard, Shards, have
 from tkamb.run.results import STATISTICS_LIMITS, Results
 from tkamb.run.results_folder import (
     BANDS_NAME,
@@ -144,7 +144,7 @@ class Uncertainty:
     """Result of `estimate_uncertainty`.
 
     Args:
-        results: of the scene as given; its summary says what varied.
+        results: results of the scene as given; its summary says what varied.
         bands: columns of bands.csv.
         tornado: influence of each input on each result.
         names: columns of results.csv that have a band.
@@ -280,7 +280,8 @@ class _Job:
         """Compute the samples that are not there yet and return all with their bands."""
         names = banded_names(self.nominal)
         count = len(self.points)
-        samples = _kept(shards, count, len(names))
+        shape = (len(names), len(self.nominal), len(self.inputs))
+        samples = _kept(shards, count, shape)
         remaining = [n for n in range(count) if n not in samples]
         new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
         try:
@@ -362,20 +363,32 @@ def banded_names(results: Results) -> list[str]:
     ]
 
 
-def _kept(shards: Shards | None, count: int, names: int) -> dict[int, Sample]:
-    """Return the samples that an earlier run left; one of other shapes counts as absent."""
+def _kept(shards: Shards | None, count: int, shape: tuple[int, int, int]) -> dict[int, Sample]:
+    """Return the samples that an earlier run left.
+
+    Args:
+        shards: None: nothing is kept.
+        count: number of samples.
+        shape: number of columns, of frames and of inputs of a sample.
+
+    Raises:
+        InputError: a kept sample has other arrays than a `Sample` of that shape.
+    """
     samples: dict[int, Sample] = {}
-    for number in range(count) if shards is not None and shards.resumed else ():
-        shard = shards.get(number) if shards is not None else None
-        if shard is not None and shard.contact is not None and _is_sample(shard.contact, names):
+    if shards is None or not shards.resumed:
+        return samples
+    for number in range(count):
+        shard = shards.get(number, lambda one: _is_sample(one.contact or {}, shape))
+        if shard is not None and shard.contact is not None:
             samples[number] = Sample(**shard.contact)
     return samples
 
 
-def _is_sample(arrays: Mapping[str, Array], names: int) -> bool:
-    """Return whether kept arrays have the kinds and shapes of a `Sample` of so many columns."""
-    kinds = {name: (array.dtype.kind, array.ndim) for name, array in arrays.items()}
-    if kinds != {"values": ("f", 2), "problems": ("U", 1), "errors": ("f", 2)}:
-        return False
-    frames = len(arrays["problems"])
-    return arrays["values"].shape == (names, frames) and len(arrays["errors"]) == frames
+def _is_sample(arrays: Mapping[str, Array], shape: tuple[int, int, int]) -> bool:
+    names, frames, inputs = shape
+    expected = {
+        "values": ("f", (names, frames)),
+        "problems": ("U", (frames,)),
+        "errors": ("f", (frames, inputs)),
+    }
+    return have(arrays, expected) and bool(np.isfinite(arrays["errors"]).all())

@@ -17,7 +17,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.guard import interrupt_as_such
-from tkamb.run.recorder import Shard, Shards
+from tkamb.run.recorder import Shard, Shards, have
 from tkamb.run.results import STATISTICS_LIMITS
 from tkamb.run.workers import Numbered, PoolOptions, Task
 from tkamb.studies.uncertainty.bands import percentiles
@@ -44,8 +44,8 @@ class Scaled(WearLaw):
     """Another law times a factor.
 
     Args:
-        law: of wear.
-        factor: on every depth.
+        law: wear law.
+        factor: factor on every depth.
     """
 
     name: ClassVar[str] = "scaled"
@@ -121,8 +121,8 @@ class WearSampler:
 
     Args:
         simulation: the case as it stands, cycles, and updates of the geometry.
-        inputs: that vary.
-        constant_share: of a pose error's variance.
+        inputs: inputs that vary.
+        constant_share: share of a pose error's variance that is the same in all frames.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class WearSampler:
         """Return the columns of a sample's table; none where it has no contact.
 
         Args:
-            number: of the sample; it changes nothing.
+            number: number of the sample; it does not change the sample.
             normal: (d,) errors of the inputs in standard deviations.
         """
         case, cycles, updates = self._simulation
@@ -183,8 +183,8 @@ class WearBands:
     Args:
         varied: what varied, by how much.
         samples: how many.
-        failed: of them found no contact before the first cycle; they are in no band.
-        ended: of them ended before the last cycle; they are in no band after it.
+        failed: number of samples without contact before the first cycle; they are in no band.
+        ended: number of samples that ended before the last cycle; they are in no later band.
         rows: one per row of the table, "<column>_p05", "_p50" and "_p95"; NaN: too few samples.
     """
 
@@ -234,12 +234,12 @@ class Sampling:
     """The samples of a simulation; sample n does not depend on their number or on the worker.
 
     Args:
-        inputs: that vary.
+        inputs: inputs that vary.
         root: (d, d) makes independent errors correlated, see
         `tkamb.studies.uncertainty.sampling`.
         samples: how many.
-        seed: of all draws.
-        constant_share: of a pose error's variance.
+        seed: seed of all draws.
+        constant_share: share of a pose error's variance that is the same in all frames.
     """
 
     inputs: tuple[VariedInput, ...]
@@ -274,7 +274,7 @@ class Sampling:
 
         Args:
             simulation: the case as given, cycles, and updates of the geometry.
-            rows: of that case.
+            rows: rows of the table of the case as given.
             crew: who computes; default: this process.
             shards: where samples are kept.
             progress: wraps the samples as they come.
@@ -284,8 +284,10 @@ class Sampling:
         """
         count = self.samples
         normal = normal_samples("lhs", count, len(self.inputs), self.seed) @ self.root.T
-        shard_of = {n: shards.get(n) for n in range(count)} if shards and shards.resumed else {}
-        done: dict[int, Rows] = {n: shard.contact or {} for n, shard in shard_of.items() if shard}
+        done: dict[int, Rows] = {}
+        for n in range(count) if shards and shards.resumed else ():
+            if shards and (shard := shards.get(n, _is_sample)):
+                done[n] = shard.contact or {}
         remaining = [(n, normal[n]) for n in range(count) if n not in done]
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
         try:
@@ -302,6 +304,19 @@ class Sampling:
             what = f"{len(done)} of {count} samples are kept; go on with resume=True"
             raise KeyboardInterrupt(what) from None
         return _bands(self.inputs, [done[n] for n in range(count)], rows, simulation[1])
+
+
+def _is_sample(shard: Shard) -> bool:
+    """Return whether a kept shard has the columns that a `WearSampler` returns."""
+    columns = shard.contact or {}
+    if not columns:
+        return True
+    rows = columns["cycles"].size if "cycles" in columns else 0
+    if not rows or not have(columns, dict.fromkeys(("cycles", *BANDED), ("f", (rows,)))):
+        return False
+    cycles = columns["cycles"]
+    finite = np.isfinite(cycles).all() and np.isfinite(columns["volume_mm3"]).all()
+    return bool(finite and (np.diff(cycles) >= 0).all())
 
 
 def _bands(

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +21,10 @@ from tkamb.io.scene import Scene
 from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.identity import foreign_code
-from tkamb.run.recorder import UNREADABLE, Shards
+from tkamb.run.recorder import UNREADABLE, Shards, have, read_arrays
 from tkamb.run.results import Results
 from tkamb.run.workers import PoolOptions
-from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
+from tkamb.studies.wear.bands import BANDED, WEAR_BAND, Progress, Sampling, check_samples
 from tkamb.studies.wear.laws import WearLaw
 from tkamb.studies.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
 from tkamb.studies.wear.report import SAMPLES_NAME, STATE_NAME, WearReport
@@ -76,9 +75,9 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
     """Return the state that a folder keeps; None where there is none.
 
     Args:
-        folder: of the simulation.
-        identity: of the simulation to go on with.
-        count: of articular vertices.
+        folder: folder of the simulation.
+        identity: hash of the simulation to go on with, from `wear_identity`.
+        count: number of articular vertices.
 
     Raises:
         InputError: it is of another simulation, or cannot be read.
@@ -87,8 +86,7 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
     if not path.is_file():
         return None
     try:
-        with np.load(BytesIO(read_bytes(path, FILE_LIMITS.mesh_bytes)), allow_pickle=False) as file:
-            content = dict(file)
+        content = read_arrays(read_bytes(path, FILE_LIMITS.mesh_bytes))
     except UNREADABLE as error:
         raise _damaged(path, str(error) or type(error).__name__) from None
     if str(content.pop("identity", "")) != identity:
@@ -98,20 +96,31 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
         rows = json.loads(str(content.pop("rows")))
         values = {name: one.item() if one.ndim == 0 else one for name, one in content.items()}
         state = WearState(rows=tuple(rows), **values)
-        whole = all(isinstance(row, dict) for row in rows)
+        whole = bool(rows) and all(_is_row(row, rows[0]) for row in rows)
     except (ValueError, KeyError, TypeError) as error:
         raise _damaged(path, str(error)) from None
-    numbers = (state.cycles, state.step, state.volume, state.creep_volume, state.map_error)
-    if not (whole and all(isinstance(one, float) and math.isfinite(one) for one in numbers)):
-        raise _damaged(path, "its values are not numbers")
-    arrays = (state.wear, state.creep, state.fall)
-    if not all(isinstance(one, np.ndarray) and one.shape == (count,) for one in arrays):
+    arrays = {name: one for name, one in content.items() if one.ndim}
+    if not have(arrays, dict.fromkeys(("wear", "creep", "fall"), ("f", (count,)))):
         raise _damaged(path, f"its arrays are not of {count} vertices")
+    numbers = (state.cycles, state.step, state.volume, state.creep_volume, state.map_error)
+    whole &= all(isinstance(one, float) and math.isfinite(one) for one in numbers)
+    whole &= type(state.unsettled) is int and isinstance(state.end, str)
+    if not (whole and all(np.isfinite(one).all() for one in arrays.values())):
+        raise _damaged(path, "its values are not numbers")
     return state
 
 
+def _is_row(row: Any, first: Any) -> bool:
+    """Return whether a row of the kept table has numbers, and the columns of the first row."""
+    return (
+        isinstance(row, dict)
+        and {"cycles", *BANDED} <= row.keys() == first.keys()
+        and all(type(value) in (int, float) for value in row.values())
+    )
+
+
 def _damaged(path: Path, why: str) -> InputError:
-    return InputError(f"is damaged ({why})", path, "leave --resume out to begin again")
+    return InputError(f"is damaged ({why})", path, "leave out resume=True to begin again")
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +132,7 @@ class WearRun:
         case: what is worn, by what law.
         material: with sources.
         cycles: how many.
-        updates: of the geometry.
+        updates: number of updates of the geometry.
         sampling: for bands; None: none.
     """
 
@@ -298,8 +307,8 @@ def wear_of_results(
     Material, law and closing of the cycle are those of the scene's [wear].
 
     Args:
-        scene: of the results, with the contact they were computed with.
-        path: of its file.
+        scene: scene of the results, with the contact that they were computed with.
+        path: file of the scene.
         results: with their maps.
         cycles: how many.
         updates: how often the insert's geometry follows.
