@@ -214,8 +214,14 @@ class Measure:
     map: dict[str, float] = field(default_factory=dict)
 
 
+MOST_NODES = 10**9
+"""No model has so many nodes, and no press so many iterations."""
+
+
 def is_whole(measure: Measure) -> bool:
     """Return whether a kept measure has all numbers of its status."""
+    if max(measure.iterations, measure.nodes) > MOST_NODES:
+        return False
     if measure.status != "ok":
         return not measure.values and not measure.map
     return are_quantities(measure.values) and is_map(measure.map)

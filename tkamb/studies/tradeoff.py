@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -277,7 +278,7 @@ def run_tradeoff(
         reference = references[job.case]
         code = contact_code(job.contact)
         key = row_key("tradeoff", asdict(job), code, reference.hash, reference.values)
-        measured = _measured(rows, key, lambda job=job: measure_apart(job))
+        measured = _measured(rows, key, partial(measure_apart, job))
         yield compared(job, measured, reference)
 
 
@@ -315,9 +316,7 @@ def run_peer(
             if size not in PEER_GRIDS_MM.get(case.name, ()):
                 continue
             key = row_key("calculix", case.hash, reference.values, size)
-            measured = _measured(
-                rows, key, lambda case=case, size=size: measure_by_calculix(case, size)
-            )
+            measured = _measured(rows, key, partial(measure_by_calculix, case, size))
             yield compared(Job(case.name, f"calculix {ELEMENT}", size), measured, reference)
 
 

@@ -94,7 +94,9 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
         raise InputError(what, path, "leave out resume=True, or choose another directory")
     try:
         rows = json.loads(str(content.pop("rows")))
-        values = {name: one.item() if one.ndim == 0 else one for name, one in content.items()}
+        values: dict[str, Any] = {
+            name: one.item() if one.ndim == 0 else one for name, one in content.items()
+        }
         state = WearState(rows=tuple(rows), **values)
         whole = bool(rows) and all(_is_row(row, rows[0]) for row in rows)
     except (ValueError, KeyError, TypeError) as error:
