@@ -30,10 +30,9 @@ def plain_report(monkeypatch):
 @pytest.fixture
 def quick_case(monkeypatch):
     """Scenes are read, and their bodies built, once."""
-    from tkamb.geometry import frames
     from tkamb.run import simulation
 
-    parts = ((simulation, "load_case", Scene.model_dump_json), (frames, "mechanics_of", id))
+    parts = ((simulation, "load_case", Scene.model_dump_json), (simulation, "mechanics_of", id))
     for module, name, key_of in parts:
         kept = {}
 

@@ -277,7 +277,7 @@ def test_an_axial_rotation_kept_as_recorded_shows_the_moment_that_keeps_it(bend)
     results = Results(columns, summary, None)
     (card,) = [c for c in cards(results, horizontal_axis(results)) if "Residual" in c.title]
     assert card.value == "0.0 %"
-    assert "residual axial moment of up to 7.6" in card.detail
+    assert "residual axial moment is at most 7.6" in card.detail
 
 
 def test_several_questions_are_told_apart(bend):

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Any
 from tkamb import __version__, code_identity
 from tkamb.errors import InputError
 from tkamb.files import named_files, sha256_of
-from tkamb.io.scene import Scene, load_scene
-from tkamb.io.scene.case import Case, load_case
-from tkamb.io.scene.scene import scene_files
 
 if TYPE_CHECKING:
+    from tkamb.io.scene import Scene
+    from tkamb.io.scene.case import Case
     from tkamb.run.results import Results
 
 
@@ -76,12 +75,12 @@ def _code_in(folder: Path) -> Iterable[Path]:
     return (path for path in folder.rglob("*") if path.suffix in SUFFIXES and path.is_file())
 
 
-def scene_hash(case: Case) -> str:
+def scene_hash(case: "Case") -> str:
     """Return the SHA-256 of the validated scene."""
     return hashlib.sha256(case.scene.identity_json.encode()).hexdigest()
 
 
-def run_identity(case: Case, frames: range) -> dict[str, Any]:
+def run_identity(case: "Case", frames: range) -> dict[str, Any]:
     """Return the identity of a run: hashes of scene, files and code, frames and version.
 
     A contact model of another package adds that package's code.
@@ -98,7 +97,7 @@ def run_identity(case: Case, frames: range) -> dict[str, Any]:
     return identity if foreign is None else identity | {CONTACT_CODE: foreign}
 
 
-def files_hash(case: Case) -> str:
+def files_hash(case: "Case") -> str:
     """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
     digest = hashlib.sha256()
     for path in _files_read(case):
@@ -106,13 +105,15 @@ def files_hash(case: Case) -> str:
     return digest.hexdigest()
 
 
-def input_hashes(case: Case, scene: Path | None) -> dict[str, str]:
+def input_hashes(case: "Case", scene: Path | None) -> dict[str, str]:
     """Return path -> SHA-256 of the scene file, if there is one, its base and what it has read."""
+    from tkamb.io.scene.scene import scene_files
+
     paths = [*([] if scene is None else scene_files(scene.absolute())), *_files_read(case)]
     return {str(path): sha256_of(path) for path in paths}
 
 
-def _files_read(case: Case) -> list[Path]:
+def _files_read(case: "Case") -> list[Path]:
     unread = {"output"} | ({"implant"} if case.femoral is None else set())
     named = files_in(case.scene.model_dump(exclude=unread))
     models = [path for path in named if path.suffix.lower() == ".osim"]
@@ -131,12 +132,14 @@ def files_in(value: Any) -> list[Path]:
 RUN_AGAIN = "run it again: tkamb run"
 
 
-def case_of_results(results: "Results") -> Case:
+def case_of_results(results: "Results") -> "Case":
     """Return the case of results, whose summary names the scene.
 
     Raises:
         InputError: the scene is not there, or no longer what was run.
     """
+    from tkamb.io.scene.case import load_case
+
     summary = results.summary
     case, scene = load_case(_scene_of(summary)), summary.get("scene")
     if scene_hash(case) != summary.get("scene_sha256"):
@@ -170,14 +173,16 @@ def run_again(summary: Mapping[str, Any]) -> str:
     return " ".join([RUN_AGAIN, str(summary["scene"]), *study, *changed])
 
 
-def same_files(case: Case, summary: Mapping[str, Any]) -> bool:
+def same_files(case: "Case", summary: Mapping[str, Any]) -> bool:
     """Say whether meshes and tables hold what the run read; a run without a record counts."""
     result = (summary.get("identity") or {}).get("content of a file")
     return result is None or result == files_hash(case)
 
 
-def _scene_of(summary: Mapping[str, Any]) -> Scene:
+def _scene_of(summary: Mapping[str, Any]) -> "Scene":
     """Return the scene of results, with the contact model they were run with."""
+    from tkamb.io.scene import load_scene
+
     name = summary.get("scene")
     if not name:
         raise InputError("names no scene file", "summary", "give the scene itself to tkamb view")

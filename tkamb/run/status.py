@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.io.scene.case import Case
-from tkamb.run.mechanics import FrameLoads
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -153,9 +151,9 @@ FAILED = "failed: "
 
 
 def frame_status(
-    case: Case,
+    case: "Case",
     k: int,
-    body: FrameLoads,
+    body: "FrameLoads",
     contact: "FrameContact | None",
     doubts: Sequence[str] = (),
 ) -> str:
@@ -185,7 +183,7 @@ def frame_status(
     return "; ".join(words) or "ok"
 
 
-def failures_of(body: FrameLoads, contact: "FrameContact | None") -> list[str]:
+def failures_of(body: "FrameLoads", contact: "FrameContact | None") -> list[str]:
     """Return why a frame has no force, in words; empty if it has."""
     result = list(body.loads.problems)
     if contact and contact.problem and not result:
@@ -193,7 +191,7 @@ def failures_of(body: FrameLoads, contact: "FrameContact | None") -> list[str]:
     return result
 
 
-def _lift_off(body: FrameLoads, side: str, released: bool) -> str:
+def _lift_off(body: "FrameLoads", side: str, released: bool) -> str:
     if released:
         return f"{side} condyle lifts off"
     if side in body.geometry.lifted:
@@ -202,7 +200,7 @@ def _lift_off(body: FrameLoads, side: str, released: bool) -> str:
     return f"{side} condyle unloaded: the other one alone balances the adduction moment"
 
 
-def _flank_flags(body: FrameLoads) -> list[str]:
+def _flank_flags(body: "FrameLoads") -> list[str]:
     """Return a flag for each condyle whose contact normal leans far from the vertical."""
     result = []
     for side, condyle in body.geometry.condyles.items():
@@ -214,7 +212,7 @@ def _flank_flags(body: FrameLoads) -> list[str]:
     return result
 
 
-def _adjustment_flags(case: Case, body: FrameLoads) -> list[str]:
+def _adjustment_flags(case: "Case", body: "FrameLoads") -> list[str]:
     if body.effect is None or body.loads.problems:
         return []
     change = abs(body.effect.force) / case.body_weight
@@ -223,7 +221,7 @@ def _adjustment_flags(case: Case, body: FrameLoads) -> list[str]:
     return [f"femoral adjustment changes the total force by {change:.2f} BW: {body.effect.cause}"]
 
 
-def _patella_flags(case: Case, body: FrameLoads) -> list[str]:
+def _patella_flags(case: "Case", body: "FrameLoads") -> list[str]:
     """Return a flag where the lines do not hold a recorded patella at its place."""
     patella = case.scene.patella
     if patella is None or patella.motion != "recorded" or body.loads.problems:
@@ -239,7 +237,7 @@ def _patella_flags(case: Case, body: FrameLoads) -> list[str]:
     ]
 
 
-def _motion_flags(case: Case, k: int) -> list[str]:
+def _motion_flags(case: "Case", k: int) -> list[str]:
     motion = case.motion
     far = motion.deviation_translation[k] > STATUS.filter_translation
     rotated = motion.deviation_rotation[k] > STATUS.filter_rotation

@@ -171,17 +171,16 @@ def _thickness(case: Case, columns: Mapping[str, Any]) -> dict[str, list[float]]
 
 def _tolerances(table: ContactTable) -> dict[str, float]:
     """Return the relative tolerances of a contact model's solver, as far as they are known."""
-    from tkamb.contact.lattice.settings import LatticeSolverSettings
-    from tkamb.contact.pressing import PRESS
+    if table.model.startswith("foundation"):
+        from tkamb.contact.pressing import PRESS
+
+        return {"load": PRESS.load_tolerance}
+    if table.model not in ("lattice", "lattice-linear", "fe"):
+        return {}
     from tkamb.contact.registry import contact_model
 
-    settings = getattr(
-        contact_model(table.model, table.resolution_mm, **table.options), "settings", None
-    )
-    if table.model.startswith("foundation"):
-        return {"load": PRESS.load_tolerance}
-    if table.model == "lattice-source" or not isinstance(settings, LatticeSolverSettings):
-        return {}
+    model = contact_model(table.model, table.resolution_mm, **table.options)
+    settings = getattr(model, "settings")  # noqa: B009  a lattice's own
     return {"force": settings.force_tolerance, "gap": settings.gap_tolerance}
 
 
