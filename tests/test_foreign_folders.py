@@ -69,6 +69,7 @@ def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, how):
     [
         ("body_mass_kg", "heavy"),
         ("contact", ["foundation"]),
+        ("contact", {"resolution_mm": 2.0}),
         ("material", {"name": "x"}),
         ("known_error", {"area": 1.0}),
         ("cycle_percent_s", [1.0]),

@@ -93,10 +93,8 @@ UNCERTAINTY = {
         }
     ),
 }
-CONTACT = optional(
+CONTACT = {"model": "text", "resolution_mm": "number"} | optional(
     {
-        "model": "text",
-        "resolution_mm": "number",
         "material": "text",
         "released": TEXTS,
         "coupling": "text",
