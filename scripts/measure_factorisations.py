@@ -23,7 +23,12 @@ from tkamb.contact.materials import material
 
 
 def block(counts, edge):
-    """Return nodes, lattice places and cells of a block (m)."""
+    """Return node positions (n, 3) m, their integer lattice indices (n, 3) and the block's cells.
+
+    Args:
+        counts: number of cells along x, y and z.
+        edge: edge length of a cell, m.
+    """
     sizes = np.array(counts) + 1
     index = np.stack(np.meshgrid(*[np.arange(n) for n in sizes], indexing="ij"), -1).reshape(-1, 3)
     number = np.arange(len(index)).reshape(sizes)
@@ -47,7 +52,7 @@ def timed(label, make, right, entries):
 
 
 def superlu(matrix, order):
-    """Return a SuperLU factorisation in natural order of the permuted matrix, or by MMD."""
+    """Return a SuperLU factorisation: in the given order of unknowns; None: in SuperLU's own."""
     options = {"SymmetricMode": True}
     if order is None:
         made = linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options)

@@ -14,7 +14,7 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 WEIGHTS = np.sin(1.0 + np.arange(12.0)).reshape(3, 4)
-"""Of a pose's upper twelve entries in its sum, as in scripts/make_opensim_references."""
+"""Weights of the (3, 4) entries of a pose in its checksum, as in make_opensim_references."""
 
 
 @cache

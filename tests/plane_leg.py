@@ -22,7 +22,10 @@ COORDINATES = ("hip_flexion_r", "knee_flexion_r", "ankle_flexion_r")
 
 
 def hinge(name: str, parent: str, child: str, coordinate: str | None, place) -> Joint:
-    """Return a hinge from a point of the parent to the child's origin; no coordinate: welded."""
+    """Return a joint from a point of the parent to the child's origin.
+
+    The joint is a hinge about z. It is a weld if `coordinate` is None.
+    """
     axes = () if coordinate is None else (JointAxis(Z, coordinate, Linear(1.0, 0.0)),)
     kind = "WeldJoint" if coordinate is None else "PinJoint"
     return Joint(name, kind, parent, child, pose(np.eye(3), place), np.eye(4), axes, ())

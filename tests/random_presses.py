@@ -1,4 +1,4 @@
-"""Random presses of the lattice from random starts, beside solutions to 1e-6."""
+"""Compare random presses of the lattice from random initial guesses with solutions to 1e-6."""
 
 import numpy as np
 
@@ -31,12 +31,12 @@ def presses(model, state, wanted, exact, rng, cases):
     """Yield load, start, status and errors of random presses between 1 N and 24 kN.
 
     Args:
-        model: of the default tolerance, and what it prepared.
-        state: see above.
-        wanted: the same to 1e-6, and what it prepared.
-        exact: see above.
-        rng: of numpy.
-        cases: how many.
+        model: lattice with the tolerance under test.
+        state: the state that `model` prepared.
+        wanted: lattice with a tolerance of 1e-6, for the reference solutions.
+        exact: the state that `wanted` prepared.
+        rng: random generator of numpy.
+        cases: number of presses.
     """
     last = None
     for _ in range(cases):

@@ -16,7 +16,10 @@ from tkamb.io.recordings.meshes import load_surface
 
 
 def torus_dish(major=0.03, minor=0.02, spacing=5e-4):
-    """A block whose top is the lower half of a torus about an axis along z; and its height."""
+    """Return a block whose top is the lower half of a torus, and the function height(x, z).
+
+    The axis of the torus is along z.
+    """
 
     def height(x, z):
         ring = major - minor + np.sqrt(minor**2 - z**2)
@@ -28,7 +31,7 @@ def torus_dish(major=0.03, minor=0.02, spacing=5e-4):
 
 
 def test_arc_length_on_a_cylinder():
-    """Oblique to the axis: an ellipse; its length by quadrature."""
+    """A section oblique to the axis is an arc of an ellipse; its exact length is by quadrature."""
     radius = 0.05
     surface = trough(radius, spacing=5e-4)
     start = np.array([[-0.012, 0, -0.015], [-0.01, 0, 0.0], [0.0, 0, -0.01]])

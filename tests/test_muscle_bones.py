@@ -1,4 +1,4 @@
-"""What muscles do to the bones: virtual work against lengths, wrenches, and the knee's reaction."""
+"""Muscle forces on bones: virtual work against change of length, wrenches, knee reaction."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ KNEE_AXES = tuple(f"knee_{axis}" for axis in ("flexion", "adduction", "rotation"
 
 
 def still(chain, q):
-    """Return a motion that stands at each q (f, n)."""
+    """Return a motion through coordinates q (f, n) with zero velocity and acceleration."""
     return CoordinateMotion(np.arange(float(len(q))), q, 0 * q, 0 * q)
 
 
@@ -30,12 +30,14 @@ def walking():
 
 
 def moved_points(chain, q, coordinate, bones, attached):
-    """Return the work (f, m) of attachments' pulls per unit of a coordinate, by differences.
+    """Return the virtual work (f, m) of unit muscle tensions per unit of one coordinate.
+
+    The velocities of the attachments are central differences.
 
     Args:
         chain: the model's kinematics.
-        q: (f, n).
-        coordinate: that moves, alone.
+        q: (f, n) coordinates of the model.
+        coordinate: name of the only coordinate that moves.
         bones: bone -> its first body.
         attached: bone -> list of Attachments on it.
     """
@@ -57,7 +59,7 @@ def moved_points(chain, q, coordinate, bones, attached):
 
 @needs_jw
 def test_attachments_do_the_work_of_the_length(walking):
-    """About all six axes of the knee, each alone: F·(-dL/dq), wraps included."""
+    """Along each of the knee's six axes the work of unit tension is -dL/dq, wraps included."""
     trial, found = walking
     chain, q = trial.kinematics, trial.motion.q[::33]
     pull = found.bones.pull_on(("tibia", "foot"), "tibia")[..., 3:]
@@ -91,7 +93,10 @@ def test_a_wrench_is_that_of_the_attachments(walking):
 
 @needs_jw
 def test_the_knee_carries_about_its_hinge_what_reserve_and_patella_leave(walking):
-    """The reaction's work about flexion, with that of the patella's coupler, is the reserve."""
+    """The generalised force of knee and patella reactions about flexion equals the reserve.
+
+    The patella's coordinate is coupled to knee flexion, so both move in the virtual work.
+    """
     trial, found = walking
     chain, q = trial.kinematics, trial.motion.q
     flexion, patella = (chain.coordinates[n] for n in ("knee_flexion", "patfem_flexion"))
@@ -116,7 +121,7 @@ def test_the_knee_carries_about_its_hinge_what_reserve_and_patella_leave(walking
 
 @needs_jw
 def test_the_leg_balances_as_a_whole(walking):
-    """What ground, hip and gravity do to shank and foot is what the knee and the muscles do."""
+    """Forces of knee, muscles, ground and gravity on shank and foot are mass x acceleration."""
     trial, found = walking
     chain, both = trial.kinematics, ("tibia", "foot")
     pose = found.bones.poses[:, found.bones.index("tibia")]
@@ -130,7 +135,7 @@ def test_the_leg_balances_as_a_whole(walking):
         second = np.gradient(np.gradient(place[:, :3], 1 / 120, axis=0), 1 / 120, axis=0)
         inertia = inertia + own.mass_kg * (second - chain.model.gravity)
     inner = slice(4, -4)
-    np.testing.assert_allclose(force[inner], inertia[inner], atol=1.0)  # N, of differences
+    np.testing.assert_allclose(force[inner], inertia[inner], atol=1.0)  # N, for finite differences
 
 
 def test_a_muscle_past_the_tibia_loads_it_through_the_foot_alone():
@@ -149,7 +154,7 @@ def test_a_muscle_past_the_tibia_loads_it_through_the_foot_alone():
 
 
 def test_quadriceps_that_end_on_the_patella_are_named():
-    """DM's patella is held by a ligament, not a muscle; Rajagopal's lines continue to the tibia."""
+    """In DM a ligament joins patella and tibia; in Rajagopal the muscles continue to the tibia."""
     chain = kinematics("DM")
     q = chain.coupled({})[None]
     with pytest.raises(InputError, match=r"recfem_r.* end on 'patella_r'"):

@@ -1,4 +1,4 @@
-"""The settings of the algorithms: found, explained, and recorded where they are changed."""
+"""Settings of the algorithms: each has a documented meaning, and a run records changed ones."""
 
 import ast
 from dataclasses import dataclass, fields

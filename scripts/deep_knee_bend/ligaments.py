@@ -1,7 +1,8 @@
 """The bundles: attachments, law, and their strain over the motion.
 
-Attachments are in the femoral and in the insert frame (mm), which is where an implant's
-surgeon would look for them; the tibia link's own frame is only a shift away.
+Femoral attachments are in the femoral frame, tibial attachments in the insert frame (mm), so that
+their positions relative to the implant can be read off. The frame of the tibia link differs from
+the insert frame by a translation.
 """
 
 from dataclasses import dataclass

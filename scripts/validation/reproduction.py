@@ -1,7 +1,7 @@
-"""What docs/dissertation.md puts beside Sharma (2008), computed with the preset sharma-2008.
+"""Compute what docs/dissertation.md compares with Sharma (2008), by the preset sharma-2008.
 
-Facts of the source stand in `reproduction.toml`, appendix D in `dissertation_tables.toml`. Numbers
-that scripts/data/validation.json has already are taken from there by the page.
+Facts of the source stand in `reproduction.toml`, appendix D in `dissertation_tables.toml`. The page
+takes some other numbers from scripts/data/validation.json; they are not computed here.
 """
 
 import time
@@ -25,11 +25,11 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 PRESET = "sharma-2008"
 LOAD, CELLS = 1500.0, 1.5 * MILLIMETRE
-"""N and m: of the press by which the loops are shown."""
+"""N and m: load and cell size of the press in `lattice`."""
 TILTED = (0.3, (30.5, 30.7, 31.2), -6.9)
-"""deg coronal, mm of recorded heights, mm AP: where the adjustment is shown."""
+"""Poses of `adjustment`: coronal angle (deg), recorded heights (mm), AP position (mm)."""
 LIFTED = (0.45, (15.0, 30.0))
-"""deg coronal error put in, deg of flexion: the positions of section 5.2.2."""
+"""Coronal error that `lift_off` adds (deg), and its flexion angles (deg), as in section 5.2.2."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,8 @@ class ReproductionSettings:
     """The reproduction of the dissertation."""
 
     stride: int = 10
-    """Every so many of the 101 frames of the shipped bend: 0, 10, ... 100 % as in appendix D."""
+    """Every `stride`-th of the 101 frames of the shipped bend is computed. Source: appendix D has
+    0, 10, ... 100 %."""
 
 
 REPRODUCTION = ReproductionSettings()
@@ -111,7 +112,10 @@ def template() -> Values:
 
 
 def adjustment(model: Path) -> Values:
-    """Return the medial force at recorded heights that differ, adjusted and not."""
+    """Return the least and greatest medial force over the recorded heights, with adjustment.
+
+    Without adjustment, return the medial force at the middle height.
+    """
     angle, heights, place = TILTED
 
     def medial(height: float, adjust: bool) -> float:
@@ -133,7 +137,11 @@ def adjustment(model: Path) -> Values:
 
 
 def lift_off(scene: Path) -> Values:
-    """Return how many positions lose a condyle to a recorded coronal angle, adjusted and not."""
+    """Return in how many positions a coronal error lifts a condyle off, adjusted and unadjusted.
+
+    The result also has the least share of the load that a condyle carries.
+    """
+
     error, flexions = LIFTED
     recorded = load_case(load_scene(scene)).motion.coordinates[:, 5] / DEGREE
     frames = [int(np.abs(recorded - flexion).argmin()) for flexion in flexions]

@@ -44,7 +44,7 @@ class ContactPair:
 
     @cached_property
     def first_touch(self) -> FirstTouch:
-        """Search for the travel of the femoral component until each condyle touches."""
+        """Object that finds the travel of the femoral component until each condyle touches."""
         return FirstTouch(self.femoral, self.insert, self.split)
 
     @cached_property
@@ -54,7 +54,7 @@ class ContactPair:
 
     @cached_property
     def closest_points(self) -> "ClosestPointQuery":
-        """Search for the closest points of the two undeformed bodies."""
+        """Object that finds the closest points of the two undeformed bodies."""
         from tkamb.geometry.closest import ClosestPointQuery
 
         return ClosestPointQuery(self.femoral, self.insert, self.split)

@@ -138,7 +138,7 @@ class C3dFile:
         points: (n, m, 3) in the file's length unit, gaps NaN.
         residual: (n, m) in the file's length unit; NaN in gaps.
         raw_analog: (k, c) analog words before offset and scale.
-        notices: remarks on what was read otherwise than stated.
+        notices: remarks where the data differ from what the file states.
     """
 
     header: Header
@@ -173,7 +173,7 @@ def parse_c3d(content: bytes, path: Path) -> C3dFile:
 
 
 def _header(content: bytes, machine: int) -> Header:
-    """Return the header; numbers that no recording has are left to the checks."""
+    """Return the header; its numbers are checked later."""
     words = np.frombuffer(content, ">u2" if machine == _MIPS else "<u2", 10)
     scale = _floats(content[12:16], machine)[0]
     rate = _floats(content[20:24], machine)[0]
@@ -182,7 +182,10 @@ def _header(content: bytes, machine: int) -> Header:
 
 
 def _floats(content: bytes, machine: int) -> Array:
-    """Return 32-bit floats of a machine; those of DEC have exchanged halves and a bias of two."""
+    """Return 32-bit floats of a machine.
+
+    DEC floats have their 16-bit halves exchanged and an exponent that is larger by two.
+    """
     if machine != _DEC:
         kind = ">f4" if machine == _MIPS else "<f4"
         return np.frombuffer(content, kind).astype(float)
@@ -191,7 +194,14 @@ def _floats(content: bytes, machine: int) -> Array:
 
 
 def _parameters(content: bytes, at: int, end: int, machine: int) -> tuple[dict[str, Any], set[str]]:
-    """Return the values of the chain of records between two places, and those damaged."""
+    """Return "GROUP:NAME" -> values, and the names of the damaged parameters.
+
+    Args:
+        content: bytes of the file.
+        at: first byte of the chain of records.
+        end: byte at which the chain ends at the latest.
+        machine: code of the machine that wrote the file.
+    """
     order = "big" if machine == _MIPS else "little"
     groups: dict[int, str] = {}
     records: list[tuple[int, str, int, int]] = []
@@ -264,7 +274,10 @@ def _check_agreement(header: Header, parameters: Parameters, path: Path) -> None
         )
     if header.analog and (not header.samples or header.analog % header.samples):
         raise InputError(
-            f"holds {header.analog} analog values a frame in {header.samples} samples", path, EXPORT
+            f"states {header.analog} analog values per frame, which is no multiple of its "
+            f"{header.samples} samples per frame",
+            path,
+            EXPORT,
         )
     channels = parameters.integers("ANALOG:USED")
     if channels and header.analog and channels[0] != header.channels:
@@ -326,7 +339,15 @@ class _Data:
         )
 
     def _start(self, notices: list[str]) -> int:
-        """Return the first byte of the data; POINT:DATA_START decides where the header fails."""
+        """Return the first byte of the data.
+
+        The header states the block. POINT:DATA_START replaces it if the frames fit the size of the
+        file only from there.
+
+        Raises:
+            InputError: no block within the file, or header and POINT:DATA_START contradict each
+                other and the size of the file does not decide between them.
+        """
         stated = self.parameters.integers("POINT:DATA_START")
         blocks = list(dict.fromkeys([self.header.data_block, *stated[:1]]))
         after = self.content[0]
@@ -346,7 +367,7 @@ class _Data:
         return (chosen - 1) * BLOCK
 
     def _fits(self, start: int) -> bool:
-        """Return whether the frames fill the file from a byte on, but for less than a block."""
+        """Return whether less than a block remains behind the frames if they begin at `start`."""
         spare = len(self.content) - start - self._stated() * self._frame
         return 0 <= spare < BLOCK
 
@@ -363,8 +384,8 @@ class _Data:
     def _stated(self) -> int:
         """Return how many frames the file states.
 
-        TRIAL's two words count beyond 16 bits, as LONG_FRAMES does; POINT:FRAMES is believed
-        where it exceeds them.
+        The header's frame numbers have 16 bits. For longer recordings the number is that of the
+        two words of TRIAL, else that of POINT:LONG_FRAMES or POINT:FRAMES if it is above 65535.
         """
         wrap = LARGEST_16_BIT + 1
         begin, end = (
@@ -383,10 +404,11 @@ class _Data:
         return header
 
     def _count(self, stored: int, notices: list[str]) -> int:
-        """Return how many of `held` frames are read.
+        """Return how many of the `stored` frames are read.
 
         Raises:
-            InputError: none, fewer than the file states, or more than 16 bits count.
+            InputError: the file states no frame, holds fewer frames than it states, or is too
+                long for its 16-bit frame number.
         """
         stated = self._stated()
         other = self.parameters.integers("POINT:FRAMES")
@@ -397,7 +419,7 @@ class _Data:
         uncounted = self.header.last >= LARGEST_16_BIT or stored > stated + LARGEST_16_BIT
         if uncounted and stored > stated + spare:
             raise InputError(
-                f"states {stated} frames, which 16 bits can count, and is long enough for {stored}",
+                f"states {stated} frames, but is long enough for {stored}",
                 self.path,
                 "export it with TRIAL:ACTUAL_END_FIELD, or cut the trial",
             )

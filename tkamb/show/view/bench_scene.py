@@ -1,4 +1,4 @@
-"""A state of the bench as a scene: the files that `tkamb run` computes to the same numbers."""
+"""Write a state of the bench as a scene, from which `tkamb run` computes the same numbers."""
 
 import csv
 import json
@@ -48,12 +48,12 @@ ROWS = 6
 def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
     """Write a case of `Bench.case_of` as a scene that `tkamb run` reads; return the scene file.
 
-    The URDF is copied; meshes are named where they are.
+    The URDF is copied. Meshes are not copied: the scene holds their paths.
 
     Args:
         case: a case that stands still.
         folder: an existing folder; its files of these names are replaced.
-        own: a folder of this session; its meshes are copied too.
+        own: a folder of this session, whose meshes are copied nevertheless; None: no such folder.
     """
     scene, side = case.scene, -1.0 if case.scene.patient.side == "left" else 1.0
     times = case.motion.time
@@ -80,7 +80,7 @@ def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
 
 
 def write_motion(folder: Path, times: Sequence[float], coordinates: Array, side: float) -> None:
-    """Write knee coordinates (f, 6) of a right knee as [motion] of `STILL` reads them.
+    """Write knee coordinates (f, 6) of a right knee to motion.csv, the [motion] file of `STILL`.
 
     Args:
         folder: folder for motion.csv.
@@ -221,14 +221,14 @@ def still_motion(coordinates: Array) -> KneeMotion:
 def write_knee(knee: Knee, placement: Array, coordinates: Array, folder: Path) -> Path:
     """Write a `tkamb.Knee` as a scene that stands still, and return its file.
 
-    The leg around the knee is the starter's, with the axes of the tibia parallel to the axes of the
-    insert: no result of the bench depends on it. The load therefore acts along the y axis of the
-    insert, as in `Knee.press`. Muscles, extensor mechanism and friction are left out: the knee does
-    not move.
+    The scene has the leg that `tkamb new` writes, because no result of the bench depends on the
+    leg. The axes of its tibia are parallel to the axes of the insert, so that the load acts along
+    the y axis of the insert, as in `Knee.press`. Muscles, extensor mechanism and friction are left
+    out: the knee does not move.
 
     Args:
         knee: the knee.
-        placement: (4, 4) of its insert's axes in the insert frame.
+        placement: (4, 4) pose of the insert's mesh in the insert frame (`insert_placement`).
         coordinates: (f, 6) of a right knee; the first row is written.
         folder: an empty one.
     """
@@ -265,7 +265,7 @@ def _bundles(knee: Knee, tibia: Array) -> "list[Ligament]":
 
     Args:
         knee: the knee.
-        tibia: (4, 4) of its tibia in the tibia of the scene.
+        tibia: (4, 4) pose of the knee's tibia link in the tibia link of the scene.
     """
     bundles: list[Ligament] = []
     for bundle in knee.ligaments:

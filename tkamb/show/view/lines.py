@@ -62,10 +62,10 @@ ARROW = ArrowSettings()
 def force_arrows(
     results: "Results", geometries: Sequence[KneeGeometry], friction: float
 ) -> tuple[Arrow, ...]:
-    """Return the forces on the leg that are modelled.
+    """Return arrows of the modelled forces: ground reaction, hip, extensor mechanism, contact.
 
-    The condyles' arrows are the forces on the insert with their friction: their sum is the
-    contact force of results.csv.
+    The arrow of a condyle is its contact force on the insert, friction included. The two arrows
+    add up to the contact force of results.csv.
 
     Args:
         results: results of the frames.
@@ -158,7 +158,7 @@ def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Ar
 
 
 def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
-    """Return where a tendon ends and the pull (3,) of one newton there."""
+    """Return a tendon's distal end (3,) m, and the force (3,) there at a tension of one newton."""
     if geometry.extensor is None:
         return NOTHING, NOTHING
     (muscle,) = geometry.muscles
@@ -214,7 +214,8 @@ def _vector(results: "Results", pattern: str) -> Array:
 
 
 BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
-"""m, radii; bundles are thinner where a ligament has many."""
+"""m: radii of ligament bundles, tendons and load paths. The first is halved if there are more than
+`many_bundles` bundles."""
 
 
 @dataclass(frozen=True)
@@ -227,11 +228,11 @@ class ViewStrandSettings:
     """N: a tendon or muscle with a smaller force is drawn grey. Chosen: far below forces that
     matter."""
     least_activation: float = 0.1
-    """1: smallest upper end of the colour scale of activations. Chosen: small activations then look
-    small."""
+    """1: least value at the upper end of the colour scale of activations. Chosen: small activations
+    then look small."""
     many_bundles: int = 20
-    """Ligament bundles from which on they are drawn thinner. Chosen: thick ones would cover each
-    other."""
+    """Number of ligament bundles above which each is drawn at half its radius. Chosen: thick ones
+    would cover each other."""
 
 
 VIEW_STRAND = ViewStrandSettings()
@@ -242,7 +243,7 @@ def ligament_strands(
 ) -> tuple[tuple[Strand, ...], float]:
     """Return the bundles coloured by strain, and the upper limit of the colour scale.
 
-    A frame that failed has no numbers: its bundles are grey, and no scale ends at them.
+    A failed frame has no strains: its bundles are grey and do not affect the limit.
     """
     bundles = mechanics.ligaments
     if not bundles:
@@ -291,8 +292,9 @@ def extensor_strands(
 def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ...], float]:
     """Return the muscles across the knee coloured by activation, and the scale's upper limit.
 
-    From where a line leaves the shank or foot to where it reaches thigh or pelvis; those that
-    carry less than a newton are grey, and frames without a solution have none.
+    A strand runs from the point where a muscle leaves shank or foot to the point where it reaches
+    thigh or pelvis. It is grey where the muscle carries less than `slack_force`. Frames without a
+    solution have no strands.
     """
     shares = [one.share if one.share and one.share.status == "ok" else None for one in geometries]
     first = next((share for share in shares if share), None)
@@ -323,9 +325,10 @@ def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ..
 
 
 def _tendon(name: str, paths: list[TautPath | None], slack: Mask) -> Strand:
-    """Return the strand of a taut path (f), grey where it is slack (f,).
+    """Return the strand of a tendon along its taut paths, one path per frame.
 
-    Its corners are doubled where the colour changes.
+    The strand is grey in the frames of `slack` (f,). Its corners are doubled where the colour
+    changes.
     """
     lines = [_colour_path(path) for path in paths]
     most = max(len(points) for points, _ in lines)
@@ -336,7 +339,7 @@ def _tendon(name: str, paths: list[TautPath | None], slack: Mask) -> Strand:
 
 
 def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
-    """Return points and colours: free, on the bone, free."""
+    """Return points and colours of a path; the part that lies on the bone has its own colour."""
     free, wrapped = rgb(TENDON), rgb(WRAPPED)
     if path is None or not np.isfinite(path.points).all():
         return np.full((2, 3), np.nan), np.stack([free, free])
@@ -350,7 +353,7 @@ def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
 
 
 def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
-    """Return side -> (f, 3) m, on the undeformed insert; NaN beside it."""
+    """Return side -> centre of pressure (f, 3) m on the undeformed insert; NaN where off it."""
     rays, top = insert.rays, float(insert.bounds[1, 1]) + MILLIMETRE
     result = {}
     for side in SIDE_COLOURS:

@@ -1,9 +1,9 @@
 """The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-A scene has no bone meshes except one that a muscle may wrap, which is drawn. The other bones are
-stand-ins of about the right size between the joint centres, for orientation only; they carry no
-load. The pose of the foot is not measured: it is drawn level with the floor and pointing forward
-with the shank, so that the arrow of the ground reaction starts at a foot.
+A scene can have the mesh of one bone, around which a muscle wraps. This mesh is drawn. The other
+bones are stand-ins of about the right size between the joint centres, for orientation only; they
+carry no load. The pose of the foot is not measured. The foot is drawn level with the floor and
+pointing forward with the shank, so that the arrow of the ground reaction starts at a foot.
 """
 
 from collections.abc import Sequence
@@ -54,7 +54,8 @@ SOLE = (
     (172.0, 11.0, -20.0, 11.0),
     (160.0, 10.0, 22.0, 10.0),
 )
-"""Balls in whose hull the foot lies: anterior of the ankle, above the sole, right; radius; mm."""
+"""mm: balls whose convex hull is the foot: centre (anterior of the ankle, above the sole, to the
+right) and radius."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ VIEW_SOLID = ViewSolidSettings()
 
 PLATE = np.array([340.0, 5.0, 200.0]) * MILLIMETRE
 GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
-"""rad: successive points of a spiral turned by it cover a sphere evenly."""
+"""rad: golden angle. Points of a spiral that are this angle apart cover a sphere evenly."""
 
 
 def solids(
@@ -84,8 +85,8 @@ def solids(
 ) -> tuple[Solid, ...]:
     """Return the solids of a case.
 
-    The femoral component stands where the contact model pressed it, else where it was
-    recorded.
+    The femoral component has the pose that the contact model found, and the pose of `states` in
+    frames without a map.
 
     Args:
         case: the case.
@@ -126,7 +127,7 @@ def solids(
 
 
 def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
-    """Return the insert as `tkamb wear` left it, coloured by depth; nothing without one.
+    """Return the worn insert that `tkamb wear` wrote, coloured by wear depth; () if there is none.
 
     Args:
         results: results of a run; their folder may have wear.vtp of the same scene.
@@ -228,7 +229,7 @@ def floor_and_foot(
 
 
 def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float) -> Array:
-    """Return the pose (4, 4) in the insert frame of the floor under the ankle, y up."""
+    """Return the floor's pose (4, 4) in the insert frame: origin below the ankle, y up."""
     laboratory = geometry.state.pose("tibia") @ inverse(tibia_in_laboratory)
     up = laboratory[:3, 1]
     ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
