@@ -1,41 +1,28 @@
 """Sections of the report: conclusions, tables of the motion and of flagged frames, and wear."""
 
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-
-from tkamb.geometry.frames import Mask
-from tkamb.run import metrics
-from tkamb.run.known_errors import is_large, known_error_words
-from tkamb.run.status import AGREEMENT
-from tkamb.show.headline import PRESSURE_AND_AREA
-
-if TYPE_CHECKING:
-    from tkamb.run.results import Results
-
+import base64
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from tkamb.geometry.frames import Array
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.files import MEGABYTE, read_bytes, read_json
+from tkamb.geometry.frames import Array, Mask
+from tkamb.run import metrics
+from tkamb.run.known_errors import is_large, known_error_words
 from tkamb.run.metrics import (
     body_weight,
     medial_share,
     residual_share,
     tension_ratio,
 )
+from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis
-
-if TYPE_CHECKING:
-    from tkamb.run.results import Results
-
-import base64
-from typing import TYPE_CHECKING
-
-from tkamb.errors import InputError
-from tkamb.files import MEGABYTE, read_bytes, read_json
+from tkamb.show.headline import PRESSURE_AND_AREA
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results

@@ -2,39 +2,32 @@
 
 import csv
 import json
-import shutil
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from tkamb.geometry.frames import KNEE_COORDINATES, Array
-from tkamb.io.recordings.motion import KneeMotion
-from tkamb.io.recordings.recording_tables import GroundReactionTable, MotionTable, TibiaTable
-from tkamb.io.recordings.scene_table import SceneTable
-from tkamb.io.scene.case import Case
-from tkamb.knee.load import LinkPoint
-from tkamb.units import MILLIMETRE
-
-if TYPE_CHECKING:
-    from tkamb.knee.ligaments import Ligament
-
 import logging
 import re
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from importlib import resources
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.contact.materials import MATERIALS, material
 from tkamb.contact.registry import contact_class, contact_names
 from tkamb.errors import InputError
-from tkamb.geometry.frames import inverse, pose, transform
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.io.given_material import LAW_KEYS, material_as_json
+from tkamb.io.recordings.motion import KneeMotion
+from tkamb.io.recordings.recording_tables import GroundReactionTable, MotionTable, TibiaTable
+from tkamb.io.recordings.scene_table import SceneTable
+from tkamb.io.scene.case import Case
 from tkamb.io.starter.person import Person, patient_urdf
 from tkamb.knee.knee import Knee
+from tkamb.knee.load import LinkPoint
 from tkamb.knee.parts import mirrored_surface
+from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.knee.ligaments import Ligament

@@ -3,7 +3,7 @@
 The size of a force comes from results.csv, its line of action from the geometry of the frame.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,14 +14,16 @@ from tkamb.geometry.frames import Array, Mask, transform
 from tkamb.geometry.surface import Surface
 from tkamb.knee.chain import ChainState
 from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.load import PointForces
 from tkamb.knee.wrapping import TautPath
 from tkamb.run.mechanics import Mechanics
 from tkamb.run.metrics import failed, stretches
-from tkamb.show.style import SIDE_COLOURS
+from tkamb.show.style import BLACK, FORCE_COLOURS, SIDE_COLOURS
 from tkamb.show.view.drawing import (
     SLACK,
     TENDON,
     WRAPPED,
+    Arrow,
     Colours,
     Marker,
     Strand,
@@ -33,17 +35,6 @@ from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
-
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
-from tkamb.knee.load import PointForces
-from tkamb.show.style import BLACK, FORCE_COLOURS
-from tkamb.show.view.drawing import Arrow
-
-if TYPE_CHECKING:
-    from tkamb.run.results import Results
-
 
 NOTHING = np.full(3, np.nan)
 

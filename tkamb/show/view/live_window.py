@@ -6,7 +6,7 @@ import shutil
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from tkamb.knee.knee import Knee
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import SIDE_COLOURS
 from tkamb.show.view.bench import BenchRequest, still_motion
+from tkamb.show.view.bench_scene import write_knee
 from tkamb.show.view.drawing import (
     INSERT,
     METAL,
@@ -43,10 +44,6 @@ from tkamb.show.view.payload import pack, packed_map
 from tkamb.show.view.server import NotYet, ViewServer
 from tkamb.show.view.show import serve_in_background
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
-
-if TYPE_CHECKING:
-    pass
-from tkamb.show.view.bench_scene import write_knee
 
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
 COARSE = ("foundation", 2.0)
