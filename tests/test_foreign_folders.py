@@ -104,6 +104,16 @@ def test_a_contact_table_of_other_values_is_refused_by_wear(copy, tmp_path, capf
     assert f"contact.{key}" in said
 
 
+def test_a_frame_without_its_flexion_is_refused(copy, capfd):
+    path = copy / "results.csv"
+    head, row = path.read_text().splitlines()[:2]
+    cells = row.split(",")
+    cells[head.split(",").index("flexion_deg")] = "nan"
+    path.write_text(f"{head}\n{','.join(cells)}\n")
+    _rehash(copy)
+    assert "'flexion_deg' is not a number" in refused(capfd, "report", copy)
+
+
 def test_a_table_without_frames_is_refused(copy, capfd):
     path = copy / "results.csv"
     path.write_text(path.read_text().partition("\n")[0] + "\n")

@@ -65,6 +65,9 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     columns = read_csv(directory / CSV_NAME)
     if not len(next(iter(columns.values()), ())):
         raise InputError("holds no frame", directory / CSV_NAME, "run it again")
+    for name in ("time_s", "flexion_deg"):
+        if name in columns and not np.isfinite(np.asarray(columns[name], float)).all():
+            raise InputError(f"'{name}' is not a number", directory / CSV_NAME, "run it again")
     summary = read_summary(directory)
     maps = None
     if (directory / MAPS_NAME).exists():
