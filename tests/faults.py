@@ -1,4 +1,4 @@
-"""Calls to the system that fail, one after the other: what a full or broken disk does."""
+"""File operations of which a chosen one fails, as on a full or broken disk."""
 
 import builtins
 import io
@@ -17,9 +17,9 @@ class Faults:
     """Counts the opens, writes, flushes, syncs and renames in one folder; one of them fails.
 
     Args:
-        folder: calls on other files are left alone.
-        number: which call fails, from 0; None: none does, they are only counted.
-        error: with which errno.
+        folder: folder in which calls are counted; calls on other files are not touched.
+        number: number of the call that fails, from 0; None: no call fails.
+        error: errno of the failure.
     """
 
     def __init__(self, folder, number=None, error=ENOSPC):
@@ -35,7 +35,7 @@ class Faults:
 
     @contextmanager
     def injected(self, patch):
-        """Have the calls go through here while the block runs."""
+        """Replace the calls by versions that count and may fail while the block runs."""
         opened, path_of = io.open, {}
 
         def opening(file, mode="r", *args, **options):

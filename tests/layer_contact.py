@@ -6,7 +6,7 @@ displacement under a pressure with Hankel transform P(k), frictionless:
     u(r) = 2 (1 - nu²)/E ∫ L(k t) P(k) J0(k r) dk
     L(w) = (2 κ sinh 2w - 4 w)/(2 κ cosh 2w + 1 + κ² + 4 w²),   κ = 3 - 4 nu
 
-The half-space part (L = 1) is closed by elliptic integrals, the rest by quadrature.
+Elliptic integrals give the half-space part (L = 1) in closed form. Quadrature gives the rest.
 Reference: Johnson, Contact Mechanics (1985), sections 3.4 and 5.8.
 """
 
@@ -34,7 +34,7 @@ def _indent(radius, thickness, a, young, nu, rings):
     full = np.zeros((rings + 1, rings + 1))
     full[:rings, :rings] = matrix
     full[:rings, rings] = -1.0
-    # the pressure vanishes at the edge like a root: ring values extrapolate to zero
+    # Near the edge the pressure is proportional to sqrt(1 - (r/a)²). The last two rings obey this.
     s = np.sqrt(1 - (middles[-2:] / a) ** 2)
     full[rings, rings - 2 : rings] = [s[1], -s[0]]
     right = np.append(-(middles**2) / (2 * radius), 0.0)

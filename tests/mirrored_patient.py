@@ -54,7 +54,7 @@ def _negate_columns(path, names):
 
 
 def _mirrored_urdf(text):
-    """Reflect origins (z, roll and pitch change sign), axes of rotation and products."""
+    """Reflect origins (z, roll, pitch change sign), axes of rotation and products of inertia."""
     text = re.sub(
         r'xyz="(\S+) (\S+) (\S+)"', lambda m: f'xyz="{m[1]} {m[2]} {-float(m[3])!r}"', text
     )
@@ -67,7 +67,7 @@ def _mirrored_urdf(text):
 
     def axis(match):
         x, y, z = (float(part) for part in match[2].split())
-        z = -z  # undone by the xyz rule above: here axes are as in the right knee
+        z = -z  # the first rule has negated z of every axis: restore the axis of the right knee
         if match[1] in ("revolute", "continuous"):
             x, y = -x, -y
         return match[0].replace(match[2], f"{x + 0.0!r} {y + 0.0!r} {z + 0.0!r}")

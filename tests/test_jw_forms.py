@@ -13,7 +13,10 @@ pytestmark = pytest.mark.skipif(
     not JW.is_dir(), reason="subject JW's files are not beside the project"
 )
 FORCES_N = {2.275: 1039.0, 2.675: 838.0, 3.475: 1006.0, 3.675: 861.0}
-"""Time (s) -> total force of the untouched model, foundation at 3 mm, by the release before."""
+"""Time (s) -> total contact force (N) of the original model, as an earlier version computed it.
+
+The contact model is the elastic foundation at a resolution of 3 mm.
+"""
 
 
 def original() -> str:
@@ -21,7 +24,7 @@ def original() -> str:
 
 
 def cut(text: str, tag: str, folder: Path) -> str:
-    """Put a set into a file of its own."""
+    """Move a set of the model into its own file; return the text that refers to this file."""
     found = re.search(rf"<{tag} .*?</{tag}>", text, re.S)
     assert found
     held = f'<OpenSimDocument Version="40000">{found[0]}</OpenSimDocument>'
@@ -30,7 +33,7 @@ def cut(text: str, tag: str, folder: Path) -> str:
 
 
 def massless(text: str, inertia: str) -> str:
-    """Take the mass of two bodies, and give them an inertia."""
+    """Return the text of the model with two bodies that have zero mass and the given inertia."""
     for name in ("tibial_tray", "femoral_component"):
         begin = text.index(f'<Body name="{name}">')
         end = text.index("</Body>", begin)
@@ -78,7 +81,7 @@ FORMS = ("ampersand", "Latin-1", "ConstraintSet", "ForceSet", "MarkerSet", "ever
 def test_another_form_gives_the_same_patient(tmp_path, reference, name):
     (tmp_path / "JW.osim").write_bytes(form(name, tmp_path))
     scene = imported(tmp_path / "JW.osim", tmp_path / "out")
-    if name == "massless":  # as if the file gave those two bodies no inertia
+    if name == "massless":  # the inertia of a massless body is ignored, so zeros give the same
         (tmp_path / "JW.osim").write_text(massless(original(), "0 0 0 0 0 0"), encoding="utf-8")
         reference = imported(tmp_path / "JW.osim", tmp_path / "zero")
     ours, theirs = (

@@ -1,4 +1,4 @@
-"""Passes that look only where forces are lost: what they report holds for the whole solid."""
+"""Passes that evaluate only a region of the solid: their results hold for the whole solid."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def state(model):
 
 @pytest.fixture(scope="module")
 def tight(model, state):
-    """The same for a tolerance that 16-bit integers are too coarse for."""
+    """The state for a tolerance that a factor in 16-bit integers cannot reach."""
     finer = replace(model, tolerance=1e-4).prepare(state.pair)
     kept = [one.problem.operator.factor.values.dtype for one in (state, finer)]
     assert kept == [np.int16, np.float32]
@@ -43,7 +43,7 @@ def tight(model, state):
 
 
 def solved(state, x, tolerance, before=None):
-    """Return the solution at a place, from rest or from an earlier solution."""
+    """Return the solution with the femur shifted by x (m), with or without a warm start."""
     pose = POSE.copy()
     pose[0, 3] += x
     gaps, planes = undeformed(state.problem, pose)
@@ -65,7 +65,7 @@ def solved(state, x, tolerance, before=None):
 
 
 def settings(tolerance):
-    """Return settings whose residual force and gap may be as large as a tolerance."""
+    """Return solver settings for a relative tolerance of the residual force."""
     usual = LatticeSolverSettings()
     return replace(
         usual,
@@ -76,7 +76,7 @@ def settings(tolerance):
 
 
 def imbalance(state, solution):
-    """Return what is out of balance anywhere in the solid, relative to the contact forces."""
+    """Return the norm of the residual of the whole solid, relative to the contact forces."""
     problem, touched = state.problem, state.problem.contact_nodes[solution.candidates]
     pushed = solution.forces.force[:, None] * solution.planes.normals
     outside = -problem.solid.internal_force(solution.field)
@@ -118,13 +118,13 @@ def test_elements_are_left_out_up_to_the_bound():
 
 @pytest.fixture(scope="module")
 def pressed(state):
-    """The solid and what it was displaced by."""
+    """The solid and its displacement field."""
     return state.problem.solid, solved(state, 0.0, 1e-3).field
 
 
 @pytest.mark.parametrize("model", ["lattice"], indirect=True)
 def test_a_region_that_is_too_small_is_found_out_and_chosen_anew(state):
-    """Passes that looked at few elements go on with more: none is counted twice or left out."""
+    """Passes over too few elements continue with more, and the residual counts each just once."""
     cold = solved(state, 0.0, 2e-3)
     sizes = np.linalg.norm(state.problem.solid.nonlinear_residual(cold.field), axis=1)
     few = Region.of(state.problem, np.sort(np.argsort(sizes)[-40:]))
@@ -136,7 +136,7 @@ def test_a_region_that_is_too_small_is_found_out_and_chosen_anew(state):
 
 
 def test_the_approach_is_that_of_the_pose(state):
-    """Nothing is handed over: it follows from pair and pose, also after a change of pose."""
+    """A result computes its approach from pair and pose, also after a change of the pose."""
     resting = state.pair.pose_at_approach(POSE, 0.0)
     result = ContactResult.of(state, resting, *np.zeros((2, len(state.points))))
     assert result.approach == 0.0
@@ -146,7 +146,7 @@ def test_the_approach_is_that_of_the_pose(state):
 
 
 def test_compliance_at_hand_changes_no_answer(state):
-    """Pressed with what other poses have left, and with nothing: single precision's rounding."""
+    """A cache filled at other poses and an empty one give results that differ by rounding only."""
     model = contact_model("lattice", 2.0)
     for x in (4e-3, -3e-3):
         moved = POSE.copy()
@@ -159,7 +159,7 @@ def test_compliance_at_hand_changes_no_answer(state):
 
 
 def test_the_compliance_at_hand_stays_within_its_bound(state, monkeypatch):
-    """Nodes are kept beside new ones, unless there are too many."""
+    """Stored nodes stay when others are added, unless their number would exceed the bound."""
     for most, kept in ((4, [3, 5, 9, 10]), (3, [9, 10])):
         settings = compliance.ComplianceSettings(max_nodes=most)
         monkeypatch.setattr(compliance, "COMPLIANCE", settings)
@@ -170,7 +170,7 @@ def test_the_compliance_at_hand_stays_within_its_bound(state, monkeypatch):
 
 
 def test_the_compliance_grows_node_by_node(state, monkeypatch):
-    """In whatever order nodes come, and through every way of working it out."""
+    """The result depends neither on the order of the nodes nor on the way of the products."""
     half = state.problem.operator.half
     nodes = np.array([2, 3, 5, 8, 20, 21, 30])
     whole = by_component(half.among(unknowns_of(nodes)).compliance())
@@ -190,7 +190,7 @@ def test_the_compliance_grows_node_by_node(state, monkeypatch):
 
 
 def test_a_warm_start_of_another_insert_is_not_used(state):
-    """A guess of another state saves nothing and harms nothing."""
+    """Only a warm start of the same prepared state is accepted."""
     model = contact_model("lattice", 2.0)
     other = replace(state, problem=replace(state.problem))
     result, stranger = model.press_from(other, LOAD, POSE)

@@ -1,7 +1,9 @@
 """The Methods paragraph: what was modelled, with the scene's own numbers."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -9,7 +11,12 @@ import tkamb
 from scenes import MODEL
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.geometry.frames import SIDES
+from tkamb.io.scene import load_scene
+from tkamb.io.scene.case import load_case
 from tkamb.knee.ligaments import BUNDLES
+from tkamb.run.results import read_csv
+from tkamb.run.summary import measures
 from tkamb.show.methods import methods
 
 
@@ -46,15 +53,31 @@ def test_the_paragraph_has_thickness_meshes_tolerance_and_rate(run):
     """The numbers are those of the files: insert.stl, and motion.csv with 101 rows in 4 s."""
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     text = " ".join(methods(summary).sentences)
-    assert "recorded at 25 Hz" in text
+    assert "The motion had 25 frames per second." in text
     insert = trimesh.load_mesh(MODEL / "insert.stl")
     assert f"{len(insert.faces)} triangles for the insert" in text
     low, high = summary["measures"]["insert_thickness_mm"]
     assert 0.3 * insert.extents.min() < low <= high < insert.extents.min()
     assert "mm thick" in text
     assert "relative tolerance of 1e-06" in text
+    columns = read_csv(run / "results.csv")
+    thickness = [columns[f"{side}_thickness_mm"] for side in SIDES]
+    assert [low, high] == [np.nanmin(thickness), np.nanmax(thickness)]
     del summary["measures"]
     assert "triangles for" not in " ".join(methods(summary).sentences)
+
+
+def test_a_resampled_motion_is_not_called_recorded(run):
+    """motion.csv has 25 rows a second; 51 frames in 4 s are 12.5 a second."""
+    case = load_case(load_scene(MODEL / "scene.toml", {"motion.frames": 51}))
+    columns = {f"{side}_thickness_mm": np.array([np.nan, 5.0]) for side in SIDES}
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    summary["measures"] = measures(case, columns)
+    summary["scene_tables"]["motion"]["frames"] = 51
+    text = " ".join(methods(summary).sentences)
+    assert "The motion was resampled to 12.5 frames per second." in text
+    case = replace(case, motion=replace(case.motion, time=case.motion.time**1.1))
+    assert "frame_rate_Hz" not in measures(case, columns)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ equations of a massless patella without friction:
     muscle, ligament and contact force meet in one point (moment balance in the plane)
 
 By virtual work, the third equation says that the muscle's length is stationary among all places
-that satisfy the first two. A stable patella is at a minimum of this length. Near a known place,
-Newton steps with Broyden's slopes solve the three equations together. Elsewhere the search turns
-the patella in the direction of the residual moment until the moment changes sign.
+that satisfy the first two. A stable patella is at a minimum of this length. Near a known solution,
+Newton's method solves the three equations together. Broyden's updates improve its Jacobian, which
+is called slopes here. Elsewhere the search turns the patella in the direction of the residual
+moment until the moment changes sign.
 """
 
 from collections.abc import Sequence
@@ -43,8 +44,8 @@ class PatellaSearchSettings:
     """rad: step of the rotation below which the search has converged. Chosen: far below what
     changes a force."""
     max_chord_lengths: float = 8.0
-    """1: largest extrapolation along a chord, in lengths of the chord. Chosen: farther away the
-    prediction fails."""
+    """1: largest extrapolation along the chord between the states at two rotations, in lengths of
+    this chord. Chosen: farther away the prediction fails."""
     max_evaluations: int = 14
     """Maximum number of Newton steps from a guess near by. Chosen: searches that converge need
     fewer."""
@@ -52,8 +53,8 @@ class PatellaSearchSettings:
     """m: arm that makes a rotation comparable to a length in Broyden's update. Chosen: half the
     width of a patella."""
     max_distance: float = 5e-3
-    """m: largest distance of a place from the button's first touch at that rotation. Chosen: a
-    place farther away lies behind the femur."""
+    """m: largest distance between a solution and the position at which the button first touches
+    the femur at the same rotation. Chosen: a solution farther away lies behind the femur."""
 
 
 PATELLA_SEARCH = PatellaSearchSettings()
@@ -64,14 +65,15 @@ LONGEST_STEP = np.array([5e-3, 5e-3, np.deg2rad(4.0)])
 
 
 FIRST_STEP = np.deg2rad(0.5)
+"""rad: first step of the rotation when the search turns the patella."""
 NEAR_TURN = np.deg2rad(12.0)
+"""rad: largest rotation from the initial guess in Newton's method with known slopes."""
 WIDEST_TURN = np.deg2rad(40.0)
-"""rad: first step of the rotation, and the largest distances from the initial guess, by Newton
-steps with known slopes and by turning."""
+"""rad: largest rotation from the initial guess when the search turns the patella."""
 
 
 class _Lost(ComputationError):
-    """A search found no place; `status` is the condition that is not met."""
+    """The search found no equilibrium; `status` names the condition that is not met."""
 
     def __init__(self, status: PatellaStatus) -> None:
         super().__init__(status.value)
@@ -91,7 +93,7 @@ def solve_patella(
         mechanism: the extensor mechanism.
         pose_femur_in_insert: (4, 4) pose of the femur link.
         guess: (3,) m and rad, initial guess; None: all rotations are searched.
-        slopes: (3, 3) `slopes` of the guess; None: unknown.
+        slopes: (3, 3) `PatellaState.slopes` at the guess; None: unknown.
         anywhere: whether all rotations are searched if the search from the guess fails.
 
     Returns:
@@ -161,7 +163,8 @@ class _Search(PatellaFrame):
         """Return the balance with zero gap and the given ligament length at a rotation (rad).
 
         Raises:
-            ComputationError: there is none, or an end of a line lies inside its outline.
+            ComputationError: no such balance exists, or an end of the muscle or the ligament lies
+                inside the outline that it wraps.
         """
         closing = _Closing(self.mechanism.ligament_length)
         coordinates = np.array([start[0], start[1], rotation])
@@ -217,15 +220,21 @@ class _Search(PatellaFrame):
         try:
             brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
-            # From one end the search reaches another place at the other end, where the moment has
-            # the same sign.
+            # A search from `first` may end at another solution than `second` at the same rotation.
+            # The moment there may have the same sign as at `first`, so no zero is bracketed.
             raise _Lost(PatellaStatus.MOMENT) from None
         return last
 
     def _chord(
         self, first: PatellaBalance, second: PatellaBalance, reach: float = 1.0
     ) -> PatellaBalance | None:
-        """Return the stable balance within `reach` lengths of a chord; None: there is none."""
+        """Return the stable equilibrium near the chord between two balances; None: there is none.
+
+        Args:
+            first: balance at the start of the chord.
+            second: balance at its end.
+            reach: 1, largest distance from the start, in lengths of the chord.
+        """
         turn = float(second.coordinates[2] - first.coordinates[2])
         way = (second.coordinates - first.coordinates)[:2] / turn
         slope = (second.moment - first.moment) / turn
@@ -243,7 +252,8 @@ class _Search(PatellaFrame):
     ) -> PatellaBalance | None:
         """Return the stable balance near a place by Newton's method with Broyden's slopes.
 
-        None if a step leaves the span, if the place is unstable, or without convergence.
+        None if a step leaves the span, if the slopes show an unstable state, or if the iteration
+        does not converge.
 
         Args:
             start: (3,) coordinates, m and rad.
@@ -305,9 +315,9 @@ class _Search(PatellaFrame):
         return min(balances, key=lambda b: b.muscle.length), len(balances) > 1
 
     def first_touch(self, rotation: float) -> PatellaBalance:
-        """Return the balance at a rotation, where a patella from the front touches first.
+        """Return the balance at a rotation (rad), near the first contact of a swinging patella.
 
-        The patella swings on its ligament about the tuberosity.
+        The patella swings on its ligament about the tuberosity, from anterior to posterior.
 
         Raises:
             ComputationError: the button touches nothing, or there is no balance near the touch.
@@ -348,12 +358,12 @@ _CONDITIONS = (
 
 
 def _condition(error: ComputationError) -> PatellaStatus:
-    """Return the condition that is not met; errors of the lines have no status."""
+    """Return the condition that an error reports; an error without a status means LINE."""
     return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
 
 
 def _slopes_in_plane(balance: PatellaBalance) -> Array:
-    """Return the slopes (2, 2) of gap and ligament length by ap and si at a balance."""
+    """Return the derivatives (2, 2) of gap and ligament length with respect to ap and si."""
     return np.stack([balance.contact.normal[:2], -balance.ligament.start_direction[:2]])
 
 

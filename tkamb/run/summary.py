@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tkamb import __version__
+from tkamb.geometry.frames import SIDES
 from tkamb.io.recordings.gait_cycle import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene
@@ -55,6 +56,9 @@ class SummarySettings:
     notable_reserve: float = 0.05
     """1: share of a coordinate's largest moment; more reserve than this is a warning. Chosen: less
     changes no muscle force noticeably."""
+    uneven_share: float = 0.01
+    """1: the largest step of time may exceed the smallest by this share; a motion of more uneven
+    steps has no frame rate. Chosen: clocks and rounded times differ by less."""
 
 
 SUMMARY = SummarySettings()
@@ -129,14 +133,16 @@ def summary_of(
 def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
     """Return numbers that a Methods section needs and that no table of the scene holds.
 
-    They are the sampling rate of the recorded motion, the triangles of each mesh with the median of
-    their longest edges, the least and largest thickness of the insert below the centres of pressure
-    of the frames, and the tolerances of the contact solver. A number that is not known is left out.
+    They are the frames per second of an evenly sampled motion, the triangles of each mesh with the
+    median of their longest edges, the least and largest thickness of the insert below the centres
+    of pressure of the frames, and the tolerances of the contact solver. A number that is not known
+    is left out.
     """
     time = case.motion.time
     result: dict[str, Any] = {}
-    if len(time) > 1:
-        result["recording_rate_Hz"] = (len(time) - 1) / float(time[-1] - time[0])
+    steps = np.diff(time)
+    if len(steps) and steps.max() < (1.0 + SUMMARY.uneven_share) * steps.min():
+        result["frame_rate_Hz"] = float(1.0 / steps.mean())
     surfaces = {"femoral": case.femoral, "insert": case.insert, "patella": case.patella}
     result["meshes"] = {
         name: {
@@ -147,40 +153,34 @@ def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
         if surface is not None
     }
     if case.scene.contact is not None:
-        result |= _thickness(case, columns) | {"tolerances": _tolerances(case.scene.contact)}
+        result |= _thickness(columns) | {"tolerances": _tolerances(case.scene.contact)}
     return result
 
 
-def _thickness(case: Case, columns: Mapping[str, Any]) -> dict[str, list[float]]:
+def _thickness(columns: Mapping[str, Any]) -> dict[str, list[float]]:
     """Return the range of the insert's thickness below the centres of pressure, mm."""
-    assert case.insert is not None
-    sides = [
-        np.stack([columns[f"{side}_cop_ap_mm"], columns[f"{side}_cop_ml_mm"]], axis=1)
-        for side in ("medial", "lateral")
-    ]
-    places = np.concatenate(sides).astype(float) * MILLIMETRE
-    places = places[np.isfinite(places).all(axis=1)]
-    high = 2.0 * float(case.insert.bounds[1, 1]) + MILLIMETRE
-    start = np.column_stack([places[:, 0], np.full(len(places), high), places[:, 1]])
-    down = case.insert.rays.first(start, np.array([0.0, -1.0, 0.0]))[0]
-    thickness = high - down[np.isfinite(down)]  # the bottom lies at y = 0 of the insert frame
+    sides = [columns[f"{side}_thickness_mm"] for side in SIDES]
+    thickness = np.concatenate(sides).astype(float)
+    thickness = thickness[np.isfinite(thickness)]
     if not len(thickness):
         return {}
-    return {"insert_thickness_mm": [float(f(thickness)) / MILLIMETRE for f in (np.min, np.max)]}
+    return {"insert_thickness_mm": [float(thickness.min()), float(thickness.max())]}
 
 
 def _tolerances(table: ContactTable) -> dict[str, float]:
     """Return the relative tolerances of a contact model's solver, as far as they are known."""
-    if table.model.startswith("foundation"):
+    if table.model in ("foundation", "foundation-linear"):
         from tkamb.contact.pressing import PRESS
 
         return {"load": PRESS.load_tolerance}
     if table.model not in ("lattice", "lattice-linear", "fe"):
         return {}
+    from tkamb.contact.lattice.model import CellContact
     from tkamb.contact.registry import contact_model
 
     model = contact_model(table.model, table.resolution_mm, **table.options)
-    settings = getattr(model, "settings")  # noqa: B009  a lattice's own
+    assert isinstance(model, CellContact)
+    settings = model.settings
     return {"force": settings.force_tolerance, "gap": settings.gap_tolerance}
 
 

@@ -210,7 +210,7 @@ SUMMARY = optional(
         "scene_tables": TABLES,
         "changed_settings": {ANY_KEY: "any"},
         "measures": {
-            "recording_rate_Hz?": "number",
+            "frame_rate_Hz?": "number",
             "meshes": {ANY_KEY: {"triangles": "count", "edge_mm": "number"}},
             "insert_thickness_mm?": ["number", "number"],
             "tolerances?": {ANY_KEY: "number"},

@@ -34,8 +34,8 @@ class FrameMapSettings:
     """Byte of the page's picture where the contact ends; above it there is pressure. Chosen: bytes
     below it describe the fading rim."""
     most_frames: int = 250
-    """Largest number of maps in the page. Chosen: a longer run shows the nearest one at each place
-    of the slider."""
+    """Largest number of maps in the page. A longer run shows the map of the nearest frame at each
+    position of the slider. Chosen: it limits the size of the page."""
     coarsening: int = 2
     """Ratio of the grid in the page to the grid of the picture. Chosen: the page is a quarter of
     the size."""
@@ -45,7 +45,10 @@ FRAME_MAP = FrameMapSettings()
 
 
 def draw_insert(view: TopView, largest: float) -> Figure:
-    """Return the bare insert, over which the page draws, and the colours up to `largest`, MPa."""
+    """Return a figure of the bare insert with a colour bar up to `largest`, MPa.
+
+    The page draws the pressure over it.
+    """
     with settings():
         figure = new_figure(5.4, 3.7)
         (axes,), beside = place_maps(figure, 1, 1, 4.0)
@@ -64,10 +67,18 @@ def largest_pressure(results: "Results") -> float:
 def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
     """Return what the page needs to draw any frame's pressure, JSON-able.
 
-    `picture` is the PNG with the frames' tiles as a data address, `across` tiles side by side,
-    each `columns` by `rows` bytes; `tile` names each frame's tile and `shown` the frame whose map
-    it is; `edges` are the left, right, bottom and top of a tile in mm on the page and `span`
-    those of the drawn insert; `centres` are the centres of pressure there, per side.
+    Returns:
+        picture: data address of a PNG that holds one tile per map.
+        across: number of tiles side by side.
+        rows, columns: size of a tile in bytes.
+        tile: number of the tile that each frame shows.
+        shown: frame to which this tile belongs, for each frame.
+        edges: left, right, bottom and top of a tile, mm on the page.
+        span: left, right, bottom and top of the drawn insert, mm on the page.
+        rim: `FRAME_MAP.rim_byte`.
+        largest: MPa, top of the colour scale.
+        colours: the colour scale, 256 hexadecimal colours in one string.
+        centres: side -> centre of pressure of each frame, mm on the page; None: no contact.
     """
     assert results.maps is not None
     rows = map_rows(results)
@@ -100,7 +111,10 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
 def _tiles(
     results: "Results", view: TopView, rows: list[int], largest: float
 ) -> tuple[NDArray[np.uint8], list[float]]:
-    """Return the bytes (frames, rows, columns), cut to all contacts, and the edges, mm."""
+    """Return the bytes (frames, rows, columns) and the edges of a tile, mm.
+
+    A tile is cropped to the area that is in contact in any of the frames.
+    """
     maps = results.maps
     assert maps is not None
     levels = pressure_levels(maps.pressure_Pa[rows], maps.gap_m[rows], view.triangles, largest)

@@ -196,9 +196,10 @@ def _motion(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[s
             else "a chain of segments was fitted to all markers by least squares (Lu 1999)"
         )
         yield f"For that {way}; weights: {_weights(markers)}."
-    rate = (summary.get("measures") or {}).get("recording_rate_Hz")
+    rate = (summary.get("measures") or {}).get("frame_rate_Hz")
     if rate is not None:
-        yield f"It was recorded at {rate:.4g} Hz."
+        words = "had" if motion.get("frames") is None else "was resampled to"
+        yield f"The motion {words} {rate:.4g} frames per second."
     yield f"The coordinates were {_filter_words(motion['cutoff_Hz'])}."
     if motion.get("motion") == "roll-slip":
         yield (

@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
 TITLE_PAD, LEGEND_ROW = 8.0, 14.0
-"""Points between a plot and its title, for each row of the legend between them."""
+"""Points: distance of a plot from its title, and what each row of the legend adds to it."""
 FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
 """Points around a plot: for the labels of the horizontal axis; for half of its last label; for the
 vertical axis' label."""
 SIDE_LABEL, LEGEND = 8.0, 8.5
-"""Points, sizes of letters."""
+"""Points: font sizes of the labels beside a plot and of the legend."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PlotSettings:
     label_offset_points: float = 12.0
     """Points from a plot's edge to the near side of an axis' label. Chosen by looks."""
     side_gap: float = 0.01
-    """1: share of the width between the axes and what is written beside them. Chosen by looks."""
+    """1: gap between axes and the text beside them, as a share of the width. Chosen by looks."""
     band_opacity: float = 0.16
     """1: opacity of the band around a line, 0 to 1. Chosen by looks."""
     wide_band_opacity: float = 0.07
@@ -59,7 +59,7 @@ class PlotSettings:
 PLOT = PlotSettings()
 
 HANDLE, COLUMN_GAP = 2.7, 1.4
-"""Of a legend's letters: a handle with its gap, and the gap between columns."""
+"""In font sizes of the legend: width of a handle with its gap, and the gap between columns."""
 DASHES = (0, (4, 2))
 SPAN = "#e2e2e2"
 STANCE = "#eef3f7"
@@ -156,10 +156,10 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     """Give a plot that stands alone the room that its labels need; say whether that was possible.
 
     The places are those of matplotlib's constrained layout, which is slow. That layout is still
-    used for plots with a factor over a vertical axis or with a legend that is too wide.
+    used for plots with a power of ten above a vertical axis or with a legend that is too wide.
     """
     for second in axes.child_axes:
-        second.apply_aspect()  # takes its range from the first
+        second.apply_aspect()  # the second axis takes its range from the first
     sides = [one.yaxis for one in (axes, *axes.child_axes)]
     widths = [label_width(side) for side in sides]
     if any(side.get_major_formatter().get_offset() for side in sides):
@@ -243,7 +243,7 @@ def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
 
 
 def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
-    """Shade a line's 5 to 95 % and dot its median."""
+    """Shade a line's band from the 5th to the 95th percentile, and draw its median dotted."""
     assert line.band is not None
     (x, low), (_, middle), (_, high) = (axis.broken(one) for one in line.band)
     opacity, name = PLOT.band_opacity, f"band-{line.name}"
@@ -308,7 +308,7 @@ def _draw_level(axes: Axes, value: float, label: str) -> None:
 
 
 def _draw_span(axes: Axes, low: float, high: float, label: str) -> None:
-    """Shade a range, as a line where it is one value."""
+    """Shade a range of values. A range of one value appears as a line."""
     axes.axhspan(low, high, facecolor=SPAN, edgecolor=SPAN, linewidth=2, zorder=0.5, gid="span")
     middle, transform = 0.5 * (low + high), axes.get_yaxis_transform()
     words = label.replace(" ", "\n", 1)

@@ -148,7 +148,7 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """A table of texts.
 
     Args:
@@ -160,22 +160,22 @@ class Table:
     rows: Sequence[Sequence[str]]
 
 
-def motion_table(results: "Results", axis: HorizontalAxis) -> Table:
+def motion_table(results: "Results", axis: HorizontalAxis) -> TextTable:
     """Return the table of the frames nearest to round flexion angles, or at even times."""
     entries = [entry for entry in _entries(results, axis) if np.isfinite(entry[2]).any()]
     stops = axis.stops(13 if axis.kind == "flexion" else 11)
-    return Table(
+    return TextTable(
         [(name, unit) for name, unit, *_ in entries],
         [[_number(values[k], digits) for *_, values, digits in entries] for k in stops],
     )
 
 
-def strain_table(summary: Mapping[str, Any]) -> Table | None:
+def strain_table(summary: Mapping[str, Any]) -> TextTable | None:
     """Return the table of the ligaments' strains, %; a high strain reveals a wrong insertion."""
     result = summary.get("ligament_strain")
     if not result:
         return None
-    return Table(
+    return TextTable(
         [f"{angle:g}°" for angle in result["flexion_deg"]],
         [
             [name, *("–" if one is None else _number(100.0 * one, 1) for one in strain)]

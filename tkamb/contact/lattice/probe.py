@@ -5,10 +5,10 @@ them; with n the femoral normals, lambda the forces along them and C the complia
 
     dF = n dlambda + lambda dn,    n . (C dF - v) = 0,    dn = r cross n - G (v - n (n . v)),
 
-G the change of the femoral normal along the surface. The femur slides over the nodes, which are
-assumed to move along the normal only. C is the compliance of the linear operator. A softened
-material is softer than this stiffness, and nodes may come into contact or leave it. So the forces
-come from `evaluate`, and the stiffness only gives the direction of the search.
+where G is the gradient of the femoral normal along the surface. The femur slides over the nodes,
+which are assumed to move along the normal only. C is the compliance of the linear operator. A
+softened material is softer than this stiffness, and nodes may come into contact or leave it. So
+the forces come from `evaluate`, and the stiffness only gives the direction of the search.
 """
 
 from dataclasses import replace
@@ -26,9 +26,9 @@ from tkamb.geometry.frames import Array, Index
 TURN_STEP = 5e-5
 """m: step of the finite difference of femoral normals. Chosen: well below a cell."""
 REGION_HOLDS_WITHIN = 0.1
-"""Cells: largest distance of a search from the pose at which the whole solid was measured last.
-Within it the residual of the whole solid stays within 1.2 times the tolerance
-(`tests/test_lattice_probe.py`), and an evaluation takes half the time."""
+"""Cells: largest distance from the pose at which the whole solid was evaluated last. Within this
+distance only the region of its solution is evaluated, in half the time. The residual of the whole
+solid then stays within 1.2 times the tolerance (`tests/test_lattice_probe.py`)."""
 REGION_HOLDS_TO = 1.1
 """1: largest ratio of the contact forces to those at that pose."""
 LEVER_ARM = 0.03
@@ -45,10 +45,10 @@ class FindsForces(Presses, Protocol):
 
 
 class LatticeProbe(Probe):
-    """`evaluate` with the stiffness of what it found; see `tkamb.contact.model.Probe`.
+    """Contact forces and their stiffness at neighbouring poses; see `tkamb.contact.model.Probe`.
 
     Args:
-        model: of the lattice family, nodes pressed along the femoral normal.
+        model: lattice model whose nodes are pressed along the femoral normal.
         state: what its `prepare` returned.
         start: an earlier result or warm start.
         accuracy: 1, the model's tolerance, as a share of the contact force.
@@ -60,13 +60,16 @@ class LatticeProbe(Probe):
         super().__init__(model, state, start)
         self._finds, self._accuracy = model, accuracy
         self._measured: tuple[Array, float] | None = None
-        """Pose at which the whole solid was measured last, and norm of the forces there, N."""
+        """Pose at which the whole solid was evaluated last, and norm of the forces there, N."""
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
-        """Return the forces at a pose. Near the last measured pose, measure the region alone."""
+        """Return the contact at a pose and the start of the next evaluation.
+
+        Near the pose at which the whole solid was evaluated last, only the region is evaluated.
+        """
         if self._measured is not None:
             way = (pose - self._measured[0])[:3] * [LEVER_ARM, LEVER_ARM, LEVER_ARM, 1.0]
-            way[1, 3] = 0.0  # a change of height is seen in the forces
+            way[1, 3] = 0.0  # the limit on the forces covers a change of height
             if np.linalg.norm(way) <= REGION_HOLDS_WITHIN * self._state.lattice.spacing.min():
                 result, start = self._finds.evaluate_from(self._state, pose, self.start, True)
                 if np.linalg.norm(result.nodal_force) <= REGION_HOLDS_TO * self._measured[1]:
@@ -107,7 +110,8 @@ def force_changes(state: LatticeState, result: ContactResult, moved: Array, node
         nodes: (m,) loaded contact nodes.
 
     Returns:
-        N per m of its point at the insert's origin, then N per rad.
+        Columns 0 to 2: N per m of translation of the femoral point at the insert's origin.
+        Columns 3 to 5: N per rad of rotation about this point.
     """
     problem = state.problem
     force = result.nodal_force[nodes]
@@ -133,7 +137,7 @@ def force_changes(state: LatticeState, result: ContactResult, moved: Array, node
 def _normal_gradient(problem: ContactProblem, where: Array, pose: Array) -> Array:
     """Return the change (m, 3, 3) of the femoral normal per m along x, y and z; 0 along y.
 
-    Beside the femoral component the normal is assumed not to change.
+    Where a neighbouring point lies beside the femoral component, the change is taken as 0.
     """
     gradient = np.zeros((len(where), 3, 3))
     for axis in (0, 2):

@@ -1,8 +1,8 @@
 """Force plates of a C3D file: channels to the wrench that the ground exerts on the foot.
 
 A plate's axes follow from its corners, in the order of the format: x from corner 2 to corner 1,
-y from corner 4 to corner 1, z = x × y, down for a plate that lies. The channels give the force
-and the moment about the transducers' origin in these axes:
+y from corner 4 to corner 1, and z = x × y, which points down if the plate is horizontal. The
+channels give the force and the moment about the transducers' origin in these axes:
 
     type 1   Fx Fy Fz Px Py Tz: the force, its point on the surface and the free moment
     type 2   Fx Fy Fz Mx My Mz
@@ -13,11 +13,11 @@ and the moment about the transducers' origin in these axes:
     type 5   as type 2 after a calibration matrix (6, 8) of eight channels
 
 A calibration matrix gives forces in N (or FORCE_PLATFORM:UNITS) and moments in that unit times
-POINT:UNITS. Where the channels of a type 4 plate themselves state units of force and moment,
-these count; if both readings differ, the one that puts the centre of pressure on the plate does.
+POINT:UNITS. The channels of a type 4 plate may state other units of force and moment. Then the
+units are used that put the centre of pressure on the plate.
 
-With o = ORIGIN from the transducers' origin to the surface's centre the moment there is
-M - o × F. The centre of pressure is not computed here: it needs a force threshold.
+ORIGIN is the vector o from the transducers' origin to the centre of the surface. The moment about
+this centre is M - o × F. The centre of pressure is not returned: it needs a force threshold.
 
 FORCE_PLATFORM:ZERO names frames in which nobody stands on the plates. The mean of each channel
 over them is subtracted, unless the plate is loaded in them.
@@ -52,8 +52,8 @@ class PlateSettings:
     """N; a vertical force over the frames of ZERO up to this is drift of the amplifier. Chosen: a
     foot makes more."""
     baseline_share: float = 0.2
-    """Share of the largest change that the plate shows. Chosen: a larger force over the frames of
-    ZERO is drift too where it is at most this; a person who stands on the plate makes more."""
+    """1; share of the largest change of the vertical force. A mean vertical force over the frames
+    of ZERO up to this share is drift too. Chosen: a person who stands on the plate makes more."""
     loaded_N: float = 100.0
     """N; force from which the centre of pressure of a plate is checked. Chosen: with less it is a
     quotient of small numbers."""
@@ -149,7 +149,7 @@ def force_plate(record: PlateRecord) -> ForcePlate:
     axes = _axes(record.corners, where)
     origin = record.origin
     if origin[2] > 0 and kind != 1:
-        _log.warning("%s: ORIGIN points below the surface; its sign is taken as turned", where)
+        _log.warning("%s: ORIGIN puts the surface below the sensors; its sign is reversed", where)
         origin = origin * (np.array([1.0, 1.0, -1.0]) if kind == 3 else -1.0)
     record = replace(record, origin=origin)
     force, moment, notices = _read(record)
@@ -263,7 +263,7 @@ def _axes(corners: Array, where: str) -> Array:
 
 
 def _stated_scales(record: PlateRecord) -> Array | None:
-    """Return SI per unit of six channels that state force and moment; None if one does not."""
+    """Return the factors (6,) from the channels' units to N and N·m; None: a unit is unknown."""
     readers = (newtons,) * 3 + (newton_metres,) * 3
     result = [read(unit) for read, unit in zip(readers, record.units, strict=False)]
     return None if None in result or len(result) < 6 else np.array(result, float)
@@ -272,12 +272,13 @@ def _stated_scales(record: PlateRecord) -> Array | None:
 def _given_moment(record: PlateRecord) -> float:
     unit = newton_metres(record.given.moment or "")
     if unit is None:
-        raise InputError(f"'{record.given.moment}' is no unit of moment", "moment_unit", "as in Nm")
+        what = f"'{record.given.moment}' is no unit of moment"
+        raise InputError(what, "moment_unit", "give for example Nm")
     return unit
 
 
 def _scales(record: PlateRecord) -> Array:
-    """Return SI per unit of each channel."""
+    """Return the factor (c,) from the unit of each channel to N, N·m or m."""
     kinds = {1: "fffllm", 3: "ffffffff"}.get(record.kind, "fffmmm")
     readers = {"f": newtons, "m": newton_metres, "l": metres}
     keys = {"f": "force_unit", "m": "moment_unit", "l": "length_unit"}
@@ -289,7 +290,8 @@ def _scales(record: PlateRecord) -> Array:
         text = units[quantity]
         stated = None if text is None else readers[quantity](text)
         if text is not None and stated is None:
-            raise InputError(f"'{text}' is no unit of it", keys[quantity], examples[quantity])
+            what = f"'{text}' is no unit of {keys[quantity].removesuffix('_unit')}"
+            raise InputError(what, keys[quantity], f"give for example {examples[quantity]}")
         if scale is not None and stated is not None and quantity != "l" and stated != scale:
             raise InputError(
                 f"has a channel in '{unit}', but {keys[quantity]} says '{text}'",
@@ -323,18 +325,18 @@ class PlateLoadSettings:
     """s; the wrench counts from this much before a load to this much after it. Chosen: a foot comes
     down and leaves within 0.02 s."""
     quiet_share: float = 0.1
-    """Share of the samples, those of the smallest force, that show the unloaded level. Chosen: a
-    plate is unloaded for longer in a usual recording."""
+    """1; share of the samples whose median is the unloaded level: those with the smallest forces.
+    Chosen: a plate is unloaded for longer in a usual recording."""
     quiet_spread_N: float = 2.0
-    """N; these samples show the level if they lie within this of each other. Chosen: no foot is so
-    steady."""
+    """N; largest range of these samples. A larger range gives no unloaded level. Chosen: no foot is
+    so steady."""
     most_drift_N: float = 60.0
     """N; largest unloaded level that is drift. Chosen: a larger force is that of a foot."""
     drift_N: float = 2.0
     """N; a larger unloaded level gets a note. Chosen: the median of noise is zero, and 2 N change
     the force of the knee by less than 0.5 % of a body weight."""
     unloaded_s: float = 0.1
-    """s; a plate that is unloaded for less shows no drift. Chosen: a foot that swings leaves the
+    """s; shortest unloaded time from which drift is computed. Chosen: a foot that swings leaves the
     plate for longer."""
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array, Mask, knee_pose, transform
+from tkamb.io.recordings.gait_cycle import uninterrupted_runs
 from tkamb.io.scene.case import Case
 from tkamb.run.plausibility import Question
 from tkamb.units import MILLIMETRE
@@ -95,7 +96,7 @@ def step_questions(case: Case) -> Iterator[Question]:
     bears = upward > GROUND_REACTION_LIMITS.unloaded_force * case.body_weight
     still = [
         (first, last)
-        for first, last in _runs(~bears & (speed < STANDS))
+        for first, last in uninterrupted_runs(~bears & (speed < STANDS))
         if time[last] - time[first] > GROUND_REACTION_LIMITS.max_unloaded_stance
     ]
     if still:
@@ -110,7 +111,9 @@ def step_questions(case: Case) -> Iterator[Question]:
             frames,
         )
     ends = (0, len(time) - 1)
-    peaks = [first + int(upward[first : last + 1].argmax()) for first, last in _runs(bears)]
+    peaks = [
+        first + int(upward[first : last + 1].argmax()) for first, last in uninterrupted_runs(bears)
+    ]
     peaks = [k for k in peaks if k not in ends]  # not cut off on its way up or down
     if len(peaks) > 1:
         low, high = min(peaks, key=upward.__getitem__), max(peaks, key=upward.__getitem__)
@@ -121,12 +124,6 @@ def step_questions(case: Case) -> Iterator[Question]:
                 "gain, or bear only part of the foot?",
                 "steps of one foot loaded unlike each other",
             )
-
-
-def _runs(mask: Mask) -> list[tuple[int, int]]:
-    """Return the first and the last frame of each unbroken stretch."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def direction_questions(case: Case) -> Iterator[Question]:

@@ -3,8 +3,8 @@
 With K = L Lᵀ and Z = L⁻¹ E (E picks the contact nodes' unknowns) the compliance between them
 is Eᵀ K⁻¹ E = Zᵀ Z, so that the backward half of the solves is not needed. A column of Z is zero
 except on the path from its node to the root of the elimination tree, and the columns of one
-subtree follow each other. So Z is stored as one dense block per member of the tree, column by
-column. A product with few nodes then reads only their columns. `ComplianceCache` stores the
+subtree follow each other. So Z is stored as one dense block per front (node of this tree), column
+by column. A product with few nodes then reads only their columns. `ComplianceCache` stores the
 compliance of the nodes that were candidates lately.
 """
 
@@ -26,7 +26,7 @@ from tkamb.geometry.threads import both, in_halves
 Precision = type[np.floating[Any]]
 
 SINGLE: Precision = np.float32
-"""Precision of a stored operator: every solve then reads half as many bytes."""
+"""Precision of a stored operator. A solve reads half as many bytes as in double precision."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class ResponseSettings:
     """Columns that are copied for BLAS at a time. Chosen: 3 MB, about the size of a processor's
     cache."""
     few_columns: int = 12
-    """Columns up to which products are taken in place. Chosen: a copy for BLAS costs more than it
-    gains."""
+    """Largest number of columns whose products are computed without a copy for BLAS. Chosen: for so
+    few columns the copy costs more time than BLAS saves."""
 
 
 RESPONSE = ResponseSettings()
@@ -49,11 +49,12 @@ class HalfResponse:
     """Z = L⁻¹ E of q unknowns.
 
     Args:
-        rank: (q,) sorted column of each unknown as the caller numbers them; -1 if it is held.
-        blocks: (b, 4) rows of Z that are not zero: first row, in elimination order, one past the
-            last, first column and one past the last column. No two share a row.
-        values: (v,) float64 or float32, columns of Z, each as long as its block has rows.
-        places: (w,) where in `values` each column of each block begins, block after block.
+        rank: (q,) column of Z that belongs to each unknown of the caller; -1: the unknown is held.
+        blocks: (b, 4) blocks of Z that are not zero: first row, end of the rows, first column, end
+            of the columns. An end is one past the last. Rows are in elimination order, and no two
+            blocks share a row.
+        values: (v,) float64 or float32, the columns of the blocks, one after the other.
+        places: (w,) position in `values` at which each column of each block begins, block by block.
     """
 
     rank: Index
@@ -88,7 +89,7 @@ class HalfResponse:
         return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
 
     def among(self, unknowns: Index) -> "HalfResponse":
-        """Return the response of some of the unknowns (u,) alone; it shares the columns."""
+        """Return the response of a subset (u,) of the unknowns. Both share the same `values`."""
         ranks = self.rank[unknowns]
         live = np.flatnonzero(ranks >= 0)
         order = live[np.argsort(ranks[live])]
@@ -98,11 +99,15 @@ class HalfResponse:
         return HalfResponse(rank, blocks, self.values, places)
 
     def compliance(self, some: Index | None = None) -> Array:
-        """Return the compliance (s, q), m/N, of some unknowns, by default all, to all."""
+        """Return displacements (s, q), m/N, of some unknowns under unit forces on all q unknowns.
+
+        Args:
+            some: (s,) the unknowns whose displacements are returned; None: all.
+        """
         rank = self.rank if some is None else self.rank[some]
         rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
-        # C = H Hᵀ with H the half solves: the compliance is summed block by block of the
-        # elimination tree.
+        # The compliance Zᵀ Z is the sum of the products of the blocks. `few` and `others` hold
+        # columns of Z as their rows.
         inner = np.zeros((len(rows), self.columns))
         firsts, lasts = np.searchsorted(rows, self.blocks[:, 2:]).T
         for block in np.flatnonzero(lasts > firsts):
@@ -141,7 +146,7 @@ class HalfResponse:
 
     @cached_property
     def _edges(self) -> Index:
-        """Where the places of each block begin, and their number at the end (b + 1,)."""
+        """(b + 1,) index in `places` at which each block begins, then the number of places."""
         return np.cumsum(np.concatenate([[0], self.blocks[:, 3] - self.blocks[:, 2]]))
 
     @cached_property
@@ -163,7 +168,7 @@ def _add_columns(
     begin: int,
     end: int,
 ) -> None:
-    """Add the columns times factors to y in the rows of blocks [begin, end), in their precision."""
+    """Add the columns of blocks [begin, end) times factors to y, in the precision of `values`."""
     for block in range(begin, end):
         start, stop, first = blocks[block, 0], blocks[block, 1], blocks[block, 2]
         total = np.zeros(stop - start, values.dtype)
@@ -189,7 +194,7 @@ def _add_products(
     begin: int,
     end: int,
 ) -> None:
-    """Add the products of columns [begin, end) with y to `products`, in their precision."""
+    """Add the products of columns [begin, end) with y to `products`, in precision of `values`."""
     for block in range(len(blocks)):
         first = blocks[block, 2]
         some, last = max(first, begin), min(blocks[block, 3], end)
@@ -205,7 +210,14 @@ def _add_products(
 
 @compiled
 def _of_columns(blocks: Index, edges: Index, places: Index, columns: Index) -> tuple[Index, Index]:
-    """Return blocks and places of some columns (u,), increasing, in their numbers."""
+    """Return blocks and places of a subset of the columns; blocks count columns of the subset.
+
+    Args:
+        blocks: (b, 4), see `HalfResponse`.
+        edges: (b + 1,) index in `places` at which each block begins.
+        places: (w,), see `HalfResponse`.
+        columns: (u,) the subset, increasing.
+    """
     firsts, lasts = np.searchsorted(columns, blocks[:, 2]), np.searchsorted(columns, blocks[:, 3])
     nonempty = np.flatnonzero(lasts > firsts)
     some, at = blocks[nonempty], 0
@@ -230,7 +242,7 @@ def _gathered(values: Array, places: Index, length: int) -> Array:
 
 @compiled
 def _products(values: Array, places: Index, few: Array) -> Array:
-    """Return the products (f, k) of a few columns (f, n) with some others, in their precision."""
+    """Return the products (f, k) of a few columns (f, n) with those that begin at places (k,)."""
     result = np.empty((len(few), len(places)), values.dtype)
     for k in range(len(places)):
         column = values[places[k] : places[k] + few.shape[1]]
@@ -244,7 +256,7 @@ def _products(values: Array, places: Index, few: Array) -> Array:
 
 @compiled
 def _take_away(target: Array, columns: Index, values: Array) -> None:
-    """Take values (n, k) from some columns (k,) of the target."""
+    """Subtract values (n, k) from some columns (k,) of the target."""
     for i in range(len(values)):
         for j in range(len(columns)):
             target[i, columns[j]] -= values[i, j]
@@ -262,7 +274,7 @@ class HalfSolves:
     single precision compliances are right to 1e-6 of the largest.
 
     Args:
-        starts: (f + 1,) first unknown of each front in elimination order, and how many there are.
+        starts: (f + 1,) first unknown of each front in elimination order, then their total number.
         parents: front above each, -1 at a root.
         unknowns: (q,) in elimination order, -1 = held.
         precision: of the numbers that are computed and kept.
@@ -282,7 +294,7 @@ class HalfSolves:
         self._columns: list[NDArray[Any]] = []
 
     def add(self, member: int, front: Front) -> None:
-        """Take the next front, before its numbers are made coarser."""
+        """Add the columns of the next front, from its numbers before they are rounded."""
         first, last = self._spans[member]
         if last == first:
             return
@@ -301,12 +313,12 @@ class HalfSolves:
         self._columns.append(own)
 
     def response(self) -> HalfResponse:
-        """Return the response from all fronts, and release its memory here."""
+        """Return the response of all fronts; the columns stored here are released."""
         blocks = np.array(self._blocks, np.int64).reshape(-1, 4)
         return HalfResponse.of(self._rank, blocks, joined(self._columns, self._precision))
 
     def _of(self, member: int) -> NDArray[Any]:
-        """Return a front's right-hand side so far (its columns, own unknowns)."""
+        """Return a front's current right-hand side (columns of its span, unknowns of the front)."""
         if member not in self._waiting:
             first, last = self._spans[member]
             shape = (last - first, self._starts[member + 1] - self._starts[member])
@@ -326,7 +338,7 @@ class HalfSolves:
         return spans
 
     def _pass_up(self, member: int, boundary: Index, passed: NDArray[Any]) -> None:
-        """Take a front's products (columns, m) from the right-hand sides of those above it."""
+        """Subtract a front's products (columns, m) from the right-hand sides of fronts above it."""
         above, at = self._parents[member], 0
         first, last = self._spans[member]
         while at < len(boundary):
@@ -354,11 +366,11 @@ COMPLIANCE = ComplianceSettings()
 
 @dataclass(frozen=True, eq=False)
 class ContactResponse:
-    """What forces on candidate nodes do.
+    """Displacements under forces on candidate nodes.
 
     Args:
-        whole: response of nodes of which the candidates are some.
-        candidates: (m,) their positions among these.
+        whole: response of a set of nodes that contains the candidates.
+        candidates: (m,) positions of the candidates in this set.
         compliance: (3, m, 3, m) m/N, of the candidates: component and node moved, component
             and node pushed.
     """
@@ -369,7 +381,7 @@ class ContactResponse:
 
     @classmethod
     def of(cls, half: HalfResponse) -> "ContactResponse":
-        """Return the response of candidates that are all of the nodes of `half`."""
+        """Return the response in which all nodes of `half` are candidates."""
         return cls(half, np.arange(len(half.rank) // 3), by_component(half.compliance()))
 
     @cached_property
@@ -386,10 +398,11 @@ class ContactResponse:
         return self._half.project(y).reshape(-1, 3)
 
     def along(self, normals: Array) -> tuple[Array, Array]:
-        """Return the compliance along normals (m, 3), and all that forces along them move.
+        """Return the compliance along normals (m, 3), and the displacement vectors.
 
         Returns:
-            (m, m) m/N, and (3, m, m) m/N for `moved`.
+            (m, m) m/N, displacements along the normals under unit forces along the normals, and
+            (3, m, m) m/N, the displacement vectors under the same forces, for `moved`.
         """
         n = np.ascontiguousarray(normals.T, dtype=self.compliance.dtype)
         pushed = np.einsum("aibj,bj->aij", self.compliance, n)
@@ -408,11 +421,13 @@ def by_component(matrix: Array) -> Array:
 
 @dataclass
 class ComplianceCache:
-    """The compliance among the nodes asked for so far; what is at hand changes no answer.
+    """The compliance among the nodes that were requested so far.
+
+    Apart from rounding, a result does not depend on which nodes are stored.
 
     Args:
         whole: response of all contact nodes.
-        nodes: (p,) contact nodes at hand, in the order in which they came.
+        nodes: (p,) stored contact nodes, in the order in which they were added.
         stored: (3, s, 3, s) m/N, s >= p: component and node moved, component and node pushed.
     """
 
@@ -422,7 +437,7 @@ class ComplianceCache:
     _lock: Lock = field(default_factory=Lock)
 
     def among(self, needed: Index) -> ContactResponse:
-        """Return the response among contact nodes, increasing positions (m,)."""
+        """Return the response of some contact nodes, given by increasing positions (m,)."""
         with self._lock:
             at = self._at(needed)
             compliance = _taken(_taken(self.stored, at, 1), at, 3)
@@ -443,7 +458,7 @@ class ComplianceCache:
         return np.einsum("aibj,jb->ia", compliance, force)
 
     def _at(self, needed: Index) -> Index:
-        """Return where nodes (m,) are stored; what is not at hand is worked out."""
+        """Return the positions of nodes (m,) in `stored`. Missing nodes are computed and added."""
         place = np.full(len(self.whole.rank) // 3, -1)
         place[self.nodes] = np.arange(len(self.nodes))
         if (place[needed] < 0).any():
@@ -455,7 +470,7 @@ class ComplianceCache:
         return place[needed]
 
     def _take(self, nodes: Index) -> None:
-        """Take more nodes."""
+        """Compute the compliance of nodes that are not stored yet, and add it."""
         had, new = len(self.nodes), len(nodes)
         count = had + new
         if count > self.stored.shape[1]:
@@ -472,5 +487,8 @@ class ComplianceCache:
 
 
 def _taken(values: Array, index: Index, axis: int) -> Array:
-    """Return some entries along an axis; "clip" spares numpy a copy, all are in range."""
+    """Return some entries along an axis.
+
+    All indices are in range, and the mode "clip" lets numpy omit a buffer.
+    """
     return np.take(values, index, axis=axis, mode="clip")

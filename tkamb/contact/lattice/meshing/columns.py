@@ -65,7 +65,7 @@ class Levels:
     count: int
 
     def position(self, height: Array, i: Index, k: Index) -> Array:
-        """Return the position of heights (m,) among the layers of columns (i, k); a fraction."""
+        """Return heights (m,) of columns (i, k) as layer numbers, with fractions in between."""
         reference = self.reference[i, k]
         within = np.clip(height, 0.0, reference) * self.layers / reference
         outside = np.minimum(height, 0.0) + np.maximum(height - reference, 0.0)
@@ -101,9 +101,9 @@ def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
 def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: float) -> int:
     """Return the number of layers that can follow the largest part of the top.
 
-    Where the top is more than half a layer too low for them, the layers end in a step, whose
-    edge has a cell on one side only and half the support: no number is taken that puts such
-    steps into the dishes. No condyle stands on the steps higher up.
+    Where the top is more than half a layer too low for them, the layers end in a step. The edge of
+    a step has a cell on one side only, and so half the support. A number of layers that puts such
+    steps into the dishes is excluded. Steps higher up are allowed: no condyle rests on them.
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
@@ -131,7 +131,7 @@ def _smooth_part(height: Array, across: Array) -> Array:
 
 
 def _slope_limited(height: Array, across: Array) -> Array:
-    """Return the largest function below `height` whose slope is at most MAX_SLOPE."""
+    """Return the largest function below `height` whose slope is at most `LAYER.max_slope`."""
     result = np.where(np.isfinite(height), height, np.inf)
     while True:
         before = result.copy()
@@ -178,7 +178,7 @@ Nodes = tuple[Index, ...]
 
 @dataclass(frozen=True)
 class ColumnSettings:
-    """The columns of nodes that a lattice stands on."""
+    """Tolerances with which nodes are placed on the surface."""
 
     tie: float = 1e-6
     """Cells: a distance this near half a cell counts as half a cell. Chosen: rounding does not
@@ -190,11 +190,11 @@ class ColumnSettings:
     """1: a triangle whose normal has a smaller superior component (87 deg) belongs to a wall.
     Chosen: no surface that carries is as steep."""
     wall_inset: float = 0.02
-    """Cells: distance that a node stays inside a wall. Chosen: rays along y miss a wall at its
-    hit."""
+    """Cells: distance from a wall at which a ray along y is fired again after a miss. Chosen: a ray
+    exactly on a rough wall may miss the part."""
     max_height_change: float = 0.75
-    """Cells: a surface whose height changes by more from one column to the next is another surface.
-    Chosen: a slope that a column of cells can follow changes by less."""
+    """Cells: largest change of a surface's height where a node moves sideways; beyond it, a ray has
+    hit another surface. Chosen: a slope that a column of cells can follow changes by less."""
 
 
 COLUMN = ColumnSettings()
@@ -272,10 +272,13 @@ def settle_columns(surface: Surface, spacing: Array) -> NodeField:
 def interval_ends(low: Array, high: Array, count: int) -> Ends:
     """Return the nodes that hold intervals [low, high] of a line, in layers.
 
-    With T = high - low and n nodes strictly inside, the node nearest to either end goes there.
-    n = 0: two nodes for T > 1/2, else one at the mean. n = 1: left alone for T < 1/2; else,
-    where one node is nearest to both ends, it goes to the nearer end and the outside node
-    beyond the other end joins it.
+    T = high - low is the thickness and n the number of nodes strictly inside. In general, the node
+    nearest to each end is moved to that end. The exceptions are:
+
+        n = 0, T <= 1/2   one node, moved to the mean height
+        n = 1, T <= 1/2   one node, not moved
+        n = 1, T > 1/2    if the node is nearest to both ends, it is moved to the nearer end, and
+                          the next node outside is moved to the other end
 
     Args:
         low: (m,) lower ends.
@@ -299,7 +302,10 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
 
 
 def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
-    """Return even coordinates over the part, first and last on the inner side of its walls."""
+    """Return equally spaced coordinates over the part.
+
+    The first and the last are moved to the innermost vertices of the part's sides.
+    """
     lower, upper = surface.bounds[:, axis]
     line = np.linspace(lower, upper, round((upper - lower) / spacing) + 1)
     values = surface.vertices[:, axis]
@@ -372,7 +378,7 @@ def _admit(field: NodeField, intervals: Intervals, ends: Ends) -> None:
 def refired_inwards(
     field: NodeField, nodes: Nodes, target: Array, inward: Array, rays: RayCaster
 ) -> Array:
-    """Return the heights (n,) of nodes at places on walls; a miss moves the target inwards.
+    """Return the heights (n,) of nodes that are moved onto walls.
 
     The mesh's noise makes a wall rough, so that a vertical ray on it may miss the part. Such a ray
     is fired again, `wall_inset` inside the wall, and the target (n, 3) is moved there.
@@ -380,8 +386,8 @@ def refired_inwards(
     Args:
         field: nodes.
         nodes: which of them.
-        target: (n, 3) m, where they go; y is not used.
-        inward: (n, 2) along x and z into the part, of any length but 0.
+        target: (n, 3) m, new positions of the nodes, changed in place; y is not used.
+        inward: (n, 2) directions along x and z into the part, of any length but 0.
         rays: of the part.
     """
     height = refired(field, nodes, target, rays)
@@ -395,9 +401,10 @@ def refired_inwards(
 
 
 def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> Array:
-    """Return the heights (n,) of nodes at new places: on the surface for ends of intervals.
+    """Return the heights (n,) of nodes after a move sideways to `target` (n, 3).
 
-    NaN where the surface is farther than REACH from where it was.
+    Ends of intervals stay on the surface, and other nodes keep their height. NaN where the height
+    of the surface changes by more than `COLUMN.max_height_change`.
     """
     height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):

@@ -28,11 +28,11 @@ class NotchSettings:
     """1: share of the way that a node stays short of the line between its neighbours. Chosen: on
     the line the cell's corner would be flat."""
     corner_inset: float = 1e-3
-    """1: share of the way inwards by which a node stays inside its corner. Chosen: rays along y
-    hit."""
+    """1: distance of a node from its corner, as a share of the way to the node across the diagonal.
+    Chosen: rays along y then hit the part."""
     ray_start_cells: float = 0.1
-    """Cells below a node on the top, or above one underneath, from which rays test what is inside.
-    Chosen: above the rounding of a mesh, within the cell."""
+    """Cells: depth below the top, or height above the bottom, of the points that are tested for
+    being inside the part. Chosen: above the rounding of a mesh, within the cell."""
     max_move_diagonals: float = 0.75
     """Diagonals of a cell's face: largest move of a node. Chosen: a larger one would turn the cell
     inside out."""
@@ -42,7 +42,7 @@ NOTCH = NotchSettings()
 
 
 def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
-    """Admit nodes outside a step of the surface: three corners of their square are members.
+    """Admit nodes outside a step of the surface, where a grid square has three members.
 
     Steps of the outline in a layer come first, then steps between layers.
     """
@@ -132,8 +132,8 @@ def _towards(point: Array, other: Array, share: float, rise: Array | float) -> A
 def _settle(field: NodeField, notch: Notch, target: Array, keep: Mask, flat: bool) -> None:
     """Admit the nodes to keep.
 
-    In a flat notch, a node between two nodes of the top is one of the top itself. Otherwise the
-    upper face of its cell would carry no contact, and the face's other nodes too much.
+    In a flat notch, a node between two nodes of the top belongs to the top itself. Otherwise the
+    upper face of its cell would carry no contact, and the face's other nodes would carry too much.
     """
     dropped, chosen = (tuple(n[mask] for n in notch.node) for mask in (~keep, keep))
     field.upper_end[dropped] = field.lower_end[dropped] = False
@@ -165,7 +165,13 @@ WALL_NODE = WallSettings()
 
 @dataclass(frozen=True, eq=False)
 class WallHits:
-    """For each node and way sideways: is there no cell, and how far is the wall (m)."""
+    """Cells and walls beside the nodes of the grid in one of the four directions.
+
+    Args:
+        open: (nx, ny, nz) the node is a member without a cell on this side. At an end of an
+            interval, the next node inside the interval must be one too.
+        distance: (nx, ny, nz) m, distance to the wall; inf: there is none.
+    """
 
     open: Mask
     distance: Array
@@ -263,15 +269,19 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
 
 
 def _leave_far_side(pair: list[WallHits], forth_left: Mask, back_left: Mask) -> None:
-    """Keep the wall on the far side of a thin part for the node outside it; drop the used."""
+    """Drop the walls onto which nodes are moved.
+
+    In a thin part, the wall on the other side remains for the node outside it.
+    """
     pair[0].distance[back_left] = np.inf
     pair[1].distance[forth_left] = np.inf
 
 
 def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
-    """Return where nodes go that have walls at `move` (n, 2) along x and z (0: no wall).
+    """Return the new positions (n, 3) of nodes with walls at `move` (n, 2) along x and z; 0: none.
 
-    With two walls: the corner, if it is in the part, else the foot on the line between hits.
+    With two walls, a node moves to their corner if this lies in the part. Otherwise it moves to the
+    foot of its perpendicular on the line through the two hits.
     """
     move = move * (1.0 - WALL_NODE.wall_inset)
     corner = start.copy()
@@ -288,7 +298,7 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
 
 
 def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCaster) -> None:
-    """Admit nodes outside that have a wall within half a cell, seen from a member beside."""
+    """Admit nodes outside the part onto the wall between them and a member beside them."""
     move = np.zeros((*field.member.shape, 2))
     upper, lower, top = (np.ones(field.member.shape, bool) for _ in range(3))
     height = np.full(field.member.shape, np.nan)
@@ -341,7 +351,11 @@ def _admit_at(
 
 
 def _foot(move: Array) -> Array:
-    """Return the foot of the node on the line through its two hits, or its only hit."""
+    """Return the moves (n, 2) of nodes onto their only hit or between their two hits.
+
+    With two hits, a node moves to the foot of its perpendicular on the line through them.
+    """
+
     move = move * (1.0 + WALL_NODE.wall_inset)
     both = (move != 0.0).all(axis=1)
     result = move.copy()
