@@ -7,7 +7,8 @@ and results.csv, in which the remaining frames are not computed.
 The files of the frames lie in `.frames` of the output folder, beside a file that identifies their
 run. They are removed when the run's results are written. Each has a SHA-256 over the run's
 identity, its number and its content: a frame of another run, or one that cannot be read whole,
-counts as absent. Until the first frame is finished, nothing is written and nothing of an earlier
+counts as absent. A frame with the right SHA-256 whose content no frame of this run has was forged:
+it is refused. Until the first frame is finished, nothing is written and nothing of an earlier
 run is removed.
 """
 
