@@ -76,7 +76,7 @@ def test_a_key_without_young_s_modulus_fails(monkeypatch):
         cache, "operator_key", lambda solid, *rest: honest(SameModulus(solid), *rest)
     )
     verdict = judged(case)
-    assert verdict.failed and "1 operators are kept of two materials" in verdict.reason
+    assert verdict.failed and "1 operators are in the cache after two materials" in verdict.reason
 
 
 @pytest.mark.parametrize("case", PLATES, ids=lambda case: case.model)
