@@ -53,8 +53,8 @@ class ClosedFormSettings:
     block_side_mm: float = 24.0
     """mm: side of the block under the plate. Chosen because cells of 2 and 3 mm divide it."""
     kept_grid_mm: float = 0.9
-    """mm: cell size of the "kept" cases. Chosen because the operator cache stores only operators
-    of at least this size."""
+    """mm: cell size of the "kept" cases. Chosen because the cache does not store the smaller
+    operators of larger cells."""
     sharma_approach_ratio: float = 0.6808
     """Approach of Sharma's spring model under the plate over that of the elastic solid. The springs
     have nu = 0.35 for every material and are too stiff at free sides. Measured; the test detects
