@@ -79,7 +79,7 @@ def test_a_run_wears_as_tkamb_wear_says(cohort, capsys):
     told = rows(cohort, "runs.csv")[0]
     assert float(told["wear_volume_mm3_per_Mc"]) == pytest.approx(found["volume_mm3_per_Mc"])
     assert main([*wear, "--set", "patient.mass_kg=80", "--out", str(cohort / "no")]) == 2
-    assert "not of the run in this folder" in capsys.readouterr().err
+    assert "cannot be changed after the run in this folder" in capsys.readouterr().err
 
 
 def test_what_is_kept_of_a_run_holds_its_wear():

@@ -174,11 +174,11 @@ def test_a_forged_row_of_a_study_is_one_line(tmp_path, changed):
     rows.put("a", asdict(MEASURE))
     assert KeptRows(tmp_path, True).read("a", Measure, is_whole) == MEASURE
     rows.put("a", asdict(MEASURE) | changed)
-    with pytest.raises(InputError, match=r"rows\.jsonl.*no Measure.*; remove the file"):
+    with pytest.raises(InputError, match=r"rows\.jsonl.*not a Measure.*; remove the file"):
         KeptRows(tmp_path, True).read("a", Measure, is_whole)
     name = next(iter(changed.keys() & asdict(MEASURE).keys()), "status")
     rows.put("a", {key: value for key, value in asdict(MEASURE).items() if key != name})
-    with pytest.raises(InputError, match="no Measure"):
+    with pytest.raises(InputError, match="not a Measure"):
         KeptRows(tmp_path, True).read("a", Measure, is_whole)
 
 
@@ -201,14 +201,14 @@ def test_studies_refuse_a_forged_row(tmp_path, monkeypatch):
     cases = [Extreme(model="nothing")]
     assert list(run_stability(cases, kept=KeptRows(tmp_path, False)))
     forge_rows(tmp_path)
-    with pytest.raises(InputError, match="no Verdict"):
+    with pytest.raises(InputError, match="not a Verdict"):
         list(run_stability(cases, kept=KeptRows(tmp_path, True)))
     monkeypatch.setattr("tkamb.studies.tradeoff.measure_apart", lambda job: MEASURE)
     references = {"sphere": _reference()}
     jobs = [Job("sphere", "hertz", 2.0)]
     assert list(run_tradeoff(jobs, references, KeptRows(tmp_path, False)))
     forge_rows(tmp_path)
-    with pytest.raises(InputError, match="no Measure"):
+    with pytest.raises(InputError, match="not a Measure"):
         list(run_tradeoff(jobs, references, KeptRows(tmp_path, True)))
 
 

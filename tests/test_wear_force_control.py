@@ -20,8 +20,8 @@ from tkamb.studies.wear.laws import Archard
 from tkamb.studies.wear.motion import CycleMotion
 from tkamb.studies.wear.simulation import WearCase, simulate_wear
 from tkamb.studies.wear.simulator import (
+    EquilibriumPoses,
     ForceDrive,
-    RestingPoses,
     Spring,
     Springs,
     read_profile,
@@ -60,7 +60,7 @@ def rest(insert, femoral, drive, load, resolution=2.0):
     """Return the coordinates (6,) at which a drive's first row rests, and what stops it."""
     model = contact_model("foundation", resolution)
     pair = ContactPair(femoral, insert, material("polyethylene-linear"))
-    pose, why = RestingPoses(model, model.prepare(pair), drive).at(0, load, None)
+    pose, why = EquilibriumPoses(model, model.prepare(pair), drive).at(0, load, None)
     return knee_coordinates(pose), why
 
 

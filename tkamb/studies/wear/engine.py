@@ -17,7 +17,7 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.frames import pose as pose_of
 from tkamb.geometry.surface import Surface
 from tkamb.studies.wear.motion import CycleMotion
-from tkamb.studies.wear.simulator import RestingPoses
+from tkamb.studies.wear.simulator import EquilibriumPoses
 
 GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
 """m: positions along x of the initial guesses of the dwell position."""
@@ -83,7 +83,7 @@ class ContactEngine:
         pressure = np.zeros((len(motion), len(state.points)))
         poses, failed, start = motion.poses.copy(), {}, None
         drive = motion.drive
-        equilibrium = None if drive is None else RestingPoses(self.model, state, drive)
+        equilibrium = None if drive is None else EquilibriumPoses(self.model, state, drive)
         for k, (pose, load) in enumerate(zip(motion.poses, motion.load, strict=True)):
             if load <= 0:
                 continue
@@ -154,7 +154,7 @@ def interpolation(map_points: Array, points: Array) -> csr_array:
     return csr_array((weights.ravel(), (rows, columns.ravel())), shape=shape)
 
 
-def carried(pressure: Array, projected: Array, load: Array) -> tuple[Array, float]:
+def scaled_to_load(pressure: Array, projected: Array, load: Array) -> tuple[Array, float]:
     """Return pressure maps scaled to their loads, and the largest relative change.
 
     Args:
