@@ -223,7 +223,7 @@ def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]
         and 0 < limits[0] <= 1 <= limits[1]
     )
     if not valid:
-        hint = "give one factor up to 1 and one from 1, e.g. [0.5, 2.0]"
+        hint = "give a first factor of at most 1 and a second of at least 1, e.g. [0.5, 2.0]"
         raise InputError(f"cannot be {limits}", f"{where}: factor_range", hint)
     if "range_source" not in content:
         raise InputError("'range_source' is missing", where, "give the source of the range")

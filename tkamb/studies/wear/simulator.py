@@ -11,7 +11,7 @@ including the superior-inferior one, are released and follow from equilibrium:
   through the origin of the femoral mesh, or a torque, N·m, about the axis of the coordinate through
   this origin. The axial force F acts on the superior-inferior coordinate as -F.
 - S_i is the force of the spring that replaces the ligaments.
-- J contains the axes of the coordinates, see `knee_axes`.
+- J_i is the twist of the femoral component per unit rate of coordinate i, see `knee_axes`.
 - w_contact is the contact wrench on the insert.
 
 The equilibrium is quasi-static and without friction.
