@@ -170,7 +170,7 @@ def test_invalid_input_is_an_error_of_one_line(capsys, tmp_path, profile, scene)
 
 
 @pytest.mark.parametrize(
-    ("turned", "words"),
+    ("change", "words"),
     [
         (("100,300,0,0,0", "100,300,5,0,0"), "does not close: 'flexion_deg'"),
         (("100,300,0,0,0", "99,300,0,0,0"), "runs from 0 to 99"),
@@ -267,7 +267,7 @@ def test_conformity_increases_wear_by_area_but_not_by_archard(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("line", "words"),
     [
         ("factor_range = [0.5]", "cannot be"),
         ("factor_range = [1.5, 2.0]", "at most 1"),

@@ -195,7 +195,7 @@ def test_the_cycle_omits_failed_rows_and_fails_with_too_many(driven):
 
 
 @pytest.mark.parametrize(
-    ("turned", "words"),
+    ("change", "words"),
     [
         (("axial_torque_Nm", "ap_mm"), "both 'ap_force_N' and 'ap_mm'"),
         (("axial_torque_Nm", "axial_torque_Nmm"), "unknown column 'axial_torque_Nmm'"),
@@ -211,7 +211,7 @@ def test_an_invalid_profile_of_forces_is_refused(tmp_path, change, words):
 
 
 @pytest.mark.parametrize(
-    ("turned", "words"),
+    ("change", "words"),
     [
         (("stiffness_N_per_mm = 30.0\n", ""), "it needs: stiffness_N_per_mm, gap_mm"),
         (("30.0", "-30.0"), "cannot be -30"),
