@@ -36,7 +36,6 @@ def two_condyles(material_name):
 
 
 def deck(**changes):
-    """Return the deck of a dished insert with changed arguments."""
     lattice = build_grid(dished_insert(cells=24), 6e-3)
     patch = Surface(np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.0]]), np.array([[0, 1, 2]]), "patch")
     arguments = {"lattice": lattice, "patch": patch, "material": material(LINEAR),

@@ -132,7 +132,6 @@ def test_a_result_that_contradicts_its_load_fails_a_check(changed, word):
 
 
 def model_of(extreme):
-    """Return the contact model of an extreme case."""
     from tkamb.contact.registry import contact_model
 
     return contact_model(extreme.model, extreme.resolution_mm, cache=False)

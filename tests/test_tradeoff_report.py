@@ -148,7 +148,6 @@ def test_the_tables_of_the_pages_agree_with_the_study():
 
 
 def error_cases_rows():
-    """Return the stored rows of the study of known errors."""
     return read_error_rows(MEASURED / "known_error_cases.json")
 
 

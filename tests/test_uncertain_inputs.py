@@ -38,7 +38,6 @@ NAMES = ["a", "b", "c"]
 
 
 def table(first, second, coefficient):
-    """Return an entry of [[uncertainty.correlation]]."""
     return CorrelationTable(between=(first, second), coefficient=coefficient)
 
 

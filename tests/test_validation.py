@@ -24,7 +24,6 @@ VALUES = {row["id"]: row for row in published()["value"]}
 
 
 def stored_row(design, condyle, percent):
-    """Return the stored row of a table for a design, condyle and percentage."""
     key = (design, condyle, percent)
     rows = STORED["tables"]
     return next(r for r in rows if (r["design"], r["condyle"], r["percent"]) == key)

@@ -37,7 +37,6 @@ QUICK = ("--resolution", "4", "--frames-per-cycle", "5", "--updates", "2")
 
 @pytest.fixture(scope="module")
 def profile(tmp_path_factory):
-    """Return the path of a simulator's profile in displacement control."""
     path = tmp_path_factory.mktemp("profile") / "cycle.csv"
     path.write_text(CYCLE, encoding="utf-8")
     return path
@@ -45,7 +44,6 @@ def profile(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Return the path of a scene with two spheres on two dishes."""
     return balls_scene(tmp_path_factory.mktemp("balls"))
 
 
@@ -59,7 +57,6 @@ def written(tmp_path_factory, profile, scene):
 
 
 def refused(capsys, *arguments):
-    """Return the one line of the error of `tkamb wear`."""
     assert main(["wear", *map(str, arguments)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1

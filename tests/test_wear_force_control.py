@@ -65,13 +65,10 @@ def equilibrium(insert, femoral, drive, load, resolution=2.0):
 
 
 def ball():
-    """Return a sphere of radius 25 mm."""
     return shapes.sphere(25 * MM, 3)
 
 
 def dish(radius, depth=10 * MM, spacing=0.5 * MM):
-    """Return an insert with a spherical dish of a radius, m."""
-
     def height(x, z):
         return depth + radius - np.sqrt(radius**2 - x**2 - z**2)
 
@@ -246,7 +243,6 @@ def test_a_spring_needs_a_force_on_its_coordinate(tmp_path):
 
 @pytest.fixture(scope="module")
 def command(tmp_path_factory):
-    """Return the arguments of a wear simulation in force control."""
     folder = tmp_path_factory.mktemp("machine")
     for name, text in (("cycle.csv", CYCLE), ("springs.toml", SPRINGS)):
         (folder / name).write_text(text, encoding="utf-8")

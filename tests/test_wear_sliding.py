@@ -12,7 +12,6 @@ POINT = np.array([[0.01, 0.008, -0.02]])
 
 
 def translated(positions):
-    """Return poses without rotation at positions (f, 3), m."""
     positions = np.asarray(positions, float)
     return pose(np.broadcast_to(np.eye(3), (len(positions), 3, 3)), positions)
 

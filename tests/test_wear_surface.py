@@ -11,7 +11,6 @@ MM = 1e-3
 
 
 def longest_edge(surface, faces):
-    """Return the length of the longest edge of some faces, m."""
     corners = surface.triangles[faces]
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
 

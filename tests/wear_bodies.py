@@ -77,12 +77,10 @@ class Pressed:
 
 
 def always(points):
-    """Return that all points are pressed."""
     return np.ones(len(points), bool)
 
 
 def plate_case(motion, law, under=always, creep=None, thickness=0.01, **more):
-    """Return the case of a plate under a prescribed contact."""
     articular = ArticularSurface.of_insert(shapes.plate(thickness), 2 * MM)
     return WearCase(Pressed(under, **more), articular, motion, law, DENSITY, creep)
 
@@ -93,7 +91,6 @@ def ball_case(insert, radius, motion, wear_factor, resolution=1.0, facets=3):
 
 
 def swinging_case(femoral, insert, motion, wear_factor=1e-6, resolution=2.0):
-    """Return the case of a femoral body on an insert with the foundation model."""
     model = contact_model("foundation", resolution)
     engine = ContactEngine(model, femoral, material("polyethylene"))
     articular = ArticularSurface.of_insert(insert, resolution * MM)

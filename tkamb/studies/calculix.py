@@ -204,7 +204,7 @@ class PeerAnswer:
 def measure_by_calculix(
     case: StudyCase, grid_mm: float, longest: float = CALCULIX.longest_seconds
 ) -> Measure:
-    """Return the cost and results of CalculiX on a case. After an error only the status is set.
+    """Return cost and results of CalculiX on a case; after an error only the status.
 
     Args:
         case: contact problem.
@@ -292,7 +292,6 @@ def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, flo
 
 
 def _bent(problem: PressProblem, run: PeerRun) -> ContactMap:
-    """Return the deformed contact surface."""
     displacement = run.blocks["NINSERT"]
     displacement = displacement[np.argsort(displacement[:, 0]), 1:] * MILLIMETRE
     deformed = replace(problem.lattice, nodes=problem.lattice.nodes + displacement)

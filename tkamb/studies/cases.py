@@ -38,10 +38,9 @@ def balls(
     """Return one or two spheroids whose lowest points are at y = -radius.
 
     Args:
-        radius: radius of curvature in the sagittal plane at the lowest point, m.
-        apart: z of the lateral spheroid's centre, m; the medial centre is at -apart. 0: a single
-            spheroid.
-        waist: radius of curvature in the frontal plane at the lowest point, over `radius`.
+        radius: sagittal radius of curvature at the lowest point, m.
+        apart: z of the lateral centre, m; the medial one is at -apart. 0: a single spheroid.
+        waist: frontal radius of curvature at the lowest point over the sagittal radius.
         finest_deg: angle between the rings of vertices near the lowest point, deg.
         sectors: number of vertices of a ring.
     """
@@ -174,11 +173,8 @@ class StudyCase:
         return content_hash(pair, [self.pose, np.array(self.load)], (pair.material, pair.bearing))
 
     def nearby(self, steps: float) -> Array:
-        """Return the pose after a number of frames of a typical motion.
-
-        Each frame moves 0.06 mm posteriorly and adds 0.2 deg of flexion and 0.06 deg of axial
-        rotation.
-        """
+        """Return the pose some frames later: each 0.06 mm posteriorly, with 0.2 deg more flexion
+        and 0.06 deg more axial rotation."""
         increment = np.array([-0.06 * MILLIMETRE, 0, 0, 0.06 * DEGREE, 0, 0.2 * DEGREE])
         moved = knee_pose(steps * increment)
         pose = self.pose.copy()
@@ -255,11 +251,7 @@ _ANALYTIC = {"sphere": _sphere, **dict.fromkeys(BICONDYLAR, _two_condyles)}
 
 
 def _shipped(name: str) -> StudyCase:
-    """Return a case of the shipped knee's meshes at a stored pose and load.
-
-    They are stored because the references hold for them, even if the motion or muscles of the
-    knee bend change.
-    """
+    """Return a case of the shipped knee's meshes at the stored pose and load of its reference."""
     from tkamb.geometry.flat_bottom import insert_placement
     from tkamb.io.recordings.meshes import load_surface
 

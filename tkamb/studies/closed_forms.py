@@ -230,7 +230,6 @@ def _wide(
 
 
 def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
-    """Return cases with extreme loads, thicknesses, moduli and Poisson's ratios."""
     for model, load in product(solids, (0.01, 1.0, 100.0, 2000.0)):
         yield ClosedForm("plate", model, load)
     yield ClosedForm("plate", "lattice-linear", 50000.0, modulus_MPa=2000.0)

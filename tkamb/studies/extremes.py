@@ -22,8 +22,8 @@ class ExtremeMeshSettings:
     """Meshes of the study of extreme cases."""
 
     sectors: int = 48
-    """Vertices of a ring of the condyles. Larger: smoother condyles. A coarse mesh suffices,
-    because all compared models use it."""
+    """Vertices of a ring of the condyles. A coarse mesh suffices, because all compared models use
+    it."""
 
 
 EXTREME_MESH = ExtremeMeshSettings()
@@ -128,7 +128,6 @@ def _lipped(height: Height) -> Height:
 
 
 def _shaped(surface: Surface, shape: Shape) -> Surface:
-    """Return the femoral component in an unusual shape or mesh."""
     vertices, faces = surface.vertices.copy(), surface.faces
     if shape == "spike":
         vertices[np.argmin(vertices[:, 1])] -= [0.0, 3 * MILLIMETRE, 0.0]

@@ -4,19 +4,15 @@ The reference of a sphere on a linear layer is the exact solution below (`sphere
 cases are solved with finite elements and with the lattice, to a tolerance of 1e-6, on refined
 grids:
 
-- The value of approach and forces is the common limit of both models (Richardson extrapolation).
-- Pressures and areas change from grid to grid without an order of convergence. Their value is the
-  mean over the two finest grids.
-- The uncertainty of approach and forces is the largest of the residual of the fit, half the
-  difference of the two models' limits, and the distance from the limit to the finest grids.
-- The uncertainty of pressures and areas is the larger of half the range on the two finest grids and
-  half the distance from their mean to the limit.
+- Approach and forces: the common limit of both models (Richardson extrapolation). Uncertainty: the
+  largest of the residual of the fit, half the difference of the models' limits, and the distance
+  from the limit to the finest grids.
+- Pressures and areas: the mean over the two finest grids, because they have no order of
+  convergence. Uncertainty: the larger of half their range and half the distance to the limit.
 
-References are stored with the hash of their case.
-
-The exact solution is that of a rigid sphere on an elastic layer of thickness t, which is bonded to
-a rigid base, without friction. Under an axisymmetric pressure with the Hankel transform P(k) the
-displacement of the surface is
+The exact solution is that of a rigid sphere, without friction, on an elastic layer of thickness t
+bonded to a rigid base. Under an axisymmetric pressure with the Hankel transform P(k) the surface
+displacement is
 
     u(r) = 2 (1 - nu²)/E ∫ L(k t) P(k) J0(k r) dk
     L(w) = (2 κ sinh 2w - 4 w)/(2 κ cosh 2w + 1 + κ² + 4 w²),   κ = 3 - 4 nu
@@ -56,8 +52,8 @@ class ElasticLayerSettings:
     """Numerical solution of a layer under a sphere."""
 
     rings: int = 160
-    """Number of rings of constant pressure under the sphere. Larger: more accurate and slower.
-    Chosen because twice as many have no effect on the comparisons."""
+    """Rings of constant pressure under the sphere. Chosen because twice as many have no effect on
+    the comparisons."""
     half_space_wave_number: float = 60.0
     """Wave number times thickness above which the layer is treated as a half-space. Chosen because
     the difference is below round-off."""
@@ -126,10 +122,7 @@ def _indented(
 
 
 def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -> Array:
-    """Return the displacement at radii `at` (n,) under unit pressure on disks of `radii` (m,).
-
-    The displacements have shape (n, m) and unit m/Pa.
-    """
+    """Return displacements (n, m), m/Pa, at radii `at` (n,) of pressed disks of `radii` (m,)."""
     r, b = at[:, None], radii[None]
     share = np.minimum(r / b, b / r) ** 2
     inside = 4 * b / np.pi * ellipe(share)
@@ -250,9 +243,9 @@ def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
 def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
     """Return the common limit h -> 0 of several families of grids, and its uncertainty.
 
-    The limit q0 is the least-squares fit of q0 + c_f h² over all families f, which is Richardson
-    extrapolation with the order of trilinear cells. The uncertainty is the larger of the largest
-    residual and half the range of the limits that each family has alone.
+    The limit q0 is from a least-squares fit of q0 + c_f h² over all families f (Richardson
+    extrapolation of trilinear cells). The uncertainty is the larger of the largest residual and
+    half the range of the families' separate limits.
 
     Args:
         h: cell sizes, m, shape (n,).
@@ -332,7 +325,7 @@ def reference_of(case: StudyCase, stored: dict[str, Reference]) -> Reference:
     """Return the stored reference of a case.
 
     Raises:
-        InputError: there is no reference of this case, or it belongs to an earlier version of it.
+        InputError: the reference is missing, or belongs to an earlier version of the case.
     """
     result = stored.get(case.name)
     if result is None or result.hash != case.hash:

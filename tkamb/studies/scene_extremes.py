@@ -135,7 +135,6 @@ def _apply(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
 
 
 def _relative_error(extreme: SceneExtreme, results: "Results", folder: Path) -> float:
-    """Return the largest relative difference between the results and the expected results."""
     assert results.maps is not None
     required = results["force_si_N"]
     force = -results.maps.nodal_force_N[:, :, 1].sum(axis=1)
@@ -168,7 +167,6 @@ def _add_noise(folder: Path, noise: float) -> None:
 
 
 def _damage(path: Path, defect: str) -> None:
-    """Overwrite a mesh file with a mesh that has a defect."""
     mesh = trimesh.load_mesh(path)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     if defect == "hole":

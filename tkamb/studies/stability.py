@@ -104,17 +104,12 @@ def run_stability(
 def kept_verdicts(
     cases: Sequence[Case], kept: KeptRows, longest: float = STABILITY.longest_seconds
 ) -> list[Verdict]:
-    """Return the stored verdicts in the order of the cases.
-
-    They include verdicts that `run_stability` did not yield, because an earlier case was not yet
-    finished.
-    """
+    """Return all stored verdicts in the order of the cases, also those not yet yielded."""
     rows, stored = [_kept_verdict(kept, case, longest) for case in cases], stored_verdicts()
     return [replace(row, expected=stored.get(row.key)) for row in rows if row is not None]
 
 
 def _kept_verdict(kept: KeptRows, case: Case, longest: float) -> Verdict | None:
-    """Return the stored verdict on a case; None if there is none."""
     return kept.read(
         _row_key(case, longest),
         Verdict,
@@ -198,10 +193,7 @@ class _Judges:
 
 
 def _leave_interrupts_to_parent() -> None:
-    """Block Ctrl-C in this thread and in the processes that it starts; the parent kills them.
-
-    A process inherits the blocked signals of the thread that starts it.
-    """
+    """Block Ctrl-C in this thread and in the processes that it starts; the parent kills them."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 

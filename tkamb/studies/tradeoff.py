@@ -154,8 +154,8 @@ def on_front(points: Sequence[tuple[float, float]]) -> list[bool]:
 def beats(first: tuple[float, float], second: tuple[float, float]) -> bool:
     """Return whether the first point (seconds, error) beats the second.
 
-    It does if it is faster with an error that is at most equal, or if its error is smaller and it
-    is at most as slow. Times within `TIMING.equal_ratio` count as equal.
+    It is faster and at least as accurate, or more accurate and not slower. Times within
+    `TIMING.equal_ratio` count as equal.
     """
     faster = first[0] * TIMING.equal_ratio < second[0]
     not_slower = first[0] <= second[0] * TIMING.equal_ratio
@@ -283,7 +283,6 @@ def run_tradeoff(
 
 
 def _measured(rows: KeptRows | None, key: str, measure: Callable[[], Measure]) -> Measure:
-    """Return the stored measure. If there is none, measure and store it."""
     result = rows.read(key, Measure, is_whole) if rows else None
     if result is None:
         result = measure()
@@ -326,9 +325,7 @@ def references_for(
     announce: Callable[[str], None],
     rows: KeptRows | None = None,
 ) -> dict[str, Reference]:
-    """Return case name -> reference.
-
-    The references of a user's scene are computed and stored in `rows`.
+    """Return case name -> reference. Those of a user's scene are computed and stored in `rows`.
 
     Args:
         cases: contact problems.

@@ -2,12 +2,11 @@
 
 Each extreme case is tested in three ways:
 
-- Checks that every contact result must pass (`complaints`). The nodal forces sum to the load. The
-  pressures integrate to the load. No pressure is negative. No solved node lies inside the femoral
-  component. The condyle forces agree with the pressure map.
-- A stored result of CalculiX, if there is one (`peer_distances`). CalculiX solves the same
-  hexahedra (C3D8I), so coarse cells suffice. The two elements differ if the contact is only a few
-  cells wide. The bounds are therefore the largest measured differences, rounded up.
+- Checks that every contact result must pass (`complaints`): nodal forces and pressures sum to the
+  load, no pressure is negative, no solved node lies inside the femoral component, and the condyle
+  forces agree with the pressure map.
+- A stored result of CalculiX on the same hexahedra (C3D8I), if there is one (`peer_distances`). The
+  elements differ, so the bounds are the largest measured differences, rounded up.
 - Newton's method on the same grid, which shows errors of the solver without those of the grid.
 
 A closed form is tested with its formula (`closed_forms`). Kinds of verdict:
@@ -20,8 +19,7 @@ A closed form is tested with its formula (`closed_forms`). Kinds of verdict:
 - exception: an exception of a class that tkamb does not define.
 - hang: the model exceeds its time limit.
 
-Accepted verdicts are stored. A case is worse if its stored verdict is converged and the new one is
-flagged.
+Accepted verdicts are stored.
 """
 
 import json
@@ -51,8 +49,8 @@ class AuditSettings:
     """Tolerances of the checks that need no reference."""
 
     force_tolerance: float = 0.005
-    """Largest relative difference from the load of the summed nodal forces, integrated pressures
-    and condyle forces. Chosen as a few times the solver's tolerance."""
+    """Largest relative difference of forces and pressures from the load. Chosen as a few times the
+    solver's tolerance."""
     penetration_tolerance: float = 5e-3
     """Largest penetration of a node into the femoral component over the approach. Chosen as a few
     times the solver's tolerance."""
@@ -72,8 +70,8 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
     Args:
         result: contact result with status ok.
         load: force along -y, N.
-        solved: whether the gaps are those of deformed nodes. Otherwise the model computes pressure
-            from penetration, and the checks of penetration and peak pressure are skipped.
+        solved: whether the gaps are those of deformed nodes. Otherwise penetration and peak
+            pressure are not checked.
         source_rule: whether pressure is the force along the insert's normal over a uniform area.
             Otherwise it is the force over the tributary area of the node.
     """
@@ -269,7 +267,6 @@ def _words(result: ContactResult) -> str:
 
 
 def _failed_checks(model: str, result: ContactResult, load: float) -> list[str]:
-    """Return the checks that the result of a model fails."""
     fields = getattr(contact_class(model), "__dataclass_fields__", {})
     rule = fields["pressure_rule"].default if "pressure_rule" in fields else None
     return complaints(result, load, "newton" in fields, rule == "source")

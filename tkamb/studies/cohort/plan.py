@@ -295,7 +295,6 @@ def _scene(
 
 
 def _overrides(entry: Any, folder: Path) -> dict[str, Any]:
-    """Return the overrides of an entry of an axis, with absolute paths."""
     if entry is None:
         return {}
     result: dict[str, Any] = {}

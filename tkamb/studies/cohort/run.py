@@ -215,7 +215,7 @@ def run_cohort(
         part: part of the runs to compute; default: all.
         resume: use the runs that are stored in the folder, also those of parts.
         force: write into the folder even if it contains files of other programs.
-        progress: function that wraps the iterator of the finished runs.
+        progress: wrapper of the iterator of the finished runs.
 
     Returns:
         Number of the run -> its outcome, for all runs of the cohort or of the part.
@@ -283,7 +283,6 @@ def _holds_parts_alone(directory: Path) -> bool:
 
 
 def _stored(folders: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
-    """Return the outcomes of the runs that are already stored."""
     result: dict[int, Outcome] = {}
     for shards in folders:
         for number in numbers if shards.resumed else ():

@@ -41,13 +41,8 @@ DESIGN_TOUCH = DesignTouchSettings()
 
 @dataclass(frozen=True)
 class TouchingPose:
-    """Pose at which both condyles touch the insert.
-
-    Args:
-        si: superior-inferior position, mm.
-        adduction: adduction, rad.
-        points: medial and lateral contact point in the insert frame, mm, shape (2, 3).
-    """
+    """Pose at which both condyles touch: SI position, mm, adduction, rad, and the medial and
+    lateral contact point in the insert frame, mm, shape (2, 3)."""
 
     si: float
     adduction: float
@@ -155,10 +150,7 @@ class Design:
         return self.articulation.insert
 
     def write_meshes(self, folder: Path) -> tuple[Path, ...]:
-        """Write the parts as binary STL files in mm and return the paths.
-
-        A femoral component that has a cam is written both with and without the cam.
-        """
+        """Write the parts as binary STL files in mm, a cam both with and without, return paths."""
         folder.mkdir(parents=True, exist_ok=True)
         meshes = {
             FEMORAL_MESH: self.femoral.mesh(),

@@ -8,9 +8,8 @@ it. If the J-curves of the two condyles differ, the surface blends from one to t
 groove.
 
 A posterior-stabilised component has a cam: a cylinder across the box that is joined to its walls.
-The cylinder is exact up to `CAM.flange_mm` from a wall. Between there and the wall it widens and
-meets the edge of an opening in the wall. The mesh is therefore one closed body without
-self-intersection.
+The cylinder is exact up to `CAM.flange_mm` from a wall. From there it widens to the edge of an
+opening in the wall, so the mesh is one closed body without self-intersection.
 """
 
 from collections.abc import Sequence
@@ -63,10 +62,7 @@ class Cam:
     radius: float
 
     def rings(self, half_length: float) -> Array:
-        """Return points (`CAM.stations`, `CAM.sides`, 3) on the cylinder.
-
-        The rings lie between z = -half_length and half_length; the angle increases from x to y.
-        """
+        """Return points (`CAM.stations`, `CAM.sides`, 3) on the cylinder within ±half_length."""
         turn = np.linspace(0.0, 2.0 * np.pi, CAM.sides, endpoint=False)
         x = self.centre_ap + self.radius * np.cos(turn)
         y = self.centre_si + self.radius * np.sin(turn)
@@ -105,11 +101,7 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
 
 
 def _outline(vertices: Array, window: Ids) -> Ids:
-    """Return the edge vertices of an area of a wall, sorted by angle about their mean.
-
-    Raises:
-        InputError: the edge is not one loop in this order.
-    """
+    """Return the edge vertices of an area of a wall, sorted by angle about their mean."""
     edges = window[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
     rim = pairs[count == 1]
@@ -307,10 +299,7 @@ class FemoralComponent:
         return np.asarray(top + (self.width_half - top) * self._taper(phi))
 
     def notch(self, phi: ArrayLike) -> Array:
-        """Return the ML distance of the notch's edge from the middle.
-
-        The front of the notch is elliptic, and behind it the edges are parallel.
-        """
+        """Return the ML distance of the notch's edge, elliptic in front, from the middle."""
         start, end = np.radians(self.notch_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         s = np.where(s < 1e-9, 0.0, s)
@@ -381,7 +370,6 @@ class FemoralComponent:
         return np.concatenate([place, np.asarray(z)[..., None]], axis=-1)
 
     def _bone_side(self, phi: Array, z: Array) -> Array:
-        """Return points (..., 3) of the surface towards the bone."""
         top = self.thickness_at_flange_top
         thickness = top + (self.thickness - top) * self._taper(phi)
         return self._below(phi, z, thickness)

@@ -76,10 +76,9 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
         failed: whether each frame of each sample failed, shape (n, f).
 
     Returns:
-        None if no nominal value is finite. Otherwise frame, nominal value, number of samples and of
-        failed samples at this frame, median, p05 and p95 (None: no band), nominal_percentile and
-        words. The nominal percentile is the per cent of samples below the nominal value, with half
-        of the equal ones.
+        Frame, nominal value, number of samples and of failed samples, median, p05 and p95 (None:
+        no band), per cent of the samples below the nominal value (with half of the equal ones), and
+        a sentence. None if no nominal value is finite.
     """
     if not np.isfinite(nominal).any():
         return None
@@ -145,7 +144,7 @@ def discrepancy_columns(
     """Return the columns `<name>_discrepancy_p05` and `_p95`: the band of inputs and discrepancy.
 
     There are no columns if the discrepancy of the run is unknown. Values are NaN where the force or
-    the total force has no band. The discrepancy is a share of the total force.
+    the total force has no band.
 
     Args:
         names: names of m columns of results.csv.
@@ -228,9 +227,8 @@ def measured_inside(
         compared: force -> its comparison, as in `measured` of the summary.
 
     Returns:
-        Force -> "frames", the number of frames with force and band, "share", the share of them
-        inside the band of inputs (NaN without frames), and "share_with_discrepancy", the share
-        inside the band of inputs and discrepancy, if that exists.
+        Force -> number of frames with force and band, share of them inside the band of inputs (NaN
+        without frames), and inside the band of inputs and discrepancy if that exists.
     """
     rows: dict[str, dict[str, Any]] = {}
     for name, comparison in compared.items():

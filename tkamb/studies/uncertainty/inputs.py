@@ -102,7 +102,6 @@ def _pose_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
 
 
 def _marker_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
-    """Return the position inputs of each marker on shank and thigh."""
     markers = case.scene.motion.markers
     by_segment = {"shank": SKIN_MARKER_ERROR.shank_mm, "thigh": SKIN_MARKER_ERROR.thigh_mm}
     inputs: list[VariedInput] = []
@@ -133,7 +132,6 @@ def _load_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
 
 
 def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
-    """Return the strength of each muscle group, and the attachments of each line or group."""
     inputs: list[VariedInput] = []
     groups: tuple[str, ...] = ()
     if case.scene.muscles is not None:

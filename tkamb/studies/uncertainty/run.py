@@ -199,7 +199,7 @@ def estimate_uncertainty(
         scene_path: path of the scene file, for the summary.
         resume: whether to use the samples that an interrupted run stored in the folder.
         force: whether to write into a folder that contains files of other programs.
-        progress: function that wraps the iterator of the finished samples.
+        progress: wrapper of the iterator of the finished samples.
 
     Raises:
         InputError: the input is invalid, the folder holds another run, or cannot be claimed.
@@ -242,11 +242,7 @@ def estimate_uncertainty(
 
 
 def _check_correlation(case: Case, inputs: Sequence[VariedInput], indices: bool) -> None:
-    """Check the correlations, and that Sobol' indices are not requested with them.
-
-    Raises:
-        InputError: the correlations are impossible, or combined with Sobol' indices.
-    """
+    """Raise if the correlations are impossible, or combined with Sobol' indices."""
     tables = uncertainty_of(case).correlation
     correlation_root(tables, [one.name for one in inputs])
     if tables and indices:
@@ -373,16 +369,7 @@ def banded_names(results: Results) -> list[str]:
 
 
 def _stored(shards: Shards | None, count: int, shape: tuple[int, int, int]) -> dict[int, Sample]:
-    """Return the samples that an earlier run stored.
-
-    Args:
-        shards: stored samples of the folder; None: no folder.
-        count: number of samples.
-        shape: numbers of columns, frames and inputs of a sample.
-
-    Raises:
-        InputError: a stored sample has other arrays than a `Sample` of this shape.
-    """
+    """Return the stored samples. `shape`: numbers of columns, frames and inputs of a sample."""
     samples: dict[int, Sample] = {}
     if shards is None or not shards.resumed:
         return samples

@@ -92,7 +92,6 @@ def varied_case(case: Case, draw: Draw) -> Case:
 
 
 def _scene(case: Case, draw: Draw) -> Scene:
-    """Return the scene with varied friction and yield stress."""
     scene = case.scene
     if scene.contact is None:
         return scene

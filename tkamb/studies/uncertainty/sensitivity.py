@@ -58,11 +58,10 @@ def sobol_indices(
         first = sum y_B (y_AB - y_A) / sum y²      (Saltelli et al. 2010)
         total = sum (y_A - y_AB)² / (2 sum y²)     (Jansen 1999)
 
-    where sum y² is the mean of the sums over A and B. Numerators and denominators are summed over
-    the frames (Gamboa et al. 2014), so each frame has the weight of its variance. Rows with a
-    failed sample are omitted; the indices then describe the poses without failure. Standard errors
-    come from a bootstrap over the rows. A result has no indices if it does not vary, or if fewer
-    than `STATISTICS_LIMITS.min_samples` rows remain.
+    where sum y² is the mean over A and B. Numerators and denominators are summed over the frames
+    (Gamboa et al. 2014). Rows with a failed sample are omitted. Standard errors come from a
+    bootstrap over the rows. A result has no indices if it does not vary, or if fewer than
+    `STATISTICS_LIMITS.min_samples` rows remain.
 
     Args:
         results: names of the m results.
@@ -149,9 +148,8 @@ class Screened:
         nominal: largest nominal value of the result.
         flexion: flexion of the frame with this value, deg.
         varied: the input.
-        minus: change of the result at this frame for minus one standard deviation; NaN if the frame
-            failed.
-        plus: change for plus one standard deviation; NaN if the frame failed.
+        minus: change at this frame for minus one standard deviation; NaN if the frame failed.
+        plus: change for plus one standard deviation.
     """
 
     result: str
@@ -183,7 +181,7 @@ def screen(
         scene: the scene.
         frames: slice of the frames; default: all.
         crew: settings of the worker pool; default: compute in this process.
-        progress: function that wraps the iterator of the finished samples.
+        progress: wrapper of the iterator of the finished samples.
 
     Returns:
         The inputs of each result, with the largest change first. A result without a nominal value
@@ -214,10 +212,7 @@ def screen(
 def _of_result(
     result: str, values: Array, flexion: float, inputs: Sequence[VariedInput]
 ) -> list[Screened]:
-    """Return the effect of each input on a result, with the largest change first.
-
-    `values` are the results of the screening at one frame, shape (1 + 2 d,).
-    """
+    """Return the effect of each input from `values` (1 + 2 d,), with the largest change first."""
     changes = values[1:] - values[0]
     rows = [
         Screened(result, float(values[0]), float(flexion), varied, float(minus), float(plus))

@@ -285,7 +285,7 @@ class Sampling:
             rows: rows of the nominal table.
             crew: settings of the worker pool; default: compute in this process.
             shards: store of the finished samples; None: they stay in memory.
-            progress: function that wraps the iterator of the finished samples.
+            progress: wrapper of the iterator of the finished samples.
 
         Raises:
             KeyboardInterrupt: interrupted. The finished samples stay in `shards`.
@@ -315,7 +315,6 @@ class Sampling:
 
 
 def _is_sample(shard: Shard) -> bool:
-    """Return whether a stored shard has valid columns of a `WearSampler`."""
     columns = shard.contact or {}
     if not columns:
         return True

@@ -91,9 +91,9 @@ class CrossShear(WearLaw):
 
         h = k(CS) sum p s,      k(CS) = k_iso 2 (1 + (ratio - 1) CS) / (1 + ratio)
 
-    This is h = k_along W_along + k_across W_across with k_across = ratio k_along. W_along and
-    W_across are the frictional work along and across the principal direction of sliding. k_iso is
-    the wear factor of a test on a circular path (CS = 1/2), and k(0) = 2 k_iso / (1 + ratio).
+    This is h = k_along W_along + k_across W_across with k_across = ratio k_along and the work W of
+    friction along and across the principal direction of sliding. A test on a circular path
+    (CS = 1/2) gives k_iso.
 
     Args:
         wear_factor_mm3_per_Nm: wear factor k_iso at CS = 1/2, mm³/(N m).

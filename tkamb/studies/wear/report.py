@@ -134,13 +134,11 @@ class WearReport:
         }
 
     def _rows(self) -> list[dict[str, float]]:
-        """Return the rows of the table, with their bands if these exist."""
         rows = self.state.rows
         bands = [{}] * len(rows) if self.bands is None else self.bands.rows
         return [row | band for row, band in zip(rows, bands, strict=True)]
 
     def _control(self) -> dict[str, Any]:
-        """Return the kind of control, and with force control the springs and the positions."""
         drive = self.case.motion.drive
         if drive is None:
             return {"control": "displacement", "found_in_equilibrium": []}
@@ -328,7 +326,6 @@ class WearReport:
 
 
 def _table(rows: Sequence[dict[str, float]]) -> list[list[str]]:
-    """Return the column names and the rows as cells. The cell of NaN is empty."""
     cells = [["" if math.isnan(value) else repr(value) for value in row.values()] for row in rows]
     return [list(rows[0]), *cells]
 

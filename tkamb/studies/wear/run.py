@@ -161,7 +161,7 @@ class WearRun:
             resume: whether to use the state that is stored in the folder.
             progress: function that is called with the number of finished cycles.
             crew: settings of the worker pool for the samples; default: compute in this process.
-            sample_progress: function that wraps the iterator of the finished samples.
+            sample_progress: wrapper of the iterator of the finished samples.
 
         Raises:
             InputError: the folder holds another simulation, or there is no contact.
@@ -224,13 +224,7 @@ class WearRun:
 
 @dataclass(eq=False)
 class _MaterialChoice:
-    """Material and law of the call, or of the table [wear] of the scene.
-
-    Args:
-        law: name of the law; None: that of the table.
-        material: name or file of the material; None: that of the table.
-        wear_factor: wear factor, mm³/(N m); None: that of the table.
-    """
+    """Names of law and material, and wear factor, mm³/(N m); None: that of [wear] in the scene."""
 
     law: str | None
     material: str | Path | None

@@ -100,7 +100,7 @@ def wear_setup(
         overrides: dotted key of the scene -> value. A folder of results accepts only keys of
             [wear], because other keys need another run.
         check: function of [wear] and the path of the scene that is called before frames are run.
-        progress: function that wraps the iterator of the frames to run.
+        progress: wrapper of the iterator of the frames to run.
 
     Raises:
         InputError: the scene, folder or profile is invalid, or has no contact, or a post.
@@ -196,7 +196,6 @@ def _refuse_post(case: Case) -> None:
 
 
 def _cycle_of_maps(maps: ContactMaps, scene: Scene, most: int) -> CycleMotion:
-    """Return the cycle of at most `most` frames of a run."""
     track = _Track.of_maps(maps)
     frames = [*chain(*chosen_frames(len(track.time), most))]
     return _cycle_of(track, frames, scene, track.time, (track.time, track.poses))
@@ -215,7 +214,6 @@ def _hashes(case: Case, scene: Scene) -> tuple[str, ...]:
 def _of_profile(
     profile: Profile, springs: Springs | None, engine: ContactEngine, case: Case, period: float
 ) -> CycleMotion:
-    """Return a simulator's cycle in displacement or force control."""
     assert case.insert is not None and case.scene.contact is not None
     profile.drive((0.0, 0.0), springs)  # raises for unsuitable springs before the search
     dwell = engine.dwell(case.insert, profile.rotation)
@@ -248,13 +246,7 @@ def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleM
 
 
 class _Track(NamedTuple):
-    """Computed frames.
-
-    Args:
-        time: times of the frames, s, shape (f,).
-        poses: pose_femoral_in_insert, shape (f, 4, 4).
-        load: load along -y, N, shape (f,).
-    """
+    """Computed frames: times, s, (f,); pose_femoral_in_insert (f, 4, 4); load along -y, N, (f,)."""
 
     time: Array
     poses: Array
@@ -279,8 +271,8 @@ def _cycle_of(
         track: computed frames.
         chosen: numbers of the frames of the cycle.
         scene: scene with the closing of the cycle.
-        recorded: times of the whole recording, s, shape (g,).
-        whole: these times and the poses (g, 4, 4) at them; None: the poses are unknown.
+        recorded: times of the recording, s, shape (g,).
+        whole: times and poses (g, 4, 4) of the recording; None: the poses are unknown.
     """
     frames, count = list(chosen), len(recorded)
     time, poses, load = (values[frames] for values in track)

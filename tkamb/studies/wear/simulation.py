@@ -174,12 +174,11 @@ def simulate_wear(
 ) -> tuple[WearState, CycleWear]:
     """Return the insert after a number of cycles, and the wear of a further cycle.
 
-    A block uses the pressure maps at its beginning. It adds the worn depth per cycle times its
-    number of cycles (explicit Euler, first order in the length of the block). A block has at most
-    cycles / updates cycles. It is repeated with half its length if there is no contact after it, or
-    if more than `most_change` of the worn volume per cycle moves to other points. (A block that
-    removes more than the compression of the contact moves the pressure away from the worn area. The
-    pressure returns in the next block.) The simulation ends early if the insert is worn through or
+    A block adds the worn depth per cycle at its beginning times its number of cycles (explicit
+    Euler, first order). It has at most cycles / updates cycles. It is repeated with half its length
+    if there is no contact after it, or if more than `most_change` of the worn volume per cycle
+    moves to other points. (A block that removes more than the compression of the contact moves the
+    pressure away from the worn area.) The simulation ends early if the insert is worn through or
     contact is lost. `end` then contains the reason.
 
     Args:
@@ -241,7 +240,6 @@ def _cycle(case: WearCase, state: WearState) -> CycleWear | str:
 
 
 def _cycle_wear(case: WearCase, insert: Surface, maps: CycleMaps, rows: list[int]) -> CycleWear:
-    """Return the wear of a cycle on an insert from the maps of the frames `rows`."""
     points = insert.vertices[case.articular.vertices]
     normals, area = case.articular.normals_and_areas(insert)
     pressure = maps.pressure[rows] @ interpolation(maps.points, points).T
@@ -300,8 +298,8 @@ def first_cycle(case: WearCase, laws: Mapping[str, WearLaw]) -> FirstCycle:
 def _rows(maps: CycleMaps, motion: CycleMotion) -> list[int] | str:
     """Return the frames of the cycle, or the reason why there is no cycle.
 
-    Failed rows of a force-controlled profile are omitted, and the first remaining row is repeated
-    at the end if an end of the profile failed. A prescribed motion needs every frame.
+    Failed rows of a force-controlled profile are omitted. If an end failed, the first remaining row
+    closes the cycle. A prescribed motion needs every frame.
     """
     frames = range(len(motion))
     successful = [k for k in frames if k not in maps.failed]
@@ -349,7 +347,6 @@ def _until_worn_through(thickness: Array, fall: Array) -> float:
 
 
 def _row(case: WearCase, state: WearState, current: CycleWear) -> dict[str, float]:
-    """Return the row of the table for the insert in a state."""
     articular, worn_nodes = case.articular, state.wear > WEAR_SIMULATION.min_depth
     area = float(current.area[worn_nodes].sum())
     medial = articular.surface.vertices[articular.vertices, 2] < 0

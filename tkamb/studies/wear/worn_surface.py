@@ -39,13 +39,12 @@ WORN_SURFACE = WornSurfaceSettings()
 class ArticularSurface:
     """The upward-facing vertices of the insert, with their tributary areas.
 
-    A vertex has a third of the area of each of its triangles. Its normal n is the direction of the
-    summed area vectors of its upward-facing triangles. At the rim it is therefore the normal of the
-    articular surface and not that of the wall. Its area is the sum of the y components of the area
-    vectors of all its triangles over n_y.
+    A vertex has a third of the area vector of each of its triangles. Its normal n is the direction
+    of the sum over its upward-facing triangles, so at the rim the wall has no effect. Its area is
+    the y component of the sum over all its triangles, over n_y.
 
-    A worn depth h along the normal moves the vertex down by h/n_y. x and z do not change. The
-    volume of a closed surface is then linear in y, and for any depth exactly
+    A worn depth h along the normal moves the vertex down by h/n_y. The volume of a closed surface
+    is linear in y, so for any depth exactly
 
         volume removed = sum over vertices of h times area
 
