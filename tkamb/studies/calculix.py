@@ -6,12 +6,10 @@ Each case is solved without a warm start, so the cold and warm times are equal.
 
 The contact nodes lie on the smooth surface of the insert's mesh, as in the lattice. The femoral
 component is faceted. CalculiX gives pressures on the deformed faces. They are converted to nodal
-forces and divided by the undeformed tributary areas, because the built-in models define pressure
-in this way.
+forces and divided by the undeformed tributary areas, as in the built-in models.
 
 Linear cases use small strain in both programs. With the Ramberg-Osgood law CalculiX uses finite
-strain (true stress over the Eulerian strain), the built-in models small strain. A nonlinear
-comparison includes this difference.
+strain (true stress over the Eulerian strain), the built-in models small strain.
 """
 
 import math
@@ -109,7 +107,7 @@ def run_calculix(text: str, longest: float = CALCULIX.longest_seconds) -> PeerRu
         seconds = clock.perf_counter() - start
         if not (place / "peer.dat").exists():
             raise ComputationError(
-                f"gave no output: {_last_words(place / OUTPUT_FILE)}", "CalculiX"
+                f"gave no output: {_error_line(place / OUTPUT_FILE)}", "CalculiX"
             )
         blocks = _blocks((place / "peer.dat").read_text(encoding="utf-8").splitlines())
         iterations = _iterations((place / "peer.cvg").read_text(encoding="utf-8"))
@@ -136,11 +134,11 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
         finally:
             process.kill()
     if process.returncode:
-        raise ComputationError(f"stopped: {_last_words(place / OUTPUT_FILE)}", "CalculiX")
+        raise ComputationError(f"stopped: {_error_line(place / OUTPUT_FILE)}", "CalculiX")
     return memory
 
 
-def _last_words(path: Path) -> str:
+def _error_line(path: Path) -> str:
     """Return the last line of the output that reports an error, or else the last line."""
     lines = [line.strip(" *") for line in path.read_text(errors="replace").splitlines()]
     lines = [line for line in lines if line]

@@ -135,7 +135,7 @@ KNEE_CASES = Path(__file__).with_name("knee_cases.json")
 RECORDINGS = ("motion.csv", "tibia.csv", "ground_reaction.csv")
 """Recorded tables of the shipped knee bend."""
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
-"""deg: flexion of the cases of the shipped knee. For a user's scene it is the nearest frame."""
+"""deg: flexion of the cases of the shipped knee. A user's scene has the nearest frames."""
 
 
 @dataclass(frozen=True)

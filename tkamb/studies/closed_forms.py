@@ -162,7 +162,7 @@ def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
         return model.press(state, case.load_N, np.eye(4)), pair
 
 
-def apart(case: ClosedForm, result: ContactResult) -> dict[str, float]:
+def relative_errors(case: ClosedForm, result: ContactResult) -> dict[str, float]:
     """Return the relative errors of approach and pressure against the closed form."""
     approach, pressure = solution(case)
     if case.model == "lattice-source":

@@ -32,8 +32,7 @@ EXTREME_MESH = ExtremeMeshSettings()
 Shape = Literal["usual", "swapped", "lip", "spike", "subdivided", "slivers"]
 """Shape of the two bodies. swapped: the bodies are exchanged. lip: the insert has a steep anterior
 rim of 6 mm. spike: one femoral vertex is pulled out by 3 mm. subdivided: each femoral triangle is
-divided into four. slivers: one vertex of each femoral ring is moved almost onto the next, which
-makes needle-shaped triangles."""
+divided into four. slivers: one vertex of each femoral ring is moved almost onto the next."""
 
 
 @dataclass(frozen=True)

@@ -67,9 +67,9 @@ def is_map(stored: Mapping[str, float]) -> bool:
 def errors(values: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
     """Return the relative errors of approach, force, mean_pressure, peak_pressure and area.
 
-    Errors of force and area are relative to the sum of both condyles. Errors of pressure are
-    relative to the higher pressure of the two. A condyle with little load therefore does not
-    dominate. The larger error of the two condyles is returned.
+    Errors of force and area are relative to the sum of both condyles, errors of pressure to the
+    higher pressure, so that a condyle with little load does not dominate. The larger error of the
+    two condyles is returned.
     """
     result = {"approach": _relative(values, reference, ["approach"], np.max)}
     for part in PARTS:

@@ -13,8 +13,8 @@ A closed form is tested with its formula (`closed_forms`). Kinds of verdict:
 
 - converged: the status is ok, all checks pass, and the result is within 2 % of the reference in
   approach, condyle force and peak pressure.
-- flagged: there is no result, or it has a flag; the reason is given.
-- unflagged_wrong: the status is ok without a flag, but a check fails or a reference differs.
+- flagged: there is no result, or a result with a flag fails a check or differs too much.
+- unflagged_wrong: a result with status ok and no flag fails a check or differs too much.
 - unverified: the status is ok, but the reference did not converge. Counts as failed.
 - exception: an exception of a class that tkamb does not define.
 - hang: the model exceeds its time limit.
@@ -39,7 +39,12 @@ from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.studies.cases import content_hash
-from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form
+from tkamb.studies.closed_forms import (
+    TOLERANCES,
+    ClosedForm,
+    press_closed_form,
+    relative_errors,
+)
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.measures import Quantities, errors, quantities
 
@@ -60,7 +65,7 @@ AUDIT = AuditSettings()
 
 PEER_ANSWERS = Path(__file__).with_name("peer_answers.json")
 PEER_BOUNDS = {"approach": 0.035, "force": 0.01, "mean_pressure": 0.09, "peak_pressure": 0.09}
-"""Largest relative difference from CalculiX."""
+"""Largest accepted relative differences from CalculiX."""
 PEER_MODELS = ("lattice", "lattice-linear", "fe")
 
 
@@ -244,7 +249,7 @@ def judge_closed_form(case: ClosedForm, pressed: Callable[[], None] = lambda: No
     pressed()
     if result.status is not ContactStatus.OK:
         return _verdict(case, "flagged", _words(result), None, seconds, result)
-    distances = apart(case, result)
+    distances = relative_errors(case, result)
     bounds = dict(zip(distances, TOLERANCES[case.kind], strict=True))
     problems = [
         f"{name} {100 * value:.3g} % from the closed form"

@@ -29,8 +29,7 @@ from tkamb.run.identity import files_in
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])
 MOST_RUNS = 20_000
-"""Largest number of runs. All scenes are read before the first run, in 5 ms each; a run takes a
-minute."""
+"""Largest number of runs. Reading a scene takes 5 ms and a run takes a minute."""
 Name = Annotated[str, Field(pattern=r"^[\w .+-]{1,60}$")]
 Overrides = Annotated[
     dict[str, Any],

@@ -57,7 +57,7 @@ def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
 
 
 def held_inputs(case: Case) -> tuple[str, ...]:
-    """Return the names of the inputs of a case with standard deviation 0, without their parts."""
+    """Return the names of the inputs with standard deviation 0, as "dome" for "dome.ap"."""
     constants = [constant.name for constant in _all_inputs(case) if constant.deviation == 0]
     names = (f"{name.partition('.')[0]}{'_angles' * ('.about_' in name)}" for name in constants)
     return tuple(dict.fromkeys(names))

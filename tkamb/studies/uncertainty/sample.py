@@ -327,7 +327,7 @@ class Sampler:
         """Return the sample at a point. Each frame has a warm start from the preceding frame.
 
         Args:
-            number: number of the sample. It has no effect; the worker pool passes it.
+            number: number of the sample, which has no effect.
             point: point of the sample in the space of the inputs.
         """
         draw = self.draw(point)

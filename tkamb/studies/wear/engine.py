@@ -138,7 +138,7 @@ def interpolation(map_points: Array, points: Array) -> csr_array:
     """Return weights (n, m) that interpolate values at map points (m, 3) to points (n, 3).
 
     The interpolation in x and z is linear on the Delaunay triangles of the map points, and zero
-    outside their hull. Its error is of second order in the spacing of the map points.
+    outside their hull.
     """
     triangulation = Delaunay(map_points[:, [0, 2]])
     positions = points[:, [0, 2]]

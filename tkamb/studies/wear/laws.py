@@ -132,7 +132,7 @@ class PressureCrossShear(WearLaw):
     The table is interpolated bilinearly. Outside its range the value at its edge is used.
 
     Args:
-        cross_shear: increasing cross-shear ratios, from 0 to 0.5.
+        cross_shear: increasing cross-shear ratios between 0 and 0.5.
         pressure_MPa: increasing pressures, MPa, at least 0.
         wear_factor_mm3_per_Nm: wear factors, mm³/(N m), with one row per cross-shear ratio and one
             column per pressure.
@@ -182,7 +182,7 @@ class ContactArea(WearLaw):
     given cross-shear ratios and constant outside them.
 
     Args:
-        cross_shear: increasing cross-shear ratios, from 0 to 0.5.
+        cross_shear: increasing cross-shear ratios between 0 and 0.5.
         coefficient: C at these ratios, m of depth per m of path.
 
     Reference: Liu, Fisher & Jin, Proc Inst Mech Eng J 226:552 (2012),

@@ -61,8 +61,7 @@ class CycleMotion:
         poses: pose_femoral_in_insert, shape (f, 4, 4). The press keeps rotation, x and z.
         load: load along -y, N, shape (f,).
         duration: duration of a cycle, s.
-        passes: number of times that a cycle goes through the frames: 1 for a closed cycle, 2 for a
-            motion there and back.
+        passes: passes through the frames per cycle: 2 for a motion there and back, else 1.
         notes: notes on the cycle for the report.
         drive: loads from which equilibrium on each insert gives the poses. `poses` are then initial
             guesses. None: the poses are prescribed.

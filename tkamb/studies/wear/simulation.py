@@ -1,4 +1,4 @@
-"""Wear over many cycles in blocks. Each block starts with the contact on the worn insert."""
+"""Wear over many cycles, in blocks that begin with the contact on the worn insert."""
 
 import math
 from collections.abc import Callable, Mapping

@@ -51,7 +51,7 @@ class SlidingHistory:
         pressure: mean pressure of each step, Pa, shape (s, n); zero without contact.
         sliding: sliding path of the femoral surface in the tangent plane, m, shape (s, n, 3).
         normals: unit outward normals of the insert, shape (n, 3).
-        passes: number of times that a cycle goes through the steps: 2 for a motion there and back.
+        passes: passes through the steps per cycle: 2 for a motion there and back.
         seconds: duration of each step, s, shape (s,); None: equal steps.
     """
 

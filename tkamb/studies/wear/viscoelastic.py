@@ -122,8 +122,7 @@ class ViscoelasticContact:
 class ViscoelasticLattice:
     """A viscoelastic insert under a rigid femoral component, computed in time steps.
 
-    Limits: small strain, no yield and no friction. Poisson's ratio is constant, because shear and
-    bulk modulus relax with the same series.
+    Limits: small strain, no yield, no friction, and constant Poisson's ratio.
 
     Args:
         model: linear lattice, with its resolution.
