@@ -177,7 +177,6 @@ def test_restarts_of_scheduler_and_client_neither_lose_nor_repeat_samples(start,
 
 
 def _stored_samples(folder):
-    """Return the number of samples that are stored in a folder."""
     return len(list(folder.glob(".frames/*.frame")))
 
 

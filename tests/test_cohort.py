@@ -118,7 +118,6 @@ def test_parts_workers_and_interruption_do_not_change_the_tables(file, tmp_path,
 
 
 def outcome(scale, frames=41, kind="bend"):
-    """Return an outcome with the columns of the synthetic run, its forces and pressures scaled."""
     run = make_run(kind, frames)
     columns = {
         name: values * (scale if name.endswith(("_BW", "_N", "_MPa", "_mm2")) else 1.0)
@@ -162,7 +161,6 @@ def test_the_recorded_motion_of_failed_frames_is_not_averaged(file):
 
 
 def test_the_end_of_a_cycle_belongs_to_the_last_bin(file):
-    """There is no bin from 100 % to 110 %."""
     group = group_of_five_frames(
         file, cycle_percent=[0.0, 45.0, 90.0, 95.0, 100.0], force_total_BW=[1, 2, 3, np.nan, 5]
     )
@@ -314,7 +312,6 @@ def test_cyclic_references_are_freed_between_runs():
 
 
 def worn(pressure, area_scale=1.0):
-    """Return the outcome of a run with scaled wear and peak pressures."""
     original = outcome(1.0, 11)
     columns = dict(original.columns)
     for side in ("medial", "lateral"):

@@ -62,7 +62,6 @@ def test_a_model_of_another_package_is_found_and_conforms(plugin):
 
 
 def test_a_contact_model_of_another_package_needs_thirty_lines():
-    """A new model needs its physics in one file, which docs/contact_model.md shows."""
     folder = PLUGIN / "tkamb_winkler"
     source = (folder / "model.py").read_text(encoding="utf-8")
     assert len(source.splitlines()) <= 30

@@ -51,7 +51,6 @@ def test_meshes_are_closed_with_outward_normals(design):
 
 
 def test_symmetry_bearing_and_post_are_those_of_the_source(design):
-    """Chapter 6: Sigma and LPS-Flex are symmetric with a post, and Sigma MB is mobile."""
     name = design.name
     assert design.symmetric == (name in ("sigma_fb", "sigma_mb", "lps_flex"))
     assert design.bearing == ("mobile" if name == "sigma_mb" else "fixed")
@@ -116,7 +115,6 @@ def test_invalid_arcs_and_keys_are_refused(tmp_path):
 
 
 def test_a_larger_size_follows_the_scaling_law():
-    """The press of scaled meshes gives area and pressure of the scaling law within 1 %."""
     design, size, load = load_design(ROOT / "nkii_cp"), 1.07, 900.0
     pressed = PressedDesign(design, 4.0)
     case = Assumption(0.5, 0.5, 0.0, 0.0, size)

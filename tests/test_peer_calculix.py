@@ -30,7 +30,6 @@ LINEAR, NONLINEAR = "polyethylene-linear", "polyethylene"
 
 
 def two_condyles(material_name):
-    """Return the condyles and dishes of the trade-off study."""
     insert = block(dishes(8e-3, 34e-3, 11e-3), (30e-3, 46e-3), 1e-3)
     return ContactPair(balls(22e-3, 11e-3, sectors=64), insert, material(material_name))
 

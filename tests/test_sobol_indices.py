@@ -74,7 +74,6 @@ def test_rows_with_a_failed_sample_are_omitted_and_a_constant_has_no_index():
 
 @pytest.mark.parametrize("level", [1.0, 0.1, 2310.4567, -1e6 / 3])
 def test_a_constant_result_has_no_rows(level):
-    """The round-off of its mean is not a variance."""
     assert sobol_indices(["y"], ["a", "b"], np.full((1024, 1, 1), level), 256, 1) == []
     errors = np.random.default_rng(1).standard_normal((256, 1, 2))
     assert influences(["y"], ["a", "b"], np.full((256, 1, 1), level), errors) == []

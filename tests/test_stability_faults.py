@@ -25,7 +25,6 @@ PEERED = Extreme(resolution_mm=3.0, linear=True)
 
 
 def judged(case):
-    """Return the verdict on a case, with the kind of its stored verdict."""
     verdict = judge_safely(case)
     return replace(verdict, expected=stored_verdicts()[verdict.key])
 

@@ -65,7 +65,6 @@ def test_every_case_has_a_reference(stored):
 
 
 def test_refined_grids_converge_to_the_solution_of_the_elastic_layer(stored):
-    """The reference of the sphere is analytic. The limit of the grids must agree with it."""
     reference = stored["sphere"]
     values, uncertainty = limits(reference.solved)
     for name in ("approach", "medial_peak_pressure"):
@@ -189,7 +188,6 @@ def test_a_separate_process_gives_the_results_of_this_process():
 
 
 def test_peak_memory_is_that_of_the_process_alone():
-    """A process with 400 MB of memory starts a process with less than half of it."""
     array = np.ones(50_000_000)
     code = "from tkamb.geometry.memory import peak_rss; print(peak_rss())"
     process = subprocess.run(

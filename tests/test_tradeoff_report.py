@@ -44,7 +44,6 @@ JSON_KEYS = {
 
 
 def made_up_rows():
-    """Return rows of four settings on three cases, with a failed one for each case."""
     settings = [("hertz", 2.0, 1e-3, 0.2), ("foundation", 2.0, 1e-2, 0.3)]
     settings += [("lattice", 2.0, 1e-2, 0.01), ("fe", 2.0, 1.0, 0.001)]
     rows = []

@@ -251,7 +251,6 @@ def test_each_input_changes_a_result_of_the_shipped_knee():
 
 
 def test_correlated_inputs_of_opposite_effect_give_a_narrow_band():
-    """The effects of two positively correlated offsets cancel."""
     pair = [{"between": ["centre_of_pressure_ap", "knee_centre.ap"], "coefficient": 0.99}]
     names = ("ap", "si", "ml", "axial_rotation", "adduction", "flexion")
     constant = {f"uncertainty__{n}_{'mm' if n in AXES else 'deg'}": 0.0 for n in names}

@@ -48,7 +48,6 @@ def test_the_nominal_peak_has_its_percentile_and_the_number_of_failures():
 
 
 def uncertain(failed=0):
-    """Return the results of three frames with the bands of `samples`."""
     values, failures = samples(failed)
     columns = {
         "time_s": np.arange(3.0),

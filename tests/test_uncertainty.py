@@ -149,7 +149,6 @@ def draw_of(sampler, **normal):
 
 
 def sampled(sampler, monkeypatch, **normal):
-    """Return the values of the sample with errors of the named inputs."""
     monkeypatch.setattr(sampler, "draw", lambda point: draw_of(sampler, **normal))
     return sampler(0, Point.of(0, np.zeros(0))).values
 

@@ -58,7 +58,6 @@ def test_fast_values_agree_with_the_stored_ones():
 
 
 def test_a_tenth_of_the_tables_agrees_with_the_stored_one():
-    """The nominal cases of one design over the knee bend, and the range of one case."""
     name = "NKII CP"
     pressed = PressedDesign(load_design(ROOT / "models" / "designs" / FOLDERS[name]))
     percent = dissertation.table(1).percent
@@ -100,7 +99,6 @@ def test_the_area_of_a_pressure_film_converges_to_the_ellipse():
 
 
 def test_a_pressure_film_measures_a_uniform_pressure_exactly():
-    """A square of 10 × 10 cells at 3 MPa has exact force, area and perimeter."""
     cell = 1e-3
 
     def field(x, z):
@@ -117,7 +115,6 @@ def test_a_pressure_film_measures_a_uniform_pressure_exactly():
 
 
 def test_errors_of_a_pressure_film_increase_with_the_perimeter_share():
-    """As published for the sensor, errors depend on the share of perimeter cells."""
     share, area = [], []
     for size in (4e-3, 6e-3, 9e-3, 14e-3):
         axes = (size, size / 1.5)

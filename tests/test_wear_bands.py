@@ -30,7 +30,6 @@ SPREAD = np.sqrt(np.log1p(0.44**2))
 
 
 def small_case(wear_factor=1e-6, creep=None):
-    """Return the wear case of a plate of 8 mm under a uniform pressure."""
     plate = shapes.block(lambda x, z: 0.01 + 0 * x, 8 * MM, 8 * MM, 4 * MM)
     surface = ArticularSurface.of_insert(plate, 4 * MM)
     law = Archard(wear_factor)
@@ -38,7 +37,6 @@ def small_case(wear_factor=1e-6, creep=None):
 
 
 def sampled(case, inputs=(FACTOR,), samples=20, **options):
-    """Return the bands of a case, and the rows of its nominal table."""
     state, _ = simulate_wear(case, CYCLES, 2)
     sampling = Sampling(inputs, np.eye(len(inputs)), samples, 1, 0.5)
     return sampling.bands((case, CYCLES, 2), state.rows, **options), state.rows
@@ -105,7 +103,6 @@ def test_the_pose_of_a_profile_varies_only_by_stated_deviations():
 
 
 def test_correlations_of_wear_inputs_are_used():
-    """Pairs with inputs that wear does not vary are ignored."""
     pairs = [
         {"between": ["ap", "wear_factor"], "coefficient": 0.6},
         {"between": ["ap", "tuberosity.ap"], "coefficient": 0.9},

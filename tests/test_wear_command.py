@@ -49,7 +49,6 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, profile, scene):
-    """Return the folder of a wear simulation over 100,000 cycles."""
     out = tmp_path_factory.mktemp("wear") / "out"
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK]
     assert main([*worn, "--cycles", "1e5", "--out", str(out)]) == 0
@@ -122,7 +121,6 @@ def test_an_interrupted_simulation_is_resumed_to_the_same_result(
 
 @pytest.mark.slow
 def test_a_killed_simulation_is_resumed_to_the_same_result(tmp_path, profile, scene):
-    """SIGKILL after the first stored block loses no block."""
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK[:-1], "6", "--cycles", "60000"]
     assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
     part = tmp_path / "part"

@@ -32,7 +32,6 @@ def frames(positions, load=LOAD):
 
 
 def worn(motion):
-    """Return the worn volume of a plate under a uniform pressure after a million cycles, mm³."""
     state, _ = simulate_wear(plate_case(motion, Archard(K)), 1_000_000, 1)
     return state.volume / MM**3
 
@@ -89,7 +88,6 @@ def test_chosen_frames_are_even_and_include_both_ends(count, most):
 
 @pytest.mark.parametrize("closing", CLOSINGS)
 def test_fewer_frames_give_the_same_cycle(closing):
-    """The recorded path of 101 frames gives the volume for any number of computed frames."""
     time = np.linspace(0.0, 1.0, 101)
     positions = 6 * MM * np.sin(5 * time) + 1 * MM * np.sin(31 * time)
     recording = frames(positions)
@@ -127,7 +125,6 @@ def test_the_change_with_half_the_frames_shows_too_few_frames():
 
 
 def profile(folder, rows):
-    """Return the path of a profile with rows of percentage, force, flexion and AP position."""
     path = folder / "profile.csv"
     head = "cycle_percent,axial_force_N,flexion_deg,ap_mm\n"
     path.write_text(head + "".join("{:g},{:g},{:g},{:g}\n".format(*row) for row in rows))

@@ -129,7 +129,6 @@ def test_the_dwell_position_is_the_lowest_position():
 
 
 def dish_case(applied):
-    """Return the wear case of a ball in a dish with the forces of each row (f, 6)."""
     engine = ContactEngine(contact_model("foundation", 2.0), ball(), material("polyethylene"))
     drive = machine(applied, (AP, SI, ML))
     motion = CycleMotion(knee_pose(drive.coordinates), -applied[:, SI], 1.0, 1, drive=drive)
@@ -150,7 +149,6 @@ FORCES = np.array(
 
 @pytest.fixture(scope="module")
 def driven():
-    """Return a force-controlled case, its state after 10 cycles, and the wear of a cycle."""
     case = dish_case(FORCES)
     return case, *simulate_wear(case, 10, 1)
 
@@ -181,7 +179,6 @@ def test_rows_of_the_table_have_the_range_of_released_coordinates(driven):
 
 
 def test_the_cycle_omits_failed_rows_and_fails_with_too_many(driven):
-    """The cycle is that of a profile without the failed row."""
     applied = np.insert(FORCES, 2, [3000, -500, 0, 0, 0, 0], axis=0)
     state, last = simulate_wear(dish_case(applied), 10, 1)
     assert list(last.failed) == [2] and state.rows[-1]["failed_rows"] == 1

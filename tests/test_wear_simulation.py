@@ -19,7 +19,6 @@ PLATE = 40 * 60  # mm²
 
 
 def last(case, cycles, updates, **options):
-    """Return the state of a case after some cycles, and the last row of its table."""
     state, _ = simulate_wear(case, cycles, updates, **options)
     return state, state.rows[-1]
 

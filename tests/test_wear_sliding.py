@@ -23,7 +23,6 @@ def turned(axis, angles, centre):
 
 
 def history(path, pressure=1e6, normals=UP):
-    """Return the history of one point under constant pressure in a translation along a path."""
     frames = len(path)
     return SlidingHistory.of_cycle(translated(path), np.full((frames, 1), pressure), POINT, normals)
 

@@ -39,7 +39,6 @@ def test_the_volume_of_a_box_and_a_dish_has_the_closed_form():
 
 @pytest.mark.parametrize("insert", [shapes.two_dishes(), shapes.trough(0.02), shapes.plate()])
 def test_the_mesh_loses_the_volume_of_the_wear_map(insert):
-    """Three updates remove depths along the normals of the current surface."""
     articular = ArticularSurface.of_insert(insert, 1.5 * MM)
     points = articular.surface.vertices[articular.vertices]
     fall, mapped = np.zeros(len(points)), 0.0

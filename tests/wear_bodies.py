@@ -23,7 +23,6 @@ DENSITY = 930.0
 
 
 def balls():
-    """Return two spheres of radius 22 mm, 44 mm apart along z."""
     return shapes.joined(*(shapes.sphere(0.022, 3, (0, 0, z)) for z in (-0.022, 0.022)))
 
 
@@ -86,7 +85,6 @@ def plate_case(motion, law, under=always, creep=None, thickness=0.01, **more):
 
 
 def ball_case(insert, radius, motion, wear_factor, resolution=1.0, facets=3):
-    """Return the case of a sphere of `radius`, m, on an insert with the foundation model."""
     return swinging_case(shapes.sphere(radius, facets), insert, motion, wear_factor, resolution)
 
 

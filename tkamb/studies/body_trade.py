@@ -122,7 +122,6 @@ def run_body_trade(rows: KeptRows | None = None) -> Iterator[BodyRow]:
 
 
 def _is_whole(row: BodyRow) -> bool:
-    """Return whether a stored row belongs to a change and has every column of the table."""
     return row.name in CHANGES and (row.changed is None or row.changed.keys() == HEADS.keys())
 
 

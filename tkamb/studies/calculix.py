@@ -1,8 +1,8 @@
 """CalculiX as an independent check: another program solves the same hexahedra, pose and load.
 
-CalculiX runs as a process with one thread and a time limit. It uses no result of the lattice. Its
+CalculiX runs as a process with one thread and a time limit, without a result of the lattice. The
 initial position of the femoral component is that at which an elastic foundation carries the load.
-Each case is solved without a warm start, so the cold and warm times are equal.
+There is no warm start, so the cold and warm times are equal.
 
 The contact nodes lie on the smooth surface of the insert's mesh, as in the lattice. The femoral
 component is faceted. CalculiX gives pressures on the deformed faces. They are converted to nodal
@@ -139,7 +139,6 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
 
 
 def _error_line(path: Path) -> str:
-    """Return the last line of the output that reports an error, or else the last line."""
     lines = [line.strip(" *") for line in path.read_text(errors="replace").splitlines()]
     lines = [line for line in lines if line]
     errors = [line for line in lines if line.lower().startswith("error")]

@@ -198,11 +198,7 @@ def content_hash(pair: ContactPair, arrays: Sequence[Array], words: tuple[Any, .
 
 
 def case_names(scene: Path | None = None) -> tuple[str, ...]:
-    """Return the names of the available cases.
-
-    Args:
-        scene: scene file of a user. Its cases are the last ones.
-    """
+    """Return the names of the available cases, those of a user's scene file last."""
     names = list(_ANALYTIC)
     if SHIPPED_SCENE.exists():
         names += [f"knee {flexion:g} deg" for flexion in FLEXIONS_DEG]
@@ -292,12 +288,7 @@ def copied_scene(folder: Path) -> Path:
 
 
 def change_recording(path: Path, change: Callable[[list[str], Array], Array]) -> None:
-    """Overwrite a recorded table with changed rows.
-
-    Args:
-        path: .csv file.
-        change: function of the column names and the rows (n, columns) that returns the new rows.
-    """
+    """Overwrite the rows (n, columns) of a .csv file with `change(column names, rows)`."""
     with open(path, encoding="utf-8", newline="") as file:
         lines = list(csv.reader(file))
     rows = change(lines[0], np.array(lines[1:], float))

@@ -5,9 +5,9 @@ and nu Poisson's ratio.
 
 - plate: a rigid flat plate on a block of height h and area A with nu = 0. The stress is F/A
   everywhere. The approach is d = h eps(F/A), with the material's curve eps(sigma) = sigma/E +
-  alpha (sigma0/E) (sigma/sigma0)^n. It is exact on any grid while the plastic strain is small:
-  plastic strain widens the block, which its fixed bottom resists. A column of an elastic
-  foundation follows p = sigma(-ln(1 - d/h)), so its approach is d = h (1 - exp(-eps)).
+  alpha (sigma0/E) (sigma/sigma0)^n. It is exact on any grid while the plastic strain is small,
+  because the fixed bottom resists plastic widening. A column of an elastic foundation follows
+  p = sigma(-ln(1 - d/h)), so its approach is d = h (1 - exp(-eps)).
 - slide: the plate on a mobile bearing, for any nu and strain. Two nodes of the bottom are fixed
   to prevent rigid motion. They also fix their distance, which stiffens the block by up to 2 %.
 - kept: the plate with the operator cache on disk, which already contains the operator of another
@@ -56,9 +56,8 @@ class ClosedFormSettings:
     """mm: cell size of the "kept" cases. Chosen because the cache does not store the smaller
     operators of larger cells."""
     sharma_approach_ratio: float = 0.6808
-    """Approach of Sharma's spring model under the plate over that of the elastic solid. The springs
-    have nu = 0.35 for every material and are too stiff at free sides. Measured; the test detects
-    any change of it."""
+    """Approach of Sharma's springs under the plate over that of the elastic solid. The springs have
+    nu = 0.35 for every material and are too stiff at free sides. Measured."""
 
 
 CLOSED_FORM = ClosedFormSettings()
@@ -249,7 +248,6 @@ def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
 
 
 def _strain(case: ClosedForm, stress: float) -> float:
-    """Return the uniaxial strain at a stress, Pa, after the law of the case."""
     young = case.modulus_MPa * MEGAPASCAL
     strain = stress / young
     if case.linear or case.model.endswith("linear"):
@@ -286,7 +284,6 @@ def _inner(result: ContactResult) -> Mask:
 
 
 def _plate(side: float) -> Surface:
-    """Return a box whose lower face lies in y = 0."""
     box = block(flat(10 * MILLIMETRE), (side, side), side / 2)
     return Surface(box.vertices, box.faces, "plate")
 

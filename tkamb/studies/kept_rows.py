@@ -96,7 +96,6 @@ def _row_hash(key: str, row: Row) -> str:
 
 
 def _whole_rows(path: Path) -> dict[str, Row]:
-    """Return key -> row of the lines that are complete and unchanged."""
     if not path.exists():
         return {}
     result: dict[str, Row] = {}

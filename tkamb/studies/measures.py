@@ -136,14 +136,13 @@ class MeasureSettings:
     """s: time limit of a job. A longer job is stopped and has no result. Chosen because the study
     should take minutes."""
     repeats: int = 3
-    """Largest number of timed preparations and first presses, and smallest number of timed warm
-    presses. Chosen because it gives a median."""
-    warm_presses: int = 7
-    """Largest number of timed presses from a neighbouring pose. Chosen because it gives a
+    """Most timed preparations and first presses, and fewest timed warm presses. Chosen for a
     median."""
+    warm_presses: int = 7
+    """Most timed presses from a neighbouring pose. Chosen for a median."""
     enough_seconds: float = 3.0
-    """s: measured time after which no more presses are timed, except for `repeats` warm ones.
-    Chosen because the study should take minutes."""
+    """s: measured time after which only `repeats` warm presses are still timed. Chosen because the
+    study should take minutes."""
 
 
 MEASURE = MeasureSettings()

@@ -190,11 +190,7 @@ class Reference:
 
 
 def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None) -> Reference:
-    """Solve a case on refined grids and return its reference.
-
-    Args:
-        case: contact problem.
-        grids_mm: cell sizes, mm; default: depends on the size of the insert.
+    """Solve a case on grids of the given or default cell sizes, mm, and return its reference.
 
     Raises:
         ComputationError: a grid did not converge.
@@ -219,11 +215,7 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
 
 
 def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
-    """Return values and uncertainties from the results of the grids; see the module.
-
-    Args:
-        solved: grid, as "fe 1 mm" -> its values.
-    """
+    """Return values and uncertainties from grid, as "fe 1 mm" -> its values; see the module."""
     h = np.array([float(name.split()[1]) for name in solved]) * MILLIMETRE
     family = np.array([FAMILIES.index(name.split()[0]) for name in solved])
     values, uncertainty = {}, {}

@@ -116,7 +116,6 @@ def _run(scene: Path, overrides: dict[str, Any]) -> "Results":
 
 
 def _apply(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
-    """Change the files of the copied scene and return the overrides of the scene."""
     if extreme.kind == "time":
         stretch_time(folder, extreme.value)
     elif extreme.kind == "noise":

@@ -31,11 +31,11 @@ class StabilitySettings:
     """Limits of the stability study."""
 
     longest_seconds: float = 120.0
-    """s: time limit of a model, beyond which a case counts as a hang. Chosen because usual cases
-    take seconds."""
+    """s: time limit of a model; a longer case is a hang. Chosen because usual cases take
+    seconds."""
     longest_reference_seconds: float = 900.0
-    """s: time limit of a reference, beyond which a case is unverified. Chosen because the study
-    should end within a day."""
+    """s: time limit of a reference; a longer case is unverified. Chosen because the study should
+    end within a day."""
     workers: int = 2
     """Number of processes of the study. Chosen because a small computer has two cores."""
     quick_share: int = 13
@@ -177,7 +177,6 @@ class _Judges:
             self._running.discard(process)
 
     def _received(self, case: Case, receiver: Connection) -> Verdict:
-        """Return the verdict that a process sends, or that it exceeds a time limit."""
         if self._stopped:
             raise EOFError
         if not receiver.poll(self.limit(case)):
@@ -198,7 +197,6 @@ def _leave_interrupts_to_parent() -> None:
 
 
 def _send_verdict(case: Case, sender: Connection) -> None:
-    """Judge a case. Send `PRESSED` when the model has a result, then the verdict."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     sender.send(judge_safely(case, lambda: sender.send(PRESSED)))
 

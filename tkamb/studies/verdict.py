@@ -9,7 +9,7 @@ Each extreme case is tested in three ways:
   elements differ, so the bounds are the largest measured differences, rounded up.
 - Newton's method on the same grid, which shows errors of the solver without those of the grid.
 
-A closed form is tested with its formula (`closed_forms`). Kinds of verdict:
+A closed form is tested with its formula. Kinds of verdict:
 
 - converged: the status is ok, all checks pass, and the result is within 2 % of the reference in
   approach, condyle force and peak pressure.
@@ -262,7 +262,6 @@ def judge_closed_form(case: ClosedForm, pressed: Callable[[], None] = lambda: No
 
 
 def _kind_and_reason(result: ContactResult, problems: list[str]) -> tuple[str, str]:
-    """Return kind and reason of the verdict on a result with the given problems."""
     kind = "converged" if not problems else "flagged" if result.flags else "unflagged_wrong"
     return kind, "; ".join((*result.flags, *problems))
 
@@ -278,7 +277,6 @@ def _failed_checks(model: str, result: ContactResult, load: float) -> list[str]:
 
 
 def _differences_from_peer(extreme: Extreme, result: ContactResult) -> list[str]:
-    """Return one line for each quantity that differs too much from CalculiX's result."""
     return [
         f"{name.replace('_', ' ')} {100 * value:.3g} % from CalculiX"
         for name, value in peer_distances(extreme, result).items()

@@ -49,8 +49,8 @@ class Outcome:
 
     Args:
         reason: reason why the whole run failed; "" if it did not.
-        columns: name -> values (f,) of a numeric column of results.csv. Computing times and
-            quantities that the scene does not model are omitted.
+        columns: name -> values (f,) of a modelled numeric column of results.csv, without computing
+            times.
         status: status of each frame.
         chosen: pressure map of one frame; None without contact.
         wear: name -> wear result, such as "volume_mm3_per_Mc"; empty if wear was not computed.
@@ -189,7 +189,6 @@ class CohortWorker:
     def _worn(
         self, run: CohortRun, results: Results, outcome: Outcome, wear: CohortWearTable
     ) -> Outcome:
-        """Return the outcome with the wear of the insert, or with the reason why it failed."""
         from tkamb.studies.wear.run import wear_of_results
 
         try:

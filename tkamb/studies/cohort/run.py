@@ -123,7 +123,6 @@ PROVENANCE = {
 
 
 def _repeated(values: Sequence[Any], counts: Sequence[int], kind: Any = None) -> Any:
-    """Return an array that repeats the value of each run once per frame."""
     index = np.repeat(np.arange(len(values)), counts)
     return pa.array(values, kind or pa.string()).take(pa.array(index, pa.int64()))
 
@@ -211,7 +210,7 @@ def run_cohort(
         cohort: the cohort, or the path of its file.
         directory: folder of the results. A part is stored in a folder inside it, without table
             and report.
-        crew: settings of the worker pool; default: compute in this process.
+        crew: worker pool settings; default: this process.
         part: part of the runs to compute; default: all.
         resume: use the runs that are stored in the folder, also those of parts.
         force: write into the folder even if it contains files of other programs.

@@ -1,7 +1,6 @@
 """Groups of a cohort: mean, standard deviation and range over runs in each bin of the motion.
 
-The frames of a run in a bin are averaged first. Every run then has the same weight, however long
-its recording and however slow its motion.
+The frames of a run in a bin are averaged first, so that every run has the same weight.
 """
 
 import warnings
@@ -150,8 +149,7 @@ def _group(
 def _computed(outcome: Outcome) -> dict[str, Array]:
     """Return the columns of a run with NaN in failed frames, except for time and the bin axes.
 
-    The motion of a failed frame is the recorded one. Other frames may have a solved motion, so the
-    two must not be averaged.
+    The recorded motion of a failed frame must not be averaged with a solved one.
     """
     failures = np.array([status.startswith(FAILED) for status in outcome.status], bool)
     return {
@@ -170,7 +168,6 @@ def _bin_indices(values: Array, axis: str, width: float) -> NDArray[np.int64]:
 
 
 def _means(values: Array, index: Array, count: int) -> Array:
-    """Return the mean of the values in each bin, shape (count,); NaN for an empty bin."""
     finite = np.isfinite(values)
     total = np.bincount(index[finite], values[finite], minlength=count)
     number = np.bincount(index[finite], minlength=count)

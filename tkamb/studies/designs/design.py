@@ -51,12 +51,7 @@ class TouchingPose:
 
 @dataclass(frozen=True)
 class Articulation:
-    """A femoral component on an insert, as analytic surfaces without a mesh.
-
-    Args:
-        femoral: femoral component.
-        insert: insert.
-    """
+    """A femoral component on an insert, as analytic surfaces without a mesh."""
 
     femoral: FemoralComponent
     insert: Insert
@@ -86,11 +81,11 @@ class Articulation:
     def touch(
         self, ap: float, ml: float, axial_rotation: float, flexion: float, guess: float = 0.0
     ) -> TouchingPose:
-        """Return the superior-inferior position and adduction at which both condyles touch.
+        """Return the pose at which both condyles touch.
 
         Args:
-            ap: anterior-posterior position, mm.
-            ml: mediolateral position, mm.
+            ap: AP position, mm.
+            ml: ML position, mm.
             axial_rotation: axial rotation, rad.
             flexion: flexion, rad.
             guess: initial guess of the adduction, rad.

@@ -119,7 +119,6 @@ def _outline(vertices: Array, window: Ids) -> Ids:
 
 
 def _angles(vertices: Array, loop: Ids) -> Array:
-    """Return the angle (m,) of points about their mean in the sagittal plane, 0 to 2 pi rad."""
     x, y = (vertices[loop, :2] - vertices[loop, :2].mean(axis=0)).T
     return np.arctan2(y, x) % (2.0 * np.pi)
 

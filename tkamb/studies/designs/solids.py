@@ -27,10 +27,9 @@ def close_sheets(
     Args:
         outer: sheet of which all points are used.
         inner: opposite sheet on the same grid, of which a subset is used.
-        rows_kept: increasing numbers of the rows of `inner` that are used. They include the first
-            row, the last row and `fork`.
-        columns_kept: increasing numbers of the columns of `inner` that are used. They include the
-            first and last column, and with `fork` the middle two.
+        rows_kept: increasing numbers of the used rows of `inner`, including first, last and `fork`.
+        columns_kept: increasing numbers of the used columns of `inner`, including first, last and,
+            with `fork`, the middle two.
         fork: last row in which the two middle columns coincide; behind it a notch separates them.
             None: no notch.
 
@@ -75,7 +74,6 @@ def _sheet(ids: Ids, rows: Ids, columns: Ids, middle: int | None) -> Ids:
 
 
 def _loop(rows: list[int], columns: list[int], fork: int | None) -> list[Node]:
-    """Return the grid nodes (row, column) once around the edge of a sheet."""
     last = rows[-1]
     path = [(rows[0], c) for c in columns] + [(r, columns[-1]) for r in rows[1:]]
     if fork is None:

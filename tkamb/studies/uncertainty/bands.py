@@ -102,7 +102,6 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
 
 
 def _peak_words(peak: Mapping[str, Any]) -> str:
-    """Return a sentence on the percentile of the nominal peak and the number of failed samples."""
     share = peak["failed_samples"] / peak["samples"]
     failed = f"{peak['failed_samples']} of {peak['samples']} samples failed there ({share:.0%})"
     if peak["median"] is None:

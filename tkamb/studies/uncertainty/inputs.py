@@ -157,7 +157,6 @@ def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
 
 
 def _wrapped_tendons(case: Case) -> list[str]:
-    """Return the names of the tendons that wrap as a band."""
     names = [muscle.name for muscle in case.muscles if muscle.wrap and muscle.wrap.band > 0]
     ligament = case.patellar_ligament
     if ligament is not None and ligament.wrap and ligament.wrap.band > 0:

@@ -369,7 +369,6 @@ def banded_names(results: Results) -> list[str]:
 
 
 def _stored(shards: Shards | None, count: int, shape: tuple[int, int, int]) -> dict[int, Sample]:
-    """Return the stored samples. `shape`: numbers of columns, frames and inputs of a sample."""
     samples: dict[int, Sample] = {}
     if shards is None or not shards.resumed:
         return samples

@@ -154,7 +154,6 @@ def _muscle(case: Case, muscle: Muscle, draw: Draw) -> Muscle:
 
 
 def _wrap(wrap: SagittalWrap | None, name: str, draw: Draw) -> SagittalWrap | None:
-    """Return the wrapping of a tendon with the width of its band varied."""
     error = draw.error(f"tendon_band.{name}")
     return wrap if wrap is None or not error else replace(wrap, band=max(0.0, wrap.band + error))
 

@@ -5,8 +5,7 @@ a smaller one.
 
 Correlated inputs ([[uncertainty.correlation]]) are z = L x, with x independent standard normal and
 L L^T the correlation matrix (Cholesky). This is a Gaussian copula, because every input is a
-function of one normal error. The method of Iman & Conover (1982) is not used, because its samples
-depend on their number.
+function of one normal error. Samples by Iman & Conover (1982) would depend on their number.
 
 References: Cario & Nelson, Modeling and generating random vectors with arbitrary marginal
 distributions and correlation matrix, Northwestern University (1997); Iman & Conover, Commun Stat
@@ -95,8 +94,8 @@ class Point:
 
     Args:
         normal: standard normal value of each input, shape (d,).
-        noise_of: for each input the number of the sample that defines its noise over the frames,
-            length d. None: no noise; pose errors are constant over the frames.
+        noise_of: number of the sample that defines the noise of each input over the frames, length
+            d; None: no noise.
     """
 
     normal: Array

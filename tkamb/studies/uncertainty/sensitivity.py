@@ -180,7 +180,7 @@ def screen(
     Args:
         scene: the scene.
         frames: slice of the frames; default: all.
-        crew: settings of the worker pool; default: compute in this process.
+        crew: worker pool settings; default: this process.
         progress: wrapper of the iterator of the finished samples.
 
     Returns:
@@ -228,10 +228,7 @@ def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
     """Return the lines of the printed tornado table, with a bar for each input.
 
     Inputs with less than `SCREENING.least_share` of the largest change are counted in one line.
-
-    Args:
-        rows: result of `screen`.
-        width: length of the longest bar, characters.
+    `rows` come from `screen`; `width` is the length of the longest bar in characters.
     """
     lines: list[str] = []
     names = max((len(_named(row)) for row in rows), default=0)

@@ -1,9 +1,8 @@
 """Uncertainty of wear: samples of the simulation, and bands of the rows of its table.
 
 Sampling and percentiles are those of `tkamb uncertainty`. The varied inputs are the wear factor,
-the constants of creep, the modulus of the insert and the position of the whole cycle, which is the
-constant part of each pose error. The noise over the frames averages out over millions of cycles.
-Loads do not vary.
+the constants of creep, the modulus of the insert and the position of the whole cycle (the constant
+part of each pose error). Noise over the frames averages out.
 """
 
 import math
@@ -41,12 +40,7 @@ Rows = Mapping[str, Array]
 
 @dataclass(frozen=True)
 class Scaled(WearLaw):
-    """A wear law times a factor.
-
-    Args:
-        law: wear law.
-        factor: factor on the worn depth.
-    """
+    """A wear law with a factor on the worn depth."""
 
     name: ClassVar[str] = "scaled"
     assumes: ClassVar[str] = "another law times a factor"
@@ -55,7 +49,7 @@ class Scaled(WearLaw):
     factor: float
 
     def depth(self, history: SlidingHistory) -> Array:
-        """Return the depth of the law times the factor, m, shape (n,)."""
+        """Return the factor times the depth of the law, m, shape (n,)."""
         return self.factor * self.law.depth(history)
 
 
@@ -283,7 +277,7 @@ class Sampling:
         Args:
             simulation: nominal case, number of cycles, and number of updates of the geometry.
             rows: rows of the nominal table.
-            crew: settings of the worker pool; default: compute in this process.
+            crew: worker pool settings; default: this process.
             shards: store of the finished samples; None: they stay in memory.
             progress: wrapper of the iterator of the finished samples.
 
@@ -332,7 +326,6 @@ def _bands(
     rows: Sequence[Mapping[str, float]],
     cycles: int,
 ) -> WearBands:
-    """Return bands at the cycles of the nominal table, with samples interpolated to them."""
     names = [name for name in BANDED if np.isfinite(rows[-1][name])]
     row_cycles = np.array([row["cycles"] for row in rows])
     values = np.full((len(samples), len(names), len(row_cycles)), np.nan)

@@ -59,14 +59,7 @@ class CycleMaps:
 
 @dataclass(frozen=True, eq=False)
 class ContactEngine:
-    """A contact model with femoral component and material, for any shape of the insert.
-
-    Args:
-        model: contact model.
-        femoral: rigid femoral component, in the femoral frame.
-        material: material of the insert.
-        bearing: fixed or mobile.
-    """
+    """A contact model with femoral component and insert material, for any shape of the insert."""
 
     model: ContactModel
     femoral: Surface

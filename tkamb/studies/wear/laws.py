@@ -178,8 +178,8 @@ class PressureCrossShear(WearLaw):
 class ContactArea(WearLaw):
     """Wear volume proportional to contact area and path: W = C(CS) A s, so depth h = C(CS) sum s.
 
-    Pressure has no effect, except that only the path in contact counts. C is linear between the
-    given cross-shear ratios and constant outside them.
+    Only the path in contact counts. C is linear between the given cross-shear ratios and constant
+    outside them.
 
     Args:
         cross_shear: increasing cross-shear ratios between 0 and 0.5.

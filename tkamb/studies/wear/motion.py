@@ -248,7 +248,6 @@ def chosen_frames(count: int, most: int) -> list[range]:
 
 
 def _path(time: Array, track: tuple[Array, Array]) -> Path | None:
-    """Return the recorded poses from the first frame to the last; None if one is missing."""
     recorded, poses = track
     inside = (recorded >= time[0]) & (recorded <= time[-1])
     if not np.isfinite(poses[inside]).all():
@@ -257,7 +256,6 @@ def _path(time: Array, track: tuple[Array, Array]) -> Path | None:
 
 
 def _way(begin: Array, end: Array, pieces: int) -> Array:
-    """Return the poses (pieces + 1, 4, 4) of the screw motion from one pose to another."""
     twist = pinocchio.log6(pinocchio.SE3(end @ inverse(begin)))
     shares = np.linspace(0.0, 1.0, pieces + 1)
     way = np.array([pinocchio.exp6(pinocchio.Motion(s * twist.vector)).homogeneous for s in shares])

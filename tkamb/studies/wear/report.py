@@ -295,14 +295,12 @@ class WearReport:
         remove_shards(folder, SAMPLES_NAME)
 
     def _worn(self) -> Surface:
-        """Return the worn insert. That of a left knee is mirrored back to the left."""
         surface = self.case.articular.lowered(self.state.fall)
         if self.setup.side == "right":
             return surface
         return Surface(surface.vertices @ MIRROR, surface.faces[:, ::-1], surface.name)
 
     def _maps(self) -> dict[str, Array]:
-        """Return name -> values at all vertices of the insert, zero off the articular surface."""
         state, vertices = self.state, self.case.articular.vertices
         creep = {} if self.case.creep is None else {"creep_depth_mm": state.creep / MILLIMETRE}
         named = {
@@ -319,7 +317,6 @@ class WearReport:
         return maps
 
     def _mean_cross_shear(self) -> float:
-        """Return the mean cross-shear ratio, weighted with the worn volume of the last cycle."""
         weight = self.last.rate * self.last.area
         total = float(weight.sum())
         return float(weight @ self.last.history.cross_shear) / total if total else math.nan

@@ -113,7 +113,6 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
 
 
 def _is_row(row: Any, first: Any) -> bool:
-    """Return whether a row of the stored table has numbers and the columns of the first row."""
     return (
         isinstance(row, dict)
         and {"cycles", *BANDED} <= row.keys() == first.keys()
@@ -131,8 +130,8 @@ class WearRun:
 
     Args:
         setup: bodies, motion and contact.
-        case: bodies, motion and laws of the simulation.
-        material: wear material with its sources.
+        case: bodies, motion and laws.
+        material: wear material.
         cycles: number of cycles.
         updates: number of updates of the geometry.
         sampling: samples for bands; None: no bands.
@@ -160,7 +159,7 @@ class WearRun:
             folder: folder in which the state is stored after each block; None: it stays in memory.
             resume: whether to use the state that is stored in the folder.
             progress: function that is called with the number of finished cycles.
-            crew: settings of the worker pool for the samples; default: compute in this process.
+            crew: worker pool settings for the samples; default: this process.
             sample_progress: wrapper of the iterator of the finished samples.
 
         Raises:

@@ -206,7 +206,6 @@ def _wear_table(scene: Scene) -> WearTable:
 
 
 def _hashes(case: Case, scene: Scene) -> tuple[str, ...]:
-    """Return the hashes of the scene without and with the requested contact model."""
     hashes = (scene_hash(replace(case, scene=variant)) for variant in (scene, case.scene))
     return tuple(dict.fromkeys(hashes))
 
@@ -290,7 +289,6 @@ def _cycle_of(
 def _of_results(
     folder: Path, most: int, overrides: Mapping[str, Any]
 ) -> tuple[Case, CycleMotion, tuple[int, ...], Path]:
-    """Return the case, the cycle, the choice of frames and the scene of a folder of results."""
     for key in overrides:
         if key.partition(".")[0] not in AFTER_A_RUN:
             what = f"'{key}' cannot be changed after the run in this folder"

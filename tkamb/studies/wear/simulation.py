@@ -34,9 +34,8 @@ class WearSimulationSettings:
     min_depth: float = 1e-9
     """m: depth below which a point counts as unworn. Chosen above the round-off of a mesh."""
     max_pattern_change: float = 0.2
-    """Share of the wear rate that may move to other points during a block. A block with a larger
-    share is halved. Larger: fewer blocks and a less accurate wear pattern. Chosen below the error
-    of a wear law."""
+    """Share of the wear rate that may move to other points during a block, or the block is halved.
+    Larger: fewer blocks, less accurate. Chosen below the error of a wear law."""
     max_block_division: int = 256
     """Largest ratio of the longest block to a halved block. Chosen to allow eight halvings."""
     min_row_share: float = 0.5

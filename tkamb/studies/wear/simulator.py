@@ -6,13 +6,13 @@ including the superior-inferior one, are released and follow from equilibrium:
 
     r_i(q) = F_i - S_i(q_i) - J_i(q) . w_contact(q) = 0
 
-- r_i is the residual of the released coordinate i.
-- F_i is the load of the machine on the femoral component: a force, N, along the axis of the insert
-  through the origin of the femoral mesh, or a torque, N·m, about the axis of the coordinate through
-  this origin. The axial force F acts on the superior-inferior coordinate as -F.
-- S_i is the force of the spring that replaces the ligaments.
-- J_i is the twist of the femoral component per unit rate of coordinate i, see `knee_axes`.
-- w_contact is the contact wrench on the insert.
+- r_i: residual of the released coordinate i.
+- F_i: load of the machine on the femoral component through the origin of its mesh. It is a force,
+  N, along the axis of the insert or a torque, N·m, about the axis of the coordinate. The axial
+  force F is -F on the superior-inferior coordinate.
+- S_i: force of the spring that replaces the ligaments.
+- J_i: twist of the femoral component per unit rate of coordinate i, see `knee_axes`.
+- w_contact: contact wrench on the insert.
 
 The equilibrium is quasi-static and without friction.
 """
@@ -122,11 +122,9 @@ class ForceDrive:
     Args:
         coordinates: prescribed coordinates, and initial guesses of the released ones, m and rad,
             shape (f, 6).
-        applied: load on the femoral component along each released coordinate, N and N·m,
-            shape (f, 6).
+        applied: load along each released coordinate, N and N·m, shape (f, 6).
         free: indices of the released coordinates, including the superior-inferior one.
-        zero: coordinates of the dwell position, which is the origin of AP, ML and the springs,
-            m and rad, shape (6,).
+        zero: coordinates of the dwell position, m and rad, shape (6,).
         springs: springs of the machine; None: no springs.
         percent: percentage of the cycle at each row, shape (f,); None: evenly spaced rows.
     """
@@ -316,11 +314,10 @@ class Profile:
     Args:
         percent: percentage of the cycle, from 0 to 100, shape (f,).
         load: axial load, N, shape (f,).
-        coordinates: knee coordinates (`tkamb.geometry.frames`), m and rad, shape (f, 6). AP and ML
-            are relative to the dwell position. Released coordinates and the superior-inferior one
-            are zero.
-        applied: load on the femoral component along each released coordinate, including the axial
-            force, N and N·m, shape (f, 6).
+        coordinates: knee coordinates, m and rad, shape (f, 6), AP and ML relative to the dwell
+            position. Released coordinates and the superior-inferior one are zero.
+        applied: load along each released coordinate, including the axial force, N and N·m, shape
+            (f, 6).
         free: indices of the coordinates with a force or torque in the file; empty with
             displacement control.
         source: path of the file.
@@ -377,8 +374,8 @@ def read_profile(path: str | Path, frames: int) -> Profile:
     The file has a header and rows from 0 to 100 % of the cycle. The columns are cycle_percent,
     axial_force_N, flexion_deg and optionally ap_mm, ml_mm, axial_rotation_deg and adduction_deg,
     which are otherwise zero. A force or torque may replace each optional column: ap_force_N,
-    ml_force_N, axial_torque_Nm or adduction_torque_Nm. Motions are those of the femoral component
-    on the insert. Forces act on the femoral component. Signs and frames are those of tkamb.
+    ml_force_N, axial_torque_Nm or adduction_torque_Nm. Motions and forces are those of the femoral
+    component on the insert, with tkamb's signs.
 
     Args:
         path: path of the file.
@@ -386,8 +383,7 @@ def read_profile(path: str | Path, frames: int) -> Profile:
 
     Raises:
         InputError: a column is missing or unknown, a displacement and its force are both given, a
-            value is missing or out of range, the percentages do not run from 0 to 100, the cycle
-            does not close, or force control has a row without axial force.
+            value is invalid, the cycle does not close, or force control lacks axial force.
     """
     table = read_table(Path(path), "csv")
     names = (PERCENT, LOAD, *COORDINATES, *FORCES)

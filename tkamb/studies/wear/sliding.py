@@ -28,9 +28,8 @@ def step_sliding(poses: Array, points: Array, normals: Array) -> Array:
     """Return the sliding path of the femoral surface over each point, m, shape (f - 1, n, 3).
 
     In a screw motion the femoral material at a fixed point x has the constant velocity
-    v + omega × x. The path of a step is therefore exact for translations and rotations of any size:
-    it is the arc r·phi and not its chord. The component along the insert's normal is removed. At a
-    point of pure rolling v + omega × x is zero.
+    v + omega × x, which is zero for pure rolling. The path of a step is therefore exact for
+    rotations of any size. The component along the insert's normal is removed.
 
     Args:
         poses: pose_femoral_in_insert, shape (f, 4, 4).

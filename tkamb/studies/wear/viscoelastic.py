@@ -10,9 +10,8 @@ in which u is linear in time the equation at the end of the step is
 
     C_0 f' = slope u' + memory
 
-`PronySeries.response` gives the slope and the evolution of the memory. A step is therefore an
-elastic contact with the compliance C_0/slope, on a surface with the initial displacement
--memory/slope. The solver of `lattice-linear` solves it.
+`PronySeries.response` gives slope and memory. A step is therefore an elastic contact with the
+compliance C_0/slope and the initial displacement -memory/slope, which `lattice-linear` solves.
 
 Reference: Lee & Radok, J Appl Mech 27:438 (1960), doi:10.1115/1.3644020.
 """
@@ -224,6 +223,5 @@ class ViscoelasticLattice:
 
 
 def _softer(guess: InitialGuess, slope: float, offset: Array) -> InitialGuess:
-    """Return the initial guess of the solver with softer springs and displaced nodes."""
     response = replace(guess.response, compliance=guess.response.compliance / np.float32(slope))
     return replace(guess, response=response, offset=offset[guess.candidates])

@@ -146,7 +146,6 @@ def refined(surface: Surface, longest: float, chosen: Chosen) -> Surface:
 
 
 def _halved(surface: Surface, longest: float, chosen: NDArray[np.bool_]) -> Surface | None:
-    """Return the surface with every long edge of chosen faces halved; None: no long edge."""
     faces, vertices = surface.faces, surface.vertices
     edge, count = edge_use(faces)
     edge = edge.reshape(-1, 3)  # edges 01, 12, 20 of each face
