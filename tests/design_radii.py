@@ -1,4 +1,4 @@
-"""Radii measured back from a mesh: circles fitted to its plane sections."""
+"""Radii of a mesh, measured by circles that are fitted to its plane sections."""
 
 from dataclasses import dataclass
 
@@ -14,27 +14,28 @@ from tkamb.studies.designs.insert import Insert
 
 @dataclass(frozen=True)
 class RadiusSettings:
-    """Where the radii of a design are measured."""
+    """Areas in which the radii of a design are measured."""
 
     coronal_reach_mm: float = 6.0
-    """mm on either side of the ridge or the low line over which a radius is fitted. Chosen: about a
-    contact's width."""
+    """mm: distance from the ridge or the lowest line within which a coronal radius is fitted.
+    Chosen as the width of a contact."""
     dish_reach_mm: float = 14.0
-    """mm in front of and behind the low point over which a radius is fitted. Chosen: the flat part
-    of a dish."""
+    """mm: distance from the lowest point within which a sagittal radius of a dish is fitted. Chosen
+    as the extent of the dish."""
     arc_margin_deg: float = 1.5
-    """deg that are left out at both ends of an arc. Chosen: facets of two arcs meet there."""
+    """deg: angle that is omitted at both ends of an arc. Chosen because facets of two arcs meet
+    there."""
 
 
 RADIUS = RadiusSettings()
 
 CONTACT_PHI = (-25.0, 125.0)
-"""Arcs between these normals meet the insert."""
+"""deg: angles of the normals between which arcs touch the insert."""
 
 
 @dataclass(frozen=True)
 class Radius:
-    """One documented radius and what the mesh has, mm."""
+    """A documented radius, and the radius of the mesh, mm."""
 
     name: str
     documented: float
@@ -44,24 +45,24 @@ class Radius:
 def circle_radius(points: ArrayLike) -> float:
     """Return the radius of the circle through points (n, 2), by algebraic least squares.
 
-    x² + y² = 2 a x + 2 b y + c; r² = c + a² + b² (Kasa 1976, doi:10.1109/TIM.1976.6312298).
+    The fit is x² + y² = 2 a x + 2 b y + c with r² = c + a² + b² (Kasa 1976,
+    doi:10.1109/TIM.1976.6312298).
     """
-    at = np.asarray(points, float)
-    middle = at.mean(axis=0)
-    x, y = (at - middle).T
+    points = np.asarray(points, float)
+    x, y = (points - points.mean(axis=0)).T
     columns = np.column_stack([2.0 * x, 2.0 * y, np.ones_like(x)])
     (a, b, c), *_ = np.linalg.lstsq(columns, x**2 + y**2, rcond=None)
     return float(np.sqrt(c + a * a + b * b))
 
 
 def section(mesh: trimesh.Trimesh, normal_of: ArrayLike, through: ArrayLike) -> Array:
-    """Return points (n, 3) in which a plane cuts the edges of a mesh."""
+    """Return the points (n, 3) at which a plane cuts the edges of a mesh."""
     lines = trimesh.intersections.mesh_plane(mesh, np.asarray(normal_of), np.asarray(through))
     return np.asarray(lines).reshape(-1, 3)
 
 
 def measured_radii(design: Design) -> list[Radius]:
-    """Return every radius of a design that meets the other part, measured on its own meshes."""
+    """Return all radii of a design that touch the other part, measured on its meshes."""
     femoral, insert = design.femoral, design.insert
     body, dish = _mesh(*femoral.mesh()), _mesh(*insert.mesh())
     result = []
@@ -134,10 +135,10 @@ def _dish(dish: trimesh.Trimesh, insert: Insert, sign: float, side: str) -> list
     cut = section(dish, [0.0, 0.0, 1.0], [0.0, 0.0, z])
     cut = cut[cut[:, 1] > 0.5 * insert.thickness]
     result = []
-    for radius, way, words in ((radii[0], 1.0, "anterior"), (radii[1], -1.0, "posterior")):
-        ahead = way * (cut[:, 0] - low)
-        part = cut[(ahead > 0.7) & (ahead < RADIUS.dish_reach_mm)]
-        result.append(Radius(f"{side} dish, {words}", radius, circle_radius(part[:, :2])))
+    for radius, sense, name in ((radii[0], 1.0, "anterior"), (radii[1], -1.0, "posterior")):
+        distance = sense * (cut[:, 0] - low)
+        part = cut[(distance > 0.7) & (distance < RADIUS.dish_reach_mm)]
+        result.append(Radius(f"{side} dish, {name}", radius, circle_radius(part[:, :2])))
     cut = section(dish, [1.0, 0.0, 0.0], [low, 0.0, 0.0])
     near = (np.abs(cut[:, 2] - z) < RADIUS.coronal_reach_mm) & (cut[:, 1] > 0.5 * insert.thickness)
     measured = circle_radius(cut[near][:, 1:])

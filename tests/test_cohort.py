@@ -1,4 +1,4 @@
-"""Cohorts: the runs that a file makes, one table, groups, parts, resuming, and what fails."""
+"""Cohorts: runs, table, groups, parts, resuming, and failed runs."""
 
 import gc
 import json
@@ -35,11 +35,11 @@ WRITTEN = {"cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.ht
 
 @pytest.fixture
 def file(tmp_path):
-    """Write a cohort of two subjects and a lost one, of a leg without implants."""
+    """Return a cohort file with two subjects and one whose motion file is missing, no implants."""
     for name in ("patient.urdf", "motion.csv", "tibia.csv", "ground_reaction.csv"):
         shutil.copy(KNEE / name, tmp_path)
-    whole = (KNEE / "scene.toml").read_text()
-    (tmp_path / "scene.toml").write_text(whole[: whole.index("[implant.femoral]")])
+    scene = (KNEE / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(scene[: scene.index("[implant.femoral]")])
     path = tmp_path / "legs.toml"
     path.write_text(
         """
@@ -67,58 +67,57 @@ def file(tmp_path):
     return path
 
 
-def test_a_cohort_is_its_runs_one_by_one_and_lists_what_failed(file, tmp_path, capsys):
+def test_the_table_of_a_cohort_equals_its_runs_and_lists_failures(file, tmp_path, capsys):
     folder = tmp_path / "out"
     assert main(["cohort", str(file), "--out", str(folder)]) == 0
-    said = capsys.readouterr()
-    assert "4 of 6 runs computed" in said.out
-    assert "lost" in said.err and "nowhere.csv" in said.err
+    output = capsys.readouterr()
+    assert "4 of 6 runs computed" in output.out
+    assert "lost" in output.err and "nowhere.csv" in output.err
     assert {path.name for path in folder.iterdir()} == {*WRITTEN, ".tkamb"}
     table = pq.read_table(folder / "cohort.parquet").to_pydict()
     cohort = load_cohort(file)
     for run in (cohort.runs[1], cohort.runs[2]):
-        alone = simulate(run.scene, frames=cohort.frames)
+        results = simulate(run.scene, frames=cohort.frames)
         rows = [k for k, number in enumerate(table["run"]) if number == run.number]
         for name in ("time_s", "force_total_BW", "hip_moment_si_Nm"):
-            assert [table[name][k] for k in rows] == list(alone[name])
-        assert {table["scene_sha256"][k] for k in rows} == {alone.summary["scene_sha256"]}
+            assert [table[name][k] for k in rows] == list(results[name])
+        assert {table["scene_sha256"][k] for k in rows} == {results.summary["scene_sha256"]}
         assert {table["subject"][k] for k in rows} == {run.labels["subject"]}
     runs = (folder / "runs.csv").read_text().splitlines()
     assert len(runs) == 7
     assert sum("nowhere.csv" in line for line in runs) == 2
     summary = json.loads((folder / "cohort.json").read_text())
-    assert [one["run"] for one in summary["failed_runs"]] == [4, 5]
+    assert [run["run"] for run in summary["failed_runs"]] == [4, 5]
     assert summary["identity"]["code of tkamb"]
     page = (folder / "cohort.html").read_text()
     assert "Three legs" in page and "nowhere.csv" in page
 
 
-def test_parts_and_workers_and_an_interrupt_change_nothing(file, tmp_path, monkeypatch):
+def test_parts_workers_and_interruption_do_not_change_the_tables(file, tmp_path, monkeypatch):
     monkeypatch.setattr("tkamb.show.cohort_report.cohort_html", lambda *_: "page")
-    whole, parted = tmp_path / "whole", tmp_path / "parted"
+    resumed, in_parts = tmp_path / "resumed", tmp_path / "in_parts"
 
     with pytest.raises(KeyboardInterrupt, match="1 of 6 runs are kept"):
-        run_cohort(file, whole, progress=broken_off(1))
-    assert not (whole / "cohort.parquet").exists()
-    computed = []
+        run_cohort(file, resumed, progress=broken_off(1))
+    assert not (resumed / "cohort.parquet").exists()
+    run_counts = []
 
-    def counted(runs, count):
-        computed.append(count)
+    def record_count(runs, count):
+        run_counts.append(count)
         return runs
 
-    run_cohort(file, whole, crew=PoolOptions(2), resume=True, progress=counted)
-    assert computed == [5]
+    run_cohort(file, resumed, crew=PoolOptions(2), resume=True, progress=record_count)
+    assert run_counts == [5]
     for part in ("1/2", "2/2"):
-        assert main(["cohort", str(file), "--out", str(parted), "--shard", part]) in (0, 1)
-    run_cohort(file, parted, resume=True, progress=counted)
-    assert computed == [5, 0]
+        assert main(["cohort", str(file), "--out", str(in_parts), "--shard", part]) in (0, 1)
+    run_cohort(file, in_parts, resume=True, progress=record_count)
+    assert run_counts == [5, 0]
     for name in ("cohort.parquet", "runs.csv", "groups.csv"):
-        assert (whole / name).read_bytes() == (parted / name).read_bytes()
-    assert not list(whole.rglob("*.frame")) and not list(parted.rglob("*.frame"))
+        assert (resumed / name).read_bytes() == (in_parts / name).read_bytes()
+    assert not list(resumed.rglob("*.frame")) and not list(in_parts.rglob("*.frame"))
 
 
 def outcome(scale, frames=41, kind="bend"):
-    """Return an outcome made of the synthetic run with its numbers scaled."""
     run = make_run(kind, frames)
     columns = {
         name: values * (scale if name.endswith(("_BW", "_N", "_MPa", "_mm2")) else 1.0)
@@ -128,14 +127,14 @@ def outcome(scale, frames=41, kind="bend"):
     return Outcome("", columns, run.status, chosen_map(run, 60.0))
 
 
-def test_group_statistics_count_each_run_once(file):
+def test_each_run_has_the_same_weight_in_group_statistics(file):
     cohort = load_cohort(file)
     outcomes = {0: outcome(0.8, 41), 2: outcome(1.2, 201), 4: Outcome("gone", {}, [])}
     (group,) = groups_of(cohort, outcomes)
     assert (group.labels, group.numbers, group.failed) == ({"design": "plain"}, (0, 2), 1)
     peak = spread(group.peaks["force_total_BW"])
     original = make_run("bend", 201)["force_total_BW"].max()
-    assert peak.mean == pytest.approx(original, rel=2e-3)  # 41 and 201 frames alike
+    assert peak.mean == pytest.approx(original, rel=2e-3)  # for runs of 41 and 201 frames
     assert peak.sd == pytest.approx(0.4 * original / np.sqrt(2), rel=0.02)
     assert (peak.low, peak.high) == pytest.approx((0.8 * original, 1.2 * original), rel=0.01)
     flexion = make_run("bend", 201)["flexion_deg"]
@@ -145,8 +144,8 @@ def test_group_statistics_count_each_run_once(file):
     assert group.bins["force_total_BW"][1, 3] == pytest.approx(mean, rel=1e-12)
 
 
-def by_hand(file, **columns):
-    """Return the group of one run of five frames, of which the fourth failed."""
+def group_of_five_frames(file, **columns):
+    """Return the group of one run with five frames. The fourth frame failed."""
     status = ["ok", "ok", "ok", "failed: no contact", "ok"]
     columns = {"time_s": np.arange(5.0), "flexion_deg": np.arange(5.0)} | columns
     columns = {name: np.array(values, float) for name, values in columns.items()}
@@ -154,16 +153,15 @@ def by_hand(file, **columns):
     return group
 
 
-def test_a_failed_frames_recorded_motion_is_not_averaged_with_the_solved_one(file):
-    """Where adduction is released, a frame that failed holds the recording's."""
-    group = by_hand(file, adduction_deg=[1.0, 2.0, 3.0, 90.0, 4.0])
+def test_the_recorded_motion_of_failed_frames_is_not_averaged(file):
+    """If adduction is released, a failed frame has the recorded adduction instead."""
+    group = group_of_five_frames(file, adduction_deg=[1.0, 2.0, 3.0, 90.0, 4.0])
     assert group.bins["adduction_deg"] == pytest.approx(np.array([[2.5]]))
     assert group.peaks["adduction_deg"] == pytest.approx([4.0])
 
 
-def test_the_end_of_a_cycle_is_in_its_last_bin(file):
-    """100 % made a bin of its own, "from 100 to 110 %"."""
-    group = by_hand(
+def test_the_end_of_a_cycle_belongs_to_the_last_bin(file):
+    group = group_of_five_frames(
         file, cycle_percent=[0.0, 45.0, 90.0, 95.0, 100.0], force_total_BW=[1, 2, 3, np.nan, 5]
     )
     assert (group.axis, group.edges[-1]) == ("cycle_percent", 100.0)
@@ -171,24 +169,25 @@ def test_the_end_of_a_cycle_is_in_its_last_bin(file):
     np.testing.assert_array_equal(group.bins["force_total_BW"], [expected])
 
 
-def test_the_map_is_that_of_the_frame_asked_for_and_the_page_shows_one_per_group(file):
-    one = outcome(1.0)
-    assert one.columns["flexion_deg"][one.chosen.frame] == pytest.approx(60.0, abs=1.5)
-    whole = Outcome.of(one.shard())
-    np.testing.assert_array_equal(whole.chosen.pressure, one.chosen.pressure)
+def test_the_map_is_at_the_requested_flexion_and_the_page_has_one_per_group(file):
+    original = outcome(1.0)
+    frame = original.chosen.frame
+    assert original.columns["flexion_deg"][frame] == pytest.approx(60.0, abs=1.5)
+    stored = Outcome.of(original.shard())
+    np.testing.assert_array_equal(stored.chosen.pressure, original.chosen.pressure)
     cohort = load_cohort(file)
     outcomes = {n: outcome(1.0 + 0.05 * n, 21) for n in range(4)}
     status = ["ok"] * 18 + ["failed: lost", "residual force is 13 %", "medial condyle lifted"]
     outcomes[0] = replace(outcomes[0], status=status)
     page = cohort_html(cohort, outcomes, groups_of(cohort, outcomes))
-    assert page.count("anterior ↑") == 2  # plain and heavy
+    assert page.count("anterior ↑") == 2  # designs "plain" and "heavy"
     assert "2 to be read with care" in page.replace("\xa0", " ")
     assert "http" not in page.replace("http-equiv", "")
     table = frame_table(cohort, outcomes, {})
     assert table.num_rows == 4 * 21
 
 
-def test_the_example_is_six_designs_that_exist_on_seventeen_legs_by_two_models():
+def test_the_example_has_all_designs_on_seventeen_legs_with_two_models():
     folder = KNEE.parent / "designs"
     table = CohortTable.model_validate(tomllib.loads((folder / "cohort.toml").read_text()))
     assert len(table.subject) * len(table.trial) * len(table.contact) == 17 * 2
@@ -211,14 +210,14 @@ def test_the_example_is_six_designs_that_exist_on_seventeen_legs_by_two_models()
         ('name = "bend"', 'name = "bend"\nsubjects = ["nobody"]', "no subject 'nobody'"),
     ],
 )
-def test_a_bad_file_is_one_line_and_nothing_is_written(file, tmp_path, capsys, old, new, words):
+def test_an_invalid_file_is_an_error_of_one_line(file, tmp_path, capsys, old, new, words):
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new))
     folder = tmp_path / "out"
     assert main(["cohort", str(file), "--out", str(folder)]) == 2
-    said = capsys.readouterr().err.strip()
-    assert words in said and "\n" not in said
+    message = capsys.readouterr().err.strip()
+    assert words in message and "\n" not in message
     assert not folder.exists()
 
 
@@ -231,21 +230,21 @@ def test_a_bad_file_is_one_line_and_nothing_is_written(file, tmp_path, capsys, o
         (["--frames", "500:600"], "not in the motion"),
     ],
 )
-def test_bad_options_are_one_line(file, tmp_path, capsys, options, words):
+def test_an_invalid_option_is_an_error(file, tmp_path, capsys, options, words):
     folder = tmp_path / "out"
     try:
         status = main(["cohort", str(file), "--out", str(folder), *options])
     except SystemExit as stop:
         status = stop.code
-    said = capsys.readouterr().err.strip()
-    assert words in said
-    if "--frames" in options:  # known when a trial is read: every run fails by name
+    message = capsys.readouterr().err.strip()
+    assert words in message
+    if "--frames" in options:  # the frames are checked for each trial, so every run fails
         assert status == 1
     else:
-        assert status == 2 and "\n" not in said and not folder.exists()
+        assert status == 2 and "\n" not in message and not folder.exists()
 
 
-def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_path, capsys):
+def test_a_folder_in_use_or_of_another_cohort_is_refused(file, tmp_path, capsys):
     folder = tmp_path / "out"
     assert main(["cohort", str(file), "--out", str(folder), "--shard", "3/6"]) == 0
     file.write_text(file.read_text().replace("scale = 1.1", "scale = 1.2"))
@@ -254,22 +253,22 @@ def test_two_into_one_folder_and_another_cohort_to_resume_are_refused(file, tmp_
     assert "cannot resume" in capsys.readouterr().err
     with held_elsewhere(folder / "shard-3-of-6"):
         assert main(["cohort", str(file), "--out", str(folder), "--shard", "3/6"]) == 2
-    said = capsys.readouterr().err.strip()
-    assert "another tkamb is writing" in said and "\n" not in said
+    message = capsys.readouterr().err.strip()
+    assert "another tkamb is writing" in message and "\n" not in message
 
 
 @pytest.mark.slow
-def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_all_files_or_none(file, tmp_path, monkeypatch):
     cohort, outcomes = load_cohort(file), {n: outcome(1.0, 5) for n in range(4)}
     monkeypatch.setattr("tkamb.show.cohort_report.cohort_html", lambda *_: "page")
 
-    def write(place, number=None):
-        place.mkdir()
-        injected = Faults(place, number).injected(monkeypatch)
-        with claimed_directory(place), injected as faults, suppress(InputError):
-            write_cohort(cohort, outcomes, {}, place)
-        settle(place)
-        return faults.calls, WRITTEN & {path.name for path in place.iterdir()}
+    def write(folder, number=None):
+        folder.mkdir()
+        injected = Faults(folder, number).injected(monkeypatch)
+        with claimed_directory(folder), injected as faults, suppress(InputError):
+            write_cohort(cohort, outcomes, {}, folder)
+        settle(folder)
+        return faults.calls, WRITTEN & {path.name for path in folder.iterdir()}
 
     calls, written = write(tmp_path / "whole")
     assert written == WRITTEN
@@ -277,7 +276,7 @@ def test_a_full_disk_leaves_no_table_or_the_whole_of_it(file, tmp_path, monkeypa
         assert write(tmp_path / f"full{number}", number)[1] in (set(), WRITTEN)
 
 
-def test_groups_too_many_for_one_plot_are_divided_by_a_label_and_keep_one_scale():
+def test_many_groups_are_divided_into_plots_of_one_scale():
     def group(design, contact, height):
         labels = {"design": design, "contact": contact}
         bins = {"force_total_BW": np.array([[0.0, height]])}
@@ -288,34 +287,33 @@ def test_groups_too_many_for_one_plot_are_divided_by_a_label_and_keep_one_scale(
     assert [words for words, _ in plots] == ["one", "two"]
     for words, part in plots:
         assert list(part) == [f"d{k}" for k in range(6)]
-        assert {one.labels["contact"] for one in part.values()} == {words}
+        assert {member.labels["contact"] for member in part.values()} == {words}
         figure = draw_groups(part, "force_total_BW", 6.0)
         assert figure.axes[0].get_ylim() == pytest.approx((0.0, 6.3))
-    (whole,) = _split_into_plots(groups[:8])
-    assert whole[0] == "" and list(whole[1])[:2] == ["d0, one", "d0, two"]
-    lonely = [group(f"d{k}", "one", 1.0) for k in range(11)]  # no label divides them
-    assert [len(part) for _, part in _split_into_plots(lonely)] == [8, 3]
+    (plot,) = _split_into_plots(groups[:8])
+    assert plot[0] == "" and list(plot[1])[:2] == ["d0, one", "d0, two"]
+    same_label = [group(f"d{k}", "one", 1.0) for k in range(11)]  # no label divides them
+    assert [len(part) for _, part in _split_into_plots(same_label)] == [8, 3]
 
 
-def test_what_only_refers_to_itself_is_freed_between_runs():
-    """A knee's surfaces and trees hold each other: no reference is left, and none is counted."""
+def test_cyclic_references_are_freed_between_runs():
+    """Surfaces and search trees refer to each other, so reference counts never free them."""
     ring = [np.zeros(4)]
     ring.append(ring)
-    kept = weakref.ref(ring[0])
+    reference = weakref.ref(ring[0])
     gc.disable()
     try:
         del ring
-        assert kept() is not None
+        assert reference() is not None
         give_back()
-        assert kept() is None
+        assert reference() is None
     finally:
         gc.enable()
 
 
 def worn(pressure, area_scale=1.0):
-    """Return the outcome of a run with wear and with its pressures scaled."""
-    one = outcome(1.0, 11)
-    columns = dict(one.columns)
+    original = outcome(1.0, 11)
+    columns = dict(original.columns)
     for side in ("medial", "lateral"):
         name = f"{side}_peak_pressure_MPa"
         columns[name] = columns[name] * pressure
@@ -323,7 +321,7 @@ def worn(pressure, area_scale=1.0):
         f"volume_mm3_per_Mc{end}": area_scale * v
         for end, v in (("", 8.0), ("_low", 4.0), ("_high", 16.0))
     }
-    return replace(one, columns=columns, wear=wear)
+    return replace(original, columns=columns, wear=wear)
 
 
 DESIGNS = """
@@ -344,7 +342,7 @@ DESIGNS = """
 
 @pytest.fixture
 def two_by_two(tmp_path):
-    """Write two thicknesses by two conformities of two people."""
+    """Return a cohort of two thicknesses by two conformities and two subjects."""
     for path in KNEE.iterdir():
         shutil.copy(path, tmp_path)
     entries = [
@@ -358,7 +356,7 @@ def two_by_two(tmp_path):
     return load_cohort(path)
 
 
-def test_two_factors_of_designs_are_axis_and_legend_with_their_bands(two_by_two):
+def test_the_figure_of_designs_has_factors_on_axis_and_legend(two_by_two):
     outcomes = {run.number: worn(1.0 + 0.1 * run.number, 2.0) for run in two_by_two.runs}
     bars = design_bars(two_by_two, groups_of(two_by_two, outcomes))
     assert [(bar.place, bar.series) for bar in bars["pressure"]] == [
@@ -366,7 +364,7 @@ def test_two_factors_of_designs_are_axis_and_legend_with_their_bands(two_by_two)
     ]
     error = run_error(two_by_two.runs[0]).peak_pressure
     first = bars["pressure"][0]
-    own = [
+    peaks = [
         max(
             np.nanmax(outcomes[run.number].columns[f"{side}_peak_pressure_MPa"])
             for side in ("medial", "lateral")
@@ -374,10 +372,10 @@ def test_two_factors_of_designs_are_axis_and_legend_with_their_bands(two_by_two)
         for run in two_by_two.runs
         if run.labels["design"] == "6 by 0.4"
     ]
-    assert (first.low, first.high) == pytest.approx((min(own), max(own)))
-    assert first.mean == pytest.approx(np.mean(own))
-    assert first.least == pytest.approx((1 - error) * min(own))
-    assert first.most == pytest.approx((1 + error) * max(own))
+    assert (first.low, first.high) == pytest.approx((min(peaks), max(peaks)))
+    assert first.mean == pytest.approx(np.mean(peaks))
+    assert first.least == pytest.approx((1 - error) * min(peaks))
+    assert first.most == pytest.approx((1 + error) * max(peaks))
     wear = bars["wear"][0]
     assert (wear.mean, wear.least, wear.most) == pytest.approx((16.0, 8.0, 32.0))
     figure = draw_designs(bars)
@@ -394,7 +392,7 @@ def test_the_page_shows_designs_and_the_known_error_of_the_contact_model(two_by_
     assert "error of the contact model alone" in page
 
 
-def test_gait_is_binned_by_per_cent_and_frames_outside_the_cycle_are_in_no_bin(file):
+def test_gait_is_binned_by_cycle_without_frames_outside_the_cycle(file):
     percent = np.array([np.nan, 5.0, 15.0, 15.0, np.nan])
     columns = {
         "time_s": np.arange(5.0),

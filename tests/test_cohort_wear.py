@@ -1,4 +1,4 @@
-"""A cohort that holds wear: the same numbers as `tkamb wear`, per run, group and law."""
+"""Wear in a cohort: the results of `tkamb wear` for each run, group and law."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ from wear_bodies import balls_scene
 
 @pytest.fixture(scope="module")
 def cohort(tmp_path_factory):
-    """Two wear factors of one knee, and a third whose law there is not; where it was written."""
+    """Return the folder of a cohort with two wear factors and a law without parameters."""
     folder = tmp_path_factory.mktemp("cohort")
     balls_scene(folder)
     file = folder / "wear.toml"
@@ -52,7 +52,7 @@ def rows(folder, name):
 
 
 @pytest.mark.slow
-def test_each_run_has_its_wear_and_a_run_without_says_why(cohort):
+def test_each_run_has_wear_or_the_reason_of_its_failure(cohort):
     one, two, none = rows(cohort, "runs.csv")
     volume = [float(run["wear_volume_mm3_per_Mc"]) for run in (one, two)]
     assert volume[1] == pytest.approx(2 * volume[0], rel=1e-3)
@@ -68,21 +68,21 @@ def test_each_run_has_its_wear_and_a_run_without_says_why(cohort):
 
 
 @pytest.mark.slow
-def test_a_run_wears_as_tkamb_wear_says(cohort, capsys):
+def test_the_wear_of_a_run_is_that_of_the_wear_command(cohort, capsys):
     run = ["run", str(cohort / "scene.toml"), "--frames", "0:101:50", "--resolution", "6"]
     assert main([*run, "--out", str(cohort / "run")]) == 0
     capsys.readouterr()
     wear = ["wear", str(cohort / "run"), "--cycles", "1000", "--updates", "1", "--json"]
-    given = ["--set", "wear.law=archard", "--wear-factor", "1e-7", "--frames-per-cycle", "6"]
-    assert main([*wear, *given, "--out", str(cohort / "worn")]) == 0
-    found = json.loads(capsys.readouterr().out)
-    told = rows(cohort, "runs.csv")[0]
-    assert float(told["wear_volume_mm3_per_Mc"]) == pytest.approx(found["volume_mm3_per_Mc"])
+    options = ["--set", "wear.law=archard", "--wear-factor", "1e-7", "--frames-per-cycle", "6"]
+    assert main([*wear, *options, "--out", str(cohort / "worn")]) == 0
+    report = json.loads(capsys.readouterr().out)
+    row = rows(cohort, "runs.csv")[0]
+    assert float(row["wear_volume_mm3_per_Mc"]) == pytest.approx(report["volume_mm3_per_Mc"])
     assert main([*wear, "--set", "patient.mass_kg=80", "--out", str(cohort / "no")]) == 2
-    assert "not of the run in this folder" in capsys.readouterr().err
+    assert "cannot be changed after the run in this folder" in capsys.readouterr().err
 
 
-def test_what_is_kept_of_a_run_holds_its_wear():
-    found = Outcome("", {}, ["ok"], None, {"volume_mm3_per_Mc": 1.5}, "")
-    again = Outcome.of(found.shard())
-    assert (dict(again.wear), again.wear_problem) == ({"volume_mm3_per_Mc": 1.5}, "")
+def test_a_stored_outcome_includes_its_wear():
+    outcome = Outcome("", {}, ["ok"], None, {"volume_mm3_per_Mc": 1.5}, "")
+    stored = Outcome.of(outcome.shard())
+    assert (dict(stored.wear), stored.wear_problem) == ({"volume_mm3_per_Mc": 1.5}, "")

@@ -1,4 +1,4 @@
-"""Contact models by name, and the conformance of every one of them."""
+"""Contact models by name, and the conformance test of every model."""
 
 import shutil
 import sys
@@ -35,11 +35,12 @@ from tkamb.testing import ConformanceError, check_contact_model
 
 PLUGIN = Path(__file__).parent / "plugin"
 COARSE = 2.0
-"""mm; the volume models need no finer grid for the contract."""
+"""mm: resolution of volume models. Chosen because the conformance test needs no finer grid."""
 
 
 @pytest.fixture
 def plugin(monkeypatch):
+    """Make the package of the contact model "winkler" importable."""
     monkeypatch.syspath_prepend(str(PLUGIN))
     yield
     for name in [n for n in sys.modules if n.startswith("tkamb_winkler")]:
@@ -60,21 +61,20 @@ def test_a_model_of_another_package_is_found_and_conforms(plugin):
     check_contact_model(model)
 
 
-def test_a_winkler_bed_is_one_file_of_thirty_lines_and_one_row():
-    """What a new model costs: its physics in one file, and a row of the entry points."""
+def test_a_contact_model_of_another_package_needs_thirty_lines():
     folder = PLUGIN / "tkamb_winkler"
     source = (folder / "model.py").read_text(encoding="utf-8")
     assert len(source.splitlines()) <= 30
-    others = [path.read_text(encoding="utf-8") for path in folder.glob("*.py")]
-    assert sum(len(text.splitlines()) for text in others) == len(source.splitlines()) + 1
+    sources = [path.read_text(encoding="utf-8") for path in folder.glob("*.py")]
+    assert sum(len(text.splitlines()) for text in sources) == len(source.splitlines()) + 1
     page = (PLUGIN.parents[1] / "docs" / "contact_model.md").read_text(encoding="utf-8")
     assert source in page
 
 
 def test_without_the_package_its_name_is_unknown():
-    with pytest.raises(InputError, match=r"there are: .*foundation") as caught:
+    with pytest.raises(InputError, match=r"there are: .*foundation") as error:
         contact_model("winkler")
-    assert "hertz" in str(caught.value)
+    assert "hertz" in str(error.value)
 
 
 def test_descriptions_cover_every_name_in_one_line(plugin):
@@ -98,9 +98,9 @@ def test_a_name_clash_is_an_error(name, monkeypatch):
 
 
 @pytest.mark.parametrize("value", ["not_there.at_all:Model", "tkamb.units:DEGREE"])
-def test_an_offer_that_is_no_model_is_an_input_error(value, monkeypatch):
-    offer = EntryPoint("broken", value, "tkamb.contact")
-    monkeypatch.setattr(named_classes, "entry_points", lambda group: [offer])
+def test_an_entry_point_that_is_not_a_model_is_an_input_error(value, monkeypatch):
+    point = EntryPoint("broken", value, "tkamb.contact")
+    monkeypatch.setattr(named_classes, "entry_points", lambda group: [point])
     with pytest.raises(InputError, match="contact model 'broken'"):
         contact_class("broken")
     assert "broken" in contact_descriptions()["broken"]
@@ -119,7 +119,7 @@ def test_an_unknown_option_is_named():
 
 @dataclass(frozen=True)
 class Sucking(ElasticFoundation):
-    """Pulls when apart."""
+    """Model with a wrench when the bodies are apart."""
 
     def evaluate(self, state, pose, guess=None):
         result = super().evaluate(state, pose, guess)
@@ -129,7 +129,7 @@ class Sucking(ElasticFoundation):
 
 @dataclass(frozen=True)
 class Forgetful(ElasticFoundation):
-    """Reports twice the pressure that its wrench stands for."""
+    """Model with pressures that integrate to twice its wrench."""
 
     def evaluate(self, state, pose, guess=None):
         result = super().evaluate(state, pose, guess)
@@ -139,7 +139,7 @@ class Forgetful(ElasticFoundation):
 
 @dataclass(frozen=True)
 class Suggestible(ElasticFoundation):
-    """Mixes the guess into the answer."""
+    """Model with a result that depends on the initial guess."""
 
     def press(self, state, load, pose, guess=None):
         result = super().press(state, load, pose, guess)
@@ -150,7 +150,7 @@ class Suggestible(ElasticFoundation):
 
 @dataclass(frozen=True)
 class Flat(ElasticFoundation):
-    """Says that the bodies only touch, whatever their pose."""
+    """Model with an approach of zero at every pose."""
 
     def evaluate(self, state, pose, guess=None):
         result = super().evaluate(state, pose, guess)
@@ -160,7 +160,7 @@ class Flat(ElasticFoundation):
 
 @dataclass(frozen=True)
 class Unmoved(ElasticFoundation):
-    """Says the same of a press alone, and leaves the femoral component where it touches."""
+    """Model with a press that leaves the femoral component at first touch."""
 
     def press(self, state, load, pose, guess=None):
         result = super().press(state, load, pose, guess)
@@ -168,7 +168,7 @@ class Unmoved(ElasticFoundation):
 
 
 @pytest.mark.parametrize(
-    ("model", "broken"),
+    ("model", "requirement"),
     [
         (Flat, "the approach is the travel since touch"),
         (Unmoved, "pressing moves the femoral component"),
@@ -177,19 +177,19 @@ class Unmoved(ElasticFoundation):
         (Suggestible, "a guess changes no answer"),
     ],
 )
-def test_the_conformance_test_can_fail(model, broken):
-    with pytest.raises(ConformanceError, match=broken):
+def test_the_conformance_test_detects_a_faulty_model(model, requirement):
+    with pytest.raises(ConformanceError, match=requirement):
         check_contact_model(model(resolution=2e-3))
 
 
-def test_models_are_values():
+def test_models_with_equal_options_are_equal():
     assert contact_model("foundation", 1.5) == contact_model("foundation", 1.5)
     assert contact_model("foundation", 1.5).resolution == pytest.approx(1.5e-3)
     assert np.isclose(contact_model("hertz").resolution, 1e-3)
 
 
-def test_the_code_of_another_package_is_part_of_a_runs_identity(tmp_path, monkeypatch):
-    """A default changed in a plug-in changes numbers, but neither the scene nor tkamb's code."""
+def test_the_identity_of_a_run_includes_the_code_of_its_contact_model(tmp_path, monkeypatch):
+    """A change of another package changes results, but neither the scene nor tkamb's code."""
     packages = tmp_path / "packages"
     shutil.copytree(PLUGIN, packages)
     monkeypatch.syspath_prepend(str(packages))
@@ -201,7 +201,7 @@ def test_the_code_of_another_package_is_part_of_a_runs_identity(tmp_path, monkey
         write_results(simulate(scene, frames=slice(0, 1), directory=folder), folder)
         assert verify_results(folder).notes == ()
         if folder == folders[0]:
-            source.write_text(source.read_text() + "\n# another one\n")
+            source.write_text(source.read_text() + "\n# a change\n")
     words = "computed by another code of the contact model 'winkler'"
     assert verify_results(folders[0]).notes == (words,)
     assert any("code of the contact model" in note for note in compare_folders(folders).notes)
@@ -216,9 +216,9 @@ def test_an_error_of_a_plug_in_names_the_plug_in(plugin, tmp_path, monkeypatch, 
     run += ["--frames", "0:1", "--out", str(tmp_path / "out")]
     model = contact_class("winkler")
     code = "def evaluate(self, *pose):\n    return np.linalg.inv(np.zeros((2, 2)))\n"
-    bad = {}
-    exec(code, vars(sys.modules[model.__module__]), bad)  # the plug-in's own, fails within NumPy
-    monkeypatch.setattr(model, "evaluate", bad["evaluate"])
+    names = {}
+    exec(code, vars(sys.modules[model.__module__]), names)  # plug-in code that fails in NumPy
+    monkeypatch.setattr(model, "evaluate", names["evaluate"])
     monkeypatch.chdir(tmp_path)
     assert main(run) == 1
     line = capsys.readouterr().err.splitlines()[-1]
@@ -233,7 +233,7 @@ def test_code_of_tkamb_is_not_foreign(plugin):
     assert foreign_code(winkler) == contact_code("winkler") != contact_code("foundation")
 
 
-def test_a_cohort_and_the_trade_off_know_a_plug_ins_code(plugin, tmp_path, monkeypatch):
+def test_identities_of_cohort_and_trade_off_include_plug_in_code(plugin, tmp_path, monkeypatch):
     scene = write_scene(tmp_path / "scene")
     text = f"set = {{ 'contact.model' = '%s' }}\n[[trial]]\nname = 'bend'\nscene = '{scene}'\n"
     keys = []
@@ -242,10 +242,10 @@ def test_a_cohort_and_the_trade_off_know_a_plug_ins_code(plugin, tmp_path, monke
         path.write_text(text % model)
         keys.append(cohort_run._identity(load_cohort(path)).get(CONTACT_CODE))
     assert keys == [None, {"winkler": contact_code("winkler")}]
-    seen = []
-    monkeypatch.setattr(tradeoff, "row_key", lambda *what: seen.append(what) or "key")
+    keys_of_rows = []
+    monkeypatch.setattr(tradeoff, "row_key", lambda *what: keys_of_rows.append(what) or "key")
     monkeypatch.setattr(tradeoff, "measure_apart", lambda job: None)
     monkeypatch.setattr(tradeoff, "compared", lambda *what: None)
     reference = SimpleNamespace(hash="", values={})
     list(tradeoff.run_tradeoff([Job("sphere", "winkler", 2.0)], {"sphere": reference}))
-    assert contact_code("winkler") in seen[0]
+    assert contact_code("winkler") in keys_of_rows[0]

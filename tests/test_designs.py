@@ -1,4 +1,4 @@
-"""Six parametric implants: closed meshes in millimetres whose radii are those documented."""
+"""Six parametric implants: closed meshes in millimetres with the documented radii."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,14 +31,14 @@ def test_there_is_a_design_for_every_column_of_the_tables():
     assert tuple(FOLDERS) == designs()
 
 
-def test_radii_measured_back_from_the_meshes(design):
-    found = measured_radii(design)
-    assert len(found) >= 18
-    for radius in found:
+def test_meshes_have_the_documented_radii(design):
+    radii = measured_radii(design)
+    assert len(radii) >= 18
+    for radius in radii:
         assert radius.measured == pytest.approx(radius.documented, abs=0.05), radius.name
 
 
-def test_meshes_are_closed_and_turn_outwards(design):
+def test_meshes_are_closed_with_outward_normals(design):
     meshes = [design.femoral.mesh(), design.insert.mesh(), design.insert.tray()]
     if design.femoral.cam is not None:
         meshes.append(design.femoral.mesh_with_cam())
@@ -51,7 +51,6 @@ def test_meshes_are_closed_and_turn_outwards(design):
 
 
 def test_symmetry_bearing_and_post_are_those_of_the_source(design):
-    """Chapter 6: symmetric Sigmas and LPS-Flex, one mobile bearing, three designs with a post."""
     name = design.name
     assert design.symmetric == (name in ("sigma_fb", "sigma_mb", "lps_flex"))
     assert design.bearing == ("mobile" if name == "sigma_mb" else "fixed")
@@ -59,7 +58,7 @@ def test_symmetry_bearing_and_post_are_those_of_the_source(design):
     assert {"sagittal", "coronal", "range", "rest"} <= set(design.sources)
 
 
-def test_deep_flexion_radii_are_ordered_as_the_source_says():
+def test_deep_flexion_radii_have_the_order_of_the_source():
     radius = {}
     for title, folder in FOLDERS.items():
         profile = load_design(ROOT / folder).femoral.profile
@@ -72,17 +71,17 @@ def test_mesh_check_passes_and_the_post_is_found(tmp_path, capsys):
     design = load_design(ROOT / "lps_flex")
     files = design.write_meshes(tmp_path)
     assert main(["mesh", "check", *map(str, files)]) == 0
-    said = capsys.readouterr().out
-    assert said.count("watertight") == len(files) == 4
-    assert "millimetres?" in said
+    output = capsys.readouterr().out
+    assert output.count("watertight") == len(files) == 4
+    assert "millimetres?" in output
     insert = load_surface(tmp_path / "insert.stl", "mm", "+x,+y,+z", name="insert", closed=True)
     assert find_post(insert) is not None
-    flat = replace(design.insert, post=None)
-    assert flat.mesh()[0][:, 1].max() < design.insert.mesh()[0][:, 1].max()
+    without_post = replace(design.insert, post=None)
+    assert without_post.mesh()[0][:, 1].max() < design.insert.mesh()[0][:, 1].max()
 
 
-def test_a_cam_crosses_the_box_clear_of_the_eminence():
-    """LPS-Flex alone has one; on the dishes it passes the eminence by more than 1 mm."""
+def test_the_cam_does_not_touch_the_eminence():
+    """Only LPS-Flex has a cam. Its distance from the eminence is more than 1 mm."""
     cams = {name: load_design(ROOT / name).femoral.cam for name in FOLDERS.values()}
     assert {name for name, cam in cams.items() if cam} == {"lps_flex"}
     design, cam = load_design(ROOT / "lps_flex"), cams["lps_flex"]
@@ -95,9 +94,9 @@ def test_a_cam_crosses_the_box_clear_of_the_eminence():
         assert (y - insert.height(x, np.zeros_like(x))).min() > 1.0
     with pytest.raises(InputError, match="has no cam"):
         load_design(ROOT / "nkii_cp").femoral.mesh_with_cam()
-    ahead = replace(design.femoral, cam=replace(cam, centre_ap=40.0))
-    with pytest.raises(InputError, match="do not hold the cam"):
-        ahead.mesh_with_cam()
+    anterior_cam = replace(design.femoral, cam=replace(cam, centre_ap=40.0))
+    with pytest.raises(InputError, match="cannot be joined"):
+        anterior_cam.mesh_with_cam()
 
 
 def test_a_circle_is_measured_exactly():
@@ -106,7 +105,7 @@ def test_a_circle_is_measured_exactly():
     assert circle_radius(points) == pytest.approx(22.0, rel=1e-9)
 
 
-def test_arcs_that_do_not_follow_each_other_are_refused(tmp_path):
+def test_invalid_arcs_and_keys_are_refused(tmp_path):
     with pytest.raises(InputError, match="do not follow"):
         SagittalProfile([(-90.0, 0.0, 30.0), (10.0, 90.0, 20.0)])
     text = (ROOT / "nkii_cp" / "design.toml").read_text()
@@ -115,8 +114,7 @@ def test_arcs_that_do_not_follow_each_other_are_refused(tmp_path):
         load_design(tmp_path)
 
 
-def test_a_larger_size_is_the_same_problem_in_other_units():
-    """Pressed as a scaled mesh, area and pressure are those of the scaling law within 1 %."""
+def test_a_larger_size_follows_the_scaling_law():
     design, size, load = load_design(ROOT / "nkii_cp"), 1.07, 900.0
     pressed = PressedDesign(design, 4.0)
     case = Assumption(0.5, 0.5, 0.0, 0.0, size)
@@ -134,19 +132,19 @@ def test_a_larger_size_is_the_same_problem_in_other_units():
     assert scaled.mean_pressure == pytest.approx(direct.mean_pressure, rel=0.01)
 
 
-def test_a_condyle_pressed_alone_carries_like_half_of_a_symmetric_pair():
+def test_a_condyle_alone_equals_half_of_a_symmetric_pair():
     pressed = PressedDesign(load_design(ROOT / "lps_flex"), 4.0)
     alone = pressed.press_alone("medial", 1.0, 1000.0).medial
-    both = pressed.press_both(1.0, 2000.0)
-    assert both.medial.force == pytest.approx(both.lateral.force, rel=2e-3)
-    assert both.medial.area == pytest.approx(alone.area, rel=5e-3)
-    assert both.medial.peak_pressure == pytest.approx(alone.peak_pressure, rel=5e-3)
+    pair = pressed.press_both(1.0, 2000.0)
+    assert pair.medial.force == pytest.approx(pair.lateral.force, rel=2e-3)
+    assert pair.medial.area == pytest.approx(alone.area, rel=5e-3)
+    assert pair.medial.peak_pressure == pytest.approx(alone.peak_pressure, rel=5e-3)
 
 
-def test_table_force_is_the_tables_body_weights_times_the_implied_mass():
+def test_table_force_is_body_weights_of_the_table_times_the_implied_mass():
     assert table_force("LPS-Flex", "medial", 10) == pytest.approx(2.61 * 70.3 * 9.80665, rel=0.01)
     assert nominal().axial_rotation == 0.0 and nominal().size == 1.0
 
 
-def test_pairs_in_order():
+def test_pairs_in_order_counts_agreeing_pairs():
     assert pairs_in_order(np.array([1.0, 2.0, 3.0]), np.array([10.0, 30.0, 20.0])) == (2, 3)

@@ -1,4 +1,4 @@
-"""What an interrupted study left is checked before it is used again: names, kinds and shapes."""
+"""Stored results of an interrupted study are checked before use: names, types and shapes."""
 
 import io
 import json
@@ -29,11 +29,11 @@ MAP = PressureMap(1, np.eye(3), np.array([[0, 1, 2]]), np.ones(3), "left", "medi
 OUTCOME = Outcome("", COLUMNS, ["ok"] * 3, MAP, {"max": 1.0})
 
 
-def test_what_a_cohort_keeps_is_read_back():
-    for one in (OUTCOME, replace(OUTCOME, chosen=None), Outcome("no file", {}, [])):
-        shard = one.shard()
+def test_a_stored_outcome_is_read_back():
+    for outcome in (OUTCOME, replace(OUTCOME, chosen=None), Outcome("no file", {}, [])):
+        shard = outcome.shard()
         assert is_outcome(Shard(json.loads(json.dumps(shard.row)), shard.contact))
-        assert Outcome.of(shard).status == one.status
+        assert Outcome.of(shard).status == outcome.status
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_what_a_cohort_keeps_is_read_back():
         {"other": 1},
     ],
 )
-def test_a_cohorts_run_with_another_row_is_none(row):
+def test_an_outcome_with_an_invalid_row_is_refused(row):
     shard = OUTCOME.shard()
     assert not is_outcome(Shard({**shard.row, **row}, shard.contact))
     for name in row.keys() & shard.row.keys():
@@ -84,7 +84,7 @@ def test_a_cohorts_run_with_another_row_is_none(row):
         {"other": np.zeros(3)},
     ],
 )
-def test_a_cohorts_run_with_other_arrays_is_none(arrays):
+def test_an_outcome_with_invalid_arrays_is_refused(arrays):
     shard = OUTCOME.shard()
     assert not is_outcome(Shard(shard.row, {**shard.contact, **arrays}))
 
@@ -106,7 +106,7 @@ SAMPLE = {name: np.arange(4.0) for name in ("cycles", *BANDED)}
         dict.fromkeys(SAMPLE, np.zeros(0)),
     ],
 )
-def test_a_sample_of_wear_with_other_columns_is_none(changed):
+def test_a_wear_sample_with_invalid_columns_is_refused(changed):
     assert _is_sample(Shard({}, SAMPLE)) and _is_sample(Shard({}, None))
     assert not _is_sample(Shard({}, SAMPLE | changed))
     assert not _is_sample(
@@ -114,19 +114,19 @@ def test_a_sample_of_wear_with_other_columns_is_none(changed):
     )
 
 
-def test_arrays_that_unpack_to_gigabytes_are_not_unpacked():
+def test_arrays_of_gigabytes_are_not_unpacked():
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("x.npy", b"")
     content = bytearray(packed.getvalue())
-    place = content.rindex(b"PK\x01\x02") + 24  # the uncompressed size in the directory
-    content[place : place + 4] = (3 * 10**9).to_bytes(4, "little")
+    offset = content.rindex(b"PK\x01\x02") + 24  # of the uncompressed size in the directory
+    content[offset : offset + 4] = (3 * 10**9).to_bytes(4, "little")
     with pytest.raises(ValueError, match="too large"):
         read_arrays(bytes(content))
     assert not have({"a": np.zeros(3)}, {"a": ("f", (3, 1))})
 
 
-def test_a_forged_result_of_right_digest_is_one_line(tmp_path):
+def test_a_forged_shard_with_a_valid_digest_is_an_input_error(tmp_path):
     shards = Shards(tmp_path, {"cohort": "a"}, resume=False)
     shards.put(0, OUTCOME.shard())
     shards.put(1, Shard({}, {"x": np.zeros(2)}))
@@ -169,27 +169,27 @@ MEASURE = Measure(
         {"other": 1},
     ],
 )
-def test_a_forged_row_of_a_study_is_one_line(tmp_path, changed):
+def test_a_forged_row_of_a_study_is_an_input_error(tmp_path, changed):
     rows = KeptRows(tmp_path, False)
     rows.put("a", asdict(MEASURE))
     assert KeptRows(tmp_path, True).read("a", Measure, is_whole) == MEASURE
     rows.put("a", asdict(MEASURE) | changed)
-    with pytest.raises(InputError, match=r"rows\.jsonl.*no Measure.*; remove the file"):
+    with pytest.raises(InputError, match=r"rows\.jsonl.*not a Measure.*; remove the file"):
         KeptRows(tmp_path, True).read("a", Measure, is_whole)
     name = next(iter(changed.keys() & asdict(MEASURE).keys()), "status")
     rows.put("a", {key: value for key, value in asdict(MEASURE).items() if key != name})
-    with pytest.raises(InputError, match="no Measure"):
+    with pytest.raises(InputError, match="not a Measure"):
         KeptRows(tmp_path, True).read("a", Measure, is_whole)
 
 
-def test_a_stopped_measure_is_kept_too(tmp_path):
+def test_a_stopped_measure_is_stored(tmp_path):
     rows = KeptRows(tmp_path, False)
     rows.put("a", asdict(Measure("stopped after 300 s")))
     assert KeptRows(tmp_path, True).read("a", Measure, is_whole).status == "stopped after 300 s"
 
 
 def forge_rows(folder):
-    """Take a number out of every row, with the right SHA-256."""
+    """Remove the iterations from every stored row and update the SHA-256."""
     path = folder / FILE_NAME
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     for row in rows:
@@ -201,14 +201,14 @@ def test_studies_refuse_a_forged_row(tmp_path, monkeypatch):
     cases = [Extreme(model="nothing")]
     assert list(run_stability(cases, kept=KeptRows(tmp_path, False)))
     forge_rows(tmp_path)
-    with pytest.raises(InputError, match="no Verdict"):
+    with pytest.raises(InputError, match="not a Verdict"):
         list(run_stability(cases, kept=KeptRows(tmp_path, True)))
     monkeypatch.setattr("tkamb.studies.tradeoff.measure_apart", lambda job: MEASURE)
     references = {"sphere": _reference()}
     jobs = [Job("sphere", "hertz", 2.0)]
     assert list(run_tradeoff(jobs, references, KeptRows(tmp_path, False)))
     forge_rows(tmp_path)
-    with pytest.raises(InputError, match="no Measure"):
+    with pytest.raises(InputError, match="not a Measure"):
         list(run_tradeoff(jobs, references, KeptRows(tmp_path, True)))
 
 
@@ -218,7 +218,7 @@ def _reference():
     return read_references()["sphere"]
 
 
-def test_the_command_ends_with_status_2(tmp_path, capsys, monkeypatch):
+def test_a_forged_row_ends_the_command_with_status_2(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tkamb.studies.tradeoff.QUICK_MODELS", ("hertz",))
     out = ["tradeoff", "--quick", "--out", str(tmp_path / "out")]
     monkeypatch.setattr("tkamb.studies.tradeoff.measure_apart", lambda job: MEASURE)
@@ -226,5 +226,5 @@ def test_the_command_ends_with_status_2(tmp_path, capsys, monkeypatch):
     forge_rows(tmp_path / "out")
     capsys.readouterr()
     assert main([*out, "--resume"]) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.count("\n") == 0 and "rows.jsonl" in said and "--resume" in said
+    message = capsys.readouterr().err.strip()
+    assert "\n" not in message and "rows.jsonl" in message and "--resume" in message

@@ -1,4 +1,4 @@
-"""CalculiX as a peer: its deck, its process, and, where it is installed, its numbers."""
+"""CalculiX: its deck, its process and, if it is installed, its results."""
 
 import json
 import runpy
@@ -30,7 +30,6 @@ LINEAR, NONLINEAR = "polyethylene-linear", "polyethylene"
 
 
 def two_condyles(material_name):
-    """Return the trade-off's condyles on its dishes."""
     insert = block(dishes(8e-3, 34e-3, 11e-3), (30e-3, 46e-3), 1e-3)
     return ContactPair(balls(22e-3, 11e-3, sectors=64), insert, material(material_name))
 
@@ -38,19 +37,19 @@ def two_condyles(material_name):
 def deck(**changes):
     lattice = build_grid(dished_insert(cells=24), 6e-3)
     patch = Surface(np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.0]]), np.array([[0, 1, 2]]), "patch")
-    given = {"lattice": lattice, "patch": patch, "material": material(LINEAR),
-             "bearing": "fixed", "load": 1000.0, "element": "C3D8I"} | changes  # fmt: skip
-    return Deck(**given)
+    arguments = {"lattice": lattice, "patch": patch, "material": material(LINEAR),
+                 "bearing": "fixed", "load": 1000.0, "element": "C3D8I"} | changes  # fmt: skip
+    return Deck(**arguments)
 
 
 def test_an_undeformed_insert_has_the_gaps_of_its_smooth_surface():
-    """Facets of 2 mm in a dish: the lift is in the nodes already, the gap must not count it."""
+    """The nodes lie on the smooth surface above facets of 2 mm, and the gaps start there."""
     insert = block(lambda x, z: 8e-3 + (x**2 + z**2) / 120e-3, (16e-3, 16e-3), 2e-3)
     bodies = ContactPair(balls(22e-3, 0.0), insert, material(LINEAR))
     problem = press_problem(bodies, 500.0, knee_pose(np.zeros(6)), 1.0)
-    still = np.zeros((len(problem.lattice.nodes), 4))
-    still[:, 0] = np.arange(1, len(still) + 1)
-    bent = peer._bent(problem, PeerRun({"NINSERT": still}, 0.0, 0.0, 0))
+    displacement = np.zeros((len(problem.lattice.nodes), 4))
+    displacement[:, 0] = np.arange(1, len(displacement) + 1)
+    bent = peer._bent(problem, PeerRun({"NINSERT": displacement}, 0.0, 0.0, 0))
     pose = knee_pose([0, 40e-3, 0, 0, 0, 0])
     gap = peer._gaps(problem, pose, bent)
     x, y, z = problem.map.points.T
@@ -62,29 +61,29 @@ def test_an_undeformed_insert_has_the_gaps_of_its_smooth_surface():
 
 
 def fake_program(folder, monkeypatch, script):
-    """Put a shell script in CalculiX's place."""
+    """Replace CalculiX by a shell script."""
     program = folder / "ccx"
     program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
 
 
-def test_the_deck_holds_the_lattice_s_nodes_and_cells_in_millimetres():
-    asked = deck()
-    lines = asked.text.splitlines()
+def test_the_deck_contains_nodes_and_cells_of_the_lattice_in_millimetres():
+    linear_deck = deck()
+    lines = linear_deck.text.splitlines()
     start = lines.index("*NODE, NSET=NALL") + 1
-    count = len(asked.lattice.nodes)
+    count = len(linear_deck.lattice.nodes)
     nodes = np.array([line.split(",") for line in lines[start : start + count]], float)
     assert nodes[:, 0] == pytest.approx(np.arange(1, count + 1))
-    assert nodes[:, 1:] / 1e3 == pytest.approx(asked.lattice.nodes, abs=1e-10)
+    assert nodes[:, 1:] / 1e3 == pytest.approx(linear_deck.lattice.nodes, abs=1e-10)
     start = lines.index("*ELEMENT, TYPE=C3D8I, ELSET=INSERT") + 1
-    cells = [line.split(",") for line in lines[start : start + len(asked.lattice.cells)]]
-    assert (np.array(cells, int)[:, 1:] - 1 == asked.lattice.cells).all()
+    cells = [line.split(",") for line in lines[start : start + len(linear_deck.lattice.cells)]]
+    assert (np.array(cells, int)[:, 1:] - 1 == linear_deck.lattice.cells).all()
     assert "*STEP, INC=300" in lines
     assert "*STEP, INC=300, NLGEOM" in deck(material=material(NONLINEAR)).text.splitlines()
 
 
-def test_what_calculix_has_not_is_refused():
+def test_materials_and_bearings_that_calculix_lacks_are_refused():
     with pytest.raises(InputError, match="bottom"):
         _ = deck(bearing="mobile").text
     tabulated = tabulated_material("table", [0.0, 0.01, 0.05], [0.0, 5e6, 15e6], 0.45)
@@ -92,30 +91,30 @@ def test_what_calculix_has_not_is_refused():
         _ = deck(material=tabulated).text
 
 
-def test_without_the_program_one_clear_line(tmp_path, monkeypatch):
+def test_without_calculix_the_error_gives_the_install_command(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match=r"CalculiX.*not installed.*apt-get"):
         list(run_peer([study_case("two condyles")], read_references()))
 
 
-def test_a_run_that_takes_too_long_or_fails_is_a_row_with_the_reason(tmp_path, monkeypatch):
+def test_a_slow_or_failed_run_gives_a_measure_with_the_reason(tmp_path, monkeypatch):
     fake_program(tmp_path, monkeypatch, "exec sleep 60")
-    found = measure_by_calculix(study_case("sphere"), 6.0, longest=0.3)
-    assert "stopped after 0.3 s" in found.status
-    assert not found.values
-    fake_program(tmp_path, monkeypatch, "echo '*ERROR in cheese: no holes'; exit 201")
-    found = measure_by_calculix(study_case("sphere"), 6.0)
-    assert "no holes" in found.status
+    measure = measure_by_calculix(study_case("sphere"), 6.0, longest=0.3)
+    assert "stopped after 0.3 s" in measure.status
+    assert not measure.values
+    fake_program(tmp_path, monkeypatch, "echo '*ERROR in material: no modulus'; exit 201")
+    measure = measure_by_calculix(study_case("sphere"), 6.0)
+    assert "no modulus" in measure.status
 
 
-def test_a_run_that_ends_without_an_answer_is_no_answer(tmp_path, monkeypatch):
+def test_a_run_without_output_is_an_error(tmp_path, monkeypatch):
     fake_program(tmp_path, monkeypatch, "echo done")
     with pytest.raises(ComputationError, match="no output"):
         run_calculix("")
 
 
 @WITH_CALCULIX
-def test_its_pressures_sum_to_the_load():
+def test_the_pressures_of_calculix_integrate_to_the_load():
     answer = press_by_calculix(two_condyles(LINEAR), 1000.0, np.eye(4), 4.0)
     assert answer.balance == pytest.approx(1, abs=2e-3)
     result = answer.result
@@ -133,34 +132,34 @@ def test_linear_lattice_and_fe_agree_with_calculix(load, varus):
     peer = press_by_calculix(pair, load, pose, 2.0).result
     for name, approach, peak in (("lattice", 0.02, 0.04), ("fe", 0.015, 0.02)):
         model = contact_model(name, 2.0)
-        own = model.press(model.prepare(pair), load, pose)
-        assert own.approach == pytest.approx(peer.approach, rel=approach)
-        assert own.pressure.max() == pytest.approx(peer.pressure.max(), rel=peak)
+        result = model.press(model.prepare(pair), load, pose)
+        assert result.approach == pytest.approx(peer.approach, rel=approach)
+        assert result.pressure.max() == pytest.approx(peer.pressure.max(), rel=peak)
         for side in ("medial", "lateral"):
             force = getattr(peer, side).force
-            assert getattr(own, side).force == pytest.approx(force, rel=0.02)
+            assert getattr(result, side).force == pytest.approx(force, rel=0.02)
 
 
 @pytest.mark.slow
 @WITH_CALCULIX
 @pytest.mark.parametrize("varus", [0.0, 0.3])
-def test_small_strain_is_near_calculix_s_finite_strain(varus):
+def test_small_strain_agrees_with_finite_strain_of_calculix(varus):
     pair, pose = two_condyles(NONLINEAR), knee_pose([0, 0, 0, 0, np.radians(varus), 0])
     peer = press_by_calculix(pair, 2000.0, pose, 2.0).result
     model = contact_model("lattice", 2.0)
-    own = model.press(model.prepare(pair), 2000.0, pose)
-    assert own.approach == pytest.approx(peer.approach, rel=0.05)
-    assert own.pressure.max() == pytest.approx(peer.pressure.max(), rel=0.05)
-    assert own.medial.force == pytest.approx(peer.medial.force, rel=0.03)
+    result = model.press(model.prepare(pair), 2000.0, pose)
+    assert result.approach == pytest.approx(peer.approach, rel=0.05)
+    assert result.pressure.max() == pytest.approx(peer.pressure.max(), rel=0.05)
+    assert result.medial.force == pytest.approx(peer.medial.force, rel=0.03)
 
 
-def test_the_page_is_what_the_script_makes_of_its_json(monkeypatch):
+def test_the_page_agrees_with_its_script_and_data(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "scripts"))
-    made = runpy.run_path(str(ROOT / "scripts" / "peer_calculix.py"))
+    script = runpy.run_path(str(ROOT / "scripts" / "peer_calculix.py"))
     rows = json.loads(
         (ROOT / "scripts" / "data" / "peer_calculix.json").read_text(encoding="utf-8")
     )
     text = (ROOT / "docs" / "development" / "peer_calculix.md").read_text(encoding="utf-8")
-    assert made["with_block"](text, made["block"](rows), "peer") == text, (
+    assert script["with_block"](text, script["block"](rows), "peer") == text, (
         "run scripts/peer_calculix.py --page"
     )

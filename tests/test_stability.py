@@ -1,4 +1,4 @@
-"""The study of extremes: its verdicts, its processes, and a tenth of it."""
+"""The stability study: its verdicts, its processes, and a sample of its cases."""
 
 import json
 import signal
@@ -36,13 +36,13 @@ ROOT = Path(__file__).parents[1]
 SMALL = Extreme(resolution_mm=3.0)
 
 
-def test_the_matrix_is_wide_enough():
+def test_the_study_varies_every_parameter():
     cases = list(extremes())
     assert len(cases) >= 300 and len(set(cases)) == len(cases)
-    driven = {
+    varied = {
         name for case in cases for name in vars(case) if vars(case)[name] != vars(Extreme())[name]
     }
-    assert driven == set(vars(Extreme()))
+    assert varied == set(vars(Extreme()))
     assert 10 * len(stability_cases(quick=True)) >= len(cases)
 
 
@@ -61,23 +61,23 @@ def test_every_quick_case_has_a_stored_verdict():
     ("flagged", "converged", True),
     ("unflagged_wrong", "flagged", True),
 ])  # fmt: skip
-def test_what_was_converged_may_not_become_flagged(kind, expected, fails):
+def test_a_flag_fails_if_the_stored_verdict_is_converged(kind, expected, fails):
     verdict = Verdict("a case", "lattice", kind, "why", expected=expected)
     assert verdict.failed is fails
-    found = summary([verdict])
-    assert found["failed"] == fails
-    assert found["worse"] == (fails and kind == "flagged")
-    told = "\n".join(table([verdict])).split("failed: ")[1]
-    assert told.startswith("1" if fails else "0")
+    counts = summary([verdict])
+    assert counts["failed"] == fails
+    assert counts["worse"] == (fails and kind == "flagged")
+    printed = "\n".join(table([verdict])).split("failed: ")[1]
+    assert printed.startswith("1" if fails else "0")
 
 
-def test_a_good_case_converges_to_newton():
+def test_a_usual_case_agrees_with_newton():
     verdict = judge(SMALL)
     assert verdict.kind == "converged" and "not converged" not in verdict.reason
     assert verdict.error < 2e-3
 
 
-def test_a_load_that_cannot_be_carried_is_flagged_with_a_reason():
+def test_an_excessive_load_is_flagged_with_a_reason():
     verdict = judge(replace(SMALL, load_N=1e5))
     assert verdict.kind == "flagged" and len(verdict.reason) > 20
 
@@ -97,7 +97,7 @@ def test_an_impossible_material_is_flagged():
     (1.03, ("a reason",), "flagged"),
     (np.nan, (), "unflagged_wrong"),
 ])  # fmt: skip
-def test_what_is_wrong_without_a_flag_is_called_so(share, flags, kind):
+def test_a_wrong_result_without_a_flag_is_unflagged_wrong(share, flags, kind):
     model = contact_model("foundation", 3.0)
     result = model.press(model.prepare(SMALL.pair), 100.0, SMALL.pose)
     assert result.status is ContactStatus.OK
@@ -114,7 +114,7 @@ def test_an_exception_is_a_verdict():
 
 
 def test_a_hang_is_stopped_and_the_next_case_judged(monkeypatch):
-    """The one has no time at all, the next all it needs, however busy the machine is."""
+    """The time limits are zero and 600 s, so that the load of the computer has no effect."""
     slow, quick = replace(SMALL, resolution_mm=0.5), replace(SMALL, model="nothing")
     monkeypatch.setattr(_Judges, "limit", lambda self, case: 0.0 if case is slow else 600.0)
     verdicts = list(run_stability([slow, quick]))
@@ -131,38 +131,38 @@ def test_a_reference_that_takes_too_long_leaves_a_case_unverified(monkeypatch):
 
 def test_counts_add_up_and_failures_are_listed():
     verdicts = [Verdict(f"load_N={k}", "lattice", kind, "why", 0.1) for k, kind in enumerate(KINDS)]
-    found = summary(verdicts)
+    counts = summary(verdicts)
     kinds = ("converged", "flagged", "unflagged_wrong", "unverified", "exceptions", "hangs")
-    assert [found[kind] for kind in kinds] == [1] * 6
-    assert found["cases"] == len(found["rows"]) == 6
+    assert [counts[kind] for kind in kinds] == [1] * 6
+    assert counts["cases"] == len(counts["rows"]) == 6
     text = "\n".join(table(verdicts))
     assert all(kind in text for kind in KINDS)
     assert picture(verdicts).axes
 
 
-def test_a_fortieth_of_the_matrix_has_no_failure():
+def test_a_quarter_of_the_quick_study_has_no_failure():
     verdicts = list(run_stability(stability_cases(quick=True)[::4]))
     assert not [v for v in verdicts if v.failed]
     assert all(v.reason for v in verdicts if v.kind == "flagged")
     assert Counter(v.kind for v in verdicts)["converged"] > 0.7 * len(verdicts)
 
 
-def test_kept_rows_are_not_judged_again(tmp_path):
+def test_stored_verdicts_are_not_computed_again(tmp_path):
     kept = KeptRows(tmp_path, resume=False)
     cases = [replace(SMALL, model="foundation"), replace(SMALL, model="nothing")]
     first = list(run_stability(cases, kept=kept))
     with open(kept.path, "a", encoding="utf-8") as file:
-        file.write('{"key": "cut short by a ki')
+        file.write('{"key": "an incomplete li')
     again = KeptRows(tmp_path, resume=True)
     assert list(run_stability(cases, longest=120.0, kept=again)) == first
     assert kept_verdicts(cases, again) == first
     assert len(again.path.read_text().splitlines()) == 2
-    changed = list(run_stability([replace(cases[0], load_N=1400.0)], kept=again))
-    assert changed[0] not in first and len(again.path.read_text().splitlines()) == 3
+    other = list(run_stability([replace(cases[0], load_N=1400.0)], kept=again))
+    assert other[0] not in first and len(again.path.read_text().splitlines()) == 3
     assert not KeptRows(tmp_path, resume=False).path.read_text()
 
 
-def test_a_row_s_key_is_that_of_case_and_code(monkeypatch):
+def test_the_key_of_a_row_depends_on_case_and_code(monkeypatch):
     key = row_key("stability", {"load_N": 1.0})
     assert key == row_key("stability", {"load_N": 1.0})
     assert key != row_key("stability", {"load_N": 2.0})
@@ -170,7 +170,7 @@ def test_a_row_s_key_is_that_of_case_and_code(monkeypatch):
     assert key != row_key("stability", {"load_N": 1.0})
 
 
-def test_ctrl_c_leaves_a_readable_part(tmp_path):
+def test_an_interrupted_study_writes_the_finished_cases(tmp_path):
     command = [sys.executable, "-m", "tkamb.cli", "stability", "--quick", "--out", str(tmp_path)]
     pipe = subprocess.PIPE
     process = subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True)
@@ -178,28 +178,28 @@ def test_ctrl_c_leaves_a_readable_part(tmp_path):
     while process.poll() is None and not (rows.exists() and rows.read_text().count("\n") > 1):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    told, complained = process.communicate(timeout=60)
+    output, message = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "--resume" in complained and "Traceback" not in complained
-    assert told.startswith("stopped: ")
-    found = json.loads((tmp_path / "stability.json").read_text())
-    assert 2 <= found["cases"] < len(stability_cases(quick=True))
+    assert "--resume" in message and "Traceback" not in message
+    assert output.startswith("stopped: ")
+    written = json.loads((tmp_path / "stability.json").read_text())
+    assert 2 <= written["cases"] < len(stability_cases(quick=True))
     assert (tmp_path / "stability.png").exists()
 
 
 @pytest.mark.slow
-def test_a_run_in_slow_motion_obeys_the_law_of_inertia():
+def test_inertia_forces_scale_with_the_square_of_the_speed():
     assert judge_scene(SceneExtreme("time", 3.0)).kind == "converged"
 
 
 @pytest.mark.slow
-def test_the_whole_matrix(tmp_path, capsys):
+def test_the_full_study_has_no_wrong_result(tmp_path, capsys):
     status = main(["stability", "--json", "--out", str(tmp_path)])
-    found = json.loads(capsys.readouterr().out)
-    assert found["cases"] >= 300
+    study = json.loads(capsys.readouterr().out)
+    assert study["cases"] >= 300
     for kind in ("unflagged_wrong", "exceptions", "hangs"):
-        assert found[kind] == 0, [row for row in found["rows"] if row["kind"] not in KINDS[:2]]
-    assert status == (1 if found["unverified"] else 0)
-    assert all(row["reason"] for row in found["rows"] if row["kind"] == "flagged")
+        assert study[kind] == 0, [row for row in study["rows"] if row["kind"] not in KINDS[:2]]
+    assert status == (1 if study["unverified"] else 0)
+    assert all(row["reason"] for row in study["rows"] if row["kind"] == "flagged")
     assert (tmp_path / "stability.png").stat().st_size > 10_000
     assert len(list(scene_extremes())) > 20

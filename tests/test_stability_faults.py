@@ -1,7 +1,7 @@
-"""Faults put into the models: the study of extremes must fail by each of them.
+"""Faults in the contact models: the stability study must detect each of them.
 
-It judges by closed forms, CalculiX's stored answers and the load, not by the models' own
-solvers, which share the fault.
+The study compares with closed forms, stored results of CalculiX and the load, because the models'
+solvers share the fault.
 """
 
 from dataclasses import replace
@@ -25,22 +25,21 @@ PEERED = Extreme(resolution_mm=3.0, linear=True)
 
 
 def judged(case):
-    """Return the verdict on a case, with what is stored of it."""
     verdict = judge_safely(case)
     return replace(verdict, expected=stored_verdicts()[verdict.key])
 
 
 @pytest.mark.parametrize("case", [c for c in closed_forms(quick=True) if c.kind != "kept"])
-def test_each_family_meets_its_closed_form(case):
+def test_each_family_agrees_with_its_closed_form(case):
     assert judged(case).kind == "converged"
 
 
 @pytest.mark.parametrize("case", PLATES, ids=lambda case: case.model)
-def test_pressures_a_twentieth_too_high_fail(case, monkeypatch):
-    honest = report._pressures
+def test_five_per_cent_too_high_pressures_fail(case, monkeypatch):
+    original = report._pressures
 
-    def higher(*given):
-        force, pressure, area = honest(*given)
+    def higher(*arguments):
+        force, pressure, area = original(*arguments)
         return force, 1.05 * pressure, area
 
     monkeypatch.setattr(report, "_pressures", higher)
@@ -49,65 +48,69 @@ def test_pressures_a_twentieth_too_high_fail(case, monkeypatch):
 
 
 @pytest.mark.parametrize("case", PLATES[1:2], ids=lambda case: case.model)
-def test_a_stiffness_a_twentieth_too_high_fails(case, monkeypatch):
-    honest = model.prepare_operator
-    monkeypatch.setattr(model, "prepare_operator", lambda k, *rest: honest(1.05 * k, *rest))
+def test_a_five_per_cent_too_high_stiffness_fails(case, monkeypatch):
+    original = model.prepare_operator
+    monkeypatch.setattr(
+        model, "prepare_operator", lambda k, *arguments: original(1.05 * k, *arguments)
+    )
     verdict = judged(case)
     assert verdict.failed and "approach 4.76 % from the closed form" in verdict.reason
 
 
 @pytest.mark.parametrize("name", ["lattice", "fe", "foundation", "lattice-source"])
-def test_a_stiffer_curve_fails(name, monkeypatch):
-    honest = RambergOsgood.stress
-    monkeypatch.setattr(RambergOsgood, "stress", lambda *given: 1.05 * honest(*given))
+def test_a_five_per_cent_too_high_stress_strain_curve_fails(name, monkeypatch):
+    original = RambergOsgood.stress
+    monkeypatch.setattr(RambergOsgood, "stress", lambda *arguments: 1.05 * original(*arguments))
     assert judged(ClosedForm("plate", name)).failed
 
 
-def test_a_key_without_young_s_modulus_fails(monkeypatch):
-    """What is read is held against the stiffness, so that only the files tell."""
+def test_an_operator_key_without_young_s_modulus_fails(monkeypatch):
+    """Operators are checked when they are read, so only the number of files shows the fault."""
     case = ClosedForm("kept", "lattice-linear", resolution_mm=CLOSED_FORM.kept_grid_mm)
-    honest = cache.operator_key
+    original = cache.operator_key
 
     class SameModulus:
         def __init__(self, solid):
             self.__dict__ = vars(solid) | {"material": replace(solid.material, young_modulus=1.0)}
 
     monkeypatch.setattr(
-        cache, "operator_key", lambda solid, *rest: honest(SameModulus(solid), *rest)
+        cache, "operator_key", lambda solid, *arguments: original(SameModulus(solid), *arguments)
     )
     verdict = judged(case)
-    assert verdict.failed and "1 operators are kept of two materials" in verdict.reason
+    assert verdict.failed and "1 operators are in the cache after two materials" in verdict.reason
 
 
 @pytest.mark.parametrize("case", PLATES, ids=lambda case: case.model)
-def test_the_weakest_node_dropped_fails(case, monkeypatch):
+def test_a_missing_contact_node_fails(case, monkeypatch):
     def dropping(compliance, gap, normal_y, load, active, approach=0.0):
-        found = solve_contact(compliance, gap, normal_y, load, active, approach)
-        kept = found.active.copy()
-        kept[np.argmin(np.where(kept, found.force, np.inf))] = False
-        force, depth = _forces_of(compliance, gap, normal_y, load, kept, approach)
-        opening = np.where(kept, 0.0, gap + compliance @ force + depth * normal_y)
-        return replace(found, force=force, gap=opening, approach=depth, active=kept)
+        solution = solve_contact(compliance, gap, normal_y, load, active, approach)
+        remaining = solution.active.copy()
+        remaining[np.argmin(np.where(remaining, solution.force, np.inf))] = False
+        force, depth = _forces_of(compliance, gap, normal_y, load, remaining, approach)
+        opening = np.where(remaining, 0.0, gap + compliance @ force + depth * normal_y)
+        return replace(solution, force=force, gap=opening, approach=depth, active=remaining)
 
     monkeypatch.setattr(solver, "solve_contact", dropping)
     verdict = judged(case)
     assert verdict.failed, verdict.reason
 
 
-def test_calculix_s_answers_hold_the_lattice_and_notice_a_changed_case():
+def test_the_lattice_agrees_with_calculix_and_a_stiffer_result_does_not():
     verdict = judged(PEERED)
     assert verdict.kind == "converged"
-    contact = model_of(PEERED)
-    found = contact.press(contact.prepare(PEERED.pair), PEERED.load_N, PEERED.pose)
-    apart = peer_distances(PEERED, found)
-    assert set(apart) == set(PEER_BOUNDS) and all(apart[key] < PEER_BOUNDS[key] for key in apart)
-    lifted = PEERED.pair.pose_at_approach(found.pose, found.approach / 1.05)
-    stiffer = replace(found, pose=lifted)
+    model = model_of(PEERED)
+    result = model.press(model.prepare(PEERED.pair), PEERED.load_N, PEERED.pose)
+    differences = peer_distances(PEERED, result)
+    assert set(differences) == set(PEER_BOUNDS) and all(
+        differences[key] < PEER_BOUNDS[key] for key in differences
+    )
+    lifted = PEERED.pair.pose_at_approach(result.pose, result.approach / 1.05)
+    stiffer = replace(result, pose=lifted)
     assert peer_distances(PEERED, stiffer)["approach"] > PEER_BOUNDS["approach"]
-    assert peer_distances(replace(PEERED, load_N=77.0), found) == {}
+    assert peer_distances(replace(PEERED, load_N=77.0), result) == {}
 
 
-def test_a_stored_answer_to_another_case_is_no_reference(monkeypatch):
+def test_a_stored_result_of_another_case_is_not_used(monkeypatch):
     monkeypatch.setattr("tkamb.studies.verdict.body_hash", lambda extreme: "another")
     verdict = judge_safely(PEERED)
     assert verdict.kind == "unverified" and "make_stability_answers" in verdict.reason
@@ -118,13 +121,13 @@ def test_a_stored_answer_to_another_case_is_no_reference(monkeypatch):
     ({"area": 1.02}, "pressures integrate to 1.0200"),
     ({"pressure": -1.0}, "negative"),
 ])  # fmt: skip
-def test_an_answer_that_does_not_carry_its_load_is_complained_of(changed, word):
+def test_a_result_that_contradicts_its_load_fails_a_check(changed, word):
     case = ClosedForm("plate", "foundation-linear", 500.0)
-    honest, _ = press_closed_form(case)
-    assert complaints(honest, 500.0, solved=False, source_rule=False) == []
+    result, _ = press_closed_form(case)
+    assert complaints(result, 500.0, solved=False, source_rule=False) == []
     ((name, factor),) = changed.items()
-    other = replace(honest, **{name: factor * getattr(honest, name)})
-    assert any(word in one for one in complaints(other, 500.0, False, False))
+    other = replace(result, **{name: factor * getattr(result, name)})
+    assert any(word in complaint for complaint in complaints(other, 500.0, False, False))
 
 
 def model_of(extreme):

@@ -1,4 +1,4 @@
-"""The trade-off: references, errors, front, rows, table and picture."""
+"""The trade-off study: references, errors, Pareto front, rows, table and figure."""
 
 import json
 import subprocess
@@ -55,7 +55,7 @@ def stored():
     return read_references()
 
 
-def test_every_case_has_a_reference_of_its_own(stored):
+def test_every_case_has_a_reference(stored):
     for name in case_names():
         reference = reference_of(study_case(name), stored)
         assert reference.values["approach"] > 0
@@ -64,16 +64,15 @@ def test_every_case_has_a_reference_of_its_own(stored):
             assert reference.uncertainty[part] < 0.05 * scale, (name, part)
 
 
-def test_refined_grids_go_to_the_elastic_layer_s_solution(stored):
-    """The sphere's reference is analytic; the grids' own limit must agree with it."""
-    found = stored["sphere"]
-    values, uncertainty = limits(found.solved)
+def test_refined_grids_converge_to_the_solution_of_the_elastic_layer(stored):
+    reference = stored["sphere"]
+    values, uncertainty = limits(reference.solved)
     for name in ("approach", "medial_peak_pressure"):
-        known = uncertainty[name] + found.uncertainty[name]
-        assert values[name] == pytest.approx(found.values[name], abs=known), name
+        known = uncertainty[name] + reference.uncertainty[name]
+        assert values[name] == pytest.approx(reference.values[name], abs=known), name
 
 
-def test_the_elastic_layer_is_hertz_when_thick_and_flattens_when_thin():
+def test_a_thick_layer_agrees_with_hertz_and_a_thin_layer_is_stiffer():
     thick = sphere_on_layer(20e-3, 2.0, 100.0, 5e8, 0.45)
     modulus = 5e8 / (1 - 0.45**2)
     radius = (3 * 100.0 * 20e-3 / (4 * modulus)) ** (1 / 3)
@@ -83,7 +82,7 @@ def test_the_elastic_layer_is_hertz_when_thick_and_flattens_when_thin():
     assert thin.approach < 0.8 * thick.approach
 
 
-def test_condyles_in_balance_share_the_load(stored):
+def test_equal_condyles_share_the_load(stored):
     for name in ("two condyles", "conforming"):
         values = stored[name].values
         assert values["medial_force"] == pytest.approx(values["lateral_force"], rel=1e-3)
@@ -91,7 +90,7 @@ def test_condyles_in_balance_share_the_load(stored):
         assert total == pytest.approx(study_case(name).load, rel=0.02)
 
 
-def test_a_changed_case_or_a_missing_reference_is_refused(stored, tmp_path):
+def test_a_missing_or_outdated_reference_is_refused(stored, tmp_path):
     case = study_case("sphere")
     with pytest.raises(InputError, match="earlier version"):
         reference_of(replace(case, load=701.0), stored)
@@ -113,20 +112,20 @@ def test_a_reference_can_be_computed_again(stored):
     assert coarse.values["approach"] == pytest.approx(stored["sphere"].values["approach"], rel=0.1)
 
 
-def test_a_scene_s_reference_is_kept_with_the_rows(tmp_path, monkeypatch, stored):
-    made = []
+def test_the_reference_of_a_scene_is_stored_with_the_rows(tmp_path, monkeypatch, stored):
+    computed_names = []
 
-    def computed(case):
-        made.append(case.name)
+    def fake_reference(case):
+        computed_names.append(case.name)
         return replace(stored["sphere"], hash=case.hash)
 
-    monkeypatch.setattr(tradeoff, "compute_reference", computed)
+    monkeypatch.setattr(tradeoff, "compute_reference", fake_reference)
     cases = [replace(study_case("sphere"), name="scene 60 deg")]
     for resume in (False, True, False):
         kept = KeptRows(tmp_path, resume)
-        found = tradeoff.references_for(cases, False, lambda line: None, kept)["scene 60 deg"]
-        assert found.values == stored["sphere"].values
-    assert made == ["scene 60 deg"] * 2
+        reference = tradeoff.references_for(cases, False, lambda line: None, kept)["scene 60 deg"]
+        assert reference.values == stored["sphere"].values
+    assert computed_names == ["scene 60 deg"] * 2
 
 
 def test_the_common_limit_of_two_families():
@@ -140,20 +139,20 @@ def test_the_common_limit_of_two_families():
     assert 5.0 < limit < 5.1 and uncertainty == pytest.approx(0.05, abs=0.02)
 
 
-def test_errors_and_map_errors_vanish_between_equals():
+def test_equal_results_have_no_error():
     case = study_case("sphere")
     model = contact_model("foundation", 2.0)
     result = model.press(model.prepare(case.pair), case.load, case.pose)
-    found, raster = quantities(result), raster_map(result)
-    assert set(errors(found, found).values()) == {0.0}
+    values, raster = quantities(result), raster_map(result)
+    assert set(errors(values, values).values()) == {0.0}
     assert map_error(raster, raster) == 0.0
     assert map_error({}, raster) == 1.0
-    assert map_error({place: 1.1 * p for place, p in raster.items()}, raster) == pytest.approx(0.1)
-    scaled = {name: 1.05 * value for name, value in found.items()}
-    assert errors(scaled, found)["peak_pressure"] == pytest.approx(0.05)
+    assert map_error({point: 1.1 * p for point, p in raster.items()}, raster) == pytest.approx(0.1)
+    scaled = {name: 1.05 * value for name, value in values.items()}
+    assert errors(scaled, values)["peak_pressure"] == pytest.approx(0.05)
 
 
-def test_the_front_is_blind_to_noise_in_time():
+def test_noise_in_time_does_not_change_the_front():
     rng = np.random.default_rng(3)
     points = [(10.0**a, 10.0**b) for a, b in rng.uniform(-3, 0, (40, 2))]
     front = on_front(points)
@@ -169,10 +168,10 @@ def test_the_front_is_blind_to_noise_in_time():
     changed = [p for p, a, b in zip(points, front, again, strict=True) if a != b]
     for point in changed:
         near = [t for t, e in points if (t, e) != point and 1 / 1.3 < t / point[0] < 1.3]
-        assert near, "only pairs within the noise may change places"
+        assert near, "only points with nearly equal times may change"
 
 
-def test_a_move_on_the_front_is_excused_by_a_tie_alone():
+def test_a_change_of_the_front_is_accepted_for_nearly_equal_times_alone():
     points = [(1.0, 0.1), (1.3, 0.05), (9.0, 0.01)]
     assert on_front(points) == [True, True, True]
     assert moved(points, [(1.0, 0.1), (1.1, 0.05), (9.0, 0.01)]) == []
@@ -180,61 +179,62 @@ def test_a_move_on_the_front_is_excused_by_a_tie_alone():
     assert moved(points, [(1.0, 0.1), (1.4, 0.05), (7.0, 0.01)]) == []
 
 
-def test_a_measure_in_a_process_of_its_own():
-    found = measure_apart(Job("sphere", "foundation", 2.0))
-    assert found.status == "ok" and found.warm_seconds > 0 and found.prepare_seconds > 0
-    assert 30 < found.peak_rss_MB < 4000
-    here = measure(Job("sphere", "foundation", 2.0))
-    assert found.values == pytest.approx(here.values)
+def test_a_separate_process_gives_the_results_of_this_process():
+    separate = measure_apart(Job("sphere", "foundation", 2.0))
+    assert separate.status == "ok" and separate.warm_seconds > 0 and separate.prepare_seconds > 0
+    assert 30 < separate.peak_rss_MB < 4000
+    local = measure(Job("sphere", "foundation", 2.0))
+    assert separate.values == pytest.approx(local.values)
 
 
-def test_peak_memory_is_the_process_s_own():
-    """A parent that holds 400 MB starts a process that takes a tenth of it."""
-    held = np.ones(50_000_000)
-    asked = "from tkamb.geometry.memory import peak_rss; print(peak_rss())"
-    told = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
-    assert float(told.stdout) < 0.5 * held.nbytes / 1e6 < peak_rss()
+def test_peak_memory_is_that_of_the_process_alone():
+    array = np.ones(50_000_000)
+    code = "from tkamb.geometry.memory import peak_rss; print(peak_rss())"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert float(process.stdout) < 0.5 * array.nbytes / 1e6 < peak_rss()
 
 
-def test_what_cannot_be_measured_is_a_row_too():
+def test_a_failed_or_stopped_job_has_a_status():
     assert measure_apart(Job("sphere", "foundation", -1.0)).status.startswith("failed: ")
     assert measure_apart(Job("sphere", "lattice", 0.7), longest=1.0).status == "stopped after 1 s"
 
 
-def test_the_default_matrix_leaves_out_only_repeats():
-    wanted, everything = tradeoff.jobs(), tradeoff.jobs(full=True)
-    assert {job.contact for job in wanted} >= set(BUILT_IN)
-    assert {job.case for job in wanted} == set(case_names())
-    labels = {job.label for job in wanted}
+def test_the_default_jobs_contain_every_setting_of_the_full_study():
+    default, full = tradeoff.jobs(), tradeoff.jobs(full=True)
+    assert {job.contact for job in default} >= set(BUILT_IN)
+    assert {job.case for job in default} == set(case_names())
+    labels = {job.label for job in default}
     assert {"lattice[tolerance=0.01]", "fe[newton=True]"} <= labels
-    keys = [(job.case, job.label, job.resolution_mm) for job in wanted]
+    keys = [(job.case, job.label, job.resolution_mm) for job in default]
     assert len(set(keys)) == len(keys)
-    every = {(job.case, job.label, job.resolution_mm) for job in everything}
-    assert set(keys) < every and {k[1:] for k in keys} == {k[1:] for k in every}
-    seconds = tradeoff.expected_seconds(wanted, tradeoff.cases_of(wanted))
-    assert len(seconds) == len(wanted) and sum(seconds) < 900
+    full_keys = {(job.case, job.label, job.resolution_mm) for job in full}
+    assert set(keys) < full_keys and {k[1:] for k in keys} == {k[1:] for k in full_keys}
+    seconds = tradeoff.expected_seconds(default, tradeoff.cases_of(default))
+    assert len(seconds) == len(default) and sum(seconds) < 900
 
 
 @pytest.mark.slow
-def test_the_quick_study_is_stopped_and_goes_on(tmp_path, capsys, monkeypatch):
+def test_an_interrupted_quick_study_is_resumed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tradeoff, "QUICK_MODELS", ("foundation", "lattice", "fe"))
-    asked = []
+    measured_jobs = []
 
     def stopped_at_the_third(job):
-        asked.append(job)
-        if len(asked) == 3:
+        measured_jobs.append(job)
+        if len(measured_jobs) == 3:
             raise KeyboardInterrupt
         return measure_apart(job)
 
     monkeypatch.setattr(tradeoff, "measure_apart", stopped_at_the_third)
     arguments = ["tradeoff", "--quick", "--json", "--out", str(tmp_path)]
     assert main(arguments) == 130
-    told = capsys.readouterr()
-    assert len(json.loads(told.out)) == 2 and "--resume continues" in told.err
+    output = capsys.readouterr()
+    assert len(json.loads(output.out)) == 2 and "--resume continues" in output.err
     assert (tmp_path / "tradeoff.txt").read_text().startswith("stopped: 2 of 6 rows")
     assert (tmp_path / "tradeoff.png").exists()
     assert main([*arguments, "--resume"]) == 0
-    assert len(asked) == 3 + 4
+    assert len(measured_jobs) == 3 + 4
     rows = json.loads(capsys.readouterr().out)
     assert rows == json.loads((tmp_path / "tradeoff.json").read_text())
     assert len(rows) == 6 and all(set(row) == KEYS for row in rows)
@@ -248,16 +248,16 @@ def test_the_quick_study_is_stopped_and_goes_on(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_user_s_scene_is_a_case(tmp_path):
+def test_a_scene_of_the_user_has_cases(tmp_path):
     path = write_scene(tmp_path)
     names = [name for name in case_names(path) if name.startswith("scene")]
     assert len(names) == 3
-    shipped, own = study_case("knee 60 deg"), study_case("scene 60 deg", path)
-    assert own.load == pytest.approx(shipped.load)
+    shipped, from_scene = study_case("knee 60 deg"), study_case("scene 60 deg", path)
+    assert from_scene.load == pytest.approx(shipped.load)
 
 
 @pytest.mark.slow
-def test_the_body_s_trade_says_what_each_part_changes(tmp_path):
+def test_the_trade_off_of_the_body_shows_the_effect_of_each_change(tmp_path):
     kept = KeptRows(tmp_path, resume=False)
     rows = {row.name: row for row in run_body_trade(kept)}
     assert set(rows["as shipped"].changed.values()) == {0.0}
@@ -272,11 +272,11 @@ def test_the_body_s_trade_says_what_each_part_changes(tmp_path):
     assert [row.name for row in run_body_trade(kept)] == list(CHANGES)
 
 
-def test_thinned_recordings_keep_the_instants_that_are_left(tmp_path):
+def test_thinned_recordings_keep_the_remaining_instants(tmp_path):
     scene = load_scene(copied_scene(tmp_path))
-    whole = load_case(scene).motion
+    recorded = load_case(scene).motion
     thin_out(tmp_path, 5)
-    thin = load_case(scene).motion
-    np.testing.assert_allclose(thin.time, whole.time[::5], atol=1e-12)
-    np.testing.assert_allclose(thin.coordinates, whole.coordinates[::5], atol=1e-12)
-    assert np.abs(thin.velocity - whole.velocity[::5]).max() > 0
+    thinned = load_case(scene).motion
+    np.testing.assert_allclose(thinned.time, recorded.time[::5], atol=1e-12)
+    np.testing.assert_allclose(thinned.coordinates, recorded.coordinates[::5], atol=1e-12)
+    assert np.abs(thinned.velocity - recorded.velocity[::5]).max() > 0

@@ -1,4 +1,4 @@
-"""The trade-off for a reader: table, advice, picture, and the pages made from its JSON."""
+"""Report of the trade-off: table, recommendations, figure, and the pages made from its JSON."""
 
 import json
 from dataclasses import replace
@@ -50,9 +50,9 @@ def made_up_rows():
     for case in ("sphere", "two condyles", "conforming"):
         for contact, grid, seconds, error in settings:
             values = dict.fromkeys(read_references()[case].values, 1.0 + error)
-            found = Measure("ok", 1.0, seconds, seconds, 100.0, values=values)
-            compared = dict.fromkeys(KEYS, error)
-            rows.append(Row(Job(case, contact, grid), found, compared, 0.005))
+            measure = Measure("ok", 1.0, seconds, seconds, 100.0, values=values)
+            row_errors = dict.fromkeys(KEYS, error)
+            rows.append(Row(Job(case, contact, grid), measure, row_errors, 0.005))
         rows.append(Row(Job(case, "lattice", 1.0), Measure("out of range"), {}, 0.005))
     return with_fronts(rows)
 
@@ -72,8 +72,8 @@ def test_rows_table_and_advice():
     assert picture(rows).axes
 
 
-def test_numbers_of_a_short_axis_do_not_lie_on_each_other():
-    """Times of 8 to 70 ms, as those of the quick study."""
+def test_labels_of_a_short_axis_do_not_overlap():
+    """The times are 8 to 70 ms, like those of the quick study."""
     rows = [
         replace(row, measure=replace(row.measure, warm_seconds=8e-3 * 1.25**k))
         for k, row in enumerate(made_up_rows()[:10])
@@ -95,17 +95,17 @@ def test_two_cases_give_no_recommendation():
     assert "run the whole study" in advice and "hertz" not in advice
 
 
-def test_a_limit_that_nothing_keeps_names_the_nearest():
+def test_a_limit_that_no_setting_meets_names_the_nearest_setting():
     rows = [row for row in made_up_rows() if row.job.contact in ("hertz", "foundation")]
     assert all(
         "no setting: the nearest is hertz at 2 mm with 20 %" in r for r in recommendations(rows)
     )
 
 
-def test_the_comparison_says_what_was_measured():
-    said = comparison(made_up_rows())
-    assert "10 ms" in said[0] and "is on the front" in said[0]
-    assert "fe at 2 mm: 1000 ms, 100 times as long as lattice; it shares" in said[1]
+def test_the_comparison_has_the_measured_times():
+    lines = comparison(made_up_rows())
+    assert "10 ms" in lines[0] and "is on the front" in lines[0]
+    assert "fe at 2 mm: 1000 ms, 100 times as long as lattice; it shares" in lines[1]
     rows = [replace(row, measure=replace(row.measure, warm_seconds=0.02)) for row in made_up_rows()]
     peer = replace(rows[8], job=Job("two condyles", "calculix C3D8I", 2.0))
     assert "0.9 % in approach" in comparison([*rows, peer])[-1]
@@ -113,18 +113,18 @@ def test_the_comparison_says_what_was_measured():
     assert comparison([*rows, *finer])[-1].startswith("calculix C3D8I at 1 mm: 20 ms, 1 times")
 
 
-def test_rows_survive_their_json(tmp_path):
+def test_rows_are_read_back_from_json(tmp_path):
     path = tmp_path / "tradeoff.json"
     path.write_text(as_json(made_up_rows()))
-    again = read_rows(path)
-    assert as_json(again) == path.read_text()
-    assert block(again) == block(made_up_rows())
+    read = read_rows(path)
+    assert as_json(read) == path.read_text()
+    assert block(read) == block(made_up_rows())
     path.write_text('[{"case": 1}]')
     with pytest.raises(InputError, match="not a table of a trade-off"):
         read_rows(path)
 
 
-def test_a_block_goes_between_its_markers_and_nowhere_else():
+def test_a_block_is_inserted_between_its_markers():
     begin, end = (marker.format("tradeoff") for marker in MARKERS)
     page = f"before\n{begin}\nold\n{end}\nafter\n"
     filled = with_block(page, ["| a |", "| b |"])
@@ -134,7 +134,7 @@ def test_a_block_goes_between_its_markers_and_nowhere_else():
         with_block("no markers", [])
 
 
-def test_the_pages_tables_are_the_study_s():
+def test_the_tables_of_the_pages_agree_with_the_study():
     rows = read_rows(MEASURED / "tradeoff.json")
     body = read_body_rows(MEASURED / "body.json")
     for page, lines, name in (
@@ -150,7 +150,7 @@ def error_cases_rows():
     return read_error_rows(MEASURED / "known_error_cases.json")
 
 
-def test_what_runs_say_of_their_error_is_made_from_both_studies():
+def test_stored_known_errors_and_their_page_agree_with_both_studies():
     rows, cases = read_rows(MEASURED / "tradeoff.json"), error_cases_rows()
     assert STORED.read_text(encoding="utf-8") == known_errors_json(rows, cases)
     page = (ROOT / "docs" / "known_errors.md").read_text(encoding="utf-8")
@@ -161,11 +161,11 @@ def test_what_runs_say_of_their_error_is_made_from_both_studies():
     lines = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8").splitlines()
     (line,) = [line for line in lines if line.startswith("| lattice[tolerance=0.01] | 2 |")]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
-    found = variant.approach, variant.force, variant.mean_pressure, variant.peak_pressure
-    assert cells[6:10] == [f"{100 * share:.2g}" for share in found]
+    shares = variant.approach, variant.force, variant.mean_pressure, variant.peak_pressure
+    assert cells[6:10] == [f"{100 * share:.2g}" for share in shares]
 
 
-def test_the_pairs_behind_the_errors_are_many_and_half_of_them_held_out():
+def test_each_situation_has_seven_cases_and_half_are_held_out():
     rows = error_cases_rows()
     for situation in SITUATIONS:
         pairs = {(row.case, row.held_out) for row in rows if row.situation == situation}
@@ -174,35 +174,37 @@ def test_the_pairs_behind_the_errors_are_many_and_half_of_them_held_out():
     assert {row.material for row in rows} == {"polyethylene", "polyethylene-linear"}
 
 
-def test_the_held_out_half_has_no_part_in_the_statement():
+def test_held_out_cases_do_not_affect_the_known_errors():
     rows = error_cases_rows()
-    wild = [replace(r, errors=dict.fromkeys(r.errors, 9.0)) if r.held_out else r for r in rows]
+    changed = [replace(r, errors=dict.fromkeys(r.errors, 9.0)) if r.held_out else r for r in rows]
     study = read_rows(MEASURED / "tradeoff.json")
-    stated, judged = (json.loads(known_errors_json(study, some)) for some in (rows, wild))
-    for one, other in zip(stated, judged, strict=True):
-        assert {k: v for k, v in one.items() if k != "covered"} == {
-            k: v for k, v in other.items() if k != "covered"
+    stated, other_statement = (
+        json.loads(known_errors_json(study, subset)) for subset in (rows, changed)
+    )
+    for entry, other_entry in zip(stated, other_statement, strict=True):
+        assert {k: v for k, v in entry.items() if k != "covered"} == {
+            k: v for k, v in other_entry.items() if k != "covered"
         }
-        assert other["covered"] in (None, 0.0)
+        assert other_entry["covered"] in (None, 0.0)
 
 
 @pytest.mark.parametrize("contact", ["lattice", "fe", "lattice-linear"])
-def test_the_statement_covers_the_held_out_half_at_1_mm(contact):
+def test_known_errors_at_1_mm_cover_the_held_out_cases(contact):
     error = known_error(contact, 1.0, "polyethylene")
     assert error.covered >= 0.9
 
 
-def test_an_error_is_stated_on_its_cases_and_by_situation():
-    said = error_json(known_error("lattice", 1.0, "polyethylene"))
-    words = known_error_words(said, ("peak_pressure", "area", "approach"))
-    assert words.startswith(f"in {said['cases']} reference cases the contact model was off by ")
+def test_a_known_error_names_its_cases_and_situations():
+    error = error_json(known_error("lattice", 1.0, "polyethylene"))
+    words = known_error_words(error, ("peak_pressure", "area", "approach"))
+    assert words.startswith(f"in {error['cases']} reference cases the contact model was off by ")
     assert "up to" not in words
     for place in ("in the interior", "on a flank", "at an edge"):
         assert place in words
-    assert said["situations"]["edge"]["area"] > said["situations"]["interior"]["area"]
+    assert error["situations"]["edge"]["area"] > error["situations"]["interior"]["area"]
 
 
-def test_what_was_not_measured_has_no_known_error():
+def test_settings_without_measurement_have_no_known_error():
     assert known_error("lattice", 1.0, "polyethylene", {}).cases >= 12
     assert known_error("lattice", 1.0, "polyethylene", {"cache": False}) is not None
     assert known_error("lattice", 2.0, "polyethylene", {"tolerance": 1e-2}) is not None

@@ -1,4 +1,4 @@
-"""The headline of an uncertain run, tendons' bands, and a patella that its lines do not hold."""
+"""Printed peak of an uncertain run, varied tendon bands, and a patella without equilibrium."""
 
 from types import SimpleNamespace
 
@@ -23,33 +23,32 @@ NOMINAL = np.array([1.0, 3.39, 2.0])
 
 
 def samples(failed=0):
-    """100 samples whose peaks are 3.31 to 4.30 in steps of 0.01, some of them failed."""
+    """Return 100 samples with peaks from 3.31 to 4.30 BW in steps of 0.01, and their failures."""
     values = np.tile(NOMINAL, (100, 1))
     values[:, 1] = 3.31 + 0.01 * np.arange(100)
     values[:failed, 1] = np.nan
-    lost = np.zeros((100, 3), bool)
-    lost[:failed, 1] = True
-    return values, lost
+    failures = np.zeros((100, 3), bool)
+    failures[:failed, 1] = True
+    return values, failures
 
 
-def test_the_nominal_peak_is_told_by_its_place_among_the_samples_and_failures_are_counted():
-    found = peak_band(NOMINAL, *samples())
-    assert (found["frame"], found["failed_samples"]) == (1, 0)
-    assert found["nominal_percentile"] == pytest.approx(8.5)
-    assert found["median"] == pytest.approx(3.805)
-    assert "0 of 100 samples failed" in found["words"]
-    assert "outside" not in found["words"]
-    found = peak_band(NOMINAL - 0.2, *samples(15))
-    assert found["nominal_percentile"] == 0.0
-    assert "outside the band" in found["words"]
-    assert "15 of 100 samples failed there (15%)" in found["words"]
-    found = peak_band(NOMINAL, *samples(60))
-    assert (found["median"], found["failed_samples"]) == (None, 60)
+def test_the_nominal_peak_has_its_percentile_and_the_number_of_failures():
+    band = peak_band(NOMINAL, *samples())
+    assert (band["frame"], band["failed_samples"]) == (1, 0)
+    assert band["nominal_percentile"] == pytest.approx(8.5)
+    assert band["median"] == pytest.approx(3.805)
+    assert "0 of 100 samples failed" in band["words"]
+    assert "outside" not in band["words"]
+    band = peak_band(NOMINAL - 0.2, *samples(15))
+    assert band["nominal_percentile"] == 0.0
+    assert "outside the band" in band["words"]
+    assert "15 of 100 samples failed there (15%)" in band["words"]
+    band = peak_band(NOMINAL, *samples(60))
+    assert (band["median"], band["failed_samples"]) == (None, 60)
 
 
 def uncertain(failed=0):
-    """An uncertain run of three frames, its samples those above."""
-    values, lost = samples(failed)
+    values, failures = samples(failed)
     columns = {
         "time_s": np.arange(3.0),
         "flexion_deg": np.array([10.0, 60.0, 90.0]),
@@ -63,48 +62,48 @@ def uncertain(failed=0):
         "not_varied": [],
         "largest_failed_share": failed / 100,
         "shares_of_variance": {},
-        "peak_force_total_BW": peak_band(NOMINAL, values, lost),
+        "peak_force_total_BW": peak_band(NOMINAL, values, failures),
     }
-    bands = band_columns(columns["time_s"], ["force_total_BW"], values[:, None], lost)
+    bands = band_columns(columns["time_s"], ["force_total_BW"], values[:, None], failures)
     return Results(columns, {"uncertainty": table}, bands=bands)
 
 
 @pytest.mark.parametrize("failed", [0, 13, 60])
-def test_the_headline_is_the_median_with_its_band_or_says_why_not(failed):
+def test_the_headline_has_median_and_band_or_the_reason_why_not(failed):
     run = uncertain(failed)
-    report = {one.title: one for one in cards(run, horizontal_axis(run))}["Peak contact force"]
-    found = SimpleNamespace(results=run, bands=run.bands, tornado=[], indices=[])
-    line = headline(found)[0]
+    card = {entry.title: entry for entry in cards(run, horizontal_axis(run))}["Peak contact force"]
+    uncertainty = SimpleNamespace(results=run, bands=run.bands, tornado=[], indices=[])
+    line = headline(uncertainty)[0]
     if failed == 60:
-        assert report.value == "3.39 BW"
+        assert card.value == "3.39 BW"
         assert "no median or band: more than half of the samples failed" in line
     else:
         middle = run.bands["force_total_BW_p50"][1]
-        assert report.value.startswith(f"{middle:.2f} BW (")
-        assert "3.39 BW with the inputs as given" in report.detail
+        assert card.value.startswith(f"{middle:.2f} BW (")
+        assert "3.39 BW with the inputs as given" in card.detail
         assert f"median {middle:.2f} BW, 5 to 95 %" in line
     assert f"{failed} of 100 samples failed" in line
 
 
-def test_a_tendon_s_band_is_an_input_and_widens_what_the_line_wraps(tmp_path):
+def test_the_width_of_a_tendon_band_is_an_input(tmp_path):
     path = write_scene(tmp_path, drop=("contact",))
     scene = load_scene(path, {"patella.motion": "solved"})
     case = load_case(scene)
-    names = [one.name for one in varied_inputs(case)]
+    names = [varied.name for varied in varied_inputs(case)]
     assert {"tendon_band.quadriceps", "tendon_band.patellar_ligament"} <= set(names)
-    alone = (VariedInput("tendon_band.quadriceps", 3.0, "mm"),)
+    inputs = (VariedInput("tendon_band.quadriceps", 3.0, "mm"),)
     frames = len(case.motion.time)
     for normal, band in ((0.0, 5.0), (2.0, 11.0), (-1.0, 2.0), (-3.0, 0.0)):
-        draw = Draw(alone, np.array([normal]), np.zeros((frames, 0)), 1.0)
-        moved = varied_case(case, draw)
-        assert moved.muscles[0].wrap.band == pytest.approx(band * 1e-3)
-        assert moved.patellar_ligament.wrap.band == case.patellar_ligament.wrap.band
+        draw = Draw(inputs, np.array([normal]), np.zeros((frames, 0)), 1.0)
+        sample = varied_case(case, draw)
+        assert sample.muscles[0].wrap.band == pytest.approx(band * 1e-3)
+        assert sample.patellar_ligament.wrap.band == case.patellar_ligament.wrap.band
     outlines = [SagittalWrap(band * 1e-3, 3.5e-3).outline(case.femoral, 0.0) for band in (5, 15)]
     assert outlines[1].max() > outlines[0].max() or outlines[1].min() < outlines[0].min()
 
 
 @pytest.mark.parametrize(("band", "flagged"), [(5.0, False), (15.0, True)])
-def test_a_recorded_patella_that_its_lines_do_not_hold_is_flagged(tmp_path, band, flagged):
+def test_a_recorded_patella_without_equilibrium_is_flagged(tmp_path, band, flagged):
     scene = write_scene(tmp_path, quadriceps__band_mm=band, contact__resolution_mm=6.0)
     run = simulate(scene, frames=slice(90, 101, 10))
     across = np.abs(run["patellofemoral_tangential_N"])
@@ -113,12 +112,12 @@ def test_a_recorded_patella_that_its_lines_do_not_hold_is_flagged(tmp_path, band
         assert ("recorded patella is not held by its lines" in status) == flagged
 
 
-def test_a_run_tells_how_its_peak_lies_among_the_samples(tmp_path):
+def test_the_summary_compares_the_nominal_peak_with_the_samples(tmp_path):
     scene = write_scene(tmp_path, drop=("contact",))
-    found = estimate_uncertainty(scene, samples=20, frames=slice(60, 101, 20))
-    peak = found.results.summary["uncertainty"]["peak_force_total_BW"]
+    uncertainty = estimate_uncertainty(scene, samples=20, frames=slice(60, 101, 20))
+    peak = uncertainty.results.summary["uncertainty"]["peak_force_total_BW"]
     assert peak["samples"] == 20
-    assert peak["nominal"] == pytest.approx(np.nanmax(found.results["force_total_BW"]))
-    lines = headline(found)
+    assert peak["nominal"] == pytest.approx(np.nanmax(uncertainty.results["force_total_BW"]))
+    lines = headline(uncertainty)
     assert lines[0].startswith("peak total force: ")
     assert any(line.startswith("peak total force at ") for line in lines)

@@ -1,4 +1,4 @@
-"""Bands: known propagation, samples by number alone, and the case with its inputs moved."""
+"""Bands: propagation with closed forms, reproducible samples, and cases with varied inputs."""
 
 import json
 from contextlib import suppress
@@ -36,13 +36,13 @@ Z95 = 1.6448536269514722
 
 
 def knee(**more):
-    """Return the shipped knee on a coarse foundation."""
+    """Return the scene of the shipped knee with a coarse foundation and changed keys."""
     coarse = {"contact.model": "foundation", "contact.resolution_mm": 4.0}
     return load_scene(SCENE, coarse | {key.replace("__", "."): v for key, v in more.items()})
 
 
 def bodies_alone(**more):
-    """Return it without contact, muscles and patella: no mesh is read."""
+    """Return the scene without contact, muscles and patella, which needs no mesh."""
     parts = ("contact", "quadriceps", "patellar_ligament", "patella")
     return knee(**more).model_copy(update=dict.fromkeys(parts))
 
@@ -53,18 +53,18 @@ def test_a_linear_map_of_gaussian_inputs_has_its_known_distribution(method):
     y = 10.0 + normal_samples(method, count, len(SLOPES), seed=3) @ SLOPES
     assert y.mean() == pytest.approx(10.0, abs=3 * LINEAR_SD / np.sqrt(count))
     assert y.std() == pytest.approx(LINEAR_SD, rel=3 / np.sqrt(2 * count))
-    found = percentiles(y)
+    band = percentiles(y)
     # standard error of a quantile: sqrt(p (1 - p) / n) / density there
     error = np.sqrt(0.05 * 0.95 / count) / (np.exp(-0.5 * Z95**2) / np.sqrt(2 * np.pi))
-    assert found["p05"] == pytest.approx(10.0 - Z95 * LINEAR_SD, abs=3 * error * LINEAR_SD)
-    assert found["p50"] == pytest.approx(10.0, abs=3 * 1.2533 * LINEAR_SD / np.sqrt(count))
-    assert found["p95"] == pytest.approx(10.0 + Z95 * LINEAR_SD, abs=3 * error * LINEAR_SD)
+    assert band["p05"] == pytest.approx(10.0 - Z95 * LINEAR_SD, abs=3 * error * LINEAR_SD)
+    assert band["p50"] == pytest.approx(10.0, abs=3 * 1.2533 * LINEAR_SD / np.sqrt(count))
+    assert band["p95"] == pytest.approx(10.0 + Z95 * LINEAR_SD, abs=3 * error * LINEAR_SD)
 
 
-def test_the_90_percent_band_covers_the_truth_in_85_to_95_percent_of_trials():
+def test_the_band_covers_the_truth_in_90_per_cent_of_trials():
     rng, covered = np.random.default_rng(0), 0
     for trial in range(200):
-        recorded = rng.standard_normal(len(SLOPES))  # of a truth whose inputs are all 0
+        recorded = rng.standard_normal(len(SLOPES))  # the true inputs are 0
         y = (recorded + normal_samples("lhs", 256, len(SLOPES), seed=trial)) @ SLOPES
         band = percentiles(y)
         covered += band["p05"] <= 0.0 <= band["p95"]
@@ -72,38 +72,38 @@ def test_the_90_percent_band_covers_the_truth_in_85_to_95_percent_of_trials():
 
 
 @pytest.mark.parametrize("count", [20, 40, 200])
-def test_a_value_drawn_like_the_samples_is_within_the_band_however_few_they_are(count):
-    drawn = np.random.default_rng(count).standard_normal((count + 1, 4000))
-    band = percentiles(drawn[1:])
-    inside = (band["p05"] <= drawn[0]) & (drawn[0] <= band["p95"])
-    error = np.sqrt(0.9 * 0.1 / inside.size)  # linear between the samples' ends: 0.81 of 20
+def test_a_new_draw_is_within_the_band_for_any_number_of_samples(count):
+    draws = np.random.default_rng(count).standard_normal((count + 1, 4000))
+    band = percentiles(draws[1:])
+    inside = (band["p05"] <= draws[0]) & (draws[0] <= band["p95"])
+    error = np.sqrt(0.9 * 0.1 / inside.size)
     assert inside.mean() == pytest.approx(0.90, abs=3 * error)
 
 
-def test_shares_of_a_linear_map_are_its_squared_slopes_and_noise_is_the_rest():
+def test_shares_of_a_linear_map_are_its_squared_slopes():
     rng = np.random.default_rng(1)
     x = normal_samples("lhs", 2048, len(SLOPES), seed=1)
     y = x @ SLOPES + 2.0 * rng.standard_normal(len(x))
-    found = influences(["y"], list("abcd"), y[:, None, None], x[:, None, :])
-    shares = {one.name: one.share for one in found}
+    rows = influences(["y"], list("abcd"), y[:, None, None], x[:, None, :])
+    shares = {row.name: row.share for row in rows}
     total = LINEAR_SD**2 + 4.0
     for name, slope in zip("abcd", SLOPES, strict=True):
         assert shares[name] == pytest.approx(slope**2 / total, abs=0.03)
     assert shares["rest"] == pytest.approx(4.0 / total, abs=0.03)
-    assert [one.name for one in found] == ["a", "b", "c", "d", "rest"]
-    assert found[1].change == pytest.approx(-2.0, abs=0.15)
-    either_way = (x[:, 0] ** 2)[:, None, None]  # var(x²) = 2, all of it the first input's
-    assert influences(["y"], list("abcd"), either_way, x[:, None, :])[0].share > 0.999
+    assert [row.name for row in rows] == ["a", "b", "c", "d", "rest"]
+    assert rows[1].change == pytest.approx(-2.0, abs=0.15)
+    square = (x[:, 0] ** 2)[:, None, None]  # all variance is that of the first input
+    assert influences(["y"], list("abcd"), square, x[:, None, :])[0].share > 0.999
 
 
 @pytest.mark.parametrize("method", ["lhs", "sobol"])
-def test_more_samples_keep_the_earlier_ones(method):
+def test_a_larger_number_of_samples_includes_the_smaller_one(method):
     many = normal_samples(method, 300, 5, seed=7)
     np.testing.assert_array_equal(normal_samples(method, 70, 5, seed=7), many[:70])
     assert not np.array_equal(normal_samples(method, 70, 5, seed=8), many[:70])
 
 
-def test_the_noise_is_stationary_with_its_correlation_time():
+def test_noise_is_stationary_with_its_correlation_time():
     time, tau = np.array([0.0, 0.05, 0.30]), 0.1
     x = np.array([noise(n, time, 2, tau, seed=1) for n in range(4000)])
     np.testing.assert_allclose(x.var(axis=0), 1.0, atol=0.1)
@@ -114,33 +114,33 @@ def test_the_noise_is_stationary_with_its_correlation_time():
     np.testing.assert_array_equal(noise(5, time, 2, tau, seed=1), x[5])
 
 
-def test_a_frame_that_failed_in_most_samples_has_no_band_and_others_say_how_many_failed():
+def test_a_frame_that_failed_in_most_samples_has_no_band():
     values = np.tile(np.arange(100.0)[:, None, None], (1, 1, 2))
     failed = np.zeros((100, 2), bool)
     failed[:60, 0] = failed[:10, 1] = True
     values[failed[:, None, :]] = np.nan
-    found = band_columns(np.arange(2.0), ["force_total_N"], values, failed)
-    np.testing.assert_allclose(found["failed_share"], [0.6, 0.1])
-    assert np.isnan(found["force_total_N_p50"][0])
-    assert found["force_total_N_p50"][1] == pytest.approx(54.5)  # of 10 to 99
+    columns = band_columns(np.arange(2.0), ["force_total_N"], values, failed)
+    np.testing.assert_allclose(columns["failed_share"], [0.6, 0.1])
+    assert np.isnan(columns["force_total_N_p50"][0])
+    assert columns["force_total_N_p50"][1] == pytest.approx(54.5)  # samples 10 to 99
 
 
-def test_the_share_of_measured_frames_inside_the_band_counts_those_that_have_both():
+def test_the_share_of_measured_frames_inside_the_band():
     nan = float("nan")
     columns = {"measured_total_N": np.array([100.0, 300.0, nan, 120.0, 90.0])}
     bands = {
         "force_si_N_p05": np.array([90.0, 100.0, 90.0, nan, 90.0]),
         "force_si_N_p95": np.array([110.0, 200.0, 110.0, nan, 110.0]),
     }
-    found = measured_inside(columns, bands, {"total": {"predicted": "force_si_N"}})
-    assert found == {"total": {"frames": 3, "share": pytest.approx(2 / 3)}}
-    none = measured_inside(columns, {}, {"total": {"predicted": "force_si_N"}})
-    assert none["total"]["frames"] == 0 and np.isnan(none["total"]["share"])
+    shares = measured_inside(columns, bands, {"total": {"predicted": "force_si_N"}})
+    assert shares == {"total": {"frames": 3, "share": pytest.approx(2 / 3)}}
+    no_band = measured_inside(columns, {}, {"total": {"predicted": "force_si_N"}})
+    assert no_band["total"]["frames"] == 0 and np.isnan(no_band["total"]["share"])
 
 
 def draw_of(sampler, **normal):
-    """Return a draw that moves the named inputs alone, by so many standard deviations."""
-    names = [one.name for one in sampler.inputs]
+    """Return a draw with errors of the named inputs, in standard deviations."""
+    names = [varied.name for varied in sampler.inputs]
     values = np.zeros(len(names))
     for name, value in normal.items():
         values[names.index(name.replace("__", "."))] = value
@@ -149,60 +149,63 @@ def draw_of(sampler, **normal):
 
 
 def sampled(sampler, monkeypatch, **normal):
-    """Return the values of the sample that moves these inputs."""
     monkeypatch.setattr(sampler, "draw", lambda point: draw_of(sampler, **normal))
     return sampler(0, Point.of(0, np.zeros(0))).values
 
 
-def test_a_sample_is_the_run_of_the_scene_with_its_inputs_moved(monkeypatch):
+def test_a_sample_equals_a_run_of_the_changed_scene(monkeypatch):
     names = ["force_total_N", "medial_force_N", "ligament_LCL_N", "quadriceps_N"]
     table = {"uncertainty__ligament_strain": 0.02, "uncertainty__tuberosity_mm": 2.0}
-    factors = ("ligament_stiffness", "segment_mass", "ground_reaction")  # of mean 1, not median
+    # the factors of these inputs have mean 1, but not median 1
+    factors = ("ligament_stiffness", "segment_mass", "ground_reaction")
     table |= {f"uncertainty__{name}": 0.0 for name in factors}
     scene, frames = knee(**table), slice(60, 61)
     sampler = Sampler(scene, range(60, 61), names)
     nominal = simulate(scene, frames=frames)
-    still = sampled(sampler, monkeypatch)
-    np.testing.assert_allclose(still, [nominal[name] for name in names], rtol=1e-12)
+    nominal_values = sampled(sampler, monkeypatch)
+    np.testing.assert_allclose(nominal_values, [nominal[name] for name in names], rtol=1e-12)
 
-    moved = {"ligament_strain__LCL": 2.0, "tuberosity__ap": -1.0, "friction": 1.0}
+    errors = {"ligament_strain__LCL": 2.0, "tuberosity__ap": -1.0, "friction": 1.0}
     bundles = tuple(
-        one.model_copy(update={"slack_length_mm": one.slack_length_mm / 1.04})
-        if one.name == "LCL"
-        else one
-        for one in scene.ligament
+        bundle.model_copy(update={"slack_length_mm": bundle.slack_length_mm / 1.04})
+        if bundle.name == "LCL"
+        else bundle
+        for bundle in scene.ligament
     )
     assert scene.patellar_ligament is not None and scene.contact is not None
     x, y, z = scene.patellar_ligament.distal.point_mm
     distal = scene.patellar_ligament.distal.model_copy(update={"point_mm": (x - 2.0, y, z)})
-    by_hand = scene.model_copy(
+    changed = scene.model_copy(
         update={
             "ligament": bundles,
             "patellar_ligament": scene.patellar_ligament.model_copy(update={"distal": distal}),
             "contact": scene.contact.model_copy(update={"friction": 0.05 + 0.017}),
         }
     )
-    expected = simulate(by_hand, frames=frames)
-    found = sampled(sampler, monkeypatch, **moved)
-    np.testing.assert_allclose(found, [expected[name] for name in names], rtol=1e-9)
-    assert np.abs(found - still).max() > 1.0
+    expected = simulate(changed, frames=frames)
+    values = sampled(sampler, monkeypatch, **errors)
+    np.testing.assert_allclose(values, [expected[name] for name in names], rtol=1e-9)
+    assert np.abs(values - nominal_values).max() > 1.0
 
 
-def test_the_chain_with_other_masses_and_another_insert():
+def test_a_changed_chain_has_other_masses_and_insert_position():
     chain, shift = load_case(bodies_alone()).chain, np.array([1e-3, 2e-3, -3e-3])
     other = chain.changed(1.5, shift)
     for link in ("tibia", "femur"):
-        (mass, centre, inertia), (more, there, turning) = chain.segment(link), other.segment(link)
-        assert more == pytest.approx(1.5 * mass)
-        np.testing.assert_allclose(turning, 1.5 * inertia)
-        np.testing.assert_allclose(there, centre)
-    turn = chain.insert_in_tibia[:3, :3]
+        (mass, centre, inertia), (other_mass, other_centre, other_inertia) = (
+            chain.segment(link),
+            other.segment(link),
+        )
+        assert other_mass == pytest.approx(1.5 * mass)
+        np.testing.assert_allclose(other_inertia, 1.5 * inertia)
+        np.testing.assert_allclose(other_centre, centre)
+    rotation = chain.insert_in_tibia[:3, :3]
     np.testing.assert_allclose(
-        other.insert_in_tibia[:3, 3], chain.insert_in_tibia[:3, 3] + turn @ shift
+        other.insert_in_tibia[:3, 3], chain.insert_in_tibia[:3, 3] + rotation @ shift
     )
 
 
-def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_path):
+def test_a_resumed_analysis_with_two_workers_gives_the_bands_of_one(tmp_path):
     scene = bodies_alone(uncertainty__ligament_strain=0.02, uncertainty__segment_mass=0.1)
     folder, options = tmp_path / "out", {"samples": 40, "frames": slice(0, 101, 25)}
 
@@ -210,22 +213,22 @@ def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_
         estimate_uncertainty(scene, **options, directory=folder, progress=broken_off(4))
     assert not (folder / BANDS_NAME).exists()
     identity = json.loads((folder / ".frames" / "run.json").read_text())
-    forged = Shard({}, {"values": np.zeros(2)})  # of right digest
+    forged = Shard({}, {"values": np.zeros(2)})  # stored with a valid digest
     Shards(folder, identity, resume=True).put(1, forged)
     with pytest.raises(InputError, match="somebody changed it"):
         estimate_uncertainty(scene, **options, directory=folder, resume=True)
     (folder / ".frames" / "000001.frame").unlink()
-    one = estimate_uncertainty(scene, **options)
-    two = estimate_uncertainty(scene, **options, directory=folder, resume=True, workers=2)
-    for name, band in one.bands.items():
-        np.testing.assert_array_equal(band, two.bands[name])
-    for mine, other in zip(one.samples, two.samples, strict=True):
-        np.testing.assert_array_equal(mine.values, other.values)
-        np.testing.assert_array_equal(mine.errors, other.errors)
+    single = estimate_uncertainty(scene, **options)
+    resumed = estimate_uncertainty(scene, **options, directory=folder, resume=True, workers=2)
+    for name, band in single.bands.items():
+        np.testing.assert_array_equal(band, resumed.bands[name])
+    for sample, resumed_sample in zip(single.samples, resumed.samples, strict=True):
+        np.testing.assert_array_equal(sample.values, resumed_sample.values)
+        np.testing.assert_array_equal(sample.errors, resumed_sample.errors)
     assert main(["verify", str(folder)]) == 0
     with pytest.raises(InputError, match="holds what `tkamb uncertainty` wrote"):
-        write_results(one.results, folder)
-    write_results(one.results, folder, force=True)  # another run: its bands go
+        write_results(single.results, folder)
+    write_results(single.results, folder, force=True)  # removes the bands
     assert not any((folder / name).exists() for name in UNCERTAINTY_NAMES)
 
 
@@ -240,53 +243,53 @@ def test_interrupted_and_resumed_by_two_workers_it_is_what_one_worker_finds(tmp_
         (["--frames", "500:600"], "not in the motion"),
     ],
 )
-def test_bad_input_is_one_line_and_nothing_is_written(arguments, words, tmp_path, capsys):
+def test_invalid_input_is_an_error_of_one_line(arguments, words, tmp_path, capsys):
     folder = tmp_path / "out"
     assert main(["uncertainty", str(SCENE), "--out", str(folder), *arguments]) == 2
-    said = capsys.readouterr().err.strip()
-    assert words in said and "\n" not in said
+    message = capsys.readouterr().err.strip()
+    assert words in message and "\n" not in message
     assert not folder.exists()
 
 
-def test_a_scene_in_which_nothing_varies_is_refused():
-    none = [f"uncertainty__{key}" for key in ("ap_mm", "si_mm", "ml_mm", "friction")]
-    none += [f"uncertainty__{key}_deg" for key in ("axial_rotation", "adduction", "flexion")]
-    none += [f"uncertainty__centre_of_pressure_{axis}_mm" for axis in ("ap", "ml")]
-    none += [f"uncertainty__{key}" for key in ("segment_mass", "ground_reaction")]
-    none += [f"uncertainty__ligament_{key}" for key in ("stiffness", "strain")]
-    none += [f"uncertainty__{key}_mm" for key in ("knee_centre", "femoral_placement")]
-    none += [f"uncertainty__insert_placement_{unit}" for unit in ("mm", "deg")]
+def test_a_scene_without_varied_inputs_is_refused():
+    keys = [f"uncertainty__{key}" for key in ("ap_mm", "si_mm", "ml_mm", "friction")]
+    keys += [f"uncertainty__{key}_deg" for key in ("axial_rotation", "adduction", "flexion")]
+    keys += [f"uncertainty__centre_of_pressure_{axis}_mm" for axis in ("ap", "ml")]
+    keys += [f"uncertainty__{key}" for key in ("segment_mass", "ground_reaction")]
+    keys += [f"uncertainty__ligament_{key}" for key in ("stiffness", "strain")]
+    keys += [f"uncertainty__{key}_mm" for key in ("knee_centre", "femoral_placement")]
+    keys += [f"uncertainty__insert_placement_{unit}" for unit in ("mm", "deg")]
     with pytest.raises(Exception, match="no input varies"):
-        estimate_uncertainty(bodies_alone(**dict.fromkeys(none, 0.0)), samples=20)
+        estimate_uncertainty(bodies_alone(**dict.fromkeys(keys, 0.0)), samples=20)
 
 
-def test_two_runs_into_one_folder_are_refused_before_anything_is_computed(tmp_path):
+def test_a_folder_in_use_is_refused(tmp_path):
     folder, message = tmp_path / "out", "another tkamb is writing into this folder"
     with held_elsewhere(folder), pytest.raises(InputError, match=message):
         estimate_uncertainty(bodies_alone(), samples=20, directory=folder)
     assert [path.name for path in folder.iterdir()] == [".tkamb"]
 
 
-def test_a_full_disk_leaves_no_bands_or_all_of_them(tmp_path, monkeypatch):
-    found = estimate_uncertainty(bodies_alone(), samples=20, frames=slice(0, 1))
+def test_a_full_disk_leaves_all_files_or_none(tmp_path, monkeypatch):
+    uncertainty = estimate_uncertainty(bodies_alone(), samples=20, frames=slice(0, 1))
     monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "page")
 
     def write(folder, number=None):
         folder.mkdir()
         injected = Faults(folder, number).injected(monkeypatch)
         with injected as faults, suppress(InputError):
-            write_uncertainty(found, folder)
+            write_uncertainty(uncertainty, folder)
         settle(folder)
-        wanted = {"bands.csv", "tornado.csv", "samples.h5", "results.csv", "summary.json"}
-        return faults.calls, wanted, wanted & {path.name for path in folder.iterdir()}
+        expected = {"bands.csv", "tornado.csv", "samples.h5", "results.csv", "summary.json"}
+        return faults.calls, expected, expected & {path.name for path in folder.iterdir()}
 
-    calls, wanted, written = write(tmp_path / "whole")
-    assert written == wanted
+    calls, expected, written = write(tmp_path / "whole")
+    assert written == expected
     for number in range(len(calls)):
-        assert write(tmp_path / f"full{number}", number)[2] in (set(), wanted)
+        assert write(tmp_path / f"full{number}", number)[2] in (set(), expected)
 
 
-def test_why_samples_fail_is_counted_whatever_the_numbers_in_it():
+def test_causes_of_failure_are_counted_without_their_numbers():
     problems = np.array(
         [
             ["", "contact out of range; a load of 800 N cannot be reached; no ellipse"],
@@ -301,10 +304,10 @@ def test_why_samples_fail_is_counted_whatever_the_numbers_in_it():
     assert causes(np.full((2, 3), "")) == {}
 
 
-def test_a_sample_says_why_it_fails(monkeypatch):
-    """60 deviations to the side: both condyles touch the insert at one of its walls."""
+def test_a_failed_sample_has_its_reason(monkeypatch):
+    """After 60 deviations laterally both condyles touch one wall of the insert."""
     sampler = Sampler(knee(), range(60, 61), ["force_total_N"])
     monkeypatch.setattr(sampler, "draw", lambda point: draw_of(sampler, ml=60.0))
-    found = sampler(0, Point.of(0, np.zeros(0)))
-    assert found.failed.tolist() == [True] and np.isnan(found.values).all()
-    assert found.problems[0].startswith("condyles apart by ")
+    sample = sampler(0, Point.of(0, np.zeros(0)))
+    assert sample.failed.tolist() == [True] and np.isnan(sample.values).all()
+    assert sample.problems[0].startswith("condyles apart by ")

@@ -1,4 +1,4 @@
-"""The page of published numbers: made of its JSON, and about a tenth of it computed anew."""
+"""The validation page: it agrees with its JSON, and a tenth of its values is computed again."""
 
 import json
 from pathlib import Path
@@ -29,11 +29,11 @@ def stored_row(design, condyle, percent):
     return next(r for r in rows if (r["design"], r["condyle"], r["percent"]) == key)
 
 
-def test_page_is_what_its_numbers_make():
+def test_the_page_agrees_with_the_stored_numbers():
     assert (ROOT / "docs" / "validation.md").read_text(encoding="utf-8") == page(STORED)
 
 
-def test_every_published_value_has_ours_a_source_and_a_band():
+def test_every_published_value_has_a_source_a_band_and_a_computed_value():
     sources = {row["key"] for row in published()["source"]}
     assert set(STORED["values"]) <= set(VALUES)
     assert len(STORED["values"]) >= 10
@@ -44,29 +44,28 @@ def test_every_published_value_has_ours_a_source_and_a_band():
     assert np.isfinite(list(STORED["values"].values())).all()
 
 
-def test_badge_counts_hits():
+def test_the_badge_counts_values_within_their_bands():
     stored = STORED["values"]
     within = sum(hit(VALUES[name], value) for name, value in stored.items())
     assert badge(stored).startswith(f"**{within} of {len(stored)} ")
 
 
-def test_cheap_values_are_computed_anew():
-    anew = {**benchmarks.film(), **benchmarks.patch(), **benchmarks.refinement()}
-    anew |= benchmarks.speed(ROOT / "scripts" / "data" / "tradeoff.json")
-    for name, value in anew.items():
+def test_fast_values_agree_with_the_stored_ones():
+    computed = {**benchmarks.film(), **benchmarks.patch(), **benchmarks.refinement()}
+    computed |= benchmarks.speed(ROOT / "scripts" / "data" / "tradeoff.json")
+    for name, value in computed.items():
         assert value == pytest.approx(STORED["values"][name], rel=1e-3), name
 
 
-def test_a_tenth_of_the_cells_is_pressed_anew():
-    """Nominal cases of one design along the bend, and the ranges of one cell."""
+def test_a_tenth_of_the_tables_agrees_with_the_stored_one():
     name = "NKII CP"
     pressed = PressedDesign(load_design(ROOT / "models" / "designs" / FOLDERS[name]))
     percent = dissertation.table(1).percent
     for row in range(11):
         cell = pressed.cell("medial", percent[row], table_force(name, "medial", row), nominal())
         stored = stored_row(name, "medial", percent[row])
-        ours = dict(zip(QUANTITIES, in_public_units([cell])[0], strict=True))
-        for quantity, value in ours.items():
+        computed = dict(zip(QUANTITIES, in_public_units([cell])[0], strict=True))
+        for quantity, value in computed.items():
             assert value == pytest.approx(stored[quantity][0], rel=5e-3), (row, quantity)
     row = pressed_row(pressed, name, "medial", 10)
     for quantity in QUANTITIES:
@@ -76,9 +75,9 @@ def test_a_tenth_of_the_cells_is_pressed_anew():
 
 
 @pytest.mark.slow
-def test_all_values_are_computed_anew():
+def test_all_values_agree_with_the_stored_ones():
     designs = ROOT / "models" / "designs"
-    anew = {
+    computed = {
         **benchmarks.spheres(),
         **benchmarks.against_fe(designs),
         **benchmarks.foundation(designs),
@@ -88,42 +87,40 @@ def test_all_values_are_computed_anew():
         **benchmarks.thickness_and_plane(designs),
     }
     for name, value in STORED["values"].items():
-        if name in anew:
-            assert value == pytest.approx(anew[name], rel=0.01), name
+        if name in computed:
+            assert value == pytest.approx(computed[name], rel=0.01), name
 
 
-def test_film_converges_to_the_ellipse_with_its_cells():
-    """The worst error of the area falls in proportion to the cell, at least with power 0.8."""
+def test_the_area_of_a_pressure_film_converges_to_the_ellipse():
+    """The worst error of the area decreases at least with power 0.8 of the cell size."""
     cells = np.array([2e-3, 1e-3, 0.5e-3])
     errors = [worst_errors((8e-3, 5e-3), cell, places=8)["area"] for cell in cells]
     assert np.polyfit(np.log(cells), np.log(errors), 1)[0] > 0.8
 
 
-def test_film_reads_a_uniform_pressure_by_counting_cells():
-    """A square of 10 × 10 cells at 3 MPa: force, area and perimeter exactly."""
+def test_a_pressure_film_measures_a_uniform_pressure_exactly():
     cell = 1e-3
 
     def field(x, z):
         return np.where((np.abs(x) < 5e-3) & (np.abs(z) < 5e-3), 3e6, 0.0)
 
-    read = PressureFilm(cell).read(field, np.full(2, -5e-3), np.full(2, 5e-3))
-    assert read.cells == 100 and read.perimeter_cells == 36
-    assert read.force == pytest.approx(300.0)
-    assert read.mean_pressure == pytest.approx(3e6)
+    reading = PressureFilm(cell).read(field, np.full(2, -5e-3), np.full(2, 5e-3))
+    assert reading.cells == 100 and reading.perimeter_cells == 36
+    assert reading.force == pytest.approx(300.0)
+    assert reading.mean_pressure == pytest.approx(3e6)
     assert (
         PressureFilm(cell, threshold=4e6).read(field, np.full(2, -5e-3), np.full(2, 5e-3)).cells
         == 0
     )
 
 
-def test_film_errors_grow_with_the_perimeter_share():
-    """What the sensor's paper found: errors follow perimeter cells over cells."""
+def test_errors_of_a_pressure_film_increase_with_the_perimeter_share():
     share, area = [], []
     for size in (4e-3, 6e-3, 9e-3, 14e-3):
         axes = (size, size / 1.5)
-        reach = np.array(axes)
+        corner = np.array(axes)
         share.append(
-            PressureFilm(1.27e-3).read(hertz_field(axes, 1.0), -reach, reach).perimeter_share
+            PressureFilm(1.27e-3).read(hertz_field(axes, 1.0), -corner, corner).perimeter_share
         )
         area.append(worst_errors(axes, 1.27e-3, places=8)["area"])
     assert (np.diff(share) < 0.0).all()

@@ -1,4 +1,4 @@
-"""Bands of worn volume: known where wear is proportional to what varies."""
+"""Bands of wear: closed forms for wear that is proportional to the varied input."""
 
 import csv
 import json
@@ -43,10 +43,10 @@ def sampled(case, inputs=(FACTOR,), samples=20, **options):
 
 
 def test_a_plate_has_the_band_of_its_wear_factor():
-    """Volume and depth are proportional to k: their quantiles are those of the lognormal."""
+    """Volume and depth are proportional to k, so their quantiles are log-normal."""
     bands, rows = sampled(small_case(), samples=64)
-    for end, at in (("p05", 0.05), ("p50", 0.5), ("p95", 0.95)):
-        factor = np.exp(SPREAD * norm.ppf(at) - 0.5 * SPREAD**2)
+    for end, probability in (("p05", 0.05), ("p50", 0.5), ("p95", 0.95)):
+        factor = np.exp(SPREAD * norm.ppf(probability) - 0.5 * SPREAD**2)
         for name in ("volume_mm3", "max_depth_mm"):
             for row, band in zip(rows[1:], bands.rows[1:], strict=True):
                 assert band[f"{name}_{end}"] == pytest.approx(factor * row[name], rel=0.05)
@@ -55,7 +55,7 @@ def test_a_plate_has_the_band_of_its_wear_factor():
     assert (bands.failed, bands.ended) == (0, 0)
 
 
-def test_creep_has_the_band_of_its_constants_and_none_of_the_wear_factor():
+def test_creep_has_the_band_of_its_constants_alone():
     law = LogarithmicCreep(3e-3, 8e-4, 1.0)
     inputs = (VariedInput("creep", 0.2, "relative"),)
     bands, _ = sampled(small_case(0.0, law), inputs, samples=128)
@@ -63,23 +63,23 @@ def test_creep_has_the_band_of_its_constants_and_none_of_the_wear_factor():
     spread = np.sqrt(np.log1p(0.2**2))
     assert high / low == pytest.approx(np.exp(2 * spread * norm.ppf(0.95)), rel=0.05)
     assert bands.rows[-1]["volume_mm3_p95"] == 0.0
-    without, _ = sampled(small_case(1e-6, law))
-    crept = {without.rows[-1][f"creep_depth_mm_{end}"] for end in ("p05", "p95")}
-    assert max(crept) == pytest.approx(min(crept), rel=1e-3)
+    factor_bands, _ = sampled(small_case(1e-6, law))
+    creep_limits = {factor_bands.rows[-1][f"creep_depth_mm_{end}"] for end in ("p05", "p95")}
+    assert max(creep_limits) == pytest.approx(min(creep_limits), rel=1e-3)
 
 
-def test_samples_that_wear_through_are_counted_and_in_no_band_from_there_on():
-    """9.9 mm are there, and the middle sample takes 80 % of it: k decides who gets to the end."""
+def test_later_bands_exclude_samples_that_wear_through():
+    """The nominal depth is 80 % of the thickness of 9.9 mm. Samples with larger k wear through."""
     depth = 100.0 / 64 * 24e-3 * CYCLES  # mm per mm³/(N m)
     bands, _ = sampled(small_case(0.8 * 9.9 / depth), samples=64)
     assert 10 < bands.ended < 32
     assert bands.rows[-1]["max_depth_mm_p95"] < 9.9
     assert f"{bands.ended} of 64 samples wore through" in bands.questions()[0]
-    most, _ = sampled(small_case(1.5 * 9.9 / depth))
-    assert np.isnan(most.rows[-1]["volume_mm3_p50"])  # more than half: nothing is said
+    no_bands, _ = sampled(small_case(1.5 * 9.9 / depth))
+    assert np.isnan(no_bands.rows[-1]["volume_mm3_p50"])  # more than half wear through
 
 
-def test_a_sample_moves_the_whole_cycle_by_the_constant_part_of_its_pose_error():
+def test_the_constant_part_of_a_pose_error_moves_the_whole_cycle():
     inputs = (VariedInput("ap", 2.0, "mm"), VariedInput("axial_rotation", 3.0, "deg"))
     case = small_case()
     moved = moved_case(case, Draw(inputs, np.array([1.0, -2.0]), np.zeros((1, 0)), 0.25))
@@ -90,53 +90,52 @@ def test_a_sample_moves_the_whole_cycle_by_the_constant_part_of_its_pose_error()
     assert moved.motion.load is case.motion.load
 
 
-def test_a_simulators_place_varies_only_where_the_table_says_so():
+def test_the_pose_of_a_profile_varies_only_by_stated_deviations():
     case = small_case()
-    said = UncertaintyTable.model_validate({"ap_mm": 0.5})
-    names = {one.name for one in varied_wear_inputs(said, case.motion, None, True)}
+    table = UncertaintyTable.model_validate({"ap_mm": 0.5})
+    names = {varied.name for varied in varied_wear_inputs(table, case.motion, None, True)}
     assert names == {"ap", "wear_factor"}
-    recorded = {one.name for one in varied_wear_inputs(said, case.motion, None, False)}
+    recorded = {varied.name for varied in varied_wear_inputs(table, case.motion, None, False)}
     assert recorded == {"ap", "ml", "adduction", "axial_rotation", "flexion", "wear_factor"}
-    nothing = UncertaintyTable.model_validate({"wear_factor": 0.0})
+    constant = UncertaintyTable.model_validate({"wear_factor": 0.0})
     with pytest.raises(InputError, match="nothing of a wear simulation varies"):
-        varied_wear_inputs(nothing, case.motion, None, True)
+        varied_wear_inputs(constant, case.motion, None, True)
 
 
-def test_inputs_that_err_together_do_so_in_a_wear_simulation():
-    """Those of the table that a wear simulation varies; the other pairs are a run's."""
-    both = [
+def test_correlations_of_wear_inputs_are_used():
+    pairs = [
         {"between": ["ap", "wear_factor"], "coefficient": 0.6},
         {"between": ["ap", "tuberosity.ap"], "coefficient": 0.9},
     ]
-    table = UncertaintyTable.model_validate({"ap_mm": 0.5, "correlation": both})
+    table = UncertaintyTable.model_validate({"ap_mm": 0.5, "correlation": pairs})
     case = small_case()
-    found = Sampling.of(SimpleNamespace(uncertainty=table, simulated=True), case, 20)
-    covariance = dict(zip(("ap", "wear_factor"), found.root @ found.root.T, strict=True))
+    sampling = Sampling.of(SimpleNamespace(uncertainty=table, simulated=True), case, 20)
+    covariance = dict(zip(("ap", "wear_factor"), sampling.root @ sampling.root.T, strict=True))
     assert covariance["ap"] == pytest.approx([1.0, 0.6])
     assert covariance["wear_factor"] == pytest.approx([0.6, 1.0])
 
 
-def test_a_creep_laws_factor_multiplies_its_strain():
+def test_the_factor_of_a_creep_law_multiplies_its_strain():
     law = LogarithmicCreep(1e-3, 2e-4, 10.0)
     assert law.times(1.3).strain_per_pascal(5e5) == pytest.approx(1.3 * law.strain_per_pascal(5e5))
 
 
-def test_interrupted_samples_go_on_to_the_same_band(tmp_path):
+def test_resumed_samples_give_the_same_band(tmp_path):
     case, identity = small_case(), {"wear simulation": "x"}
-    whole, _ = sampled(case)
-    begun = Shards(tmp_path, identity, False, ".samples")
+    uninterrupted, _ = sampled(case)
+    first_shards = Shards(tmp_path, identity, False, ".samples")
     with pytest.raises(KeyboardInterrupt, match="8 of 20 samples are kept"):
-        sampled(case, shards=begun, progress=broken_off(8))
-    computed = []
+        sampled(case, shards=first_shards, progress=broken_off(8))
+    sample_counts = []
 
-    def counted(samples, count):
-        computed.append(count)
+    def record_count(samples, count):
+        sample_counts.append(count)
         return samples
 
-    again = Shards(tmp_path, identity, True, ".samples")
-    resumed, _ = sampled(case, shards=again, progress=counted)
-    assert computed == [12]
-    assert resumed.rows == whole.rows
+    resumed_shards = Shards(tmp_path, identity, True, ".samples")
+    resumed, _ = sampled(case, shards=resumed_shards, progress=record_count)
+    assert sample_counts == [12]
+    assert resumed.rows == uninterrupted.rows
 
 
 @pytest.mark.parametrize("samples", [-1, 5, 10**6])
@@ -146,7 +145,7 @@ def test_too_few_or_too_many_samples_are_refused(samples):
 
 
 @pytest.mark.slow
-def test_a_scene_with_uncertainty_gets_bands_in_every_output(capsys, tmp_path):
+def test_a_scene_with_uncertainty_has_bands_in_every_output(capsys, tmp_path):
     cycle = tmp_path / "cycle.csv"
     cycle.write_text(
         "cycle_percent,axial_force_N,flexion_deg\n0,300,0\n50,900,30\n100,300,0\n", "utf-8"
@@ -154,30 +153,30 @@ def test_a_scene_with_uncertainty_gets_bands_in_every_output(capsys, tmp_path):
     scene = balls_scene(tmp_path / "scene")
     with open(scene, "a", encoding="utf-8") as file:
         file.write("\n[uncertainty]\nwear_factor = 0.6\nml_mm = 1.0\n")
-    quick = ("--simulator", str(cycle), "--resolution", "4", "--frames-per-cycle", "3")
-    quick = (*quick, "--updates", "1", "--cycles", "1000")
-    assert main(["wear", str(scene), *quick, "--out", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert "factor of two" in said[0]
-    assert any(line.startswith("5 to 95 % of 32 samples: volume") for line in said)
-    found = json.loads((tmp_path / "out/wear.json").read_text())
+    options = ("--simulator", str(cycle), "--resolution", "4", "--frames-per-cycle", "3")
+    options = (*options, "--updates", "1", "--cycles", "1000")
+    assert main(["wear", str(scene), *options, "--out", str(tmp_path / "out")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "factor of two" in lines[0]
+    assert any(line.startswith("5 to 95 % of 32 samples: volume") for line in lines)
+    report = json.loads((tmp_path / "out/wear.json").read_text())
     with open(tmp_path / "out/wear.csv", encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
-    low, high = (found["bands"][f"volume_mm3_{end}"] for end in ("p05", "p95"))
-    assert 0 < low < found["volume_mm3"] < high
+    low, high = (report["bands"][f"volume_mm3_{end}"] for end in ("p05", "p95"))
+    assert 0 < low < report["volume_mm3"] < high
     assert float(last["volume_mm3_p95"]) == high
-    assert found["bands"]["standard_deviations"] == {"ml (mm)": 1.0, "wear_factor (relative)": 0.6}
-    assert "loads" in found["bands"]["not_varied"]
+    assert report["bands"]["standard_deviations"] == {"ml (mm)": 1.0, "wear_factor (relative)": 0.6}
+    assert "loads" in report["bands"]["not_varied"]
     assert not (tmp_path / "out/.wear_samples").exists()
 
 
 @pytest.mark.slow
-def test_two_workers_give_the_numbers_of_one_with_a_contact_model():
-    """Modulus and place vary too: each worker prepares the contact of every sample anew."""
+def test_two_workers_give_the_bands_of_one():
+    """Modulus and pose vary too, so each worker prepares the contact of every sample."""
     case = ball_case(shapes.trough(0.03), 20 * MM, swing(0.5, 3, 500.0), 1e-7, 3.0)
     inputs = (VariedInput("ap", 0.5, "mm"), VariedInput("young_modulus", 0.1, "relative"), FACTOR)
-    alone, rows = sampled(case, inputs)
-    together, _ = sampled(case, inputs, crew=PoolOptions(2))
-    assert together.rows == alone.rows
-    low, high = (alone.rows[-1][f"volume_mm3_{end}"] for end in ("p05", "p95"))
+    single, rows = sampled(case, inputs)
+    parallel, _ = sampled(case, inputs, crew=PoolOptions(2))
+    assert parallel.rows == single.rows
+    low, high = (single.rows[-1][f"volume_mm3_{end}"] for end in ("p05", "p95"))
     assert 0 < low < rows[-1]["volume_mm3"] < high

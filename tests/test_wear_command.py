@@ -1,4 +1,4 @@
-"""`tkamb wear` from the command line: what it writes, what it refuses, and a kill on the way."""
+"""`tkamb wear` on the command line: written files, refused input, and interruption."""
 
 import csv
 import json
@@ -57,35 +57,33 @@ def written(tmp_path_factory, profile, scene):
 
 def refused(capsys, *arguments):
     assert main(["wear", *map(str, arguments)]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    return said[0]
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
 
 
-def test_table_summary_maps_and_mesh_tell_of_one_volume(written, scene):
+def test_table_summary_maps_and_mesh_have_the_same_volume(written, scene):
     names = {path.name for path in written.iterdir()}
     assert names == {".tkamb", "wear.csv", "wear.json", "wear.vtp", "worn_insert.stl", "wear.png"}
-    found = json.loads((written / "wear.json").read_text())
+    report = json.loads((written / "wear.json").read_text())
     with open(written / "wear.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert float(rows[-1]["volume_mm3"]) == found["volume_mm3"] > 0
-    assert float(rows[-1]["cycles"]) == found["cycles"] == 100_000
-    assert found["mass_mg"] == pytest.approx(0.93 * found["volume_mm3"])
-    assert found["creep_depth_mm"] is None and rows[-1]["creep_depth_mm"] == ""
-    drawn = (written / "wear.vtp").read_bytes()
-    assert b"wear_depth_mm" in drawn and b"creep_depth_mm" not in drawn
-    assert found["mesh_volume_lost_mm3"] == pytest.approx(found["volume_mm3"], rel=1e-6)
+    assert float(rows[-1]["volume_mm3"]) == report["volume_mm3"] > 0
+    assert float(rows[-1]["cycles"]) == report["cycles"] == 100_000
+    assert report["mass_mg"] == pytest.approx(0.93 * report["volume_mm3"])
+    assert report["creep_depth_mm"] is None and rows[-1]["creep_depth_mm"] == ""
+    maps = (written / "wear.vtp").read_bytes()
+    assert b"wear_depth_mm" in maps and b"creep_depth_mm" not in maps
+    assert report["mesh_volume_lost_mm3"] == pytest.approx(report["volume_mm3"], rel=1e-6)
     worn, new = (
         trimesh.load(p) for p in (written / "worn_insert.stl", scene.parent / "dishes.stl")
     )
-    # single precision in the files: 1e-7 of the insert
-    assert new.volume - worn.volume == pytest.approx(found["volume_mm3"], abs=2e-6 * new.volume)
+    # the files have single precision, which is 1e-7 of the insert
+    assert new.volume - worn.volume == pytest.approx(report["volume_mm3"], abs=2e-6 * new.volume)
     assert worn.is_watertight
 
 
-def test_doubling_the_wear_factor_doubles_the_first_cycles_and_is_said(
-    capsys, tmp_path, profile, scene, written
-):
+def test_doubling_the_wear_factor_doubles_the_wear(capsys, tmp_path, profile, scene, written):
     single = json.loads((written / "wear.json").read_text())
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--json"]
     assert main([*worn, "--cycles", "100", "--wear-factor", "5.2e-7", "--out", str(tmp_path)]) == 0
@@ -95,14 +93,16 @@ def test_doubling_the_wear_factor_doubles_the_first_cycles_and_is_said(
 
 
 @pytest.mark.slow
-def test_a_killed_simulation_goes_on_to_the_same_end(monkeypatch, capsys, tmp_path, profile, scene):
+def test_an_interrupted_simulation_is_resumed_to_the_same_result(
+    monkeypatch, capsys, tmp_path, profile, scene
+):
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--cycles", "60000"]
     assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
-    keep, left = wear_run.keep_state, iter([True])
+    keep, stops = wear_run.keep_state, iter([True])
 
-    def keep_and_stop(*given):
-        keep(*given)
-        if next(left):
+    def keep_and_stop(*arguments):
+        keep(*arguments)
+        if next(stops):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(wear_run, "keep_state", keep_and_stop)
@@ -113,15 +113,14 @@ def test_a_killed_simulation_goes_on_to_the_same_end(monkeypatch, capsys, tmp_pa
     assert main(other) == 2
     assert "another simulation" in capsys.readouterr().err
     assert main([*worn, "--out", str(tmp_path / "part"), "--resume"]) == 0
-    whole, part = (
+    complete, resumed = (
         (tmp_path / name / "wear.csv").read_text(encoding="utf-8") for name in ("whole", "part")
     )
-    assert part == whole
+    assert resumed == complete
 
 
 @pytest.mark.slow
-def test_a_simulation_that_was_killed_goes_on_to_the_same_end(tmp_path, profile, scene):
-    """SIGKILL as soon as the first block is kept: nothing is lost, nothing half written is read."""
+def test_a_killed_simulation_is_resumed_to_the_same_result(tmp_path, profile, scene):
     worn = ["wear", str(scene), "--simulator", str(profile), *QUICK[:-1], "6", "--cycles", "60000"]
     assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
     part = tmp_path / "part"
@@ -138,7 +137,7 @@ def test_a_simulation_that_was_killed_goes_on_to_the_same_end(tmp_path, profile,
         assert (part / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
-def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, scene):
+def test_invalid_input_is_an_error_of_one_line(capsys, tmp_path, profile, scene):
     out = tmp_path / "out"
     cases = {
         ("--cycles", "0"): "0 cycles",
@@ -157,8 +156,8 @@ def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, s
         ("--contact", "latice"): "did you mean lattice",
     }
     for options, words in cases.items():
-        said = refused(capsys, scene, "--simulator", profile, *options, "--out", out)
-        assert words in said, options
+        message = refused(capsys, scene, "--simulator", profile, *options, "--out", out)
+        assert words in message, options
         assert not out.exists()
     with pytest.raises(SystemExit, match="2"):
         main(["wear", str(scene), "--cycles", "1.5"])
@@ -166,7 +165,7 @@ def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, s
 
 
 @pytest.mark.parametrize(
-    ("turned", "words"),
+    ("change", "words"),
     [
         (("100,300,0,0,0", "100,300,5,0,0"), "does not close: 'flexion_deg'"),
         (("100,300,0,0,0", "99,300,0,0,0"), "runs from 0 to 99"),
@@ -178,36 +177,38 @@ def test_bad_input_is_one_line_and_leaves_no_folder(capsys, tmp_path, profile, s
         (("axial_force_N", "adduction_deg"), "no column 'axial_force_N'"),
     ],
 )
-def test_a_profile_that_is_none_is_refused(tmp_path, turned, words):
+def test_an_invalid_profile_is_refused(tmp_path, change, words):
     path = tmp_path / "cycle.csv"
-    path.write_text(CYCLE.replace(*turned), encoding="utf-8")
+    path.write_text(CYCLE.replace(*change), encoding="utf-8")
     with pytest.raises(InputError, match=words):
         read_profile(path, 10)
 
 
-def test_a_profile_moves_the_femur_about_its_dwell_position(profile, scene):
+def test_positions_of_a_profile_are_relative_to_the_dwell_position(profile, scene):
     setup = wear_setup(scene, simulator=profile, resolution_mm=3.0, frames=101)
-    found = knee_coordinates(setup.motion.poses)
-    assert np.degrees(found[[0, 15, 70, 100], 5]) == pytest.approx([0, 15, 58, 0], abs=1e-9)
-    assert (found[:, 0] - found[0, 0])[[15, 45, 70]] == pytest.approx([-1e-3, 1e-3, -3e-3])
+    coordinates = knee_coordinates(setup.motion.poses)
+    assert np.degrees(coordinates[[0, 15, 70, 100], 5]) == pytest.approx([0, 15, 58, 0], abs=1e-9)
+    assert (coordinates[:, 0] - coordinates[0, 0])[[15, 45, 70]] == pytest.approx(
+        [-1e-3, 1e-3, -3e-3]
+    )
     assert setup.motion.load[[0, 15, 70]] == pytest.approx([300, 1800, 200])
-    # two balls over two dishes: the middle, within the facets
-    assert (found[0, 0], found[0, 2]) == pytest.approx((0.0, 0.0), abs=1e-3)
+    # the dwell position of two spheres on two dishes is the middle, apart from the facets
+    assert (coordinates[0, 0], coordinates[0, 2]) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
 @pytest.mark.slow
-def test_a_folder_of_results_and_its_scene_wear_the_same(tmp_path):
+def test_a_folder_of_results_and_its_scene_give_the_same_cycle(tmp_path):
     scene = write_scene(tmp_path / "scene", contact__resolution_mm=3.0)
     assert main(["run", str(scene), "--frames", "0:101:17", "--out", str(tmp_path / "run")]) == 0
     folder = wear_setup(tmp_path / "run", frames=6, close="there-and-back")
-    again = wear_setup(scene, frames=6, close="there-and-back")
-    assert folder.motion.passes == again.motion.passes == 2
-    # the run left out the recording's last frame, the scene's own motion has it
-    assert folder.motion.poses[0] == pytest.approx(again.motion.poses[0], abs=1e-9)
-    assert [len(one.motion) for one in (folder, again)] == [6, 6]
-    assert again.motion.duration > folder.motion.duration
+    from_scene = wear_setup(scene, frames=6, close="there-and-back")
+    assert folder.motion.passes == from_scene.motion.passes == 2
+    # the run does not include the last recorded frame, but the motion of the scene does
+    assert folder.motion.poses[0] == pytest.approx(from_scene.motion.poses[0], abs=1e-9)
+    assert [len(wear_inputs.motion) for wear_inputs in (folder, from_scene)] == [6, 6]
+    assert from_scene.motion.duration > folder.motion.duration
     scene.write_text(scene.read_text().replace("75.0", "76.0"), encoding="utf-8")
-    with pytest.raises(InputError, match="another scene"):
+    with pytest.raises(InputError, match="an earlier version of the scene file"):
         wear_setup(tmp_path / "run")
 
 
@@ -217,33 +218,33 @@ def test_a_scene_without_contact_is_refused(tmp_path):
         wear_setup(scene)
 
 
-def test_every_built_in_material_names_its_sources_and_has_its_law():
+def test_every_built_in_material_has_sources_and_its_law():
     for name in material_names():
-        found = wear_material(name)
-        assert found.sources and found.caution and found.range_source
-        low, high = found.factor_range
+        material = wear_material(name)
+        assert material.sources and material.caution and material.range_source
+        low, high = material.factor_range
         assert low < 1 < high
-        for law in found.laws:
-            assert found.wear_law(law).name == law
+        for law in material.laws:
+            assert material.wear_law(law).name == law
 
 
-def test_results_have_their_range_their_geometry_and_the_laws_side_by_side(written):
-    found = json.loads((written / "wear.json").read_text())
-    made_of = wear_material("conventional")
+def test_results_have_ranges_and_the_rates_of_all_laws(written):
+    report = json.loads((written / "wear.json").read_text())
+    material = wear_material("conventional")
     for key in ("volume_mm3", "mass_mg", "max_depth_mm", "volume_mm3_per_Mc"):
-        expected = [factor * found[key] for factor in made_of.factor_range]
-        assert found[f"{key}_range"] == pytest.approx(expected)
-    assert "contact area cancels" in found["geometry"]
-    laws = {one["law"]: one for one in found["laws_side_by_side"]}
+        expected = [factor * report[key] for factor in material.factor_range]
+        assert report[f"{key}_range"] == pytest.approx(expected)
+    assert "contact area cancels" in report["geometry"]
+    laws = {entry["law"]: entry for entry in report["laws_side_by_side"]}
     assert set(laws) == {"archard", "cross-shear", "contact-area"}
-    # the first cycle's rate is that of the law that was chosen, before the shape changes
+    # on the unworn insert, the chosen law has the rate of the simulation
     first = laws["cross-shear"]["first_volume_mm3_per_Mc"]
-    assert first == pytest.approx(found["volume_mm3_per_Mc"], rel=0.1)
+    assert first == pytest.approx(report["volume_mm3_per_Mc"], rel=0.1)
     assert "more conforming" in laws["contact-area"]["geometry"]
 
 
-def test_conforming_dishes_wear_as_much_by_archard_and_more_by_area(tmp_path):
-    """The same load and path on more area: the same volume by Archard, more by area."""
+def test_conformity_increases_wear_by_area_but_not_by_archard(tmp_path):
+    """The load and the path per radius are equal, and the area of the tight contact is larger."""
     motion = swing(0.4, 5, 500.0)
     trough = shapes.trough(0.03)
     volumes = {}
@@ -251,31 +252,33 @@ def test_conforming_dishes_wear_as_much_by_archard_and_more_by_area(tmp_path):
         case = swinging_case(shapes.sphere(radius, 4), trough, motion)
         path = 500.0 * radius * 0.8
         laws = {"archard": Archard(1e-7), "area": ContactArea((0.0, 0.5), (1e-9, 1e-9))}
-        found = first_cycle(case, laws).volumes
-        volumes[name] = {law: volume / path for law, volume in found.items()}
-    archard, area = ({n: v[law] for n, v in volumes.items()} for law in ("archard", "area"))
+        cycle_volumes = first_cycle(case, laws).volumes
+        volumes[name] = {law: volume / path for law, volume in cycle_volumes.items()}
+    archard, area = (
+        {fit: by_law[law] for fit, by_law in volumes.items()} for law in ("archard", "area")
+    )
     assert archard["tight"] == pytest.approx(archard["loose"], rel=0.03)
     assert area["tight"] > 1.3 * area["loose"]
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("line", "words"),
     [
         ("factor_range = [0.5]", "cannot be"),
         ("factor_range = [1.5, 2.0]", "at most 1"),
         ("factor_range = [0.5, 2.0]", "'range_source' is missing"),
     ],
 )
-def test_a_range_that_is_none_is_refused(tmp_path, given, words):
+def test_an_invalid_range_of_factors_is_refused(tmp_path, line, words):
     path = tmp_path / "mine.toml"
     head = 'density_kg_per_m3 = 940\nlaw = "archard"\nsources = ["here"]\n'
     laws = "[laws.archard]\nwear_factor_mm3_per_Nm = 2e-7\n"
-    path.write_text(f"{head}{given}\n{laws}", encoding="utf-8")
+    path.write_text(f"{head}{line}\n{laws}", encoding="utf-8")
     with pytest.raises(InputError, match=words):
         wear_material(path)
 
 
-def test_a_material_file_brings_laws_and_creep(tmp_path):
+def test_a_material_file_contains_laws_and_creep(tmp_path):
     path = tmp_path / "mine.toml"
     text = """
 density_kg_per_m3 = 940
@@ -289,10 +292,10 @@ per_decade_per_MPa = 8e-4
 reference_min = 1000.0
 """
     path.write_text(text, encoding="utf-8")
-    found = wear_material(path)
-    assert found.wear_law().wear_factor_mm3_per_Nm == 2e-7
-    assert found.wear_law("archard", 4e-7).wear_factor_mm3_per_Nm == 4e-7
-    assert found.creep.per_decade_per_MPa == 8e-4
+    material = wear_material(path)
+    assert material.wear_law().wear_factor_mm3_per_Nm == 2e-7
+    assert material.wear_law("archard", 4e-7).wear_factor_mm3_per_Nm == 4e-7
+    assert material.creep.per_decade_per_MPa == 8e-4
     for old, new, words in (
         ("2e-7", "-2e-7", "cannot be -2e-07"),
         ("940", "0.94", "density"),
@@ -305,7 +308,7 @@ reference_min = 1000.0
             wear_material(path)
 
 
-def test_laws_say_which_parameter_is_missing_or_unknown():
+def test_a_missing_or_unknown_parameter_of_a_law_is_named():
     assert set(law_names()) >= {"archard", "cross-shear", "pressure-cross-shear", "contact-area"}
     with pytest.raises(InputError, match="does not give 'across_to_along'"):
         wear_law("cross-shear", {"wear_factor_mm3_per_Nm": 1e-6})

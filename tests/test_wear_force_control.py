@@ -1,4 +1,4 @@
-"""Force control of the virtual simulator: rest where it is known, and what it does to a cycle."""
+"""Force control of the virtual simulator: equilibria with closed forms, and cycles of wear."""
 
 import json
 from dataclasses import replace
@@ -20,8 +20,8 @@ from tkamb.studies.wear.laws import Archard
 from tkamb.studies.wear.motion import CycleMotion
 from tkamb.studies.wear.simulation import WearCase, simulate_wear
 from tkamb.studies.wear.simulator import (
+    EquilibriumPoses,
     ForceDrive,
-    RestingPoses,
     Spring,
     Springs,
     read_profile,
@@ -50,18 +50,18 @@ gap_deg = 1.0
 
 
 def machine(applied, free, springs=None):
-    """A drive of (f, 6) forces at coordinates that begin at zero."""
+    """Return the drive of forces (f, 6), with the initial guess zero."""
     applied = np.atleast_2d(np.asarray(applied, float))
-    held = springs and Springs(springs, ("test",), {})
-    return ForceDrive(np.zeros_like(applied), applied, free, np.zeros(6), held)
+    all_springs = springs and Springs(springs, ("test",), {})
+    return ForceDrive(np.zeros_like(applied), applied, free, np.zeros(6), all_springs)
 
 
-def rest(insert, femoral, drive, load, resolution=2.0):
-    """Return the coordinates (6,) at which a drive's first row rests, and what stops it."""
+def equilibrium(insert, femoral, drive, load, resolution=2.0):
+    """Return the equilibrium coordinates (6,) of the first row, and the reason of failure."""
     model = contact_model("foundation", resolution)
     pair = ContactPair(femoral, insert, material("polyethylene-linear"))
-    pose, why = RestingPoses(model, model.prepare(pair), drive).at(0, load, None)
-    return knee_coordinates(pose), why
+    pose, reason = EquilibriumPoses(model, model.prepare(pair), drive).at(0, load, None)
+    return knee_coordinates(pose), reason
 
 
 def ball():
@@ -76,45 +76,45 @@ def dish(radius, depth=10 * MM, spacing=0.5 * MM):
 
 
 @pytest.mark.parametrize("share", [0.15, pytest.param(-0.05, marks=pytest.mark.slow)])
-def test_a_ball_in_a_dish_rests_where_the_normal_lies_along_the_resultant(share):
-    """tan = P/F about the dish's centre: both bodies are symmetric about the line of centres."""
+def test_the_normal_of_a_ball_in_a_dish_is_parallel_to_the_resultant(share):
+    """Both bodies are symmetric about the line of centres, so tan(angle) = P/F."""
     load, radius = 800.0, 40 * MM
     applied = [share * load, -load, 0, 0, 0, 0]
     drive = machine(applied, (AP, SI))
-    found, why = rest(dish(radius), graded_sphere(25 * MM), drive, load, 1.0)
-    assert not why
-    # the bed is thicker up the slope, by half a per cent of stiffness over the contact
-    assert found[AP] / (10 * MM + radius - found[SI]) == pytest.approx(share, rel=0.01)
+    coordinates, reason = equilibrium(dish(radius), graded_sphere(25 * MM), drive, load, 1.0)
+    assert not reason
+    # the thickness of the bed changes its stiffness by half a per cent over the contact
+    assert coordinates[AP] / (10 * MM + radius - coordinates[SI]) == pytest.approx(share, rel=0.01)
 
 
 @pytest.mark.parametrize(("force", "gap"), [(60.0, 0.0), (-45.0, 0.7 * MM)])
-def test_on_a_flat_plate_a_spring_with_a_gap_carries_the_ap_force(force, gap):
+def test_on_a_flat_plate_the_spring_balances_the_ap_force(force, gap):
     drive = machine([force, -500.0, 0, 0, 0, 0], (AP, SI), {"ap": Spring(30e3, gap)})
-    found, why = rest(flat_insert(10 * MM), ball(), drive, 500.0)
-    assert not why
-    assert found[AP] == pytest.approx(np.sign(force) * (abs(force) / 30e3 + gap), abs=2e-6)
+    coordinates, reason = equilibrium(flat_insert(10 * MM), ball(), drive, 500.0)
+    assert not reason
+    assert coordinates[AP] == pytest.approx(np.sign(force) * (abs(force) / 30e3 + gap), abs=2e-6)
 
 
 @pytest.mark.parametrize(("torque", "gap"), [(-2.0, np.radians(2.5))])
-def test_on_a_flat_plate_a_spring_with_a_gap_carries_the_axial_torque(torque, gap):
+def test_on_a_flat_plate_the_spring_balances_the_axial_torque(torque, gap):
     stiffness = np.degrees(0.4)  # 0.4 N·m/deg
     applied = [0, -900.0, 0, torque, 0, 0]
     drive = machine(applied, (SI, TURN), {"axial_rotation": Spring(stiffness, gap)})
     plate = flat_insert(10 * MM, 15 * MM, 34 * MM)
-    found, why = rest(plate, balls(), drive, 900.0)
-    assert not why
-    turned = np.sign(torque) * (abs(torque) / stiffness + gap)
-    assert found[TURN] == pytest.approx(turned, abs=1e-4)
+    coordinates, reason = equilibrium(plate, balls(), drive, 900.0)
+    assert not reason
+    rotation = np.sign(torque) * (abs(torque) / stiffness + gap)
+    assert coordinates[TURN] == pytest.approx(rotation, abs=1e-4)
 
 
-def test_a_force_that_nothing_holds_is_no_pose():
+def test_a_force_without_resistance_has_no_equilibrium():
     drive = machine([60.0, -500.0, 0, 0, 0, 0], (AP, SI))
-    _, why = rest(flat_insert(10 * MM), ball(), drive, 500.0)
-    assert "no equilibrium" in why or "search begins" in why
+    _, reason = equilibrium(flat_insert(10 * MM), ball(), drive, 500.0)
+    assert "no equilibrium" in reason or "initial guess" in reason
 
 
-def test_the_dwell_position_is_where_the_ball_lies_deepest():
-    """A ball over a dish whose bottom lies ahead and to the left; the profile's zero is there."""
+def test_the_dwell_position_is_the_lowest_position():
+    """The lowest point of the dish is anterior and medial of the origin."""
     bottom = (6 * MM, -3 * MM)
 
     def height(x, z):
@@ -122,14 +122,13 @@ def test_the_dwell_position_is_where_the_ball_lies_deepest():
 
     femoral = graded_sphere(12 * MM)
     engine = ContactEngine(contact_model("foundation", 2.0), femoral, material("polyethylene"))
-    found = engine.dwell(dished_insert(height), np.eye(3))
-    assert found == pytest.approx(bottom, abs=0.2 * MM)
-    assert zero_at(found)[[0, 2]] == pytest.approx(found)
-    assert not zero_at(found)[[1, 3, 4, 5]].any()
+    dwell = engine.dwell(dished_insert(height), np.eye(3))
+    assert dwell == pytest.approx(bottom, abs=0.2 * MM)
+    assert zero_at(dwell)[[0, 2]] == pytest.approx(dwell)
+    assert not zero_at(dwell)[[1, 3, 4, 5]].any()
 
 
 def dish_case(applied):
-    """A ball in a dish under forces, row by row."""
     engine = ContactEngine(contact_model("foundation", 2.0), ball(), material("polyethylene"))
     drive = machine(applied, (AP, SI, ML))
     motion = CycleMotion(knee_pose(drive.coordinates), -applied[:, SI], 1.0, 1, drive=drive)
@@ -154,33 +153,32 @@ def driven():
     return case, *simulate_wear(case, 10, 1)
 
 
-def test_positions_that_force_control_found_give_the_same_wear_in_displacement_control(driven):
+def test_equilibrium_poses_give_the_same_wear_in_displacement_control(driven):
     case, state, _ = driven
     maps = case.engine.maps(case.articular.surface, case.motion)
     prescribed = replace(case.motion, poses=maps.poses, drive=None)
-    again = case.engine.maps(case.articular.surface, prescribed)
-    assert again.pressure == pytest.approx(maps.pressure, abs=1e-6 * maps.pressure.max())
-    same, _ = simulate_wear(replace(case, motion=prescribed), 10, 1)
+    prescribed_maps = case.engine.maps(case.articular.surface, prescribed)
+    assert prescribed_maps.pressure == pytest.approx(maps.pressure, abs=1e-6 * maps.pressure.max())
+    prescribed_state, _ = simulate_wear(replace(case, motion=prescribed), 10, 1)
     assert state.volume > 0
-    assert same.volume == pytest.approx(state.volume, rel=1e-6)
-    assert same.wear == pytest.approx(state.wear, abs=1e-6 * state.wear.max())
+    assert prescribed_state.volume == pytest.approx(state.volume, rel=1e-6)
+    assert prescribed_state.wear == pytest.approx(state.wear, abs=1e-6 * state.wear.max())
 
 
-def test_rows_say_how_far_the_knee_went(driven):
+def test_rows_of_the_table_have_the_range_of_released_coordinates(driven):
     _, state, last = driven
-    found = knee_coordinates(last.poses)
+    coordinates = knee_coordinates(last.poses)
     row = state.rows[-1]
     assert (row["ap_low_mm"], row["ap_high_mm"]) == pytest.approx(
-        (found[:, AP].min() / MM, found[:, AP].max() / MM)
+        (coordinates[:, AP].min() / MM, coordinates[:, AP].max() / MM)
     )
     assert row["ml_high_mm"] > 0.5 > 0.1 > row["ml_low_mm"]
     assert row["failed_rows"] == 0
-    # the first and the last row ask the same, and are found from different places
-    assert found[0] == pytest.approx(found[-1], abs=1e-5)
+    # the first and the last row have equal loads and different initial guesses
+    assert coordinates[0] == pytest.approx(coordinates[-1], abs=1e-5)
 
 
-def test_a_row_without_equilibrium_is_left_out_of_the_cycle_and_too_many_end_it(driven):
-    """The cycle without the row is that of a profile that never had it."""
+def test_the_cycle_omits_failed_rows_and_fails_with_too_many(driven):
     applied = np.insert(FORCES, 2, [3000, -500, 0, 0, 0, 0], axis=0)
     state, last = simulate_wear(dish_case(applied), 10, 1)
     assert list(last.failed) == [2] and state.rows[-1]["failed_rows"] == 1
@@ -191,7 +189,7 @@ def test_a_row_without_equilibrium_is_left_out_of_the_cycle_and_too_many_end_it(
 
 
 @pytest.mark.parametrize(
-    ("turned", "words"),
+    ("change", "words"),
     [
         (("axial_torque_Nm", "ap_mm"), "both 'ap_force_N' and 'ap_mm'"),
         (("axial_torque_Nm", "axial_torque_Nmm"), "unknown column 'axial_torque_Nmm'"),
@@ -199,15 +197,15 @@ def test_a_row_without_equilibrium_is_left_out_of_the_cycle_and_too_many_end_it(
         (("15,-60", "15,-6000"), "'ap_force_N' is -6000"),
     ],
 )
-def test_a_profile_of_forces_that_is_none_is_refused(tmp_path, turned, words):
+def test_an_invalid_profile_of_forces_is_refused(tmp_path, change, words):
     path = tmp_path / "cycle.csv"
-    path.write_text(CYCLE.replace(*turned), encoding="utf-8")
+    path.write_text(CYCLE.replace(*change), encoding="utf-8")
     with pytest.raises(InputError, match=words):
         read_profile(path, 5)
 
 
 @pytest.mark.parametrize(
-    ("turned", "words"),
+    ("change", "words"),
     [
         (("stiffness_N_per_mm = 30.0\n", ""), "it needs: stiffness_N_per_mm, gap_mm"),
         (("30.0", "-30.0"), "cannot be -30"),
@@ -221,14 +219,14 @@ def test_a_profile_of_forces_that_is_none_is_refused(tmp_path, turned, words):
         (("[ap]", "[ap"), "is not TOML"),
     ],
 )
-def test_springs_that_are_none_are_refused(tmp_path, turned, words):
+def test_invalid_springs_are_refused(tmp_path, change, words):
     path = tmp_path / "springs.toml"
-    path.write_text(SPRINGS.replace(*turned), encoding="utf-8")
+    path.write_text(SPRINGS.replace(*change), encoding="utf-8")
     with pytest.raises(InputError, match=words):
         read_springs(path)
 
 
-def test_a_spring_acts_on_what_a_force_is_given_for(tmp_path):
+def test_a_spring_needs_a_force_on_its_coordinate(tmp_path):
     profile, springs = tmp_path / "cycle.csv", tmp_path / "springs.toml"
     profile.write_text(CYCLE.replace("ap_force_N", "ml_force_N"), encoding="utf-8")
     springs.write_text(SPRINGS, encoding="utf-8")
@@ -245,56 +243,65 @@ def command(tmp_path_factory):
     folder = tmp_path_factory.mktemp("machine")
     for name, text in (("cycle.csv", CYCLE), ("springs.toml", SPRINGS)):
         (folder / name).write_text(text, encoding="utf-8")
-    worn = ["wear", str(balls_scene(folder)), "--simulator", str(folder / "cycle.csv")]
-    quick = ("--resolution", "4", "--frames-per-cycle", "5", "--updates", "1", "--cycles", "60000")
-    return [*worn, *quick, "--springs", str(folder / "springs.toml")]
+    arguments = ["wear", str(balls_scene(folder)), "--simulator", str(folder / "cycle.csv")]
+    options = (
+        "--resolution",
+        "4",
+        "--frames-per-cycle",
+        "5",
+        "--updates",
+        "1",
+        "--cycles",
+        "60000",
+    )
+    return [*arguments, *options, "--springs", str(folder / "springs.toml")]
 
 
-def test_the_report_says_which_control_and_where_it_found_the_knee(command):
+def test_the_report_has_control_springs_and_released_coordinates(command):
     machine = {"simulator": command[3], "springs": command[-1], "resolution_mm": 4.0, "frames": 5}
     run = wear_run.prepare_wear(command[1], cycles=100, updates=1, **machine)
     report = run.compute()
-    found = json.loads(json.dumps(report.as_dict()))
+    content = json.loads(json.dumps(report.as_dict()))
     assert any(line.startswith("force control: ap ") for line in report.lines())
-    assert found["control"] == "force"
-    assert found["found_in_equilibrium"] == ["ap", "axial_rotation"]
-    assert found["springs"]["ap"] == {"stiffness_N_per_mm": 30.0, "gap_mm": 0.5}
-    assert [row["status"] for row in found["last_cycle"]] == ["ok"] * 5
-    assert [row["flexion_deg"] for row in found["last_cycle"]] == pytest.approx([0, 15, 8, 50, 0])
-    places = [row["ap_mm"] for row in found["last_cycle"]]
-    assert (found["ap_low_mm"], found["ap_high_mm"]) == (min(places), max(places))
-    assert places[1] < places[0] < places[2]  # the femur goes where it is pushed
-    assert found["failed_rows"] == 0 and "friction of 0.05 is left out" in found["notes"][1]
+    assert content["control"] == "force"
+    assert content["found_in_equilibrium"] == ["ap", "axial_rotation"]
+    assert content["springs"]["ap"] == {"stiffness_N_per_mm": 30.0, "gap_mm": 0.5}
+    assert [row["status"] for row in content["last_cycle"]] == ["ok"] * 5
+    assert [row["flexion_deg"] for row in content["last_cycle"]] == pytest.approx([0, 15, 8, 50, 0])
+    positions = [row["ap_mm"] for row in content["last_cycle"]]
+    assert (content["ap_low_mm"], content["ap_high_mm"]) == (min(positions), max(positions))
+    assert positions[1] < positions[0] < positions[2]  # the femur moves along the AP force
+    assert content["failed_rows"] == 0 and "neglects the friction of 0.05" in content["notes"][1]
 
 
-def test_springs_without_a_simulator_are_one_line(command, tmp_path, capsys):
-    bare = [*command[:2], "--springs", command[-1], "--out", str(tmp_path / "out")]
-    assert main(bare) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1 and "--simulator" in said[0]
+def test_springs_without_a_simulator_are_an_error_of_one_line(command, tmp_path, capsys):
+    arguments = [*command[:2], "--springs", command[-1], "--out", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and "--simulator" in lines[0]
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_end_and_knows_its_springs(
+def test_an_interrupted_run_is_resumed_only_with_its_springs(
     command, monkeypatch, capsys, tmp_path
 ):
     assert main([*command, "--out", str(tmp_path / "whole")]) == 0
     keep = wear_run.keep_state
 
-    def keep_and_stop(*given):
-        keep(*given)
+    def keep_and_stop(*arguments):
+        keep(*arguments)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(wear_run, "keep_state", keep_and_stop)
     part = ["--out", str(tmp_path / "part")]
     assert main([*command, *part]) == 130
     monkeypatch.undo()
-    softer = tmp_path / "springs.toml"
-    softer.write_text(SPRINGS.replace("30.0", "20.0"), encoding="utf-8")
+    other_springs = tmp_path / "springs.toml"
+    other_springs.write_text(SPRINGS.replace("30.0", "20.0"), encoding="utf-8")
     capsys.readouterr()
-    assert main([*command[:-1], str(softer), *part, "--resume"]) == 2
+    assert main([*command[:-1], str(other_springs), *part, "--resume"]) == 2
     assert "another simulation" in capsys.readouterr().err
     assert main([*command, *part, "--resume"]) == 0
-    whole, again = ((tmp_path / name / "wear.csv").read_text() for name in ("whole", "part"))
-    assert again == whole
+    complete, resumed = ((tmp_path / name / "wear.csv").read_text() for name in ("whole", "part"))
+    assert resumed == complete

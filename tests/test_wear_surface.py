@@ -1,4 +1,4 @@
-"""The worn insert: refined without a crack, and every cubic millimetre accounted for."""
+"""The worn insert: refinement without cracks, and the balance of the worn volume."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def longest_edge(surface, faces):
 
 
 @pytest.mark.parametrize("spacing", [0.7, 2.3, 11.0])
-def test_refinement_keeps_a_box_closed_and_the_same(spacing):
+def test_refinement_keeps_a_box_closed_with_its_volume_and_area(spacing):
     box = flat_insert(8 * MM)
     fine = refined(box, spacing * MM, lambda s: s.face_normals[:, 1] > 0.1)
     assert fine.mesh.is_watertight
@@ -25,12 +25,12 @@ def test_refinement_keeps_a_box_closed_and_the_same(spacing):
     assert fine.mesh.area == pytest.approx(box.mesh.area, rel=1e-12)
 
 
-def test_refinement_of_what_is_fine_enough_is_the_surface_itself():
+def test_a_fine_surface_is_not_refined():
     box = flat_insert(8 * MM)
     assert refined(box, 1.0, lambda s: np.ones(len(s.faces), bool)) is box
 
 
-def test_volume_of_a_box_and_a_dish_by_their_closed_forms():
+def test_the_volume_of_a_box_and_a_dish_has_the_closed_form():
     assert volume(flat_insert(8 * MM)) == pytest.approx(30 * 30 * 8e-9, rel=1e-13)
     dish = dished_insert(lambda x, z: 5 * MM + 10 * (x**2 + z**2), spacing=0.25 * MM)
     exact = 0.03**2 * 5 * MM + 10 * 2 * 0.03 * 2 * 0.015**3 / 3
@@ -38,8 +38,7 @@ def test_volume_of_a_box_and_a_dish_by_their_closed_forms():
 
 
 @pytest.mark.parametrize("insert", [shapes.two_dishes(), shapes.trough(0.02), shapes.plate()])
-def test_the_mesh_loses_exactly_the_volume_of_the_map(insert):
-    """Three updates, each along the normals of the surface that the one before has left."""
+def test_the_mesh_loses_the_volume_of_the_wear_map(insert):
     articular = ArticularSurface.of_insert(insert, 1.5 * MM)
     points = articular.surface.vertices[articular.vertices]
     fall, mapped = np.zeros(len(points)), 0.0
@@ -54,8 +53,8 @@ def test_the_mesh_loses_exactly_the_volume_of_the_map(insert):
     assert articular.lowered(fall).mesh.is_watertight
 
 
-def test_a_sphere_worn_off_by_a_sphere_has_the_volume_of_its_shell():
-    """A dish of radius R deepened by h along its normals loses h (area) to first order in h/R."""
+def test_a_spherical_dish_loses_the_volume_of_a_shell():
+    """A dish of radius R that loses h along its normals loses h times area, to first order."""
     radius, half, depth = 30 * MM, 15 * MM, 1e-3 * MM
     dish = dished_insert(
         lambda x, z: 35 * MM - np.sqrt(radius**2 - x**2 - z**2), half, half, 0.5 * MM
@@ -66,12 +65,12 @@ def test_a_sphere_worn_off_by_a_sphere_has_the_volume_of_its_shell():
     inside = np.hypot(points[:, 0], points[:, 2]) < 10 * MM
     cap = 2 * np.pi * radius * (radius - np.sqrt(radius**2 - (10 * MM) ** 2))
     assert (depth * area)[inside].sum() == pytest.approx(depth * cap, rel=0.01)
-    towards = np.array([0, 35 * MM, 0]) - points[inside]
-    towards /= np.linalg.norm(towards, axis=1)[:, None]
-    assert np.einsum("ij,ij->i", towards, normals[inside]).min() > 0.9995
+    to_centre = np.array([0, 35 * MM, 0]) - points[inside]
+    to_centre /= np.linalg.norm(to_centre, axis=1)[:, None]
+    assert np.einsum("ij,ij->i", to_centre, normals[inside]).min() > 0.9995
 
 
-def test_thickness_is_what_lies_below_and_undersides_are_not_worn():
+def test_thickness_reaches_to_the_bottom_and_undersides_do_not_wear():
     articular = ArticularSurface.of_insert(shapes.trough(0.02), 1.5 * MM)
     points = articular.surface.vertices[articular.vertices]
     assert articular.thickness == pytest.approx(points[:, 1], abs=1e-9)

@@ -1,4 +1,4 @@
-"""Small wear cases: bodies, motions, and contacts that are known without a contact model."""
+"""Small wear cases: bodies, motions, and prescribed contacts without a contact model."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ def balls():
 
 
 def balls_scene(folder):
-    """The shipped scene with two balls on two dishes: few triangles, quickly worn."""
+    """Return the path of the shipped scene with two coarse spheres on two dishes."""
     path = write_scene(
         folder,
         drop=("patella", "quadriceps", "patellar_ligament"),
@@ -40,26 +40,27 @@ def balls_scene(folder):
 
 
 def stroke(length, frames, load, passes=2):
-    """A translation along x by `length`, there (and back)."""
-    places = np.zeros((frames, 3))
-    places[:, 0] = np.linspace(-length / 2, length / 2, frames)
-    turn = np.broadcast_to(np.eye(3), (frames, 3, 3))
-    return CycleMotion(pose(turn, places), np.full(frames, load), 1.0, passes)
+    """Return a translation along x by `length`, m; with two passes there and back."""
+    positions = np.zeros((frames, 3))
+    positions[:, 0] = np.linspace(-length / 2, length / 2, frames)
+    rotation = np.broadcast_to(np.eye(3), (frames, 3, 3))
+    return CycleMotion(pose(rotation, positions), np.full(frames, load), 1.0, passes)
 
 
 def swing(angle, frames, load):
-    """A turn about the z axis through the femoral origin, there and back."""
-    turns = np.outer(np.linspace(-angle / 2, angle / 2, frames), [0.0, 0.0, 1.0])
-    rotation = Rotation.from_rotvec(turns).as_matrix()
+    """Return a rotation by `angle`, rad, about z through the femoral origin, there and back."""
+    rotation_vectors = np.outer(np.linspace(-angle / 2, angle / 2, frames), [0.0, 0.0, 1.0])
+    rotation = Rotation.from_rotvec(rotation_vectors).as_matrix()
     return CycleMotion(pose(rotation, np.zeros((frames, 3))), np.full(frames, load), 1.0, 2)
 
 
 @dataclass
 class Pressed:
-    """A contact whose pressure is `force` over the part of the map where `under` is true.
+    """A prescribed contact: uniform pressure on the points for which `under` is true.
 
     Args:
-        under: of points (n, 3) in the femoral frame, which are pressed.
+        under: function of points (n, 3) in the femoral frame that returns whether each is pressed.
+        fails_below: height of the lowest upper point below which contact is lost, m.
     """
 
     under: object
@@ -69,7 +70,7 @@ class Pressed:
         points = insert.vertices[insert.vertices[:, 1] > insert.bounds[1, 1] / 2]
         if points[:, 1].min() < self.fails_below:
             return CycleMaps(points, None, None, motion.poses, {0: "it is gone"})
-        inside = [self.under(transform(inverse(place), points)) for place in motion.poses]
+        inside = [self.under(transform(inverse(pose), points)) for pose in motion.poses]
         pressure = np.array(inside, float) * 1e6
         return CycleMaps(points, np.zeros((0, 3), np.int64), pressure, motion.poses, {})
 
@@ -79,18 +80,15 @@ def always(points):
 
 
 def plate_case(motion, law, under=always, creep=None, thickness=0.01, **more):
-    """A plate under a contact that is known."""
     articular = ArticularSurface.of_insert(shapes.plate(thickness), 2 * MM)
     return WearCase(Pressed(under, **more), articular, motion, law, DENSITY, creep)
 
 
 def ball_case(insert, radius, motion, wear_factor, resolution=1.0, facets=3):
-    """A sphere, by a contact model."""
     return swinging_case(shapes.sphere(radius, facets), insert, motion, wear_factor, resolution)
 
 
 def swinging_case(femoral, insert, motion, wear_factor=1e-6, resolution=2.0):
-    """A body, by a contact model."""
     model = contact_model("foundation", resolution)
     engine = ContactEngine(model, femoral, material("polyethylene"))
     articular = ArticularSurface.of_insert(insert, resolution * MM)

@@ -1,1 +1,1 @@
-"""Studies on top of runs: trade-off, stability, uncertainty, cohort, wear, designs."""
+"""Studies that use runs: trade-off, stability, uncertainty, cohort, wear, designs."""

@@ -1,9 +1,8 @@
-"""Trade-off of the body side: cost and effect of coupling, filter, frame rate, patella and
-wrapping.
+"""Cost and effect of settings of the body: coupling, filter, frame rate, patella and wrapping.
 
-The shipped knee bend is run with one thing changed at a time, against the run as shipped, on
-the same instants. A lower frame rate removes rows of the recordings themselves (motion, shank and
-ground reaction), so that derivatives come from the remaining rows.
+Each run changes one setting of the shipped knee bend. It is compared with the run as shipped at
+the same instants. A lower frame rate removes rows of the recordings (motion, shank and ground
+reaction), so the derivatives come from the remaining rows.
 """
 
 import json
@@ -30,12 +29,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BodyTradeSettings:
-    """The study of the frame rate of a motion."""
+    """Frames that the study compares."""
 
     recorded_frames: int = 101
-    """Frames of the shipped motion."""
+    """Number of frames of the shipped motion."""
     stride: int = 10
-    """Every tenth recorded frame is compared: all frame rates have these."""
+    """Recorded frames from one compared frame to the next. Chosen because the recordings contain
+    every tenth frame at each frame rate of the study."""
 
 
 BODY_TRADE = BodyTradeSettings()
@@ -46,8 +46,8 @@ class Change:
     """One change of the shipped scene.
 
     Args:
-        keys: key of the scene -> value that replaces the shipped one.
-        every: step between the recorded frames that are kept.
+        keys: dotted key of the scene -> value that replaces the shipped one.
+        every: stride of the recorded frames that stay in the recordings.
     """
 
     keys: dict[str, Any] = field(default_factory=dict)
@@ -89,9 +89,9 @@ class BodyRow:
 
     Args:
         name: name of the change.
-        status: "ok", or why there is no result.
-        prepare_seconds: s, time of the run outside its frames.
-        frame_seconds: per frame, median.
+        status: "ok", the error, or the number of failed frames.
+        prepare_seconds: time of the run outside its frames, s.
+        frame_seconds: median time per frame, s.
         changed: column, "peak_force", or derivative of flexion -> largest change over the
             frames, relative to the largest value as shipped.
     """
@@ -104,10 +104,10 @@ class BodyRow:
 
 
 def run_body_trade(rows: KeptRows | None = None) -> Iterator[BodyRow]:
-    """Run the shipped knee bend with one thing changed at a time; yield the rows.
+    """Run the shipped knee bend with each change alone and yield one row per change.
 
     Args:
-        rows: rows of an earlier study, which are not computed again; new ones are added.
+        rows: stored rows of earlier studies. They are not computed again; new rows are added.
     """
     base: _Run | None = None
     for name, change in CHANGES.items():
@@ -122,7 +122,6 @@ def run_body_trade(rows: KeptRows | None = None) -> Iterator[BodyRow]:
 
 
 def _is_whole(row: BodyRow) -> bool:
-    """Return whether a kept row has a known name and every change that the table shows."""
     return row.name in CHANGES and (row.changed is None or row.changed.keys() == HEADS.keys())
 
 
@@ -154,11 +153,11 @@ def _row(name: str, change: Change, base: _Run) -> BodyRow:
     except TkambError as error:
         return BodyRow(name, str(error))
     result = run.results
-    spent = sum(np.nan_to_num(result[column]) for column in CLOCKS)
+    frame_seconds = sum(np.nan_to_num(result[column]) for column in CLOCKS)
     failed = sum(status.startswith("failed") for status in result.status)
     status = f"{failed} of {len(result)} frames failed" if failed else "ok"
-    outside = run.seconds - float(np.sum(spent))
-    return BodyRow(name, status, outside, float(np.median(spent)), _changed(run, base))
+    outside = run.seconds - float(np.sum(frame_seconds))
+    return BodyRow(name, status, outside, float(np.median(frame_seconds)), _changed(run, base))
 
 
 def _changed(run: _Run, base: _Run) -> dict[str, float]:
@@ -184,7 +183,7 @@ def body_json(rows: Sequence[BodyRow]) -> str:
 
 
 def body_table(rows: Sequence[BodyRow]) -> list[str]:
-    """Return the table's lines."""
+    """Return the lines of the printed table."""
     head = " ".join(f"{text:>12s}" for text in HEADS.values())
     lines = [f"{'knee bend':20s} {'ms per frame':>12s} {'else s':>6s} {head}"]
     for row in rows:
@@ -205,7 +204,7 @@ def read_body_rows(path: Path) -> list[BodyRow]:
     """Return the rows of a body.json.
 
     Raises:
-        InputError: there is none, or it is something else.
+        InputError: the file is missing or has other content.
     """
     try:
         return [BodyRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]

@@ -1,17 +1,15 @@
-"""CalculiX beside the built-in models: the same hexahedra, pose and load, by another program.
+"""CalculiX as an independent check: another program solves the same hexahedra, pose and load.
 
-CalculiX runs as a process with one thread and a time limit. It starts without a result of the
-lattice: the first position of the femoral component is the one at which an elastic foundation
-carries the load. Each position is solved from zero, so its cold and warm times are equal.
+CalculiX runs as a process with one thread and a time limit, without a result of the lattice. The
+initial position of the femoral component is that at which an elastic foundation carries the load.
+There is no warm start, so the cold and warm times are equal.
 
 The contact nodes lie on the smooth surface of the insert's mesh, as in the lattice. The femoral
 component is faceted. CalculiX gives pressures on the deformed faces. They are converted to nodal
-forces and divided by the undeformed tributary areas, which is how the built-in models define
-pressure.
+forces and divided by the undeformed tributary areas, as in the built-in models.
 
 Linear cases use small strain in both programs. With the Ramberg-Osgood law CalculiX uses finite
-strain (true stress over the Eulerian strain), the built-in models use small strain. A nonlinear
-comparison includes this difference.
+strain (true stress over the Eulerian strain), the built-in models small strain.
 """
 
 import math
@@ -45,14 +43,14 @@ PROGRAM = "ccx"
 
 @dataclass(frozen=True)
 class CalculixSettings:
-    """How long CalculiX may take."""
+    """Time limit of CalculiX, and the interval of its memory readings."""
 
     longest_seconds: float = 600.0
-    """s: a run that takes longer is stopped and says so. Chosen: most runs take less than a
-    minute."""
+    """s: time limit of a run. A longer run is stopped and has no result. Chosen because most runs
+    take less than a minute."""
     poll_seconds: float = 0.05
-    """s: interval at which the memory of the process is read. Chosen: short beside a run, and
-    cheap."""
+    """s: interval between two readings of the memory of the process. Chosen because it is short
+    compared with a run and costs little."""
 
 
 CALCULIX = CalculixSettings()
@@ -65,10 +63,10 @@ class PeerRun:
     """Results and cost of one run of CalculiX.
 
     Args:
-        blocks: the last block of numbers of each kind in its .dat file, by the first word.
-        seconds: s, time of the process.
-        peak_rss_MB: of the process (1e6 bytes).
-        iterations: equilibrium iterations, one factorisation each.
+        blocks: name of the output -> its last table of numbers in the .dat file.
+        seconds: time of the process, s.
+        peak_rss_MB: peak memory of the process, MB (1e6 bytes).
+        iterations: number of equilibrium iterations, with one factorisation each.
     """
 
     blocks: dict[str, Array]
@@ -78,10 +76,10 @@ class PeerRun:
 
 
 def find_program() -> str:
-    """Return where CalculiX is.
+    """Return the path of the CalculiX program.
 
     Raises:
-        InputError: it is not installed.
+        InputError: CalculiX is not installed.
     """
     result = shutil.which(PROGRAM)
     if result is None:
@@ -90,15 +88,15 @@ def find_program() -> str:
 
 
 def run_calculix(text: str, longest: float = CALCULIX.longest_seconds) -> PeerRun:
-    """Run a deck.
+    """Run CalculiX on an input deck.
 
     Args:
-        text: the input.
-        longest: s, after which it is stopped.
+        text: input deck.
+        longest: time limit, s.
 
     Raises:
         InputError: CalculiX is not installed.
-        ComputationError: it stopped with an error, or was stopped.
+        ComputationError: CalculiX stopped with an error or exceeded the time limit.
     """
     program = find_program()
     with tempfile.TemporaryDirectory() as folder:
@@ -109,7 +107,7 @@ def run_calculix(text: str, longest: float = CALCULIX.longest_seconds) -> PeerRu
         seconds = clock.perf_counter() - start
         if not (place / "peer.dat").exists():
             raise ComputationError(
-                f"gave no output: {_last_words(place / OUTPUT_FILE)}", "CalculiX"
+                f"gave no output: {_error_line(place / OUTPUT_FILE)}", "CalculiX"
             )
         blocks = _blocks((place / "peer.dat").read_text(encoding="utf-8").splitlines())
         iterations = _iterations((place / "peer.cvg").read_text(encoding="utf-8"))
@@ -117,7 +115,7 @@ def run_calculix(text: str, longest: float = CALCULIX.longest_seconds) -> PeerRu
 
 
 def _wait(command: list[str], place: Path, longest: float) -> float:
-    """Run a command to its end with one thread; return its peak memory, MB."""
+    """Run a command to its end with one thread and return its peak memory, MB."""
     memory, start = math.nan, clock.perf_counter()
     with (
         open(place / OUTPUT_FILE, "wb") as output,
@@ -127,7 +125,8 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
     ):
         try:
             while process.poll() is None:
-                memory = float(np.fmax(memory, peak_rss(process.pid)))  # NaN once it has ended
+                # peak_rss is NaN once the process has ended
+                memory = float(np.fmax(memory, peak_rss(process.pid)))
                 if clock.perf_counter() - start > longest:
                     raise ComputationError(f"stopped after {longest:g} s", "CalculiX")
                 with suppress(subprocess.TimeoutExpired):
@@ -135,25 +134,24 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
         finally:
             process.kill()
     if process.returncode:
-        raise ComputationError(f"stopped: {_last_words(place / OUTPUT_FILE)}", "CalculiX")
+        raise ComputationError(f"stopped: {_error_line(place / OUTPUT_FILE)}", "CalculiX")
     return memory
 
 
-def _last_words(path: Path) -> str:
-    """Return the line with the error, or the last one."""
+def _error_line(path: Path) -> str:
     lines = [line.strip(" *") for line in path.read_text(errors="replace").splitlines()]
     lines = [line for line in lines if line]
-    wrong = [line for line in lines if line.lower().startswith("error")]
-    return (wrong or lines or ["it said nothing"])[-1]
+    errors = [line for line in lines if line.lower().startswith("error")]
+    return (errors or lines or ["no output"])[-1]
 
 
 def _iterations(text: str) -> int:
-    """Count the lines of a .cvg file that belong to an iteration: step, increment, ..."""
+    """Count the iterations in a .cvg file: each is a line that begins with a step number."""
     return sum(line.split()[:1] != [] and line.split()[0].isdigit() for line in text.splitlines())
 
 
 def _blocks(lines: Iterable[str]) -> dict[str, Array]:
-    """Return the blocks of numbers; a title's first word, and its set, name one."""
+    """Return the tables of a .dat file, keyed by the set in their title, or its first word."""
     blocks: dict[str, list[list[float]]] = {}
     rows: list[list[float]] = []
     for line in lines:
@@ -161,8 +159,8 @@ def _blocks(lines: Iterable[str]) -> dict[str, Array]:
         try:
             numbers = [float(word) for word in words]
         except ValueError:
-            named = words[words.index("set") + 1] if "set" in words else words[0]
-            rows = blocks[named] = []
+            name = words[words.index("set") + 1] if "set" in words else words[0]
+            rows = blocks[name] = []
             continue
         if numbers:
             rows.append(numbers)
@@ -171,11 +169,11 @@ def _blocks(lines: Iterable[str]) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class PeerSettings:
-    """When a result of the peer finite-element program is accepted."""
+    """Condition on which a result of CalculiX is accepted."""
 
     max_residual: float = 0.01
-    """Share of the load: largest difference of the summed contact forces from it. Chosen: above
-    what a converged solution leaves."""
+    """Share of the load: largest difference between the summed contact forces and the load. Chosen
+    because converged solutions differ by less."""
 
 
 PEER = PeerSettings()
@@ -183,12 +181,12 @@ PEER = PeerSettings()
 
 @dataclass(frozen=True, eq=False)
 class PeerAnswer:
-    """Result of CalculiX.
+    """Contact result and cost of CalculiX.
 
     Args:
-        result: result on the contact nodes of the lattice's grid, as the built-in models define it.
-        run: its times, memory and iterations.
-        prepare_seconds: for the grid, the guess and the input.
+        result: contact result on the contact nodes of the lattice's grid.
+        run: output and cost of the process.
+        prepare_seconds: time to make the grid, the initial guess and the deck, s.
         nodes: number of nodes of the insert.
         balance: sum of the vertical contact forces over the load.
     """
@@ -203,12 +201,12 @@ class PeerAnswer:
 def measure_by_calculix(
     case: StudyCase, grid_mm: float, longest: float = CALCULIX.longest_seconds
 ) -> Measure:
-    """Return CalculiX's measure of a case; its status says why there is none.
+    """Return cost and results of CalculiX on a case; after an error only the status.
 
     Args:
-        case: what to press.
-        grid_mm: edge of the hexahedra.
-        longest: s, after which it is stopped.
+        case: contact problem.
+        grid_mm: edge length of the hexahedra, mm.
+        longest: time limit, s.
     """
     try:
         answer = press_by_calculix(case.pair, case.load, case.pose, grid_mm, longest=longest)
@@ -236,19 +234,19 @@ def press_by_calculix(
     element: str = ELEMENT,
     longest: float = CALCULIX.longest_seconds,
 ) -> PeerAnswer:
-    """Press a femoral component on an insert by CalculiX.
+    """Press a femoral component on an insert with CalculiX.
 
     Args:
         pair: the two bodies.
-        load: N, along -y.
-        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
-        grid_mm: edge of the hexahedra.
-        element: "C3D8I" or "C3D8".
-        longest: s, after which CalculiX is stopped.
+        load: force along -y, N.
+        pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
+        grid_mm: edge length of the hexahedra, mm.
+        element: element type, "C3D8I" or "C3D8".
+        longest: time limit, s.
 
     Raises:
-        InputError: CalculiX is not installed, or has no such material or bearing.
-        ComputationError: it failed, or what it found does not carry the load.
+        InputError: CalculiX is not installed, or the deck cannot express the material or bearing.
+        ComputationError: CalculiX failed, or its contact forces do not sum to the load.
     """
     start = clock.perf_counter()
     problem = press_problem(pair, load, pose, grid_mm)
@@ -261,11 +259,11 @@ def press_by_calculix(
 
 
 def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, float]:
-    """Return what CalculiX found by the contract's definitions, and its forces over the load.
+    """Return the contact result of a run, and the sum of its contact forces over the load.
 
     Raises:
-        ComputationError: contact reached beyond the femoral patch of the deck, or the forces do not
-        sum to the load.
+        ComputationError: contact extends beyond the femoral patch of the deck, or the forces do not
+            sum to the load.
     """
     if not {"NREF", "NINSERT", "contact"} <= run.blocks.keys():
         raise ComputationError("gave no contact stress", "CalculiX")
@@ -291,7 +289,6 @@ def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, flo
 
 
 def _bent(problem: PressProblem, run: PeerRun) -> ContactMap:
-    """Return the deformed contact surface."""
     displacement = run.blocks["NINSERT"]
     displacement = displacement[np.argsort(displacement[:, 0]), 1:] * MILLIMETRE
     deformed = replace(problem.lattice, nodes=problem.lattice.nodes + displacement)
@@ -299,19 +296,19 @@ def _bent(problem: PressProblem, run: PeerRun) -> ContactMap:
 
 
 def _gaps(problem: PressProblem, pose: Array, bent: ContactMap) -> Array:
-    """Return the vertical gaps (c,) above the deformed nodes, m, inf where nothing is above."""
+    """Return the vertical gaps (c,) above the deformed nodes, m; inf where no facet is above."""
     above, _ = problem.floor.over(bent.points, pose)
     return np.nan_to_num(above[:, 1] - bent.points[:, 1], nan=np.inf)
 
 
 def _nodal_forces(problem: PressProblem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:
-    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed area."""
+    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed tributary area."""
     stress = run.blocks["contact"]
     pressure = np.zeros(len(bent.points))
     place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)
     pressure[place] = np.maximum(stress[:, 1], 0.0) * MEGAPASCAL
     loaded = pressure > 0
     if not problem.touchable[loaded].all():
-        raise ComputationError("touches beyond the femoral patch it was given", "CalculiX")
+        raise ComputationError("found contact outside the femoral patch of the deck", "CalculiX")
     _, normals = problem.floor.over(bent.points, pose)
     return np.where(loaded[:, None], (pressure * bent.area)[:, None] * normals, 0.0)

@@ -1,7 +1,7 @@
-"""The cases of the studies: two bodies, a pose and a load.
+"""Contact problems for the studies: two bodies, a pose and a load.
 
-Bodies of simple shape (balls, dishes, flat blocks) are made here, in metres. Other cases are the
-shipped knee at stored poses, or the knee of a user's scene. The last functions change the
+Some cases have bodies of simple shape (spheres, dishes, flat blocks). Others are the shipped knee
+at stored poses, or the knee of a user's scene. The last functions of the module change the
 recordings of the shipped knee bend.
 """
 
@@ -38,19 +38,18 @@ def balls(
     """Return one or two spheroids whose lowest points are at y = -radius.
 
     Args:
-        radius: m, in the sagittal plane at the lowest point.
-        apart: m, z of the lateral one, the medial one at -apart; 0: a single one.
-        waist: radius along z over `radius`.
-        finest_deg: distance of the rings of vertices near the lowest point.
-        sectors: vertices of a ring.
+        radius: sagittal radius of curvature at the lowest point, m.
+        apart: z of the lateral centre, m; the medial one is at -apart. 0: a single spheroid.
+        waist: frontal radius of curvature at the lowest point over the sagittal radius.
+        finest_deg: angle between the rings of vertices near the lowest point, deg.
+        sectors: number of vertices of a ring.
     """
-    one = _ball(radius, waist, finest_deg, sectors)
+    vertices, faces = _ball(radius, waist, finest_deg, sectors)
     if apart == 0:
-        return Surface(*one, "ball")
-    vertices, faces = one
+        return Surface(vertices, faces, "ball")
     shift = np.array([0.0, 0.0, apart])
-    both = np.concatenate([vertices - shift, vertices + shift])
-    return Surface(both, np.concatenate([faces, faces + len(vertices)]), "condyles")
+    condyles = np.concatenate([vertices - shift, vertices + shift])
+    return Surface(condyles, np.concatenate([faces, faces + len(vertices)]), "condyles")
 
 
 def block(
@@ -59,9 +58,9 @@ def block(
     """Return a closed block on y = 0 whose upper surface is y = height(x, z).
 
     Args:
-        height: m, of arrays x and z.
-        size: m, along x and z.
-        spacing: m, of the vertices of the upper surface.
+        height: height of the upper surface, m, as a function of the arrays x and z, m.
+        size: lengths along x and z, m.
+        spacing: distance between the vertices of the upper surface, m.
         name: name of the surface.
     """
     x, z = (np.linspace(-s / 2, s / 2, max(3, round(s / spacing) + 1)) for s in size)
@@ -78,23 +77,23 @@ def block(
 
 
 def flat(thickness: float) -> Height:
-    """Return a flat upper surface."""
+    """Return the height function of a flat upper surface at `thickness`, m."""
     return lambda x, z: np.full_like(x, thickness)
 
 
 def dishes(thickness: float, radius: float, apart: float, rim: float = 2e-3) -> Height:
-    """Return two dishes (one for apart = 0), parabolic near the middle, under a flat rim.
+    """Return the height function of two parabolic dishes with a flat rim; apart = 0: one dish.
 
     Args:
-        thickness: m, under the dishes' lowest points.
-        radius: m, of curvature there.
-        apart: m, z of the lateral dish's middle.
-        rim: m, height of the rim over the lowest points.
+        thickness: thickness under the lowest points of the dishes, m.
+        radius: radius of curvature at the lowest points, m.
+        apart: z of the middle of the lateral dish, m; the medial middle is at -apart.
+        rim: height of the rim above the lowest points, m.
     """
 
     def height(x: Array, z: Array) -> Array:
-        away = np.hypot(x, np.abs(z) - apart)
-        return thickness + np.minimum(away**2 / (2 * radius), rim)
+        distance = np.hypot(x, np.abs(z) - apart)
+        return thickness + np.minimum(distance**2 / (2 * radius), rim)
 
     return height
 
@@ -134,14 +133,14 @@ def _ball(radius: float, waist: float, finest_deg: float, sectors: int) -> tuple
 SHIPPED_SCENE = Path(__file__).parents[2] / "models" / "deep_knee_bend" / "scene.toml"
 KNEE_CASES = Path(__file__).with_name("knee_cases.json")
 RECORDINGS = ("motion.csv", "tibia.csv", "ground_reaction.csv")
-"""Of the shipped knee bend."""
+"""Recorded tables of the shipped knee bend."""
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
-"""deg: flexions of the cases of the shipped knee, and of a user's scene if it reaches them."""
+"""deg: flexion of the cases of the shipped knee. A user's scene has the nearest frames."""
 
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere on a flat layer: radius and thickness, m."""
+    """Dimensions of a sphere on a flat layer: radius and layer thickness, m."""
 
     radius: float
     thickness: float
@@ -153,11 +152,11 @@ class StudyCase:
 
     Args:
         name: name of the case.
-        label: one line.
+        label: description in one line.
         pair: the two bodies.
-        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
-        load: N, along -y.
-        sphere: the case as a sphere on a linear layer, if it is one.
+        pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
+        load: force along -y, N.
+        sphere: dimensions, if the case is a sphere on a linear layer.
     """
 
     name: str
@@ -174,9 +173,10 @@ class StudyCase:
         return content_hash(pair, [self.pose, np.array(self.load)], (pair.material, pair.bearing))
 
     def nearby(self, steps: float) -> Array:
-        """Return the pose some frames later: each 0.06 mm back, 0.2 deg flexed, 0.06 deg turned."""
-        turn = np.array([-0.06 * MILLIMETRE, 0, 0, 0.06 * DEGREE, 0, 0.2 * DEGREE])
-        moved = knee_pose(steps * turn)
+        """Return the pose some frames later: each 0.06 mm posteriorly, with 0.2 deg more flexion
+        and 0.06 deg more axial rotation."""
+        increment = np.array([-0.06 * MILLIMETRE, 0, 0, 0.06 * DEGREE, 0, 0.2 * DEGREE])
+        moved = knee_pose(steps * increment)
         pose = self.pose.copy()
         pose[:3, :3] = moved[:3, :3] @ self.pose[:3, :3]
         pose[0, 3] += moved[0, 3]
@@ -184,10 +184,11 @@ class StudyCase:
 
 
 def content_hash(pair: ContactPair, arrays: Sequence[Array], words: tuple[Any, ...]) -> str:
-    """Return the SHA-256 of two bodies, further arrays, and words as they are printed.
+    """Return the SHA-256 of two bodies, further arrays, and the repr of further values.
 
-    Numbers are rounded to 1e-12 and zeros have no sign, so that rounding does not make another
-    case."""
+    Numbers are rounded to 1e-12 and zeros lose their sign, so that round-off does not change the
+    hash.
+    """
     digest = hashlib.sha256()
     meshes = [a for body in (pair.femoral, pair.insert) for a in (body.vertices, body.faces)]
     for array in (*meshes, *arrays):
@@ -197,11 +198,7 @@ def content_hash(pair: ContactPair, arrays: Sequence[Array], words: tuple[Any, .
 
 
 def case_names(scene: Path | None = None) -> tuple[str, ...]:
-    """Return the names of the cases that can be made here.
-
-    Args:
-        scene: a user's scene, whose cases come last.
-    """
+    """Return the names of the available cases, those of a user's scene file last."""
     names = list(_ANALYTIC)
     if SHIPPED_SCENE.exists():
         names += [f"knee {flexion:g} deg" for flexion in FLEXIONS_DEG]
@@ -211,10 +208,10 @@ def case_names(scene: Path | None = None) -> tuple[str, ...]:
 
 
 def study_case(name: str, scene: Path | None = None) -> StudyCase:
-    """Return the case of that name.
+    """Return the case with a given name; `scene` is a user's scene file.
 
     Raises:
-        InputError: no such case.
+        InputError: no case has this name.
     """
     if name in _ANALYTIC:
         return _ANALYTIC[name](name)
@@ -233,7 +230,7 @@ def _sphere(name: str) -> StudyCase:
 
 
 def _two_condyles(name: str) -> StudyCase:
-    """Return two condyles of 22 mm, 22 mm apart, on a nonlinear insert of 8 mm."""
+    """Return a case of two condyles of radius 22 mm, 22 mm apart, on a nonlinear insert of 8 mm."""
     label, dish_radius, varus_deg = BICONDYLAR[name]
     insert = block(dishes(8e-3, dish_radius, 11e-3), (30e-3, 46e-3))
     pair = ContactPair(balls(22e-3, 11e-3), insert, material("polyethylene"))
@@ -250,11 +247,7 @@ _ANALYTIC = {"sphere": _sphere, **dict.fromkeys(BICONDYLAR, _two_condyles)}
 
 
 def _shipped(name: str) -> StudyCase:
-    """Return a case of the shipped knee's meshes at a stored pose and load.
-
-    Pose and load are those of the knee bend when its references were computed. They are kept when
-    its motion or muscles change.
-    """
+    """Return a case of the shipped knee's meshes at the stored pose and load of its reference."""
     from tkamb.geometry.flat_bottom import insert_placement
     from tkamb.io.recordings.meshes import load_surface
 
@@ -289,18 +282,13 @@ def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
 
 
 def copied_scene(folder: Path) -> Path:
-    """Copy the shipped knee bend into a folder and return its scene file there."""
+    """Copy the shipped knee bend into a folder and return the path of the copied scene file."""
     shutil.copytree(SHIPPED_SCENE.parent, folder, dirs_exist_ok=True)
     return folder / SHIPPED_SCENE.name
 
 
 def change_recording(path: Path, change: Callable[[list[str], Array], Array]) -> None:
-    """Write a recorded table anew.
-
-    Args:
-        path: a .csv file.
-        change: takes the columns' names and the rows (n, columns), returns the new rows.
-    """
+    """Overwrite the rows (n, columns) of a .csv file with `change(column names, rows)`."""
     with open(path, encoding="utf-8", newline="") as file:
         lines = list(csv.reader(file))
     rows = change(lines[0], np.array(lines[1:], float))
@@ -309,13 +297,13 @@ def change_recording(path: Path, change: Callable[[list[str], Array], Array]) ->
 
 
 def thin_out(folder: Path, step: int) -> None:
-    """Leave only every `step`-th row of the recordings in a folder."""
+    """Remove all rows but every `step`-th from the recordings in a folder."""
     for name in RECORDINGS:
         change_recording(folder / name, lambda head, rows: rows[::step])
 
 
 def stretch_time(folder: Path, scale: float) -> None:
-    """Make the recordings in a folder take `scale` times as long."""
+    """Multiply the duration of the recordings in a folder by `scale`."""
 
     def stretched(head: list[str], rows: Array) -> Array:
         rows[:, head.index("time_s")] *= scale

@@ -1,17 +1,18 @@
-"""Contacts with a closed-form solution, on which every family of models is tested.
+"""Contacts with a closed-form solution, on which every family of contact models is tested.
 
-The formulas are written out here and do not use the models' code.
+The formulas are independent of the models' code. F is the load, d the approach, E Young's modulus
+and nu Poisson's ratio.
 
-- plate: a rigid flat plate on a block of height h and area A whose nu is 0. Stress is F/A
-  everywhere, the approach is h eps(F/A), with the material's curve eps(sigma) = sigma/E +
-  alpha (sigma0/E) (sigma/sigma0)^n. Exact on any grid while the curve's share is small (what
-  yields widens, and the bottom is glued). The bed of an elastic foundation has its own law of
-  the column, p = sigma(-ln(1 - d/h)), here d = h (1 - exp(-eps)).
-- slide: the same on a mobile bearing, any nu and strain. Two nodes of its bottom are held
-  against rigid motion, also from each other: that makes it stiffer by up to 2 %.
-- kept: the same with the operator cache on disk, after an operator of another modulus was stored
-  there. Each modulus must have its own.
-- layer: a rigid sphere on a layer bonded to a rigid base (`elastic_layer`), linear.
+- plate: a rigid flat plate on a block of height h and area A with nu = 0. The stress is F/A
+  everywhere. The approach is d = h eps(F/A), with the material's curve eps(sigma) = sigma/E +
+  alpha (sigma0/E) (sigma/sigma0)^n. It is exact on any grid while the plastic strain is small,
+  because the fixed bottom resists plastic widening. A column of an elastic foundation follows
+  p = sigma(-ln(1 - d/h)), so its approach is d = h (1 - exp(-eps)).
+- slide: the plate on a mobile bearing, for any nu and strain. Two nodes of the bottom are fixed
+  to prevent rigid motion. They also fix their distance, which stiffens the block by up to 2 %.
+- kept: the plate with the operator cache on disk, which already contains the operator of another
+  modulus. Each modulus must have its own operator.
+- layer: a rigid sphere on a linear layer bonded to a rigid base (`elastic_layer`).
 - bed: the sphere on a bed of springs, F = 2 pi R h int_0^(d/h) p(e) de (paraboloid).
 - hertz: the sphere on a half-space, a³ = 3 F R / (4 E*), d = a²/R, p0 = 3 F / (2 pi a²).
 
@@ -42,7 +43,7 @@ from tkamb.studies.references import sphere_on_layer
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4.5485}
-"""Of the polyethylene of these cases, as published; see `docs/contact.md`."""
+"""Published Ramberg-Osgood parameters of the polyethylene of these cases (`docs/contact.md`)."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +51,13 @@ class ClosedFormSettings:
     """Bodies with an analytic solution."""
 
     block_side_mm: float = 24.0
-    """mm: side of the block under the plate. Chosen: cells of 2 and 3 mm divide it."""
+    """mm: side of the block under the plate. Chosen because cells of 2 and 3 mm divide it."""
     kept_grid_mm: float = 0.9
-    """mm: cell size of the block whose operator is stored in a file. Chosen: the operator is large
-    enough to be stored."""
+    """mm: cell size of the "kept" cases. Chosen because the cache does not store the smaller
+    operators of larger cells."""
     sharma_approach_ratio: float = 0.6808
-    """Approach of Sharma's springs under the plate over that of the solid they stand for: nu is
-0.35 whatever the material, and they are too stiff at free sides. The number is measured, and
-stored so that a change is noticed."""
+    """Approach of Sharma's springs under the plate over that of the elastic solid. The springs have
+    nu = 0.35 for every material and are too stiff at free sides. Measured."""
 
 
 CLOSED_FORM = ClosedFormSettings()
@@ -70,24 +70,24 @@ TOLERANCES: dict[str, tuple[float, float]] = {
     "bed": (0.01, 0.06),
     "hertz": (0.01, 0.01),
 }
-"""Largest relative distances of approach and pressure. For plates: a few times the solver's
-tolerance. For others: 1.5 times the measured error of the cells."""
+"""Largest relative errors of approach and pressure. For plates they are a few times the solver's
+tolerance, otherwise 1.5 times the measured discretisation error."""
 
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """A contact whose answer is known.
+    """A contact with a closed-form solution.
 
     Args:
         kind: "plate", "slide", "kept", "layer", "bed" or "hertz".
-        model: contact model.
-        load_N: along -y.
-        thickness_mm: height of the block.
-        modulus_MPa: Young's modulus.
-        nu: Poisson's ratio; 0 under a plate.
-        linear: Hooke's law instead of Ramberg-Osgood.
-        radius_mm: radius of the sphere; 0: a plate.
-        resolution_mm: cell size.
+        model: name of the contact model.
+        load_N: force along -y, N.
+        thickness_mm: height of the block, mm.
+        modulus_MPa: Young's modulus, MPa.
+        nu: Poisson's ratio; "plate" and "kept" need 0.
+        linear: whether Hooke's law replaces Ramberg-Osgood.
+        radius_mm: radius of the sphere, mm; 0 for a plate.
+        resolution_mm: cell size, mm.
     """
 
     kind: str
@@ -102,14 +102,14 @@ class ClosedForm:
 
     @property
     def label(self) -> str:
-        """The case in words: "plate: load_N=1"."""
+        """Description with the values that differ from the default, as "plate: load_N=1"."""
         base = vars(ClosedForm(self.kind, self.model))
         changed = [f"{k}={v}" for k, v in vars(self).items() if v != base[k]]
         return f"closed form, {self.kind}: {', '.join(changed) or 'as it is'}"
 
     @property
     def material(self) -> Material:
-        """What the block is made of."""
+        """Material of the block."""
         properties = {"young_modulus": self.modulus_MPa * MEGAPASCAL, "poisson_ratio": self.nu}
         if self.linear:
             return material("polyethylene-linear", **properties)
@@ -137,10 +137,10 @@ class ClosedForm:
 
 
 def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
-    """Press a case; "kept" ones after another modulus in one folder of operators.
+    """Press a case. A "kept" case first stores the operator of another modulus in its cache.
 
     Raises:
-        ComputationError: there, each modulus has no operator of its own.
+        ComputationError: the cache does not contain one operator for each modulus.
     """
     pair = case.pair
     options = {"cache": case.kind == "kept"} if _has_cache(case.model) else {}
@@ -155,15 +155,17 @@ def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
         state = model.prepare(pair)
         files = len(list(Path(folder).glob("*.operator")))
         if files != 2:
-            raise ComputationError(f"{files} operators are kept of two materials", case.label)
+            raise ComputationError(
+                f"{files} operators are in the cache after two materials", case.label
+            )
         return model.press(state, case.load_N, np.eye(4)), pair
 
 
-def apart(case: ClosedForm, result: ContactResult) -> dict[str, float]:
-    """Return relative distances from the closed form: approach and pressure."""
+def relative_errors(case: ClosedForm, result: ContactResult) -> dict[str, float]:
+    """Return the relative errors of approach and pressure against the closed form."""
     approach, pressure = solution(case)
     if case.model == "lattice-source":
-        mean_pressure = result.pressure.mean()  # its rule gives every node the same area
+        mean_pressure = result.pressure.mean()  # each node has the same tributary area
     elif case.plate:
         mean_pressure = np.median(result.pressure[_inner(result)])
     else:
@@ -178,7 +180,7 @@ def apart(case: ClosedForm, result: ContactResult) -> dict[str, float]:
 
 
 def solution(case: ClosedForm) -> tuple[float, float]:
-    """Return approach (m) and pressure (Pa): mean under a plate, peak under a sphere."""
+    """Return the exact approach, m, and pressure, Pa: mean under a plate, peak under a sphere."""
     load, thick = case.load_N, case.thickness_mm * MILLIMETRE
     young, radius = case.modulus_MPa * MEGAPASCAL, case.radius_mm * MILLIMETRE
     if case.plate:
@@ -205,7 +207,7 @@ def solution(case: ClosedForm) -> tuple[float, float]:
 
 
 def closed_forms(quick: bool) -> Iterator[ClosedForm]:
-    """Return the cases; the quick ones judge each family on each thing that it can do wrong."""
+    """Return the cases: one per model and kind of solution, and unless `quick` their extremes."""
     solids = ("lattice", "lattice-linear", "fe")
     for model in (*solids, "lattice-source", "foundation", "foundation-linear"):
         yield ClosedForm("plate", model)
@@ -222,12 +224,11 @@ def closed_forms(quick: bool) -> Iterator[ClosedForm]:
 def _wide(
     kind: str, model: str, load_N: float = 3000.0, nu: float = 0.3, **options: bool
 ) -> ClosedForm:
-    """Return a sphere that presses as wide as the layer is thick: several cells of 3 mm."""
+    """Return a case of a sphere of 300 mm on 12 mm. The contact spans several cells of 3 mm."""
     return ClosedForm(kind, model, load_N, 12.0, nu=nu, radius_mm=300.0, **options)
 
 
 def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
-    """Return the extremes of each case: load, thickness, modulus, Poisson's ratio."""
     for model, load in product(solids, (0.01, 1.0, 100.0, 2000.0)):
         yield ClosedForm("plate", model, load)
     yield ClosedForm("plate", "lattice-linear", 50000.0, modulus_MPa=2000.0)
@@ -247,7 +248,6 @@ def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
 
 
 def _strain(case: ClosedForm, stress: float) -> float:
-    """Return the uniaxial strain of a stress (Pa), Ramberg-Osgood."""
     young = case.modulus_MPa * MEGAPASCAL
     strain = stress / young
     if case.linear or case.model.endswith("linear"):
@@ -258,8 +258,11 @@ def _strain(case: ClosedForm, stress: float) -> float:
 
 
 def _column(case: ClosedForm) -> Callable[[float], float]:
-    """Return the pressure (Pa) of a column of the bed at d/h: M d/h, or the curve at
-    (M/E) -ln(1 - d/h), M = E (1 - nu)/((1 + nu)(1 - 2 nu))."""
+    """Return the pressure, Pa, of a column of the bed as a function of its strain e = d/h.
+
+    Linear: M e with M = E (1 - nu)/((1 + nu)(1 - 2 nu)). Otherwise: the stress at which the
+    Ramberg-Osgood strain is -(M/E) ln(1 - e).
+    """
     nu, young = case.nu, case.modulus_MPa * MEGAPASCAL
     confined = (1 - nu) / ((1 + nu) * (1 - 2 * nu))
     if case.model == "foundation-linear":
@@ -274,14 +277,13 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
 
 
 def _inner(result: ContactResult) -> Mask:
-    """Return the points a fifth of the block's side away from its edges."""
+    """Return which map points lie at least a fifth of the block's side from its edges."""
     across = np.abs(result.points[:, [0, 2]]).max(axis=1)
     inner: Mask = across < 0.3 * CLOSED_FORM.block_side_mm * MILLIMETRE
     return inner
 
 
 def _plate(side: float) -> Surface:
-    """Return a box whose lower face lies in y = 0."""
     box = block(flat(10 * MILLIMETRE), (side, side), side / 2)
     return Surface(box.vertices, box.faces, "plate")
 

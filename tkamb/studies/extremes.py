@@ -1,4 +1,4 @@
-"""The extreme cases of the stability study: a base case with one or two extreme parameters."""
+"""Extreme cases of the stability study: a base case with one or two extreme parameters."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,45 +22,45 @@ class ExtremeMeshSettings:
     """Meshes of the study of extreme cases."""
 
     sectors: int = 48
-    """Number of sectors of the rings of the condyles. Chosen: all compared models use the same
-    mesh."""
+    """Vertices of a ring of the condyles. A coarse mesh suffices, because all compared models use
+    it."""
 
 
 EXTREME_MESH = ExtremeMeshSettings()
 
 
 Shape = Literal["usual", "swapped", "lip", "spike", "subdivided", "slivers"]
-"""Shape of the two bodies: usual; exchanged; with a steep rim of 6 mm in front; with a vertex of
-the femoral component pulled out by 3 mm; with each femoral triangle divided into four; with
-needle-shaped triangles (one vertex of each ring moved almost onto the next)."""
+"""Shape of the two bodies. swapped: the bodies are exchanged. lip: the insert has a steep anterior
+rim of 6 mm. spike: one femoral vertex is pulled out by 3 mm. subdivided: each femoral triangle is
+divided into four. slivers: one vertex of each femoral ring is moved almost onto the next."""
 
 
 @dataclass(frozen=True)
 class Extreme:
-    """A contact problem in numbers.
+    """A contact problem in numbers. Lengths are in mm, angles in deg.
 
     Args:
-        load_N: along -y.
-        thickness_mm: under the lowest points of the dishes.
+        load_N: force along -y, N.
+        thickness_mm: thickness of the insert under the lowest points of the dishes.
         resolution_mm: cell size.
-        aspect: length of the insert along x over the base case's.
-        nu: Poisson's ratio.
-        modulus_MPa: of the insert.
-        linear: Hooke's law instead of Ramberg-Osgood.
+        aspect: length of the insert along x, relative to the base case.
+        nu: Poisson's ratio of the insert.
+        modulus_MPa: Young's modulus of the insert, MPa.
+        linear: whether Hooke's law replaces Ramberg-Osgood.
         radius_mm: sagittal radius of the condyles.
-        waist: frontal radius of the condyles over the sagittal one.
-        conformity: radius of the condyles over that of the dishes; 0: a flat insert.
-        apart_mm: half the distance of the condyles; 0: a single one.
-        ap_mm: how far forward the femoral component stands.
-        ml_mm: how far lateral.
+        waist: frontal radius of the condyles over the sagittal radius.
+        conformity: radius of the condyles over the radius of the dishes; 0: a flat insert.
+        apart_mm: half the distance between the condyles; 0: a single condyle.
+        ap_mm: anterior position of the femoral component.
+        ml_mm: lateral position of the femoral component.
         varus_deg: adduction.
         flexion_deg: flexion.
         axial_deg: axial rotation.
         bearing: "fixed" or "mobile".
-        rough_mm: noise on the femoral vertices.
-        facet_deg: distance of the rings of femoral vertices.
-        shape: what is unusual about the bodies, see `SHAPES`.
-        model: contact model.
+        rough_mm: standard deviation of the noise on the femoral vertices.
+        facet_deg: angle between the rings of femoral vertices.
+        shape: shape of the bodies, see `Shape`.
+        model: name of the contact model.
     """
 
     load_N: float = 1500.0
@@ -104,29 +104,29 @@ class Extreme:
         if self.shape == "swapped":
             femoral, insert = insert, femoral.moved(insert_placement(femoral))
         name = "polyethylene-linear" if self.linear else "polyethylene"
-        chosen = material(name, young_modulus=self.modulus_MPa * MEGAPASCAL, poisson_ratio=self.nu)
-        return ContactPair(femoral, insert, chosen, self.bearing)
+        young = self.modulus_MPa * MEGAPASCAL
+        insert_material = material(name, young_modulus=young, poisson_ratio=self.nu)
+        return ContactPair(femoral, insert, insert_material, self.bearing)
 
     @property
     def pose(self) -> Array:
-        """(4, 4) pose_femoral_in_insert."""
+        """pose_femoral_in_insert, shape (4, 4)."""
         angles = np.array([self.axial_deg, self.varus_deg, self.flexion_deg]) * DEGREE
         return knee_pose([self.ap_mm * MILLIMETRE, 0.0, self.ml_mm * MILLIMETRE, *angles])
 
     @property
     def label(self) -> str:
-        """What differs from the base case: "load_N=1, nu=0.499"."""
-        base, own = vars(replace(Extreme(), model=self.model)), vars(self)
-        return ", ".join(f"{k}={v}" for k, v in own.items() if v != base[k]) or "base case"
+        """Differences from the base case, as "load_N=1, nu=0.499"."""
+        base = vars(replace(Extreme(), model=self.model))
+        return ", ".join(f"{k}={v}" for k, v in vars(self).items() if v != base[k]) or "base case"
 
 
 def _lipped(height: Height) -> Height:
-    """Return the surface with a rim of 6 mm that rises within 1 mm, 9 mm in front of the dishes."""
+    """Return the height with a rim of 6 mm that rises between x = 9 mm and x = 10 mm."""
     return lambda x, z: height(x, z) + 6 * MILLIMETRE * np.clip(x / MILLIMETRE - 9.0, 0.0, 1.0)
 
 
 def _shaped(surface: Surface, shape: Shape) -> Surface:
-    """Return the femoral component in an unusual shape or mesh."""
     vertices, faces = surface.vertices.copy(), surface.faces
     if shape == "spike":
         vertices[np.argmin(vertices[:, 1])] -= [0.0, 3 * MILLIMETRE, 0.0]
@@ -168,7 +168,7 @@ ALONE: dict[str, tuple[object, ...]] = {
     "facet_deg": (0.2, 2.0, 5.0, 11.0),
     "shape": ("swapped", "lip", "spike", "subdivided", "slivers"),
 }
-"""Extreme values of one parameter at a time; `TOGETHER`: of two at a time."""
+"""Extreme values of one parameter at a time."""
 
 TOGETHER: tuple[tuple[str, tuple[object, ...], str, tuple[object, ...]], ...] = (
     ("load_N", (10.0, 6000.0, 20000.0), "thickness_mm", (2.1, 4.0, 20.0)),
@@ -195,6 +195,7 @@ TOGETHER: tuple[tuple[str, tuple[object, ...], str, tuple[object, ...]], ...] = 
     ("resolution_mm", (1.3, 3.0, 4.0), "thickness_mm", (3.0, 20.0)),
     ("resolution_mm", (1.3, 3.0, 4.0), "conformity", (0.0, 0.99)),
 )
+"""Extreme values of two parameters at a time."""
 
 OTHER_MODELS = (
     *("hertz", "foundation", "foundation-linear"),
@@ -222,7 +223,7 @@ HARDEST: tuple[dict[str, object], ...] = (
     {"shape": "spike"},
     {"shape": "subdivided"},
 )
-"""Extremes on which the other models are tested."""
+"""Extremes on which `OTHER_MODELS` are tested."""
 
 BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
     {"linear": True},
@@ -234,15 +235,15 @@ BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
     {"linear": True, "thickness_mm": 4.0},
     {"linear": True, "modulus_MPa": 2000.0},
 )
-"""Extremes with stored results of CalculiX, for the lattice and `fe`, on cells of 3 mm."""
+"""Extremes with stored results of CalculiX. `lattice` and `fe` solve them on cells of 3 mm."""
 
 
 def extremes() -> Iterator[Extreme]:
-    """Return all of them, each once."""
-    labels = set()
+    """Return all extreme cases without duplicates."""
+    seen = set()
     for extreme in _all():
-        if extreme not in labels:
-            labels.add(extreme)
+        if extreme not in seen:
+            seen.add(extreme)
             yield extreme
 
 
@@ -261,7 +262,7 @@ def _all() -> Iterator[Extreme]:
 
 
 def beside_calculix() -> Iterator[Extreme]:
-    """Return the extremes whose answers by CalculiX are stored."""
+    """Return the extreme cases with a stored result of CalculiX."""
     base = replace(Extreme(), resolution_mm=3.0)
     for changes, model in product(BESIDE_CALCULIX, ("lattice", "fe")):
         yield replace(base, model=model, **changes)  # type: ignore[arg-type]

@@ -1,9 +1,9 @@
-"""Rows of a study, stored one by one as they are measured, so that it can be stopped and resumed.
+"""Stored rows of a study, which make it possible to stop and resume the study.
 
-Each row is one line of JSON, appended and flushed at once: {"key": ..., "row": ..., "sha256": ...}.
-"key" is the SHA-256 of what was measured and of the code that measured it. "sha256" is that of key
-and row. A line that a kill cut short, or that was changed, counts as absent. A line with the right
-SHA-256 and a row of other fields was forged: it is refused.
+Each row is stored as soon as it is measured, as a line of JSON: {"key": ..., "row": ...,
+"sha256": ...}. "key" is the SHA-256 of the measured case and the code. "sha256" is the SHA-256 of
+key and row. An incomplete or changed line counts as absent. A line with the right SHA-256 but other
+fields is an error.
 """
 
 import hashlib
@@ -27,11 +27,12 @@ T = TypeVar("T")
 
 
 class KeptRows:
-    """The rows in a study's folder.
+    """The stored rows in the folder of a study.
 
     Args:
         directory: folder of the study.
-        resume: keep what an earlier study left there; else it is removed.
+        resume: whether to use the rows of an earlier study in the folder. Otherwise they are
+            deleted.
 
     Raises:
         InputError: the folder cannot be written.
@@ -44,21 +45,21 @@ class KeptRows:
         write_text(self.path, "".join(_line(key, row) for key, row in self._rows.items()))
 
     def get(self, key: str) -> Row | None:
-        """Return the row of that key as it was written; None if there is none."""
+        """Return the row with a key; None if there is no such row."""
         return self._rows.get(key)
 
     def read(
         self, key: str, kind: type[T], is_whole: Callable[[T], bool] = lambda row: True
     ) -> T | None:
-        """Return the row of that key as an object; None if there is none.
+        """Return the row with a key as an object; None if there is no such row.
 
         Args:
-            key: see `row_key`.
+            key: key of the row, see `row_key`.
             kind: dataclass of the row.
-            is_whole: whether the values of a row are those of a row of this study.
+            is_whole: function that returns whether the values of a row are valid.
 
         Raises:
-            InputError: the row has other fields, or values of another kind.
+            InputError: the row has other fields, or invalid values.
         """
         content = self._rows.get(key)
         if content is None:
@@ -69,12 +70,12 @@ class KeptRows:
             row = None
         names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
         if row is None or content.keys() != names or not is_whole(row):
-            what = f"holds a row that is no {kind.__name__} of this study: somebody changed it"
+            what = f"holds a row that is not a {kind.__name__} of this study: somebody changed it"
             raise InputError(what, self.path, "remove the file, or leave out resume=True")
         return row
 
     def put(self, key: str, row: Row) -> None:
-        """Keep a row."""
+        """Store a row under its key."""
         with self._lock:
             self._rows[key] = row
             try:
@@ -95,7 +96,6 @@ def _row_hash(key: str, row: Row) -> str:
 
 
 def _whole_rows(path: Path) -> dict[str, Row]:
-    """Return key -> row of the lines that are whole and as they were written."""
     if not path.exists():
         return {}
     result: dict[str, Row] = {}
@@ -111,10 +111,6 @@ def _whole_rows(path: Path) -> dict[str, Row]:
 
 
 def row_key(*what: Any) -> str:
-    """Return the key of a row: the hash of what was measured and of the code.
-
-    Args:
-        what: anything that JSON can hold.
-    """
+    """Return the key of a row: the SHA-256 of the code and of `what`, the measured case."""
     text = json.dumps([code_identity(), *what], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -1,10 +1,10 @@
 """Times, memory and results of one contact model on one case.
 
-Each job runs in a process of its own: `python -m tkamb.studies.measures` reads a `Job` as JSON from
-standard input and prints the `Measure` as JSON. The peak memory is then that of the job alone, and
-a crash or a hang gives a row too. The process uses one thread, so that times are repeatable.
+Each job runs in a separate process: `python -m tkamb.studies.measures` reads a `Job` as JSON from
+standard input and prints the `Measure` as JSON. The peak memory is therefore that of the job alone,
+and a crash or a hang is recorded. The process uses one thread for repeatable times.
 
-`quantities`, `errors` and `map_error` are the numbers by which two contact results are compared.
+`quantities`, `errors` and `map_error` compare two contact results.
 """
 
 import json
@@ -43,7 +43,7 @@ Quantities = dict[str, float]
 
 
 def quantities(result: ContactResult) -> Quantities:
-    """Return approach (m) and each condyle's force (N), mean and peak pressure (Pa), area (m²)."""
+    """Return the approach, m, and force, N, pressures, Pa, and area, m², of each condyle."""
     values = {"approach": result.approach}
     for side in SIDES:
         condyle = getattr(result, side)
@@ -53,23 +53,23 @@ def quantities(result: ContactResult) -> Quantities:
 
 
 def are_quantities(values: Mapping[str, float]) -> bool:
-    """Return whether values have all names of `quantities`, and are finite."""
+    """Return whether values have exactly the names of `quantities` and are finite."""
     names = {"approach", *(f"{side}_{part}" for side in SIDES for part in PARTS)}
     return values.keys() == names and all(map(math.isfinite, values.values()))
 
 
 def is_map(stored: Mapping[str, float]) -> bool:
-    """Return whether a stored raster has places "i j" and finite pressures."""
+    """Return whether a stored raster has keys "i j" and finite pressures."""
     places = all(re.fullmatch(r"-?\d{1,6} -?\d{1,6}", place) for place in stored)
     return places and all(map(math.isfinite, stored.values()))
 
 
 def errors(values: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
-    """Return relative errors: approach, force, mean_pressure, peak_pressure, area.
+    """Return the relative errors of approach, force, mean_pressure, peak_pressure and area.
 
-    Errors of force and area are relative to the sum over both condyles, errors of pressure to the
-    higher one, so that a condyle that hardly touches does not dominate. The larger error of the two
-    condyles is returned.
+    Errors of force and area are relative to the sum of both condyles, errors of pressure to the
+    higher pressure, so that a condyle with little load does not dominate. The larger error of the
+    two condyles is returned.
     """
     result = {"approach": _relative(values, reference, ["approach"], np.max)}
     for part in PARTS:
@@ -83,22 +83,22 @@ def _relative(
     values: Mapping[str, float], reference: Mapping[str, float], names: list[str], scale: object
 ) -> float:
     assert callable(scale)
-    own = np.array([values[name] for name in names])
+    computed = np.array([values[name] for name in names])
     true = np.array([reference[name] for name in names])
-    return float(np.abs(own - true).max() / scale(np.abs(true)))
+    return float(np.abs(computed - true).max() / scale(np.abs(true)))
 
 
 Raster = dict[tuple[int, int], float]
-"""Raster place (i along x, j along z) -> pressure (Pa), where there is any."""
+"""Raster point (i along x, j along z) -> pressure, Pa. Points without pressure are omitted."""
 
 
 def raster_of(stored: Mapping[str, float]) -> Raster:
-    """Return a raster stored as "i j" -> Pa."""
+    """Return the raster that is stored as "i j" -> pressure, Pa."""
     return {(int(i), int(j)): p for (i, j), p in ((k.split(), p) for k, p in stored.items())}
 
 
 def raster_map(result: ContactResult) -> Raster:
-    """Return the pressure map on the raster."""
+    """Return the pressure map of a result, interpolated to the raster."""
     loaded = result.pressure > 0
     if not loaded.any():
         return {}
@@ -121,27 +121,28 @@ def raster_map(result: ContactResult) -> Raster:
 
 
 def map_error(raster: Raster, reference: Raster) -> float:
-    """Return the L2 norm of the maps' difference over that of the reference."""
-    places = sorted(set(raster) | set(reference))
-    own = np.array([raster.get(place, 0.0) for place in places])
-    true = np.array([reference.get(place, 0.0) for place in places])
-    return float(np.linalg.norm(own - true) / np.linalg.norm(true))
+    """Return the L2 norm of the difference of two maps over the norm of the reference."""
+    points = sorted(set(raster) | set(reference))
+    computed = np.array([raster.get(point, 0.0) for point in points])
+    true = np.array([reference.get(point, 0.0) for point in points])
+    return float(np.linalg.norm(computed - true) / np.linalg.norm(true))
 
 
 @dataclass(frozen=True)
 class MeasureSettings:
-    """How times of the trade-off study are measured."""
+    """Time measurements of the trade-off study."""
 
     longest_seconds: float = 300.0
-    """s: a job that takes longer is stopped and says so. Chosen: the whole page takes minutes."""
+    """s: time limit of a job. A longer job is stopped and has no result. Chosen because the study
+    should take minutes."""
     repeats: int = 3
-    """Repeats of the preparation and the first press; also the smallest number of warm presses.
-    Chosen: enough for a median."""
+    """Most timed preparations and first presses, and fewest timed warm presses. Chosen for a
+    median."""
     warm_presses: int = 7
-    """Presses from a neighbouring pose that are timed. Chosen: enough for a median."""
+    """Most timed presses from a neighbouring pose. Chosen for a median."""
     enough_seconds: float = 3.0
-    """s: no more repeats after this time of measurement, except `repeats` warm presses. Chosen: the
-    whole page takes minutes."""
+    """s: measured time after which only `repeats` warm presses are still timed. Chosen because the
+    study should take minutes."""
 
 
 MEASURE = MeasureSettings()
@@ -153,7 +154,7 @@ ONE_THREAD = dict.fromkeys(
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set variables of the environment for a while; processes started meanwhile keep them."""
+    """Set environment variables inside a `with` block. Processes started in it inherit them."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -165,14 +166,14 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Job:
-    """What to measure.
+    """A contact model and a case to measure.
 
     Args:
         case: name of the case.
-        contact: name of the model.
-        resolution_mm: spacing of its map points.
+        contact: name of the contact model.
+        resolution_mm: spacing of the model's map points, mm.
         options: options of the model.
-        scene: a user's scene for the cases that need it.
+        scene: path of a user's scene, for the cases of that scene.
     """
 
     case: str
@@ -183,24 +184,24 @@ class Job:
 
     @property
     def label(self) -> str:
-        """The model with its options: "lattice[tolerance=0.01]"."""
+        """Name of the model with its options, as "lattice[tolerance=0.01]"."""
         return setting_label(self.contact, self.options)
 
 
 @dataclass(frozen=True)
 class Measure:
-    """What was measured.
+    """Cost and results of a job.
 
     Args:
-        status: "ok" or why not.
-        prepare_seconds: median time of `prepare`, without anything from disk.
-        cold_seconds: first press after it; median.
-        warm_seconds: press at the next pose, from where the last one ended; median.
-        peak_rss_MB: of the process.
-        iterations: iterations of the first press.
+        status: "ok", or the reason why there is no result.
+        prepare_seconds: median time of `prepare` without the cache on disk, s.
+        cold_seconds: median time of a first press without a warm start, s.
+        warm_seconds: median time of a press at the next pose with a warm start, s.
+        peak_rss_MB: peak memory of the process, MB.
+        iterations: number of iterations of the first press.
         nodes: number of nodes that the model solves for.
-        values: approach, forces, pressures, areas.
-        map: "i j" -> Pa on a raster of 1 mm.
+        values: quantities of the first press, see `quantities`.
+        map: "i j" -> pressure, Pa, on a raster of 1 mm.
     """
 
     status: str
@@ -215,11 +216,11 @@ class Measure:
 
 
 MOST_NODES = 10**9
-"""No model has so many nodes, and no press so many iterations."""
+"""Upper limit of the nodes and iterations in a valid stored measure."""
 
 
 def is_whole(measure: Measure) -> bool:
-    """Return whether a kept measure has all numbers of its status."""
+    """Return whether a stored measure has the values that its status requires."""
     if max(measure.iterations, measure.nodes) > MOST_NODES:
         return False
     if measure.status != "ok":
@@ -228,10 +229,10 @@ def is_whole(measure: Measure) -> bool:
 
 
 def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure:
-    """Measure in a new process."""
+    """Measure a job in a new process with a time limit, s."""
     command = [sys.executable, "-m", "tkamb.studies.measures"]
     try:
-        ran = subprocess.run(
+        process = subprocess.run(
             command,
             input=json.dumps(asdict(job)),
             capture_output=True,
@@ -243,13 +244,13 @@ def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure
         )
     except subprocess.TimeoutExpired:
         return Measure(f"stopped after {longest:g} s")
-    if ran.returncode:
-        return Measure(f"failed: {(ran.stderr.strip().splitlines() or ['no message'])[-1]}")
-    return Measure(**json.loads(ran.stdout))
+    if process.returncode:
+        return Measure(f"failed: {(process.stderr.strip().splitlines() or ['no message'])[-1]}")
+    return Measure(**json.loads(process.stdout))
 
 
 def measure(job: Job) -> Measure:
-    """Measure in this process."""
+    """Measure a job in this process."""
     model = _model(job)
     (prepare, cold), (case, state, result, start) = _first(model, job)
     if result.status is not ContactStatus.OK:
@@ -277,9 +278,9 @@ def _model(job: Job) -> ContactModel:
 def _first(
     model: ContactModel, job: Job
 ) -> tuple[tuple[float, float], tuple[StudyCase, Any, ContactResult, WarmStart]]:
-    """Return the median seconds of prepare and first press, and what the last of both gave.
+    """Return the median times of preparation and first press, s, and the last results of both.
 
-    The bodies are made again each time, so that no cached property of them saves time.
+    The bodies are made anew for each repeat, so that no cached property shortens the time.
     """
     prepares: list[float] = []
     colds: list[float] = []
@@ -301,8 +302,8 @@ def _warm(model: ContactModel, state: Any, case: StudyCase, start: WarmStart) ->
         len(seconds) < MEASURE.warm_presses and sum(seconds) < MEASURE.enough_seconds
     ):
         pose = case.nearby(len(seconds) + 1)
-        spent, (_, start) = _timed(model.press_from, state, case.load, pose, start)
-        seconds.append(spent)
+        duration, (_, start) = _timed(model.press_from, state, case.load, pose, start)
+        seconds.append(duration)
     return median(seconds)
 
 

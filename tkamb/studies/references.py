@@ -1,23 +1,23 @@
-"""Converged references of the studies' cases: the limit of refined grids.
+"""Reference solutions of the studies' cases: the limit of refined grids.
 
 The reference of a sphere on a linear layer is the exact solution below (`sphere_on_layer`). Other
-cases are solved by finite elements and by the lattice, to a tolerance of 1e-6, on ever finer grids:
+cases are solved with finite elements and with the lattice, to a tolerance of 1e-6, on refined
+grids:
 
-- Approach and forces: the common limit of both families (Richardson extrapolation).
-- Peak pressures and areas jump from node to node, without an order of convergence: the mean of the
-  two finest grids.
-- Uncertainty: the largest of the residual of the fit, the difference of the two families, and the
-  distance between the limit and the finest grids (half of it for peak pressures and areas).
+- Approach and forces: the common limit of both models (Richardson extrapolation). Uncertainty: the
+  largest of the residual of the fit, half the difference of the models' limits, and the distance
+  from the limit to the finest grids.
+- Pressures and areas: the mean over the two finest grids, because they have no order of
+  convergence. Uncertainty: the larger of half their range and half the distance to the limit.
 
-References are stored with the hash of their case.
-
-A rigid sphere on an elastic layer that is bonded to a rigid base, without friction: under an
-axisymmetric pressure with the Hankel transform P(k) the surface moves by
+The exact solution is that of a rigid sphere, without friction, on an elastic layer of thickness t
+bonded to a rigid base. Under an axisymmetric pressure with the Hankel transform P(k) the surface
+displacement is
 
     u(r) = 2 (1 - nu²)/E ∫ L(k t) P(k) J0(k r) dk
     L(w) = (2 κ sinh 2w - 4 w)/(2 κ cosh 2w + 1 + κ² + 4 w²),   κ = 3 - 4 nu
 
-Elliptic integrals give the half-space part (L = 1), quadrature gives the rest.
+Elliptic integrals give the part of a half-space (L = 1), quadrature gives the part of L - 1.
 
 Reference: Johnson, Contact Mechanics (1985), sections 3.4 and 5.8.
 """
@@ -49,14 +49,14 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class ElasticLayerSettings:
-    """The numerical solution of a layer under a sphere."""
+    """Numerical solution of a layer under a sphere."""
 
     rings: int = 160
-    """Rings of constant pressure under the sphere. Chosen: twice as many change the result by less
-    than is compared."""
+    """Rings of constant pressure under the sphere. Chosen because twice as many have no effect on
+    the comparisons."""
     half_space_wave_number: float = 60.0
-    """Wave number times thickness beyond which the layer is a half space. Chosen: the difference is
-    below rounding."""
+    """Wave number times thickness above which the layer is treated as a half-space. Chosen because
+    the difference is below round-off."""
 
 
 ELASTIC_LAYER = ElasticLayerSettings()
@@ -64,13 +64,13 @@ ELASTIC_LAYER = ElasticLayerSettings()
 
 @dataclass(frozen=True, eq=False)
 class LayerContact:
-    """The contact.
+    """Contact of a sphere on a layer.
 
     Args:
-        contact_radius: m.
-        approach: m.
-        radii: (n,) m, middles of the rings.
-        pressure: (n,) Pa.
+        contact_radius: radius of the contact area, m.
+        approach: approach, m.
+        radii: mean radii of the pressure rings, m, shape (n,).
+        pressure: pressure of the rings, Pa, shape (n,).
     """
 
     contact_radius: float
@@ -82,13 +82,13 @@ class LayerContact:
 def sphere_on_layer(
     radius: float, thickness: float, load: float, young_modulus: float, poisson_ratio: float
 ) -> LayerContact:
-    """Return the contact of a sphere (paraboloid) that carries a load.
+    """Return the contact of a sphere (a paraboloid) under a load.
 
     Args:
-        radius: m, of the sphere.
-        thickness: m, of the layer.
-        load: N.
-        young_modulus: Pa, of the layer.
+        radius: radius of the sphere, m.
+        thickness: thickness of the layer, m.
+        load: load, N.
+        young_modulus: Young's modulus of the layer, Pa.
         poisson_ratio: Poisson's ratio of the layer.
     """
     low, high = 1e-6, 0.5 * thickness + 0.2 * radius
@@ -102,25 +102,27 @@ def sphere_on_layer(
 def _indented(
     radius: float, thickness: float, contact: float, young: float, nu: float
 ) -> tuple[LayerContact, float]:
-    """Return the contact of a given radius and its load (N)."""
+    """Return the contact with a given contact radius, m, and its load, N."""
     angle = np.linspace(0.0, np.pi / 2, ELASTIC_LAYER.rings + 1)
     edges, middles = contact * np.sin(angle), contact * np.sin((angle[1:] + angle[:-1]) / 2)
     disk = _disks(middles, edges[1:], thickness, young, nu)
-    full = np.zeros((ELASTIC_LAYER.rings + 1, ELASTIC_LAYER.rings + 1))
-    full[: ELASTIC_LAYER.rings, : ELASTIC_LAYER.rings] = disk - np.column_stack(
+    matrix = np.zeros((ELASTIC_LAYER.rings + 1, ELASTIC_LAYER.rings + 1))
+    # a ring is the difference of two disks
+    matrix[: ELASTIC_LAYER.rings, : ELASTIC_LAYER.rings] = disk - np.column_stack(
         [np.zeros(ELASTIC_LAYER.rings), disk[:, :-1]]
     )
-    full[: ELASTIC_LAYER.rings, ELASTIC_LAYER.rings] = -1.0
+    matrix[: ELASTIC_LAYER.rings, ELASTIC_LAYER.rings] = -1.0
+    # at the edge of the contact the pressure falls as the square root of the distance
     root = np.sqrt(1 - (middles[-2:] / contact) ** 2)
-    full[ELASTIC_LAYER.rings, ELASTIC_LAYER.rings - 2 : ELASTIC_LAYER.rings] = [root[1], -root[0]]
-    solution = np.linalg.solve(full, np.append(-(middles**2) / (2 * radius), 0.0))
+    matrix[ELASTIC_LAYER.rings, ELASTIC_LAYER.rings - 2 : ELASTIC_LAYER.rings] = [root[1], -root[0]]
+    solution = np.linalg.solve(matrix, np.append(-(middles**2) / (2 * radius), 0.0))
     pressure = solution[: ELASTIC_LAYER.rings]
     force = float(pressure @ (np.pi * np.diff(edges**2)))
     return LayerContact(contact, float(solution[ELASTIC_LAYER.rings]), middles, pressure), force
 
 
 def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -> Array:
-    """Return the displacement (n, m) at radii `at` (n,) under unit pressure on disks (m,)."""
+    """Return displacements (n, m), m/Pa, at radii `at` (n,) of pressed disks of `radii` (m,)."""
     r, b = at[:, None], radii[None]
     share = np.minimum(r / b, b / r) ** 2
     inside = 4 * b / np.pi * ellipe(share)
@@ -134,8 +136,8 @@ def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -
     ) - 1
     transform = radii[:, None] * j1(k[None] * radii[:, None]) / k
     step = layer * weights * ELASTIC_LAYER.half_space_wave_number / 2 / thickness
-    rest = j0(k[None] * at[:, None]) @ (step * transform).T
-    return 2 * (1 - nu**2) / young * (half_space + rest)
+    difference = j0(k[None] * at[:, None]) @ (step * transform).T
+    return 2 * (1 - nu**2) / young * (half_space + difference)
 
 
 STORED = Path(__file__).with_name("references.json")
@@ -146,15 +148,16 @@ LARGE_GRIDS_MM = (2.0, 1.5, 1.25, 1.0)
 
 @dataclass(frozen=True)
 class ReferenceSettings:
-    """How the studies' reference solutions are computed."""
+    """Computation of the reference solutions."""
 
     large_volume: float = 2e-5
-    """m³: volume of an insert's bounding box from which only the coarser grids are used. Chosen:
-    finer grids of it do not fit into memory."""
+    """m³: volume of the insert's bounding box above which coarser grids are used. Chosen because
+    the finest grid of such an insert does not fit into memory."""
     tolerance: float = 1e-6
-    """Relative tolerance of the reference solutions. Chosen: far below what is compared."""
+    """Relative tolerance of the reference solutions. Chosen far below the compared errors."""
     width_effect: float = 0.005
-    """Relative difference of a block 3.4 times as wide as high from an endless layer. Computed."""
+    """Relative difference between a block 3.4 times as wide as high and an infinite layer.
+    Computed."""
 
 
 REFERENCE = ReferenceSettings()
@@ -162,15 +165,15 @@ REFERENCE = ReferenceSettings()
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The converged answer of a case.
+    """The reference solution of a case.
 
     Args:
         hash: hash of the case.
-        values: approach (m), condyles' forces (N), pressures (Pa) and areas (m²).
-        uncertainty: uncertainty of each value, same units.
-        grids_mm: cell sizes that went into it.
-        solved: what each grid gave: "fe 1 mm" -> values.
-        map: "i j" -> Pa, pressure of the finest finite elements on a raster of 1 mm.
+        values: approach, m, and forces, N, pressures, Pa, and areas, m², of the condyles.
+        uncertainty: uncertainty of each value, in the same unit.
+        grids_mm: cell sizes of the solved grids, mm.
+        solved: grid, as "fe 1 mm" -> its values.
+        map: "i j" -> pressure, Pa, of the finest finite-element grid on a raster of 1 mm.
     """
 
     hash: str
@@ -182,16 +185,12 @@ class Reference:
 
     @property
     def raster(self) -> Raster:
-        """The map by raster place."""
+        """The map by raster point."""
         return raster_of(self.map)
 
 
 def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None) -> Reference:
-    """Solve a case on refined grids and return their common limit.
-
-    Args:
-        case: the case.
-        grids_mm: cell sizes; default by the size of the insert.
+    """Solve a case on grids of the given or default cell sizes, mm, and return its reference.
 
     Raises:
         ComputationError: a grid did not converge.
@@ -216,11 +215,7 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
 
 
 def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
-    """Return values and uncertainties from what the grids gave; see the module.
-
-    Args:
-        solved: "fe 1 mm" -> values.
-    """
+    """Return values and uncertainties from grid, as "fe 1 mm" -> its values; see the module."""
     h = np.array([float(name.split()[1]) for name in solved]) * MILLIMETRE
     family = np.array([FAMILIES.index(name.split()[0]) for name in solved])
     values, uncertainty = {}, {}
@@ -238,32 +233,32 @@ def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
 
 
 def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
-    """Return the limit h -> 0 that several families of grids share, and its uncertainty.
+    """Return the common limit h -> 0 of several families of grids, and its uncertainty.
 
-    Least squares of q0 + c_f h² over all families f (Richardson with the order of
-    trilinear cells). The uncertainty is the largest of half the spread of the families' own
-    limits and of the residuals.
+    The limit q0 is from a least-squares fit of q0 + c_f h² over all families f (Richardson
+    extrapolation of trilinear cells). The uncertainty is the larger of the largest residual and
+    half the range of the families' separate limits.
 
     Args:
-        h: (n,) m, cell sizes.
-        values: (n,).
-        family: (n,) number of the family of each.
+        h: cell sizes, m, shape (n,).
+        values: results on the grids, shape (n,).
+        family: number of the family of each grid, shape (n,).
     """
     kinds = np.unique(family)
     slopes = np.where(family[:, None] == kinds, h[:, None] ** 2, 0.0)
     matrix = np.column_stack([np.ones(len(h)), slopes])
     solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
     residual = np.abs(matrix @ solution - values).max()
-    own = []
+    limits = []
     for kind in kinds:
-        some = family == kind
-        line = np.column_stack([np.ones(some.sum()), h[some] ** 2])
-        own.append(np.linalg.lstsq(line, values[some], rcond=None)[0][0])
-    return float(solution[0]), float(max(residual, 0.5 * (max(own) - min(own))))
+        members = family == kind
+        line = np.column_stack([np.ones(members.sum()), h[members] ** 2])
+        limits.append(np.linalg.lstsq(line, values[members], rcond=None)[0][0])
+    return float(solution[0]), float(max(residual, 0.5 * (max(limits) - min(limits))))
 
 
 def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
-    """Return the elastic layer's solution; the block's finite width is its uncertainty."""
+    """Return the exact solution of the layer. The uncertainty is the effect of a finite width."""
     layer = sphere_on_layer(
         sphere.radius,
         sphere.thickness,
@@ -284,20 +279,18 @@ def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
 
 
 def is_reference(reference: Reference, case: StudyCase) -> bool:
-    """Return whether a kept reference is one of a case, with all numbers."""
+    """Return whether a stored reference belongs to a case and is complete."""
     values = (reference.values, reference.uncertainty, *reference.solved.values())
     return (
-        reference.hash == case.hash
-        and all(are_quantities(one) for one in values)
-        and is_map(reference.map)
+        reference.hash == case.hash and all(map(are_quantities, values)) and is_map(reference.map)
     )
 
 
 def read_references(path: Path = STORED) -> dict[str, Reference]:
-    """Return case name -> reference of a stored file; nothing if there is no file.
+    """Return case name -> reference of a file; empty if the file does not exist.
 
     Raises:
-        InputError: the file is not one of references.
+        InputError: the file has other content.
     """
     if not path.exists():
         return {}
@@ -314,7 +307,7 @@ def read_references(path: Path = STORED) -> dict[str, Reference]:
 
 
 def write_references(references: dict[str, Reference], path: Path) -> None:
-    """Store references."""
+    """Write references to a file."""
     content = {name: asdict(reference) for name, reference in references.items()}
     text = json.dumps(content, indent=1, default=float)
     write_text(path, text + "\n")
@@ -324,7 +317,7 @@ def reference_of(case: StudyCase, stored: dict[str, Reference]) -> Reference:
     """Return the stored reference of a case.
 
     Raises:
-        InputError: there is none, or the case has changed since.
+        InputError: the reference is missing, or belongs to an earlier version of the case.
     """
     result = stored.get(case.name)
     if result is None or result.hash != case.hash:

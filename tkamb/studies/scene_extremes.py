@@ -1,11 +1,11 @@
-"""Extremes of a whole run: time steps, noise, friction, moment arms, meshes, flexion.
+"""Extremes of a whole run: duration, noise, friction, moment arms and damaged meshes.
 
-The shipped knee bend is run on a few frames with one extreme parameter. The right result is
+The shipped knee bend is run on a few frames with one extreme parameter. The expected result is
 known without a second solver:
 
-- time: forces are F_rest + F_inertia / scale² where the same motion takes `scale` times as long;
-- always: the deformed insert carries the superior-inferior force that balance asks for;
-- meshes: a damaged mesh is refused in one line, or gives the intact one's answer.
+- all: the nodal forces on the insert sum to the superior-inferior force of the equilibrium.
+- time: if the motion takes `scale` times as long, the forces are F_static + F_inertia / scale².
+- meshes: a damaged mesh is an error, or gives the peak pressure of the intact mesh.
 """
 
 import math
@@ -36,11 +36,11 @@ TIME_SCALES = (1e-3, 1e-2, 0.1, 0.3, 3.0, 20.0, 1e4)
 
 @dataclass(frozen=True)
 class InertiaStudySettings:
-    """How the effect of inertia is found."""
+    """Measurement of the effect of inertia: the recorded motion against a slow one."""
 
     slow_factor: float = 10.0
-    """Ratio of the time of the slow motion to the recorded one; the difference from the recorded
-    motion is the effect of inertia. Chosen: inertia is then negligible."""
+    """Duration of the slow motion over that of the recorded motion. Chosen because the inertia
+    forces are then 1 % of those of the recorded motion."""
 
 
 INERTIA_STUDY = InertiaStudySettings()
@@ -48,8 +48,8 @@ INERTIA_STUDY = InertiaStudySettings()
 NOISES = (1e-3, 1e-2, 0.1, 1.0)
 FRICTIONS = (0.0, 0.2, 0.6, 1.0)
 ARMS_MM = (-20.0, -60.0, -90.0, -98.0, -101.0, -104.0, -108.0, -120.0)
-"""mm: positions of the patellar ligament's insertion, with a straight line, until the moment arm is
-zero (at -98 to -108, depending on flexion) and beyond."""
+"""mm: anterior shifts of the tibial insertion of the patellar ligament. Its line is straight. The
+moment arm is zero at -98 to -108 mm, depending on flexion."""
 DEFECTS = ("hole", "flipped", "doubled", "sliver", "nan", "empty", "tiny")
 
 Check = Callable[["Results", Path], float]
@@ -60,8 +60,8 @@ class SceneExtreme:
     """One extreme of a run.
 
     Args:
-        kind: "time", "noise", "friction", "arm" or a mesh: "femoral", "insert".
-        value: how far, or the defect.
+        kind: extreme parameter, "time", "noise", "friction", "arm", or mesh, "femoral", "insert".
+        value: value of the parameter, or the defect of the mesh.
     """
 
     kind: str
@@ -69,12 +69,12 @@ class SceneExtreme:
 
     @property
     def label(self) -> str:
-        """The case in words."""
+        """Name of the case."""
         return f"run: {self.kind} {self.value}"
 
 
 def scene_extremes() -> Iterator[SceneExtreme]:
-    """Return all of them; none where the shipped knee bend is not there."""
+    """Return all cases; none if the shipped knee bend is not installed."""
     if not SHIPPED_SCENE.exists():
         return
     series = {"time": TIME_SCALES, "noise": NOISES, "friction": FRICTIONS, "arm": ARMS_MM}
@@ -90,23 +90,22 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     with tempfile.TemporaryDirectory() as folder:
         scene = copied_scene(Path(folder))
         try:
-            overrides = _drive(extreme, Path(folder))
+            overrides = _apply(extreme, Path(folder))
             results = _run(scene, overrides)
             seconds = clock.perf_counter() - start
-            apart = _apart(extreme, results, Path(folder))
-        except TkambError as error:
+            error = _relative_error(extreme, results, Path(folder))
+        except TkambError as refusal:
             seconds = clock.perf_counter() - start
-            reason = str(error).replace(f"{folder}/", "")
+            reason = str(refusal).replace(f"{folder}/", "")
             return Verdict(extreme.label, "run", "flagged", reason, seconds=seconds)
-    words = sorted({status for status in results.status if status != "ok"})
-    flags = "; ".join(words)
+    flags = "; ".join(sorted({status for status in results.status if status != "ok"}))
     if any(status.startswith(FAILED) for status in results.status):
         return Verdict(extreme.label, "run", "flagged", flags, seconds=seconds)
-    right = math.isfinite(apart) and apart <= VERDICT.max_error
+    right = math.isfinite(error) and error <= VERDICT.max_error
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
-    reason = flags if right or flags else f"{100 * apart:.3g} % from what it must be"
-    distance = apart if math.isfinite(apart) else None
-    return Verdict(extreme.label, "run", kind, reason, distance, seconds)
+    reason = flags if right or flags else f"{100 * error:.3g} % from the expected result"
+    finite_error = error if math.isfinite(error) else None
+    return Verdict(extreme.label, "run", kind, reason, finite_error, seconds)
 
 
 def _run(scene: Path, overrides: dict[str, Any]) -> "Results":
@@ -116,12 +115,11 @@ def _run(scene: Path, overrides: dict[str, Any]) -> "Results":
     return simulate(load_scene(scene, CONTACT | overrides), frames=FRAMES)
 
 
-def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
-    """Change the copied scene's files; return the keys to override."""
+def _apply(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
     if extreme.kind == "time":
         stretch_time(folder, extreme.value)
     elif extreme.kind == "noise":
-        _shake(folder, extreme.value)
+        _add_noise(folder, extreme.value)
     elif extreme.kind == "friction":
         return {"contact.friction": extreme.value}
     elif extreme.kind == "arm":
@@ -135,41 +133,39 @@ def _drive(extreme: SceneExtreme, folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _apart(extreme: SceneExtreme, results: "Results", folder: Path) -> float:
-    """Return how far (relative) the results are from what they must be."""
+def _relative_error(extreme: SceneExtreme, results: "Results", folder: Path) -> float:
     assert results.maps is not None
-    demanded = results["force_si_N"]
+    required = results["force_si_N"]
     force = -results.maps.nodal_force_N[:, :, 1].sum(axis=1)
-    apart = float(np.max(np.abs(force - demanded) / np.abs(demanded)))
+    error = float(np.max(np.abs(force - required) / np.abs(required)))
     if extreme.kind == "time":
-        once = _run(SHIPPED_SCENE, {})["force_si_N"]
+        recorded = _run(SHIPPED_SCENE, {})["force_si_N"]
         stretch_time(folder, INERTIA_STUDY.slow_factor / extreme.value)
         slow = _run(folder / "scene.toml", {})["force_si_N"]
-        inertia = (once - slow) / (1.0 - 1.0 / INERTIA_STUDY.slow_factor**2)
-        law = once - inertia + inertia / extreme.value**2
-        return max(apart, float(np.max(np.abs(demanded - law) / np.abs(law))))
+        inertia = (recorded - slow) / (1.0 - 1.0 / INERTIA_STUDY.slow_factor**2)
+        expected = recorded - inertia + inertia / extreme.value**2
+        return max(error, float(np.max(np.abs(required - expected) / np.abs(expected))))
     if extreme.kind in ("femoral", "insert"):
-        whole = _run(SHIPPED_SCENE, {})
-        peak = [np.maximum(r["medial_peak_pressure_MPa"], 0) for r in (results, whole)]
-        return max(apart, float(np.max(np.abs(peak[0] - peak[1]) / peak[1])))
-    return apart
+        intact = _run(SHIPPED_SCENE, {})
+        peak = [np.maximum(r["medial_peak_pressure_MPa"], 0) for r in (results, intact)]
+        return max(error, float(np.max(np.abs(peak[0] - peak[1]) / peak[1])))
+    return error
 
 
-def _shake(folder: Path, noise: float) -> None:
-    """Add noise of that many mm and deg to the knee's coordinates."""
+def _add_noise(folder: Path, noise: float) -> None:
+    """Add noise to the knee's coordinates. `noise` is the standard deviation in mm and deg."""
 
-    def shaken(head: list[str], rows: Array) -> Array:
+    def with_noise(head: list[str], rows: Array) -> Array:
         rng = np.random.default_rng(160)
         starts = ("flex", "add", "ax", "ap", "ml")
         knee = [head.index(name) for name in head if name.startswith(starts)]
         rows[:, knee] += rng.normal(0.0, noise, (len(rows), len(knee)))
         return rows
 
-    change_recording(folder / "motion.csv", shaken)
+    change_recording(folder / "motion.csv", with_noise)
 
 
 def _damage(path: Path, defect: str) -> None:
-    """Write a mesh back with a defect."""
     mesh = trimesh.load_mesh(path)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     if defect == "hole":
@@ -186,5 +182,5 @@ def _damage(path: Path, defect: str) -> None:
         vertices = vertices * 1e-3
     elif defect == "empty":
         faces = faces[:0]
-    broken = trimesh.Trimesh(vertices, faces, process=False)
-    path.write_bytes(trimesh.exchange.stl.export_stl(broken))
+    damaged = trimesh.Trimesh(vertices, faces, process=False)
+    path.write_bytes(trimesh.exchange.stl.export_stl(damaged))

@@ -1,5 +1,4 @@
-"""Stability at the extremes: every case is judged in a process of its own, which may crash or
-hang."""
+"""Stability at extreme parameters. Each case runs in its own process, which may crash or hang."""
 
 import json
 import multiprocessing
@@ -24,7 +23,7 @@ from tkamb.studies.verdict import KINDS, Verdict, judge, judge_closed_form
 Case = Extreme | ClosedForm | SceneExtreme
 
 STORED = Path(__file__).with_name("verdicts.json")
-"""Verdict on each case, as last accepted; `scripts/make_stability_verdicts` writes it."""
+"""Accepted verdict on each case. `scripts/make_stability_verdicts` writes the file."""
 
 
 @dataclass(frozen=True)
@@ -32,41 +31,45 @@ class StabilitySettings:
     """Limits of the stability study."""
 
     longest_seconds: float = 120.0
-    """s: a case whose model takes longer counts as hanging. Chosen: usual cases take seconds."""
+    """s: time limit of a model; a longer case is a hang. Chosen because usual cases take
+    seconds."""
     longest_reference_seconds: float = 900.0
-    """s: a case whose reference takes longer is unverified. Chosen: the study ends within a day."""
+    """s: time limit of a reference; a longer case is unverified. Chosen because the study should
+    end within a day."""
     workers: int = 2
-    """Number of processes of the study. Chosen: a small computer has as many cores."""
+    """Number of processes of the study. Chosen because a small computer has two cores."""
     quick_share: int = 13
-    """Ratio of all cases to those of the quick study. Chosen: it takes minutes."""
+    """Stride of the extreme cases that the quick study takes. Chosen because it should take
+    minutes."""
     quick_grid_mm: float = 3.0
-    """mm; finest grid of the quick study. Chosen: it takes minutes."""
+    """mm: smallest cell size of the quick study. Chosen because it should take minutes."""
     quick_with_peer: int = 4
-    """Number of cases of the quick study that CalculiX solves too. Chosen: it takes minutes."""
+    """Number of cases of the quick study with a stored result of CalculiX. Chosen because it should
+    take minutes."""
 
 
 STABILITY = StabilitySettings()
 
 PRESSED = "pressed"
-"""What a process sends once the model has answered."""
+"""Message that a process sends when the model has a result."""
 QUICK_SHAPES: tuple[Shape, ...] = ("swapped", "lip", "spike")
 
 
 def stability_cases(quick: bool) -> list[Case]:
-    """Return the cases of the study."""
+    """Return the cases of the full or the quick study."""
     if not quick:
         return [*closed_forms(False), *extremes(), *scene_extremes()]
     coarse = (
         replace(c, resolution_mm=max(c.resolution_mm, STABILITY.quick_grid_mm)) for c in extremes()
     )
-    some = [*dict.fromkeys(coarse)][:: STABILITY.quick_share]
+    sample = [*dict.fromkeys(coarse)][:: STABILITY.quick_share]
     shapes = [Extreme(resolution_mm=STABILITY.quick_grid_mm, shape=shape) for shape in QUICK_SHAPES]
-    peered = list(beside_calculix())[: STABILITY.quick_with_peer]
-    return [*closed_forms(True), *dict.fromkeys((*peered, *shapes, *some))]
+    with_calculix = list(beside_calculix())[: STABILITY.quick_with_peer]
+    return [*closed_forms(True), *dict.fromkeys((*with_calculix, *shapes, *sample))]
 
 
 def stored_verdicts(path: Path = STORED) -> dict[str, str]:
-    """Return case -> kind as last accepted; nothing if there is no file."""
+    """Return case -> kind of its accepted verdict; empty if the file does not exist."""
     if not path.exists():
         return {}
     content: dict[str, str] = json.loads(path.read_text(encoding="utf-8"))
@@ -79,13 +82,13 @@ def run_stability(
     kept: KeptRows | None = None,
     workers: int = STABILITY.workers,
 ) -> Iterator[Verdict]:
-    """Judge all cases; yield their verdicts in order.
+    """Judge all cases and yield their verdicts in the order of the cases.
 
     Args:
         cases: the cases.
-        longest: s, after which a case counts as hanging.
-        kept: rows of an earlier study, which are not computed again; new ones are added.
-        workers: cases at a time.
+        longest: time limit of a case, s.
+        kept: stored verdicts of earlier studies. They are not computed again; new ones are added.
+        workers: number of cases that run at the same time.
     """
     judges, stored = _Judges(longest, kept), stored_verdicts()
     pool = ThreadPoolExecutor(workers, initializer=_leave_interrupts_to_parent)
@@ -101,13 +104,12 @@ def run_stability(
 def kept_verdicts(
     cases: Sequence[Case], kept: KeptRows, longest: float = STABILITY.longest_seconds
 ) -> list[Verdict]:
-    """Return the verdicts that are kept, in the cases' order: those finished before others, too."""
+    """Return all stored verdicts in the order of the cases, also those not yet yielded."""
     rows, stored = [_kept_verdict(kept, case, longest) for case in cases], stored_verdicts()
     return [replace(row, expected=stored.get(row.key)) for row in rows if row is not None]
 
 
 def _kept_verdict(kept: KeptRows, case: Case, longest: float) -> Verdict | None:
-    """Return the kept verdict on a case; None if there is none."""
     return kept.read(
         _row_key(case, longest),
         Verdict,
@@ -122,8 +124,8 @@ def _row_key(case: Case, longest: float) -> str:
 class _Judges:
     """Judges each case in a new process, because a case may crash or hang.
 
-    The processes are forked from a server process that has only imported the modules, so that a new
-    one costs milliseconds. Each computes with one thread.
+    The processes are forked from a server process that has imported the modules, so a new process
+    costs milliseconds. Each process computes with one thread.
     """
 
     def __init__(self, longest: float, rows: KeptRows | None) -> None:
@@ -136,30 +138,30 @@ class _Judges:
             ensure_running()
 
     def verdict(self, case: Case) -> Verdict:
-        """Return the verdict on a case, kept or new."""
+        """Return the verdict on a case, stored or new."""
         if self._kept is None:
-            return self._judged_apart(case)
+            return self._judge_in_process(case)
         result = _kept_verdict(self._kept, case, self._longest)
         if result is None:
-            result = self._judged_apart(case)
+            result = self._judge_in_process(case)
             self._kept.put(_row_key(case, self._longest), asdict(result))
         return result
 
     def limit(self, case: Case) -> float:
-        """Return after how many seconds a case counts as hanging."""
+        """Return the time limit of a case, s."""
         return self._longest
 
     def stop(self) -> None:
-        """End the processes; the cases that they judge get no verdict."""
+        """Kill the processes. Their cases get no verdict."""
         self._stopped = True
         for process in list(self._running):
             process.kill()
 
-    def _judged_apart(self, case: Case) -> Verdict:
+    def _judge_in_process(self, case: Case) -> Verdict:
         receiver, sender = self._context.Pipe(duplex=False)
         process = self._context.Process(target=_send_verdict, args=(case, sender), daemon=True)
         process.start()
-        sender.close()  # so that the process's end is seen at the other end
+        sender.close()  # otherwise the receiver does not notice that the process has ended
         self._running.add(process)
         try:
             return self._received(case, receiver)
@@ -175,7 +177,6 @@ class _Judges:
             self._running.discard(process)
 
     def _received(self, case: Case, receiver: Connection) -> Verdict:
-        """Return what a process sends within the limits of time; see `_send_verdict`."""
         if self._stopped:
             raise EOFError
         if not receiver.poll(self.limit(case)):
@@ -191,15 +192,11 @@ class _Judges:
 
 
 def _leave_interrupts_to_parent() -> None:
-    """Block Ctrl-C in this thread's processes; the parent ends them.
-
-    A process inherits the blocked signals of the thread that starts it.
-    """
+    """Block Ctrl-C in this thread and in the processes that it starts; the parent kills them."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 def _send_verdict(case: Case, sender: Connection) -> None:
-    """Judge a case: send `PRESSED` once the model has answered, then the verdict."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     sender.send(judge_safely(case, lambda: sender.send(PRESSED)))
 
@@ -209,7 +206,7 @@ def _ended(case: Case, kind: str, reason: str) -> Verdict:
 
 
 def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:
-    """Return the verdict on a case; an unexpected exception is a verdict, too."""
+    """Return the verdict on a case. An unexpected exception gives a verdict of that kind."""
     try:
         if isinstance(case, Extreme):
             return judge(case, pressed)
@@ -223,7 +220,7 @@ def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verd
 
 
 def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """Return what `tkamb stability --json` prints."""
+    """Return the content of `tkamb stability --json`."""
     counts = {kind: sum(v.kind == kind for v in verdicts) for kind in KINDS}
     return {
         "cases": len(verdicts),
@@ -240,19 +237,19 @@ def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
 
 
 def table(verdicts: Sequence[Verdict]) -> list[str]:
-    """Return the counts by contact model, then the cases that failed, then the flagged ones."""
+    """Return the lines of the printed table: counts by contact model, then lists of cases."""
     lines = [f"{'contact':18s} {'cases':>5s} " + " ".join(f"{kind:>15s}" for kind in KINDS)]
     for model in [*dict.fromkeys(v.contact for v in verdicts), "all"]:
-        some = [v for v in verdicts if model in (v.contact, "all")]
-        counts = [sum(v.kind == kind for v in some) for kind in KINDS]
-        lines.append(f"{model:18s} {len(some):5d} " + " ".join(f"{n:15d}" for n in counts))
+        group = [v for v in verdicts if model in (v.contact, "all")]
+        counts = [sum(v.kind == kind for v in group) for kind in KINDS]
+        lines.append(f"{model:18s} {len(group):5d} " + " ".join(f"{n:15d}" for n in counts))
     flagged = [v for v in verdicts if v.kind == "flagged" and not v.failed]
     better = [v for v in verdicts if v.kind == "converged" and v.expected not in (None, v.kind)]
     unknown = [v for v in verdicts if v.expected is None]
     groups = {"failed": [v for v in verdicts if v.failed], "flagged": flagged}
     groups |= {"better than stored": better, "no stored verdict": unknown}
-    for title, some in groups.items():
-        lines += ["", f"{title}: {len(some)}", *(_line(v) for v in some)]
+    for title, group in groups.items():
+        lines += ["", f"{title}: {len(group)}", *(_line(v) for v in group)]
     return lines
 
 

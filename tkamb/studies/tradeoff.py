@@ -1,9 +1,8 @@
-"""Speed against accuracy: every contact model on every case, against converged references.
+"""Trade-off of speed and accuracy: every contact model on every case, against references.
 
-A `Row` holds the times and errors of one model on one case; the rows that no other row of the case
-beats form its Pareto front. The default matrix is reduced: fine grids and solver options are
-measured on one case of each pair of bodies, not at every pose. `full` measures every setting on
-every case.
+A `Row` contains the times and errors of one model on one case. Rows that no other row of the case
+beats form the Pareto front of the case. By default, fine grids and solver options are measured only
+on some cases. With `full` every setting is measured on every case.
 """
 
 import json
@@ -43,18 +42,18 @@ from tkamb.studies.references import (
 )
 
 FRONT_ERRORS = ("approach", "force", "peak_pressure")
-"""The largest of these errors is the one of the front."""
+"""Errors of which the largest is the error of a model on the Pareto front."""
 KEYS = ("approach", "force", "mean_pressure", "peak_pressure", "area", "map")
 TIMES = ("prepare_seconds", "cold_seconds", "warm_seconds", "peak_rss_MB")
 
 
 @dataclass(frozen=True)
 class TimingSettings:
-    """How times are compared."""
+    """Comparison of times."""
 
     equal_ratio: float = 1.2
-    """Ratio: two medians of time within this factor count as equal. Chosen: repeated measurements
-    vary by as much."""
+    """Ratio of two median times below which they count as equal. Chosen because repeated
+    measurements vary by this factor."""
 
 
 TIMING = TimingSettings()
@@ -62,14 +61,14 @@ TIMING = TimingSettings()
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One model on one case.
+    """Cost and errors of one model on one case.
 
     Args:
-        job: what was measured.
-        measure: times, memory, values.
-        errors: relative, against the reference: `KEYS`; empty if it failed.
+        job: model and case.
+        measure: times, memory and results.
+        errors: name of `KEYS` -> error relative to the reference; empty if the job failed.
         floor: largest relative uncertainty of the reference among `FRONT_ERRORS`.
-        on_front: no other model of the case beats it.
+        on_front: whether the row is on the Pareto front of its case.
     """
 
     job: Job
@@ -80,13 +79,13 @@ class Row:
 
     @property
     def worst(self) -> float:
-        """The largest error of `FRONT_ERRORS`, at least the reference's own uncertainty."""
+        """The largest error of `FRONT_ERRORS`, but at least the uncertainty of the reference."""
         if not self.errors:
             return float("inf")
         return max(self.floor, *(self.errors[key] for key in FRONT_ERRORS))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row of `tradeoff --json`; None where nothing was found."""
+        """Return the row as in `tkamb tradeoff --json`. Missing numbers are None."""
         measure = self.measure
         row: dict[str, Any] = {
             "case": self.job.case,
@@ -103,12 +102,12 @@ class Row:
 
 
 def _rounded(value: float) -> float | None:
-    """Return a number to six digits for JSON, None for what is none."""
+    """Return a number to six digits for JSON; None for NaN and inf."""
     return float(f"{value:.6g}") if math.isfinite(value) else None
 
 
 def row_of(content: dict[str, Any]) -> Row:
-    """Return the row that `as_dict` made."""
+    """Return the row from the dictionary of `Row.as_dict`."""
 
     def number(key: str) -> float:
         return math.nan if content[key] is None else float(content[key])
@@ -121,46 +120,46 @@ def row_of(content: dict[str, Any]) -> Row:
 
 
 def compared(job: Job, measure: Measure, reference: Reference) -> Row:
-    """Return the row of what was measured, with its errors."""
+    """Return the row of a measure with its errors against a reference."""
     floor = floor_of(reference)
     if measure.status != "ok":
         return Row(job, measure, {}, floor)
-    apart = map_error(raster_of(measure.map), reference.raster) if measure.map else math.nan
-    return Row(job, measure, errors(measure.values, reference.values) | {"map": apart}, floor)
+    map_part = map_error(raster_of(measure.map), reference.raster) if measure.map else math.nan
+    return Row(job, measure, errors(measure.values, reference.values) | {"map": map_part}, floor)
 
 
 def floor_of(reference: Reference) -> float:
-    """Return the largest relative uncertainty among `FRONT_ERRORS`."""
+    """Return the largest relative uncertainty of a reference among `FRONT_ERRORS`."""
     shifted = {k: v + reference.uncertainty[k] for k, v in reference.values.items()}
-    apart = errors(shifted, reference.values)
-    return max(apart[key] for key in FRONT_ERRORS)
+    uncertainty = errors(shifted, reference.values)
+    return max(uncertainty[key] for key in FRONT_ERRORS)
 
 
 def with_fronts(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with those marked that are on their case's Pareto front."""
+    """Return the rows, sorted by case, with `on_front` set."""
     marked: list[Row] = []
     for case in dict.fromkeys(row.job.case for row in rows):
-        some = [row for row in rows if row.job.case == case]
-        front = on_front([(row.measure.warm_seconds, row.worst) for row in some if row.errors])
+        group = [row for row in rows if row.job.case == case]
+        front = on_front([(row.measure.warm_seconds, row.worst) for row in group if row.errors])
         marks = iter(front)
-        marked += [replace(row, on_front=bool(row.errors) and next(marks)) for row in some]
+        marked += [replace(row, on_front=bool(row.errors) and next(marks)) for row in group]
     return marked
 
 
 def on_front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Say which (seconds, error) are beaten by no other.
-
-    One beats another if it is no less accurate and clearly faster, or more accurate and not
-    clearly slower; clearly means by more than the noise.
-    """
+    """Return for each point (seconds, error) whether no other point beats it."""
     return [not any(beats(other, point) for other in points) for point in points]
 
 
-def beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Say whether one (seconds, error) beats another; see `on_front`."""
-    faster = one[0] * TIMING.equal_ratio < other[0]
-    not_slower = one[0] <= other[0] * TIMING.equal_ratio
-    return (one[1] <= other[1] and faster) or (one[1] < other[1] and not_slower)
+def beats(first: tuple[float, float], second: tuple[float, float]) -> bool:
+    """Return whether the first point (seconds, error) beats the second.
+
+    It is faster and at least as accurate, or more accurate and not slower. Times within
+    `TIMING.equal_ratio` count as equal.
+    """
+    faster = first[0] * TIMING.equal_ratio < second[0]
+    not_slower = first[0] <= second[0] * TIMING.equal_ratio
+    return (first[1] <= second[1] and faster) or (first[1] < second[1] and not_slower)
 
 
 def as_json(rows: Sequence[Row]) -> str:
@@ -172,7 +171,7 @@ def read_rows(path: Path) -> list[Row]:
     """Return the rows of a tradeoff.json.
 
     Raises:
-        InputError: there is none, or it is something else.
+        InputError: the file is missing or has other content.
     """
     try:
         return [row_of(content) for content in json.loads(path.read_text(encoding="utf-8"))]
@@ -183,11 +182,12 @@ def read_rows(path: Path) -> list[Row]:
 QUICK_CASES = ("sphere", "two condyles")
 QUICK_MODELS = ("hertz", "foundation", "lattice", "lattice-linear", "fe")
 ONE_OF_EACH = ("sphere", "two condyles", "conforming", "knee 60 deg", "scene 60 deg")
-"""Cases on which the fine grids are measured; the others repeat their bodies at another pose."""
+"""Cases on which the fine grids are measured. The other cases have the same bodies at another
+pose."""
 TRIED_ON = ("two condyles", "conforming", "knee 60 deg")
-"""Cases on which the variants are measured."""
+"""Cases on which the options of the models are varied."""
 PEER_GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
-"""mm: cell sizes of the cases for CalculiX; two condyles at 1 mm take minutes."""
+"""Case -> cell sizes for CalculiX, mm. The two condyles take minutes at 1 mm."""
 
 
 @dataclass(frozen=True)
@@ -195,10 +195,10 @@ class Settings:
     """Settings at which a contact model is measured.
 
     Args:
-        everywhere_mm: cell sizes on every case.
-        fine_mm: further ones on one case of each pair of bodies.
-        variants: options beside the default ones, at `variant_mm`.
-        variant_mm: cell size of the variants.
+        everywhere_mm: cell sizes for every case, mm.
+        fine_mm: additional cell sizes for the cases `ONE_OF_EACH`, mm.
+        variants: options other than the default, for the cases `TRIED_ON`.
+        variant_mm: cell size of the variants, mm.
     """
 
     everywhere_mm: tuple[float, ...] = (2.0,)
@@ -220,16 +220,16 @@ SETTINGS = {
     "lattice-source": Settings((2.0,), ()),
     "fe": Settings((2.0,), (1.5, 1.0), ({"newton": True},)),
 }
-"""Of the built-in models; another package's model is measured at `Settings()`."""
+"""Name of a built-in model -> its settings. Models of other packages use `Settings()`."""
 
 
 def jobs(quick: bool = False, scene: Path | None = None, full: bool = False) -> list[Job]:
-    """Return what is measured, case by case.
+    """Return the jobs of the study, sorted by case.
 
     Args:
-        quick: two cases, 2 mm, the default options.
-        scene: a user's scene, whose cases come last.
-        full: every setting on every case.
+        quick: whether to measure only two cases at 2 mm with the default options.
+        scene: scene file of a user. Its cases are the last ones.
+        full: whether to measure every setting on every case.
     """
     scene_name = None if scene is None else str(scene)
     if quick:
@@ -253,7 +253,7 @@ def _of(settings: Settings, case: str, full: bool) -> list[tuple[float, dict[str
 
 
 def expected_seconds(jobs: Sequence[Job], cases: Sequence[StudyCase]) -> list[float]:
-    """Return the approximate time of each job, from the number of cells, to show the time left."""
+    """Return the approximate time of each job, s, from its number of cells."""
     box = {c.name: float(np.prod(np.ptp(c.pair.insert.vertices, axis=0))) for c in cases}
     return [2.0 + _per_node(job) * box[job.case] / (job.resolution_mm * 1e-3) ** 3 for job in jobs]
 
@@ -267,12 +267,12 @@ def _per_node(job: Job) -> float:
 def run_tradeoff(
     jobs: Sequence[Job], references: dict[str, Reference], rows: KeptRows | None = None
 ) -> Iterator[Row]:
-    """Measure and compare; yield the rows as they come, no front marked yet.
+    """Measure the jobs and yield one row per job. The Pareto fronts are not yet marked.
 
     Args:
-        jobs: what to measure.
-        references: case name -> converged answer.
-        rows: rows of an earlier study, which are not computed again; new ones are added.
+        jobs: models and cases to measure.
+        references: case name -> reference.
+        rows: stored measures of earlier studies. They are not repeated; new ones are added.
     """
     for job in jobs:
         reference = references[job.case]
@@ -283,7 +283,6 @@ def run_tradeoff(
 
 
 def _measured(rows: KeptRows | None, key: str, measure: Callable[[], Measure]) -> Measure:
-    """Return the kept measure; measure and keep it where there is none."""
     result = rows.read(key, Measure, is_whole) if rows else None
     if result is None:
         result = measure()
@@ -298,13 +297,13 @@ def run_peer(
     rows: KeptRows | None = None,
     sizes_mm: Collection[float] = (2.0,),
 ) -> Iterator[Row]:
-    """Yield CalculiX's rows on the cases that it can do; one that fails is a row too.
+    """Measure CalculiX and yield one row per case and cell size of `PEER_GRIDS_MM`.
 
     Args:
-        cases: cases that may be pressed.
-        references: case name -> converged answer.
-        rows: rows of an earlier study, which are not computed again; new ones are added.
-        sizes_mm: cell sizes that are wanted.
+        cases: contact problems. Those without an entry in `PEER_GRIDS_MM` are skipped.
+        references: case name -> reference.
+        rows: stored measures of earlier studies. They are not repeated; new ones are added.
+        sizes_mm: requested cell sizes, mm.
 
     Raises:
         InputError: CalculiX is not installed.
@@ -326,19 +325,23 @@ def references_for(
     announce: Callable[[str], None],
     rows: KeptRows | None = None,
 ) -> dict[str, Reference]:
-    """Return the references of the cases: stored, or computed and stored where asked for.
+    """Return case name -> reference. Those of a user's scene are computed and stored in `rows`.
 
-    References of a user's own scene are computed, and kept with the study's rows.
+    Args:
+        cases: contact problems.
+        recompute: whether to compute and store the references again.
+        announce: function that prints a line before a reference is computed.
+        rows: stored rows of earlier studies.
 
     Raises:
-        InputError: one is missing, or belongs to an earlier version of its case.
-        ComputationError: one cannot be computed.
+        InputError: a stored reference is missing, or belongs to an earlier version of its case.
+        ComputationError: a reference cannot be computed.
     """
     stored = read_references(STORED)
     result: dict[str, Reference] = {}
     for case in cases:
         if case.name.startswith("scene"):
-            result[case.name] = _own_reference(case, announce, rows)
+            result[case.name] = _user_reference(case, announce, rows)
         elif recompute:
             announce(f"reference of case '{case.name}': {case.label}")
             stored[case.name] = result[case.name] = compute_reference(case)
@@ -348,13 +351,13 @@ def references_for(
     return result
 
 
-def _own_reference(
+def _user_reference(
     case: StudyCase, announce: Callable[[str], None], rows: KeptRows | None
 ) -> Reference:
     key = row_key("reference", case.hash)
-    kept = rows.read(key, Reference, lambda one: is_reference(one, case)) if rows else None
-    if kept is not None:
-        return kept
+    stored = rows.read(key, Reference, lambda row: is_reference(row, case)) if rows else None
+    if stored is not None:
+        return stored
     announce(f"reference of case '{case.name}': {case.label}")
     result = compute_reference(case)
     if rows:
@@ -363,6 +366,6 @@ def _own_reference(
 
 
 def cases_of(jobs: Sequence[Job]) -> list[StudyCase]:
-    """Return the cases of some jobs."""
+    """Return the cases of the jobs without duplicates."""
     names = {job.case: job.scene for job in jobs}
     return [study_case(name, Path(scene) if scene else None) for name, scene in names.items()]

@@ -1,25 +1,25 @@
-"""The verdict on one case: converged, flagged, or failed.
+"""The verdict on one case of the stability study: converged, flagged, or failed.
 
-Each extreme is tested in three ways:
+Each extreme case is tested in three ways:
 
-- by checks that every contact result must pass (`complaints`): the nodal forces carry the load;
-  the pressures times their areas carry it too; no pressure is negative; no solved node lies inside
-  the femoral component; the forces of the condyles are the sums over the map below them;
-- by a stored result of CalculiX, where there is one (`peer_distances`). CalculiX solves the same
-  hexahedra (C3D8I), so coarse cells suffice. Where the contact is a few cells wide, the programs
-  differ because their elements differ: the bounds are the largest measured differences, rounded up;
-- by Newton's method on the same grid, which shows errors of the solver alone.
+- Checks that every contact result must pass (`complaints`): nodal forces and pressures sum to the
+  load, no pressure is negative, no solved node lies inside the femoral component, and the condyle
+  forces agree with the pressure map.
+- A stored result of CalculiX on the same hexahedra (C3D8I), if there is one (`peer_distances`). The
+  elements differ, so the bounds are the largest measured differences, rounded up.
+- Newton's method on the same grid, which shows errors of the solver without those of the grid.
 
-A closed form is tested by its formula (`closed_forms`). Kinds of verdict:
+A closed form is tested with its formula. Kinds of verdict:
 
-- converged: status ok, no complaint, and within 2 % of the reference in approach, condyle force and
-  peak pressure.
-- flagged: no result, or a doubtful one, with a reason.
-- unflagged_wrong: status ok and no flag, but a complaint, or too far from a reference.
-- unverified: status ok, but the reference did not converge. Counts as failed.
-- exception: any exception that is not one of tkamb's own. hang: the model exceeds its time limit.
+- converged: the status is ok, all checks pass, and the result is within 2 % of the reference in
+  approach, condyle force and peak pressure.
+- flagged: there is no result, or a result with a flag fails a check or differs too much.
+- unflagged_wrong: a result with status ok and no flag fails a check or differs too much.
+- unverified: the status is ok, but the reference did not converge. Counts as failed.
+- exception: an exception of a class that tkamb does not define.
+- hang: the model exceeds its time limit.
 
-Accepted verdicts are stored. A case that was converged and is flagged now counts as worse.
+Accepted verdicts are stored.
 """
 
 import json
@@ -39,7 +39,12 @@ from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.studies.cases import content_hash
-from tkamb.studies.closed_forms import TOLERANCES, ClosedForm, apart, press_closed_form
+from tkamb.studies.closed_forms import (
+    TOLERANCES,
+    ClosedForm,
+    press_closed_form,
+    relative_errors,
+)
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.measures import Quantities, errors, quantities
 
@@ -49,30 +54,31 @@ class AuditSettings:
     """Tolerances of the checks that need no reference."""
 
     force_tolerance: float = 0.005
-    """Relative: forces, pressures and condyles against the load. Chosen: a few times the solver's
-    tolerance."""
+    """Largest relative difference of forces and pressures from the load. Chosen as a few times the
+    solver's tolerance."""
     penetration_tolerance: float = 5e-3
-    """1: largest depth of a node inside the femoral component, as a share of the approach. Chosen:
-    a few times the solver's tolerance."""
+    """Largest penetration of a node into the femoral component over the approach. Chosen as a few
+    times the solver's tolerance."""
 
 
 AUDIT = AuditSettings()
 
 PEER_ANSWERS = Path(__file__).with_name("peer_answers.json")
 PEER_BOUNDS = {"approach": 0.035, "force": 0.01, "mean_pressure": 0.09, "peak_pressure": 0.09}
-"""Largest relative distance from CalculiX."""
+"""Largest accepted relative differences from CalculiX."""
 PEER_MODELS = ("lattice", "lattice-linear", "fe")
 
 
 def complaints(result: ContactResult, load: float, solved: bool, source_rule: bool) -> list[str]:
-    """Return in words which checks a result fails.
+    """Return one line for each check that a result fails.
 
     Args:
-        result: a result with status ok.
-        load: N, along -y.
-        solved: the gaps are those of deformed nodes; else penetration is the model's measure.
-        source_rule: pressure is the force along the insert's normal over an even area; else
-            the force over the node's own area.
+        result: contact result with status ok.
+        load: force along -y, N.
+        solved: whether the gaps are those of deformed nodes. Otherwise penetration and peak
+            pressure are not checked.
+        source_rule: whether pressure is the force along the insert's normal over a uniform area.
+            Otherwise it is the force over the tributary area of the node.
     """
     force = np.linalg.norm(result.nodal_force, axis=1)
     along_y = -result.nodal_force[:, 1]
@@ -107,74 +113,74 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
 def _off(what: str, value: float, expected: float) -> str:
     if math.isclose(value, expected, rel_tol=AUDIT.force_tolerance):
         return ""
-    return f"{what} {value / expected:.4f} of what they must"
+    return f"{what} {value / expected:.4f} of the expected value"
 
 
 def body_hash(extreme: Extreme) -> str:
-    """Return the SHA-256 of an extreme's bodies, material, pose, load and grid."""
+    """Return the SHA-256 of the bodies, material, pose, load and grid of an extreme case."""
     words = (extreme.pair.material, extreme.pair.bearing, extreme.load_N, extreme.resolution_mm)
     return content_hash(extreme.pair, [extreme.pose], words)
 
 
 @cache
 def stored_answers(path: Path = PEER_ANSWERS) -> Mapping[str, tuple[str, Quantities]]:
-    """Return case -> (hash, quantities in SI)."""
+    """Return case -> (hash of the case, quantities in SI units of CalculiX's result)."""
     content = json.loads(path.read_text(encoding="utf-8"))
     return {name: (row["hash"], row["quantities"]) for name, row in content.items()}
 
 
 def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
-    """Return the relative distances from CalculiX's stored result; empty if there is none.
+    """Return the relative differences from CalculiX's stored result; empty if there is none.
 
     Raises:
-        InputError: the case has changed since that result was computed.
+        InputError: the stored result belongs to an earlier version of the case.
     """
     if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
         return {}
-    stored, answer = stored_answers()[extreme.label]
-    if stored != body_hash(extreme):
+    stored_hash, peer = stored_answers()[extreme.label]
+    if stored_hash != body_hash(extreme):
         raise InputError(
-            "CalculiX's answer is to an earlier version of the case",
+            "CalculiX's result belongs to an earlier version of the case",
             f"case '{extreme.label}'",
             "run scripts/make_stability_answers",
         )
-    misses = errors(quantities(result), answer)
-    return {name: misses[name] for name in PEER_BOUNDS}
+    differences = errors(quantities(result), peer)
+    return {name: differences[name] for name in PEER_BOUNDS}
 
 
 @dataclass(frozen=True)
 class VerdictSettings:
-    """When a result of a study is wrong."""
+    """Accuracy that the stability study requires."""
 
     max_error: float = 0.02
-    """1: relative distance from the reference above which a result is wrong. Chosen: below what is
-    published of models compared with tests."""
+    """Relative difference from the reference above which a result is wrong. Chosen below the
+    published differences between models and experiments."""
 
 
 VERDICT = VerdictSettings()
 
 JUDGED = ("approach", "force", "peak_pressure")
 NEWTON_TOLERANCES = (1e-6, 1e-4, 1e-3)
-"""Tolerances that are tried for the reference; the tightest that converges is used."""
+"""Tolerances of the reference in the order of trial. The first that converges is used."""
 LOAD_STEPS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
-"""Shares of the load in which it is applied if Newton's method does not converge at once."""
+"""Load steps, as shares of the load, if Newton's method does not converge in one step."""
 KINDS = ("converged", "flagged", "unflagged_wrong", "unverified", "exception", "hang")
 PASSED_KINDS = ("converged", "flagged")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a case ended.
+    """Verdict on a case.
 
     Args:
-        case: the extreme parameters.
-        contact: model.
+        case: label of the case.
+        contact: name of the contact model.
         kind: one of `KINDS`.
-        reason: plain words; empty where all is well.
-        error: largest relative distance from the reference; None if there is nothing to compare.
-        seconds: s, time of preparing and pressing, without the reference.
-        iterations: iterations of the model's solver.
-        expected: the stored kind; None where there is none.
+        reason: reason of a verdict other than converged, or the flags of the result.
+        error: largest relative difference from the reference; None without a comparison.
+        seconds: time of preparation and press without the reference, s.
+        iterations: number of iterations of the model's solver.
+        expected: kind of the stored verdict; None if there is none.
     """
 
     case: str
@@ -193,21 +199,21 @@ class Verdict:
 
     @property
     def worse(self) -> bool:
-        """Whether a case that was converged is flagged now."""
+        """Whether the case is flagged although its stored verdict is converged."""
         return self.kind == "flagged" and self.expected == "converged"
 
     @property
     def failed(self) -> bool:
-        """Whether the study fails by it."""
+        """Whether the verdict makes the study fail."""
         return self.worse or self.kind not in PASSED_KINDS
 
 
 def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdict:
-    """Press an extreme and compare with its reference.
+    """Press an extreme case and compare the result with its reference.
 
     Args:
         extreme: the case.
-        pressed: called once the model has answered, before the reference is computed.
+        pressed: function that is called between the model's result and the reference.
     """
     start = clock.perf_counter()
     try:
@@ -222,9 +228,12 @@ def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdi
     if result.status is not ContactStatus.OK:
         return _verdict(extreme, "flagged", _words(result), None, seconds, result)
     try:
-        wrong = [*_audited(extreme.model, result, extreme.load_N), *_beside_peer(extreme, result)]
-        if wrong:
-            kind, reason = _judged(result, wrong)
+        problems = [
+            *_failed_checks(extreme.model, result, extreme.load_N),
+            *_differences_from_peer(extreme, result),
+        ]
+        if problems:
+            kind, reason = _kind_and_reason(result, problems)
             return _verdict(extreme, kind, reason, None, seconds, result)
         reference = _reference(extreme, state, result)
     except TkambError as error:
@@ -233,44 +242,41 @@ def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdi
 
 
 def judge_closed_form(case: ClosedForm, pressed: Callable[[], None] = lambda: None) -> Verdict:
-    """Press a closed form and compare; see `judge`."""
+    """Press a case and compare the result with its closed form; see `judge`."""
     start = clock.perf_counter()
     result, _ = press_closed_form(case)
     seconds = clock.perf_counter() - start
     pressed()
     if result.status is not ContactStatus.OK:
         return _verdict(case, "flagged", _words(result), None, seconds, result)
-    distances = apart(case, result)
+    distances = relative_errors(case, result)
     bounds = dict(zip(distances, TOLERANCES[case.kind], strict=True))
-    wrong = [
+    problems = [
         f"{name} {100 * value:.3g} % from the closed form"
         for name, value in distances.items()
         if not value <= bounds[name]
     ]
-    wrong += _audited(case.model, result, case.load_N)
-    kind, reason = _judged(result, wrong)
+    problems += _failed_checks(case.model, result, case.load_N)
+    kind, reason = _kind_and_reason(result, problems)
     return _verdict(case, kind, reason, max(distances.values()), seconds, result)
 
 
-def _judged(result: ContactResult, wrong: list[str]) -> tuple[str, str]:
-    """Return kind and reason of an answer with complaints in words."""
-    kind = "converged" if not wrong else "flagged" if result.flags else "unflagged_wrong"
-    return kind, "; ".join((*result.flags, *wrong))
+def _kind_and_reason(result: ContactResult, problems: list[str]) -> tuple[str, str]:
+    kind = "converged" if not problems else "flagged" if result.flags else "unflagged_wrong"
+    return kind, "; ".join((*result.flags, *problems))
 
 
 def _words(result: ContactResult) -> str:
     return "; ".join((result.status.value.replace("_", " "), *result.flags))
 
 
-def _audited(model: str, result: ContactResult, load: float) -> list[str]:
-    """Return what an answer does not obey, in words."""
+def _failed_checks(model: str, result: ContactResult, load: float) -> list[str]:
     fields = getattr(contact_class(model), "__dataclass_fields__", {})
     rule = fields["pressure_rule"].default if "pressure_rule" in fields else None
     return complaints(result, load, "newton" in fields, rule == "source")
 
 
-def _beside_peer(extreme: Extreme, result: ContactResult) -> list[str]:
-    """Return in words where an answer is too far from CalculiX's."""
+def _differences_from_peer(extreme: Extreme, result: ContactResult) -> list[str]:
     return [
         f"{name.replace('_', ' ')} {100 * value:.3g} % from CalculiX"
         for name, value in peer_distances(extreme, result).items()
@@ -281,9 +287,9 @@ def _beside_peer(extreme: Extreme, result: ContactResult) -> list[str]:
 def compared(
     extreme: Extreme, result: ContactResult, reference: ContactResult, seconds: float
 ) -> Verdict:
-    """Return the verdict on a result with status ok."""
-    misses = errors(quantities(result), quantities(reference))
-    distance = max(misses[key] for key in JUDGED)
+    """Return the verdict on a result with status ok, compared with its reference."""
+    differences = errors(quantities(result), quantities(reference))
+    distance = max(differences[key] for key in JUDGED)
     right = math.isfinite(distance) and distance <= VERDICT.max_error
     flags = "; ".join(result.flags)
     kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
@@ -311,12 +317,12 @@ def _model(extreme: Extreme, **options: Any) -> ContactModel:
 
 
 def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactResult:
-    """Return the answer by another way: full Newton, or the generic search for the load."""
+    """Return the result of another method: full Newton, or the generic search for the load."""
     fields = getattr(contact_class(extreme.model), "__dataclass_fields__", {})
     if "newton" not in fields:
         searched = press_by_search(_model(extreme), state, extreme.load_N, extreme.pose)
         if searched.status is not ContactStatus.OK:
-            raise ComputationError("the generic search finds no such load", "reference")
+            raise ComputationError("the generic search does not reach the load", "reference")
         return searched
     for tolerance in NEWTON_TOLERANCES:
         newton = _model(extreme, newton=True, tolerance=tolerance)
@@ -334,7 +340,7 @@ def _by_steps(
     shares: tuple[float, ...],
     start: Guess | None,
 ) -> ContactResult | None:
-    """Return Newton's answer after shares of the load; None where it finds none."""
+    """Return Newton's result at the last share of the load; None if a step does not converge."""
     for share in shares:
         try:
             load = share * extreme.load_N

@@ -1,1 +1,1 @@
-"""Many runs as one: subjects by trials by designs by contact models, one table and one report."""
+"""Runs of many subjects, trials, designs and contact models, with one table and one report."""

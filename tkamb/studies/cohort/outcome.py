@@ -1,4 +1,4 @@
-"""One run of a cohort: through the whole pipeline, reduced to the results that are kept."""
+"""One run of a cohort: its computation, and the part of its results that is stored."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -27,12 +27,12 @@ class PressureMap:
     """The pressure on the insert at one frame.
 
     Args:
-        frame: number of the frame among the run's rows.
-        points: (n, 3) m.
-        triangles: (k, 3).
-        pressure: (n,) Pa.
-        side: "right" or "left".
-        lateral: what insert z points to, "lateral" or "medial".
+        frame: number of the frame among the computed frames of the run.
+        points: map points in the insert frame, m, shape (n, 3).
+        triangles: point numbers of the triangles between them, shape (k, 3).
+        pressure: contact pressure at the points, Pa, shape (n,).
+        side: side of the knee, "right" or "left".
+        lateral: direction of the insert's z axis, "lateral" or "medial".
     """
 
     frame: int
@@ -48,12 +48,13 @@ class Outcome:
     """Results of one run.
 
     Args:
-        reason: why the run failed as a whole; "" if it did not.
-        columns: name -> (f,) numbers of results.csv that the run has, without computing times.
+        reason: reason why the whole run failed; "" if it did not.
+        columns: name -> values (f,) of a modelled numeric column of results.csv, without computing
+            times.
         status: status of each frame.
-        chosen: its pressure map; None without contact.
-        wear: name -> number, "volume_mm3_per_Mc" and others; empty: not asked for, or not found.
-        wear_problem: why there is no wear; empty otherwise.
+        chosen: pressure map of one frame; None without contact.
+        wear: name -> wear result, such as "volume_mm3_per_Mc"; empty if wear was not computed.
+        wear_problem: reason why the wear computation failed; "" if it did not.
     """
 
     reason: str
@@ -65,28 +66,29 @@ class Outcome:
 
     @property
     def failed_frames(self) -> int:
-        """Return how many frames failed."""
+        """Return the number of failed frames."""
         return sum(status.startswith(FAILED) for status in self.status)
 
     @property
     def flagged_frames(self) -> int:
-        """Return how many have numbers, and a status that says more than "ok"."""
+        """Return the number of frames that have numbers and a status other than "ok"."""
         return sum(status != "ok" for status in self.status) - self.failed_frames
 
     def shard(self) -> Shard:
-        """Return it as what is kept in a folder."""
+        """Return the outcome in the form in which it is stored."""
         row: dict[str, Any] = {"reason": self.reason, "status": self.status}
         row |= {"wear": dict(self.wear), "wear_problem": self.wear_problem}
         arrays: dict[str, Any] = {f"column {name}": values for name, values in self.columns.items()}
         if self.chosen is not None:
-            one = self.chosen
-            row |= {"frame": one.frame, "side": one.side, "lateral": one.lateral}
-            arrays |= {"points": one.points, "triangles": one.triangles, "pressure": one.pressure}
+            chosen = self.chosen
+            row |= {"frame": chosen.frame, "side": chosen.side, "lateral": chosen.lateral}
+            arrays |= {"points": chosen.points, "triangles": chosen.triangles}
+            arrays["pressure"] = chosen.pressure
         return Shard(row, arrays or None)
 
     @classmethod
     def of(cls, shard: Shard) -> "Outcome":
-        """Return what a shard holds."""
+        """Return the outcome that a shard stores."""
         row, arrays = shard.row, shard.contact or {}
         columns = {
             name.removeprefix("column "): values
@@ -112,7 +114,7 @@ MAP_KINDS = {"frame": int, "side": str, "lateral": str}
 
 
 def is_outcome(shard: Shard) -> bool:
-    """Return whether a kept shard has the names, kinds and shapes that `Outcome.of` needs."""
+    """Return whether a stored shard has the names, types and shapes that `Outcome.of` needs."""
     row, arrays = shard.row, shard.contact or {}
     has_map = "points" in arrays
     kinds = ROW_KINDS | (MAP_KINDS if has_map else {})
@@ -149,9 +151,10 @@ class CohortWorker:
     """Computes runs of a cohort.
 
     Args:
-        frames: frames that are computed of every trial.
-        map_flexion: deg, which frame's map is kept; None: that of the largest force.
-        wear: settings of the wear that every run computes; None: no wear.
+        frames: slice of the frames of every trial that are computed.
+        map_flexion: flexion of the frame that gives the pressure map, deg; None: the frame of the
+            largest force.
+        wear: settings of the wear computation; None: no wear.
     """
 
     def __init__(
@@ -160,7 +163,7 @@ class CohortWorker:
         self._frames, self._map_flexion, self._wear = frames, map_flexion, wear
 
     def __call__(self, number: int, run: CohortRun) -> Outcome:
-        """Return the results of a run, as `tkamb run` would compute them, or why there are none."""
+        """Return the results of a run, as `tkamb run` computes them. A failed run has a reason."""
         try:
             return self._outcome(run)
         finally:
@@ -186,7 +189,6 @@ class CohortWorker:
     def _worn(
         self, run: CohortRun, results: Results, outcome: Outcome, wear: CohortWearTable
     ) -> Outcome:
-        """Return an outcome with the wear of its insert, or why there is none."""
         from tkamb.studies.wear.run import wear_of_results
 
         try:
@@ -208,13 +210,13 @@ class CohortWorker:
             "max_depth_mm": report["max_depth_mm"],
             "frames_change": report["frames_change"],
         }
-        for one in report["laws_side_by_side"]:
-            values[f"first_{one['law']}_mm3_per_Mc"] = one["first_volume_mm3_per_Mc"]
+        for law in report["laws_side_by_side"]:
+            values[f"first_{law['law']}_mm3_per_Mc"] = law["first_volume_mm3_per_Mc"]
         return replace(outcome, wear={k: v for k, v in values.items() if v is not None})
 
 
 def chosen_map(results: Results, flexion: float | None) -> PressureMap | None:
-    """Return the map of the frame nearest to a flexion (deg), or of the largest force."""
+    """Return the map of the frame nearest to a flexion, deg; None: of the largest force."""
     if results.maps is None:
         return None
     rows = {k: row for k, row in map_rows(results).items() if not _failed(results, k)}

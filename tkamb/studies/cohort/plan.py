@@ -1,7 +1,7 @@
-"""The cohort file: which subjects, trials, designs and contact models, and the runs they make.
+"""The cohort file: subjects, trials, designs and contact models, and the runs that they define.
 
-A TOML file. Paths in it are relative to it, an unknown key is an error. Every run is one of the
-trials' scenes with overrides, as `tkamb run --set` gives them.
+The cohort file is a TOML file. Its paths are relative to its folder, and an unknown key is an
+error. Every run is the scene of a trial with overrides, like those of `tkamb run --set`.
 """
 
 import hashlib
@@ -29,37 +29,40 @@ from tkamb.run.identity import files_in
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])
 MOST_RUNS = 20_000
-"""Largest number of runs. Scenes are read at 5 ms each before the first run; a run takes a
-minute."""
+"""Largest number of runs. Reading a scene takes 5 ms and a run takes a minute."""
 Name = Annotated[str, Field(pattern=r"^[\w .+-]{1,60}$")]
 Overrides = Annotated[
     dict[str, Any],
-    Field(default_factory=dict, description="dotted key of the scene -> value, as --set gives it"),
+    Field(default_factory=dict, description="dotted key of the scene -> value, as in --set"),
 ]
 
 
 class SubjectTable(SceneTable):
-    """One person: changes of the trials' scenes for this person."""
+    """One subject: changes of the trials' scenes for this subject."""
 
     name: Name
     scale: Annotated[Number, Field(ge=0.7, le=1.4)] = Field(
-        1.0, description="[patient] scale: a synthetic subject of the same shape and another size"
+        1.0, description="[patient] scale, for a synthetic subject of the same shape"
     )
     set: Overrides
 
 
 class TrialTable(SceneTable):
-    """One recording: a scene."""
+    """One recording: the scene that uses it."""
 
     name: Name
     scene: Path
-    activity: Name | None = Field(None, description="for groups; default: the trial's name")
-    subjects: tuple[Name, ...] = Field((), description="who did it; none named: everybody")
+    activity: Name | None = Field(
+        None, description="activity, by which runs can be grouped; default: the trial's name"
+    )
+    subjects: tuple[Name, ...] = Field(
+        (), description="subjects who performed the trial; default: all"
+    )
     set: Overrides
 
 
 class DesignTable(SceneTable):
-    """One implant: its meshes, or any other overrides."""
+    """One implant: its meshes and other overrides."""
 
     name: Name
     femoral: Path | None = Field(None, description="mesh of the femoral component")
@@ -67,12 +70,12 @@ class DesignTable(SceneTable):
     bearing: Literal["fixed", "mobile"] | None = None
     factors: dict[Name, Name] = Field(
         default_factory=dict,
-        description="what is varied -> its value, for the figure of designs: the first on its "
-        "horizontal axis, the others in its legend",
+        description="design parameter -> its value, for the figure of designs: the first parameter "
+        "is on the horizontal axis, the others are in the legend",
     )
     scenes: dict[Name, Path] = Field(
         default_factory=dict,
-        description="trial -> its scene with this implant, where that is a scene of its own",
+        description="trial -> scene file that replaces the trial's scene for this implant",
     )
     set: Overrides
 
@@ -81,36 +84,44 @@ class ContactModelTable(SceneTable):
     """One contact model."""
 
     name: Name
-    model: str | None = Field(None, description="of `tkamb contact list`; default: the name")
+    model: str | None = Field(
+        None, description="contact model, as in `tkamb contact list`; default: the name"
+    )
     resolution_mm: Annotated[Number, Field(gt=0)] | None = None
     set: Overrides
 
 
 class CohortWearTable(SceneTable):
-    """Wear of every run's insert under the run's own motion.
+    """Wear of the insert of every run under the motion of that run.
 
-    How the cycle is closed, the wear material and the wear law are those of the run's [wear].
+    The closing of the cycle, the wear material and the wear law are those of [wear] in the scene.
     """
 
     cycles: Annotated[Count, Field(ge=1, le=10**9)] = 1_000_000
-    updates: Annotated[Count, Field(ge=1, le=1000)] = Field(2, description="of the geometry")
+    updates: Annotated[Count, Field(ge=1, le=1000)] = Field(
+        2, description="number of updates of the worn geometry"
+    )
     frames_per_cycle: Annotated[Count, Field(ge=2, le=1000)] = 40
 
 
 class CohortTable(SceneTable):
-    """The cohort file. An axis that is not given has one entry that changes nothing."""
+    """The cohort file. An axis without entries changes nothing."""
 
     title: str = "Cohort"
-    frames: str = Field(":", description="A:B:STEP of every trial's frames, as in Python")
+    frames: str = Field(":", description="frames of every trial, as a Python slice A:B:STEP")
     group_by: tuple[Literal["activity", "trial", "design", "contact"], ...] = Field(
-        (), description="default: the axes with more than one entry, subjects left out"
+        (), description="labels of a group; default: the axes with more than one entry, not subject"
     )
-    bin_deg: Annotated[Number, Field(ge=1, le=180)] = Field(10.0, description="width of a bin")
+    bin_deg: Annotated[Number, Field(ge=1, le=180)] = Field(
+        10.0, description="width of a flexion bin"
+    )
     map_flexion_deg: Annotated[Number, Field(ge=-30, le=170)] | None = Field(
-        None, description="the frame nearest to it is shown; default: each run's peak force"
+        None,
+        description="flexion of the frame that gives the pressure map; default: the frame of the "
+        "largest force of each run",
     )
     wear: CohortWearTable | None = Field(
-        None, description="volumes in runs.csv and groups.csv; not computed without this table"
+        None, description="wear in runs.csv and groups.csv; without this table it is not computed"
     )
     set: Overrides
     subject: tuple[SubjectTable, ...] = ()
@@ -121,18 +132,18 @@ class CohortTable(SceneTable):
     @model_validator(mode="after")
     def _names(self) -> Self:
         for axis in AXES:
-            names = Counter(one.name for one in getattr(self, axis))
-            twice = sorted(name for name, count in names.items() if count > 1)
-            if twice:
-                raise ValueError(f"[[{axis}]] has two entries called '{twice[0]}'")
-        known = {one.name: None for one in self.subject}  # in order, found at once
+            counts = Counter(entry.name for entry in getattr(self, axis))
+            duplicates = sorted(name for name, count in counts.items() if count > 1)
+            if duplicates:
+                raise ValueError(f"[[{axis}]] has two entries called '{duplicates[0]}'")
+        # A dictionary keeps the order of the file and makes the look-up fast.
+        subjects = {entry.name: None for entry in self.subject}
         for trial in self.trial:
             for name in trial.subjects:
-                if name not in known:
-                    raise ValueError(
-                        f"no subject '{name}' for trial '{trial.name}'; {names_near(name, known)}"
-                    )
-        trials = [one.name for one in self.trial]
+                if name not in subjects:
+                    near = names_near(name, subjects)
+                    raise ValueError(f"no subject '{name}' for trial '{trial.name}'; {near}")
+        trials = [entry.name for entry in self.trial]
         for design in self.design:
             for name in design.scenes:
                 if name not in trials:
@@ -146,11 +157,12 @@ class CohortRun:
     """One run of a cohort.
 
     Args:
-        number: its place in the table of runs.
-        labels: subject, trial, activity, design and contact -> name; "" where the cohort has none.
-        scene_path: the trial's scene file.
-        overrides: dotted key -> value.
-        scene: with the overrides applied.
+        number: number of the run in the table of runs, from 0.
+        labels: "subject", "trial", "activity", "design", "contact" -> name; "" for an axis without
+            entries.
+        scene_path: path of the scene file.
+        overrides: dotted key of the scene -> value.
+        scene: scene with the overrides applied.
     """
 
     number: int
@@ -171,12 +183,12 @@ class CohortRun:
 
 @dataclass(frozen=True, eq=False)
 class Cohort:
-    """A cohort file and the runs that it makes.
+    """A cohort file and the runs that it defines.
 
     Args:
         path: path of the file.
-        table: what it says.
-        runs: all of them, in the order subject, trial, design, contact.
+        table: validated content of the file.
+        runs: all runs, sorted by subject, trial, design and contact in the order of the file.
     """
 
     path: Path
@@ -185,21 +197,21 @@ class Cohort:
 
     @property
     def group_by(self) -> tuple[str, ...]:
-        """Return the labels that make the groups."""
+        """Return the labels by which runs are grouped."""
         if self.table.group_by:
             return self.table.group_by
-        many = [a for a in GROUP_AXES if len({run.labels[a] for run in self.runs}) > 1]
-        if "activity" in many and "trial" in many:  # trials of one activity are one group
-            many.remove("trial")
-        return tuple(many)
+        varied = [a for a in GROUP_AXES if len({run.labels[a] for run in self.runs}) > 1]
+        if "activity" in varied and "trial" in varied:  # trials of one activity are one group
+            varied.remove("trial")
+        return tuple(varied)
 
     @property
     def frames(self) -> slice:
-        """Return the frames of every trial."""
+        """Return the slice of the frames of every trial."""
         return _slice(self.table.frames, self.path)
 
     def identity(self) -> dict[str, Any]:
-        """Return the content that identifies a cohort, apart from the code: runs, files, frames."""
+        """Return the inputs that identify the results of a cohort, without the code."""
         runs = [[run.labels, run.scene_hash] for run in self.runs]
         files = sorted({path for run in self.runs for path in files_in(run.scene.model_dump())})
         return {
@@ -219,11 +231,11 @@ class Cohort:
 
 
 def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
-    """Read a cohort file and the scene of every run; no other file is opened.
+    """Read a cohort file and the scene of every run. Meshes and recordings are not opened.
 
     Args:
         path: path of the cohort file.
-        frames: A:B:STEP instead of the file's.
+        frames: slice A:B:STEP that replaces `frames` of the file.
 
     Raises:
         InputError: the file or a scene cannot be used.
@@ -258,10 +270,10 @@ def _runs(table: CohortTable, path: Path) -> list[CohortRun]:
             "contact": contact.name if contact else "",
         }
         overrides = dict(table.set)
-        for one in (trial, subject, design, contact):
-            overrides |= _overrides(one, path.parent)
-        own = design.scenes.get(trial.name) if design else None
-        scene_path = path.parent / (own or trial.scene)
+        for entry in (trial, subject, design, contact):
+            overrides |= _overrides(entry, path.parent)
+        design_scene = design.scenes.get(trial.name) if design else None
+        scene_path = path.parent / (design_scene or trial.scene)
         scene = _scene(scene_path, overrides, labels, path)
         result.append(CohortRun(len(result), labels, scene_path, overrides, scene))
     if not result:
@@ -282,7 +294,6 @@ def _scene(
 
 
 def _overrides(entry: Any, folder: Path) -> dict[str, Any]:
-    """Return what an entry of an axis changes, paths made absolute."""
     if entry is None:
         return {}
     result: dict[str, Any] = {}
@@ -311,11 +322,11 @@ def _slice(text: str, path: Path) -> slice:
 
 
 def _complaint(error: ValidationError, path: Path) -> InputError:
-    """Return the first complaint in one line, unknown keys before missing ones."""
+    """Return the first error in one line. Unknown keys come first, missing keys last."""
     rank = {"extra_forbidden": 0, "missing": 2}
-    first = min(error.errors(), key=lambda one: rank.get(one["type"], 1))
+    first = min(error.errors(), key=lambda detail: rank.get(detail["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
-    if {one["loc"][:1] for one in error.errors()} >= {("motion",), ("implant",)}:
+    if {detail["loc"][:1] for detail in error.errors()} >= {("motion",), ("implant",)}:
         return InputError("is a scene, not a cohort", path, "docs/cohort.md shows a cohort file")
     if first["type"] == "extra_forbidden":
         near = names_near(str(first["loc"][-1]), _keys_beside(first["loc"]))
@@ -327,7 +338,7 @@ def _complaint(error: ValidationError, path: Path) -> InputError:
 
 
 def _keys_beside(location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table that a key of a cohort file stands in."""
+    """Return the keys of the table of the cohort file that contains a key."""
     tables: dict[int | str, type[SceneTable]] = {
         "subject": SubjectTable,
         "trial": TrialTable,

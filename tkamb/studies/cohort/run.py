@@ -1,7 +1,7 @@
-"""A cohort, from its file to the written results.
+"""Computation of a cohort, from its file to the written results.
 
-Workers compute the runs. Each finished run is stored at once. At the end the table of all frames,
-runs.csv, groups.csv, cohort.json and the report are written together.
+Workers compute the runs. Each finished run is stored immediately. At the end the table of all
+frames, runs.csv, groups.csv, cohort.json and the report are written together.
 """
 
 import json
@@ -45,7 +45,7 @@ LABELS = ("subject", *GROUP_AXES)
 def write_cohort(
     cohort: Cohort, outcomes: Mapping[int, Outcome], identity: Mapping[str, Any], folder: Path
 ) -> None:
-    """Write the table, runs.csv, groups.csv, cohort.json and cohort.html: all or none.
+    """Write cohort.parquet, runs.csv, groups.csv, cohort.json and cohort.html, all or none.
 
     Raises:
         InputError: the folder cannot be written.
@@ -82,30 +82,30 @@ def write_cohort(
 def frame_table(
     cohort: Cohort, outcomes: Mapping[int, Outcome], identity: Mapping[str, Any]
 ) -> pa.Table:
-    """Return a row per frame of every run with results: labels, provenance and numbers.
+    """Return the table of the frames of all successful runs, with one row per frame.
 
-    The columns are those of results.csv that any run has, null where a run has none; before them
-    stand the labels, and the scene's SHA-256, overrides, contact model and resolution.
+    The first columns are the labels and the provenance of the run (`PROVENANCE`). They are followed
+    by the columns of results.csv that at least one run has, null for the other runs.
     """
-    good = {n: one for n, one in outcomes.items() if not one.reason}
-    present = dict.fromkeys(name for one in good.values() for name in one.columns)
+    successful = {n: outcome for n, outcome in outcomes.items() if not outcome.reason}
+    present = dict.fromkeys(name for outcome in successful.values() for name in outcome.columns)
     names = [name for name in ordered_names(present) if name in present]
-    counts = [len(one.status) for one in good.values()]
-    columns: dict[str, Any] = {"run": _repeated(list(good), counts, pa.int64())}
+    counts = [len(outcome.status) for outcome in successful.values()]
+    columns: dict[str, Any] = {"run": _repeated(list(successful), counts, pa.int64())}
     for label in LABELS:
-        columns[label] = _repeated([cohort.runs[n].labels[label] for n in good], counts)
+        columns[label] = _repeated([cohort.runs[n].labels[label] for n in successful], counts)
     for name, of in PROVENANCE.items():
-        columns[name] = _repeated([of(cohort.runs[n]) for n in good], counts)
+        columns[name] = _repeated([of(cohort.runs[n]) for n in successful], counts)
     for name in names:
         parts = [
-            one.columns.get(name, np.full(count, np.nan))
-            for one, count in zip(good.values(), counts, strict=True)
+            outcome.columns.get(name, np.full(count, np.nan))
+            for outcome, count in zip(successful.values(), counts, strict=True)
         ]
         columns[name] = pa.array(np.concatenate([np.empty(0), *parts]), from_pandas=True)
-    statuses = [status for one in good.values() for status in one.status]
+    statuses = [status for outcome in successful.values() for status in outcome.status]
     columns["status"] = pa.array(statuses, pa.string())
-    about = {"title": cohort.table.title, "identity": json.dumps(dict(identity))}
-    return pa.table(columns).replace_schema_metadata(about)
+    metadata = {"title": cohort.table.title, "identity": json.dumps(dict(identity))}
+    return pa.table(columns).replace_schema_metadata(metadata)
 
 
 def _contact(run: CohortRun, key: str) -> str:
@@ -119,11 +119,10 @@ PROVENANCE = {
     "contact_model": lambda run: _contact(run, "model"),
     "contact_resolution_mm": lambda run: _contact(run, "resolution_mm"),
 }
-"""Column -> what it holds of a run."""
+"""Column -> function that returns its text for a run."""
 
 
 def _repeated(values: Sequence[Any], counts: Sequence[int], kind: Any = None) -> Any:
-    """Return each value as often as its run has frames."""
     index = np.repeat(np.arange(len(values)), counts)
     return pa.array(values, kind or pa.string()).take(pa.array(index, pa.int64()))
 
@@ -161,14 +160,14 @@ MOST_SHARDS = 10_000
 
 @dataclass(frozen=True)
 class Part:
-    """Which of a cohort's runs a job of a batch queue computes.
+    """Part of a cohort's runs that one job of a batch queue computes.
 
     Args:
-        index: number of the part, from 1.
+        index: number of the part, from 1 to `count`.
         count: number of parts.
 
     Raises:
-        InputError: there is no such part.
+        InputError: the numbers are out of range.
     """
 
     index: int
@@ -184,11 +183,11 @@ class Part:
 
     @property
     def folder(self) -> str:
-        """Return the name of its folder in the cohort's."""
+        """Return the name of the part's folder inside the folder of the cohort."""
         return SHARD_NAME.format(self.index, self.count)
 
     def holds(self, number: int) -> bool:
-        """Say whether a run is among its own: every `count`-th one."""
+        """Return whether a run belongs to the part. Every `count`-th run does."""
         return number % self.count == self.index - 1
 
 
@@ -204,26 +203,26 @@ def run_cohort(
 ) -> dict[int, Outcome]:
     """Compute the runs of a cohort and write its table and report.
 
-    The same table for any number of workers and parts. A run that fails is listed with its
-    reason; the others go on.
+    The table does not depend on the number of workers or parts. A failed run is listed with its
+    reason and does not stop the cohort.
 
     Args:
         cohort: the cohort, or the path of its file.
-        directory: the folder of all results; with a part, the part's own folder is made in it
-            and neither table nor report is written.
-        crew: who computes; default: this process.
-        part: compute these runs alone.
-        resume: go on with what earlier runs of the same cohort, or parts of it, left there.
-        force: write into the folder even if it holds things that are not tkamb's.
-        progress: wraps the runs as they come.
+        directory: folder of the results. A part is stored in a folder inside it, without table
+            and report.
+        crew: worker pool settings; default: this process.
+        part: part of the runs to compute; default: all.
+        resume: use the runs that are stored in the folder, also those of parts.
+        force: write into the folder even if it contains files of other programs.
+        progress: wrapper of the iterator of the finished runs.
 
     Returns:
-        Number -> what the run gave; of a part, its own runs.
+        Number of the run -> its outcome, for all runs of the cohort or of the part.
 
     Raises:
-        InputError: bad input, another cohort to resume, or a folder that cannot be claimed.
-        ComputationError: a worker ended before its run.
-        KeyboardInterrupt: what is finished is kept in the folder.
+        InputError: the input is invalid, the folder holds another cohort, or cannot be claimed.
+        ComputationError: a worker process ended during a run.
+        KeyboardInterrupt: interrupted. The finished runs stay in the folder.
     """
     cohort = cohort if isinstance(cohort, Cohort) else load_cohort(cohort)
     crew = crew or PoolOptions()
@@ -234,9 +233,9 @@ def run_cohort(
     force = force or (part is None and _holds_parts_alone(directory))
     with claimed_directory(folder, force, "cohort"), _parts(directory, part, resume) as parts:
         shards = Shards(folder, identity, resume)
-        others = [Shards(one, identity, True) for one in parts]
+        part_shards = [Shards(part_folder, identity, True) for part_folder in parts]
         numbers = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
-        outcomes = _kept([shards, *others], numbers)
+        outcomes = _stored([shards, *part_shards], numbers)
         remaining = [(n, cohort.runs[n]) for n in numbers if n not in outcomes]
         task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg, cohort.table.wear))
         answers = crew.answers(task, remaining)
@@ -251,8 +250,8 @@ def run_cohort(
         outcomes = {number: outcomes[number] for number in numbers}
         if part is None:
             write_cohort(cohort, outcomes, identity, folder)
-            for one in (folder, *parts):
-                remove_shards(one)
+            for shard_folder in (folder, *parts):
+                remove_shards(shard_folder)
     return outcomes
 
 
@@ -265,27 +264,26 @@ def _identity(cohort: Cohort) -> dict[str, Any]:
 
 @contextmanager
 def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Path]]:
-    """Lock the folders of all parts and yield them, to gather runs; none while one computes."""
+    """Lock the folders of all parts and yield them. Empty for a part, or without `resume`."""
     with ExitStack() as stack:
-        result = []
+        folders = []
         if part is None and resume:
-            result = sorted(directory.glob(SHARD_NAME.format("*", "*")))
-        for one in result:
-            stack.enter_context(claimed_directory(one, command="cohort"))
-        yield result
+            folders = sorted(directory.glob(SHARD_NAME.format("*", "*")))
+        for folder in folders:
+            stack.enter_context(claimed_directory(folder, command="cohort"))
+        yield folders
 
 
 def _holds_parts_alone(directory: Path) -> bool:
-    """Say whether a folder was made by parts of a cohort and holds nothing else."""
+    """Return whether a folder contains only folders of parts of a cohort, and at least one."""
     entries = list(directory.iterdir()) if os.path.isdir(directory) else []
     named = all(entry.match(SHARD_NAME.format("*", "*")) for entry in entries)
     return bool(entries) and named and all(is_ours(entry) for entry in entries)
 
 
-def _kept(places: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
-    """Return the runs that are finished already."""
+def _stored(folders: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
     result: dict[int, Outcome] = {}
-    for shards in places:
+    for shards in folders:
         for number in numbers if shards.resumed else ():
             shard = shards.get(number, is_outcome)
             if shard is not None:

@@ -1,7 +1,6 @@
-"""Groups of a cohort: mean, standard deviation and range over runs, bin by bin.
+"""Groups of a cohort: mean, standard deviation and range over runs in each bin of the motion.
 
-Every run counts once: its frames in a bin are averaged first, so that long recordings and slow
-parts of a motion weigh no more than others.
+The frames of a run in a bin are averaged first, so that every run has the same weight.
 """
 
 import warnings
@@ -30,8 +29,8 @@ class CohortStatisticsSettings:
     """Statistics over the runs of a cohort."""
 
     bin_tolerance: float = 1e-9
-    """Share of a bin. Chosen: 60 deg, which radians make 59.99999999999999, begins the bin from 60
-    on."""
+    """Share of the width of a bin: a value this near the upper edge belongs to the next bin. Chosen
+    above round-off: 60 deg converted from radians is 59.99999999999999."""
 
 
 COHORT_STATISTICS = CohortStatisticsSettings()
@@ -39,17 +38,17 @@ COHORT_STATISTICS = CohortStatisticsSettings()
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Runs with the same labels of grouping.
+    """Runs with the same labels.
 
     Args:
-        labels: what they have in common.
-        numbers: numbers of the runs that gave results.
-        failed: how many gave none.
-        axis: quantity that its bins divide: "flexion_deg", or "cycle_percent" of a cycle.
-        edges: (b + 1,) of the bins, in the axis's unit.
-        bins: column -> (r, b) mean of each run in each bin; NaN where it has none there.
-        peaks: column -> (r,) the largest of each run.
-        wear: name -> (r,) of each run; empty: not computed.
+        labels: axis of the cohort -> label that the runs share.
+        numbers: numbers of the r runs with results.
+        failed: number of failed runs.
+        axis: column that is divided into bins, "flexion_deg" or "cycle_percent".
+        edges: edges of the b bins, in the unit of the axis, shape (b + 1,).
+        bins: column -> mean of each run in each bin, shape (r, b); NaN for a bin without frames.
+        peaks: column -> largest value of each run, shape (r,).
+        wear: name -> wear result of each run, shape (r,); empty if wear was not computed.
     """
 
     labels: dict[str, str]
@@ -67,21 +66,21 @@ class Group:
         return self.name_without("")
 
     def name_without(self, axis: str) -> str:
-        """Return the labels but one in one line."""
-        named = (label for own, label in self.labels.items() if own != axis)
-        return ", ".join(filter(None, named)) or "all runs"
+        """Return the labels except that of one axis in one line."""
+        labels = (label for name, label in self.labels.items() if name != axis)
+        return ", ".join(filter(None, labels)) or "all runs"
 
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """A number over the runs of a group, each (...,) of the shape of one run's.
+    """Statistics of a quantity over the runs of a group. The arrays have the shape of the quantity.
 
     Args:
-        runs: number of runs that have the value.
-        mean: over them.
-        sd: standard deviation with n - 1; NaN of fewer than two.
-        low: smallest.
-        high: largest.
+        runs: number of runs with a value.
+        mean: mean over these runs.
+        sd: standard deviation with n - 1; NaN for fewer than two runs.
+        low: smallest value.
+        high: largest value.
     """
 
     runs: Array
@@ -92,10 +91,10 @@ class Spread:
 
 
 def spread(values: Array) -> Spread:
-    """Return mean, standard deviation and range over runs (r, ...), without their NaN."""
+    """Return mean, standard deviation and range over the first axis of (r, ...), ignoring NaN."""
     count = np.isfinite(values).sum(axis=0)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # bins that no run reaches: NaN, as wanted
+        warnings.simplefilter("ignore", RuntimeWarning)  # an empty bin gives NaN, as intended
         sd = np.nanstd(values, axis=0, ddof=1)
         mean, low, high = (f(values, axis=0) for f in (np.nanmean, np.nanmin, np.nanmax))
     return Spread(count, mean, np.where(count > 1, sd, np.nan), low, high)
@@ -118,34 +117,39 @@ def groups_of(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[Group]:
 def _group(
     labels: dict[str, str], numbers: list[int], outcomes: Mapping[int, Outcome], width: float
 ) -> Group:
-    good = [n for n in numbers if not outcomes[n].reason]
-    columns = [_computed(outcomes[n]) for n in good]
-    cycle = bool(columns) and all(CYCLE in one for one in columns)
+    successful = [n for n in numbers if not outcomes[n].reason]
+    columns = [_computed(outcomes[n]) for n in successful]
+    cycle = bool(columns) and all(CYCLE in run for run in columns)
     axis, width = (CYCLE, CYCLE_BIN) if cycle else ("flexion_deg", width)
-    finite = [np.isfinite(one[axis]) for one in columns]  # frames outside the gait cycle are not
-    places = [_places(one[axis][on], axis, width) for one, on in zip(columns, finite, strict=True)]
+    # cycle_percent is NaN in the frames outside the gait cycle
+    finite = [np.isfinite(run[axis]) for run in columns]
+    indices = [
+        _bin_indices(run[axis][on], axis, width) for run, on in zip(columns, finite, strict=True)
+    ]
     first, last = (
-        (min(p.min() for p in places), max(p.max() for p in places)) if places else (0, -1)
+        (min(i.min() for i in indices), max(i.max() for i in indices)) if indices else (0, -1)
     )
     edges = width * np.arange(first, last + 2)
-    names = list(dict.fromkeys(n for one in columns for n in one if n.endswith(UNITS)))
+    names = list(dict.fromkeys(n for run in columns for n in run if n.endswith(UNITS)))
     bins, peaks = {}, {}
     for name in names:
-        missing = [one.get(name, np.full(len(one["time_s"]), np.nan)) for one in columns]
-        parts = zip(missing, finite, places, strict=True)
-        bins[name] = np.array([_means(v[on], p - first, len(edges) - 1) for v, on, p in parts])
-        peaks[name] = np.array([np.nanmax(v) if np.isfinite(v).any() else np.nan for v in missing])
-    worn = dict.fromkeys(name for n in good for name in outcomes[n].wear)
+        values = [run.get(name, np.full(len(run["time_s"]), np.nan)) for run in columns]
+        parts = zip(values, finite, indices, strict=True)
+        bins[name] = np.array([_means(v[on], i - first, len(edges) - 1) for v, on, i in parts])
+        peaks[name] = np.array([np.nanmax(v) if np.isfinite(v).any() else np.nan for v in values])
+    wear_names = dict.fromkeys(name for n in successful for name in outcomes[n].wear)
     wear = {
-        name: np.array([outcomes[n].wear.get(name, np.nan) for n in good], float) for name in worn
+        name: np.array([outcomes[n].wear.get(name, np.nan) for n in successful], float)
+        for name in wear_names
     }
-    return Group(labels, tuple(good), len(numbers) - len(good), axis, edges, bins, peaks, wear)
+    failed = len(numbers) - len(successful)
+    return Group(labels, tuple(successful), failed, axis, edges, bins, peaks, wear)
 
 
 def _computed(outcome: Outcome) -> dict[str, Array]:
-    """Return a run's columns; NaN in frames that failed, but for the bins' axes.
+    """Return the columns of a run with NaN in failed frames, except for time and the bin axes.
 
-    A failed frame has only its recorded motion, while that of other frames may be solved.
+    The recorded motion of a failed frame must not be averaged with a solved one.
     """
     failures = np.array([status.startswith(FAILED) for status in outcome.status], bool)
     return {
@@ -154,8 +158,8 @@ def _computed(outcome: Outcome) -> dict[str, Array]:
     }
 
 
-def _places(values: Array, axis: str, width: float) -> NDArray[np.int64]:
-    """Return the bin of each frame; a cycle's last moment, 100 %, is in its last bin."""
+def _bin_indices(values: Array, axis: str, width: float) -> NDArray[np.int64]:
+    """Return the bin number of each frame. 100 % of the cycle belongs to the last bin."""
     result = np.floor(values / width + COHORT_STATISTICS.bin_tolerance).astype(int)
     end = axis == CYCLE and np.isclose(
         values, WHOLE_CYCLE, rtol=0, atol=COHORT_STATISTICS.bin_tolerance * width
@@ -163,35 +167,34 @@ def _places(values: Array, axis: str, width: float) -> NDArray[np.int64]:
     return np.where(end, result - 1, result)
 
 
-def _means(values: Array, place: Array, count: int) -> Array:
-    """Return the mean (count,) of what falls into each bin; NaN where nothing does."""
+def _means(values: Array, index: Array, count: int) -> Array:
     finite = np.isfinite(values)
-    total = np.bincount(place[finite], values[finite], minlength=count)
-    number = np.bincount(place[finite], minlength=count)
+    total = np.bincount(index[finite], values[finite], minlength=count)
+    number = np.bincount(index[finite], minlength=count)
     return np.divide(total, number, out=np.full(count, np.nan), where=number > 0)
 
 
 def group_rows(groups: Sequence[Group], group_by: Sequence[str]) -> list[list[str]]:
-    """Return groups.csv: a header, then per group and column its bins and its peak."""
+    """Return the rows of groups.csv: the header, then for each group and column bins and peak."""
     head = [*group_by, "axis", "from", "to", "column", "runs", "mean", "sd", "min", "max"]
     rows = [head]
     for group in groups:
         labels = [group.labels[axis] for axis in group_by]
         for name, values in group.bins.items():
-            over = spread(values)
+            statistics = spread(values)
             for b, (low, high) in enumerate(zip(group.edges[:-1], group.edges[1:], strict=True)):
-                if over.runs[b]:
-                    place = [group.axis, f"{low:g}", f"{high:g}"]
-                    rows.append([*labels, *place, name, *_cells(over, b)])
-            over = spread(group.peaks[name][:, None])
-            if over.runs[0]:
-                rows.append([*labels, PEAK, "", "", name, *_cells(over, 0)])
+                if statistics.runs[b]:
+                    limits = [group.axis, f"{low:g}", f"{high:g}"]
+                    rows.append([*labels, *limits, name, *_cells(statistics, b)])
+            statistics = spread(group.peaks[name][:, None])
+            if statistics.runs[0]:
+                rows.append([*labels, PEAK, "", "", name, *_cells(statistics, 0)])
         for name, wear in group.wear.items():
             rows.append([*labels, WEAR, "", "", name, *_cells(spread(wear[:, None]), 0)])
     return rows
 
 
-def _cells(over: Spread, place: int) -> list[str]:
-    numbers = (over.mean, over.sd, over.low, over.high)
-    texts = ["" if np.isnan(one[place]) else repr(float(one[place])) for one in numbers]
-    return [str(int(over.runs[place])), *texts]
+def _cells(statistics: Spread, index: int) -> list[str]:
+    numbers = (statistics.mean, statistics.sd, statistics.low, statistics.high)
+    texts = ["" if np.isnan(values[index]) else repr(float(values[index])) for values in numbers]
+    return [str(int(statistics.runs[index])), *texts]

@@ -1,1 +1,1 @@
-"""Parametric implants: closed meshes of a femoral component and an insert from documented radii."""
+"""Parametric implants: closed meshes of femoral component and insert from published dimensions."""

@@ -1,6 +1,7 @@
-"""A design file: the documented dimensions of one implant, and its meshes.
+"""Design file: the published dimensions of one implant, and the meshes made from them.
 
-Keys are the fields of `FemoralComponent`, `Cam`, `Insert` and `Post` with their unit behind them.
+The keys are the fields of `FemoralComponent`, `Cam`, `Insert` and `Post`, each with its unit as
+suffix.
 """
 
 from collections.abc import Mapping
@@ -25,13 +26,14 @@ PHI_REACH, Z_REACH = np.radians(30.0), 9.0
 
 @dataclass(frozen=True)
 class DesignTouchSettings:
-    """Search for the pose at which a design's condyles touch."""
+    """Search for the pose at which both condyles of a design touch."""
 
     halvings: int = 18
-    """Halvings of the bracket around the adduction. Chosen: 18 leave 3e-7 rad."""
+    """Number of times that the search area around the lowest point of a condyle is halved. Chosen
+    because 18 leave 4e-6 of the area's size."""
     largest_adduction: float = 0.04
-    """rad: largest distance of the adduction from the initial guess. Chosen: both condyles touch
-    within it."""
+    """rad: largest difference of the adduction from the initial guess. Chosen because both condyles
+    touch within it."""
 
 
 DESIGN_TOUCH = DesignTouchSettings()
@@ -39,7 +41,8 @@ DESIGN_TOUCH = DesignTouchSettings()
 
 @dataclass(frozen=True)
 class TouchingPose:
-    """Pose at which both condyles touch: mm and rad; contact points (2, 3) medial, lateral."""
+    """Pose at which both condyles touch: SI position, mm, adduction, rad, and the medial and
+    lateral contact point in the insert frame, mm, shape (2, 3)."""
 
     si: float
     adduction: float
@@ -48,22 +51,17 @@ class TouchingPose:
 
 @dataclass(frozen=True)
 class Articulation:
-    """A femoral component on an insert, as exact surfaces.
-
-    Args:
-        femoral: femoral component.
-        insert: insert.
-    """
+    """A femoral component on an insert, as analytic surfaces without a mesh."""
 
     femoral: FemoralComponent
     insert: Insert
 
     def lowest(self, pose: Array, flexion: float, side: float) -> tuple[float, Array]:
-        """Return the least vertical gap (mm) of a condyle and the insert point (3,) below it.
+        """Return the smallest vertical gap under a condyle, mm, and the insert point (3,) there.
 
         Args:
-            pose: pose_femoral_in_insert (4, 4), mm.
-            flexion: rad.
+            pose: pose_femoral_in_insert, mm, shape (4, 4).
+            flexion: flexion, rad; the search begins at this angle of the femoral normal.
             side: MEDIAL or LATERAL.
         """
         phi, z = flexion, side * self.femoral.ridge_half
@@ -83,7 +81,15 @@ class Articulation:
     def touch(
         self, ap: float, ml: float, axial_rotation: float, flexion: float, guess: float = 0.0
     ) -> TouchingPose:
-        """Return the pose that touches at AP and ML (mm), axial rotation and flexion (rad)."""
+        """Return the pose at which both condyles touch.
+
+        Args:
+            ap: AP position, mm.
+            ml: ML position, mm.
+            axial_rotation: axial rotation, rad.
+            flexion: flexion, rad.
+            guess: initial guess of the adduction, rad.
+        """
 
         def pose(adduction: float) -> Array:
             return knee_pose([ap, 0.0, ml, axial_rotation, adduction, flexion])
@@ -114,11 +120,11 @@ class Design:
 
     Args:
         name: name of the folder.
-        title: title of the implant that it stands for.
+        title: description of the modelled implant.
         bearing: "fixed" or "mobile".
-        symmetric: whether both condyles have one J-curve.
+        symmetric: whether both condyles have the same J-curve.
         articulation: femoral component and insert, mm.
-        sources: where each group of numbers comes from.
+        sources: group of dimensions -> its source.
     """
 
     name: str
@@ -139,7 +145,7 @@ class Design:
         return self.articulation.insert
 
     def write_meshes(self, folder: Path) -> tuple[Path, ...]:
-        """Write the parts as binary STL in mm, a component with a cam with and without it."""
+        """Write the parts as binary STL files in mm, a cam both with and without, return paths."""
         folder.mkdir(parents=True, exist_ok=True)
         meshes = {
             FEMORAL_MESH: self.femoral.mesh(),
@@ -157,7 +163,7 @@ def load_design(folder: str | Path) -> Design:
     """Read design.toml of a folder.
 
     Raises:
-        InputError: no such file, an unknown key, one without its unit, or an impossible value.
+        InputError: the file is missing, a key is unknown or lacks its unit, or a value is invalid.
     """
     file = Path(folder) / DESIGN_FILE
     rows = read_toml(file, what="design file")
@@ -166,7 +172,7 @@ def load_design(folder: str | Path) -> Design:
         raise InputError(f"unknown key '{min(unknown)}'", file, "see models/designs/README.md")
     bearing = rows.get("bearing", "fixed")
     if bearing not in ("fixed", "mobile"):
-        raise InputError(f"'{bearing}' is no bearing", file, "give fixed or mobile")
+        raise InputError(f"'{bearing}' is not a bearing", file, "give fixed or mobile")
     post = _part(Post, rows["post"], file) if "post" in rows else None
     cam = _part(Cam, rows["cam"], file) if "cam" in rows else None
     femoral = _part(FemoralComponent, {**rows.get("femoral", {}), "cam": cam}, file)
@@ -184,11 +190,11 @@ def load_design(folder: str | Path) -> Design:
 UNITS = ("_deg_mm", "_deg", "_mm")
 
 
-def _part(kind: type[_Part], given: Mapping[str, Any], file: Path) -> _Part:
-    """Build a part from its table: the unit is cut off each key."""
+def _part(kind: type[_Part], table: Mapping[str, Any], file: Path) -> _Part:
+    """Return a part from its table. The name of a field is the key without its unit."""
     names = {field.name for field in fields(kind)}
     values = {}
-    for key, value in given.items():
+    for key, value in table.items():
         unit = next((u for u in UNITS if key.endswith(u)), "")
         name = key.removesuffix(unit)
         if name not in names or (not unit and name not in ("cam", "post")):

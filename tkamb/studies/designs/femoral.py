@@ -1,15 +1,15 @@
 """A femoral component: sagittal J-curves swept with a coronal groove-and-ridge profile.
 
-The J-curve is a chain of circular arcs with common tangents. Two numbers name a point of the
-articular surface: phi, the angle of the normal of the sagittal profile, and z, the mediolateral
+The J-curve is a chain of circular arcs with common tangents. A point of the articular surface has
+two coordinates: phi, the angle of the normal of the sagittal profile, and z, the mediolateral
 position. The point lies `depth` below the profile along the inward normal. Every condyle is
 therefore a piece of a torus, with the sagittal radius at the ridge and the coronal radius across
-it. Where the J-curves of the two condyles differ, the groove between them blends one into the
-other.
+it. If the J-curves of the two condyles differ, the surface blends from one to the other in the
+groove.
 
-A posterior-stabilised component has a cam: a cylinder across the box, one solid with it. The
-cylinder is exact up to `CAM.flange_mm` from the walls of the box. From there it widens into a
-window of the wall, so that the mesh stays one closed body without self-intersection.
+A posterior-stabilised component has a cam: a cylinder across the box that is joined to its walls.
+The cylinder is exact up to `CAM.flange_mm` from a wall. From there it widens to the edge of an
+opening in the wall, so the mesh is one closed body without self-intersection.
 """
 
 from collections.abc import Sequence
@@ -30,17 +30,15 @@ class CamSettings:
     """The cam of a posterior-stabilised design."""
 
     sides: int = 96
-    """Number of facets around a cam. Chosen: their chords leave out 0.05 % of the radius."""
+    """Number of facets around a cam. Chosen because the facets lie within 0.05 % of the radius."""
     stations: int = 13
-    """Number of rings of vertices along the cam. Chosen: triangles are then about as long as
-    wide."""
+    """Number of rings of vertices along the cam. Chosen for triangles about as long as wide."""
     flange_mm: float = 1.0
-    """mm from the wall of the box to the cylinder. Chosen: it keeps the cylinder clear of the
-    wall."""
+    """mm: distance between the wall of the box and the cylinder. Chosen to keep them apart."""
     window_deg: float = 22.0
-    """deg about the origin on either side of the cam: what of the wall holds it."""
+    """deg: half the angle, about the origin, of the opening in a wall that joins the cam."""
     wall_tolerance_mm: float = 1e-6
-    """mm; vertices this near the plane of a wall lie in it. Chosen: above rounding."""
+    """mm: distance within which a vertex lies in the plane of a wall. Chosen above round-off."""
 
 
 CAM = CamSettings()
@@ -54,8 +52,8 @@ class Cam:
     """A cylinder along z across the box of a femoral component; mm, femoral frame.
 
     Args:
-        centre_ap: x of its axis.
-        centre_si: y of its axis.
+        centre_ap: x of the axis.
+        centre_si: y of the axis.
         radius: radius of the cylinder.
     """
 
@@ -64,7 +62,7 @@ class Cam:
     radius: float
 
     def rings(self, half_length: float) -> Array:
-        """Return points (`CAM.stations`, `CAM.sides`, 3) on the cylinder, by angle from x to y."""
+        """Return points (`CAM.stations`, `CAM.sides`, 3) on the cylinder within ±half_length."""
         turn = np.linspace(0.0, 2.0 * np.pi, CAM.sides, endpoint=False)
         x = self.centre_ap + self.radius * np.cos(turn)
         y = self.centre_si + self.radius * np.sin(turn)
@@ -77,16 +75,16 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
 
     Args:
         cam: the cam.
-        box_half: mm, half the width of the box, whose walls are planes across z.
-        vertices: (n, 3) mm, of the component without it.
-        faces: (k, 3).
+        box_half: half the width of the box, mm. Its walls are the planes z = ±box_half.
+        vertices: vertices of the component without the cam, mm, shape (n, 3).
+        faces: faces of the component without the cam, shape (k, 3).
 
     Raises:
-        InputError: the walls have no part that could hold the cam.
+        InputError: the walls have no area where the cam can be joined.
     """
-    towards = np.arctan2(-cam.centre_ap, -cam.centre_si)
-    apart = np.degrees(np.arctan2(-vertices[:, 0], -vertices[:, 1]) - towards)
-    near = np.abs((apart + 180.0) % 360.0 - 180.0) <= CAM.window_deg
+    cam_direction = np.arctan2(-cam.centre_ap, -cam.centre_si)
+    angle = np.degrees(np.arctan2(-vertices[:, 0], -vertices[:, 1]) - cam_direction)
+    near = np.abs((angle + 180.0) % 360.0 - 180.0) <= CAM.window_deg
     loops = []
     for wall in (-box_half, box_half):
         inside = near & (np.abs(vertices[:, 2] - wall) < CAM.wall_tolerance_mm)
@@ -103,7 +101,7 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
 
 
 def _outline(vertices: Array, window: Ids) -> Ids:
-    """Return the vertices around a patch of a wall, by angle about their middle."""
+    """Return the edge vertices of an area of a wall, sorted by angle about their mean."""
     edges = window[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
     rim = pairs[count == 1]
@@ -114,18 +112,19 @@ def _outline(vertices: Array, window: Ids) -> Ids:
         if np.array_equal(np.unique(steps, axis=0), rim):
             return loop
     raise InputError(
-        "the walls of the box do not hold the cam", "[cam]", "move it, or thicken them"
+        "the cam cannot be joined to the walls of the box",
+        "[cam]",
+        "move the cam, or make the component thicker",
     )
 
 
 def _angles(vertices: Array, loop: Ids) -> Array:
-    """Return the angle (m,) of points about their middle in the sagittal plane, 0 to 2 pi."""
     x, y = (vertices[loop, :2] - vertices[loop, :2].mean(axis=0)).T
     return np.arctan2(y, x) % (2.0 * np.pi)
 
 
 def _between(vertices: Array, first: Ids, second: Ids) -> Ids:
-    """Return the triangles between two loops in order of angle, the second at a greater z."""
+    """Return the triangles between two loops that are sorted by angle. `second` has greater z."""
     ahead = [np.append(_angles(vertices, loop)[1:], np.inf) for loop in (first, second)]
     i = j = 0
     triangles = []
@@ -142,7 +141,10 @@ def _between(vertices: Array, first: Ids, second: Ids) -> Ids:
 
 
 def normal(phi: ArrayLike) -> Array:
-    """Return outward normals (..., 2) as (anterior, superior): phi = 0 distal, pi/2 posterior."""
+    """Return outward normals (..., 2) as (anterior, superior).
+
+    They point distally at phi = 0 and posteriorly at phi = pi/2.
+    """
     angle = np.asarray(phi, float)
     return np.stack([-np.sin(angle), -np.cos(angle)], axis=-1)
 
@@ -150,15 +152,15 @@ def normal(phi: ArrayLike) -> Array:
 class SagittalProfile:
     """A chain of circular arcs that meet with a common tangent.
 
-    Their centres are c_{i+1} = c_i + (R_i - R_{i+1}) n(phi_i), where phi_i is the angle of the
-    normal at which arcs i and i + 1 meet.
+    The centres of the arcs are c_{i+1} = c_i + (R_i - R_{i+1}) n(phi_i), where phi_i is the angle
+    of the normal at which arcs i and i + 1 meet.
 
     Args:
-        arcs: (from deg, to deg, radius mm) in turn, each starting where the last one ends.
-        origin: (anterior, superior) mm of the first arc's centre.
+        arcs: rows (from deg, to deg, radius mm); each arc starts at the end of the preceding one.
+        origin: anterior and superior position of the first arc's centre, mm.
 
     Raises:
-        InputError: arcs that leave a gap, turn back or have no radius.
+        InputError: the arcs have a gap, run backwards or have a radius that is not positive.
     """
 
     def __init__(self, arcs: ArrayLike, origin: Sequence[float] = (0.0, 0.0)) -> None:
@@ -169,7 +171,7 @@ class SagittalProfile:
             raise InputError(
                 "sagittal arcs do not follow each other",
                 "sagittal_arcs_deg_mm",
-                "let each arc start at the angle at which the one before it ends",
+                "let each arc start at the angle at which the preceding arc ends",
             )
         self.radii = table[:, 2]
         self.joints = np.radians(table[:-1, 1])
@@ -187,17 +189,21 @@ class SagittalProfile:
         return SagittalProfile(arcs, self.centres[0] + np.asarray(offset))
 
     def centre_at(self, phi: float) -> Array:
-        """Return the centre (2,) of the arc that holds the normal phi (rad)."""
+        """Return the centre (2,) of the arc with the normal phi, rad."""
         return np.asarray(self.centres[np.searchsorted(self.joints, phi)])
 
     def point(self, phi: ArrayLike, depth: ArrayLike = 0.0) -> Array:
         """Return points (..., 2) at `depth` mm below the profile along the inward normal."""
         arc = np.searchsorted(self.joints, phi)
-        reach = np.asarray(self.radii[arc] - depth)
-        return np.asarray(self.centres[arc] + reach[..., None] * normal(phi))
+        radius = np.asarray(self.radii[arc] - depth)
+        return np.asarray(self.centres[arc] + radius[..., None] * normal(phi))
 
     def nodes(self, spacings: Sequence[Sequence[float]]) -> Array:
-        """Return normals (rad) that divide the profile; spacings: (from deg, to deg, mm)."""
+        """Return the angles of the normals, rad, at which the mesh divides the profile.
+
+        Args:
+            spacings: rows (from deg, to deg, largest spacing mm).
+        """
         pieces = []
         joints = np.degrees(self.joints)
         for start, end, spacing in spacings:
@@ -219,31 +225,31 @@ ROW_SPACING = (
     (35.0, 135.0, 0.56),
     (135.0, 150.0, 0.9),
 )
-"""Spacing of the mesh's rows, mm, between normals in deg: fine where the insert is met."""
+"""Rows (from deg, to deg, spacing mm) of the mesh. It is fine where the insert touches."""
 
 
 @dataclass(frozen=True)
 class FemoralComponent:
-    """A right femoral component; lengths mm, angles deg, z to the right (lateral).
+    """A right femoral component; lengths in mm, angles in deg, z to the right (lateral).
 
     Args:
-        medial_arcs: (from, to, radius) of the medial J-curve.
-        lateral_arcs: arcs of the lateral condyle; equal to the medial ones where symmetric.
-        origin_phi: the centre of the medial arc that holds this normal is the origin.
-        coronal_radius: across the ridges.
+        medial_arcs: arcs (from, to, radius) of the medial J-curve.
+        lateral_arcs: arcs of the lateral J-curve.
+        origin_phi: angle of a normal. The centre of the medial arc with this normal is the origin.
+        coronal_radius: coronal radius of the condyles at the ridges.
         ridge_half: ML distance of the ridges from the middle.
-        ridge_half_at_flange_top: the same at the top of the flange.
-        groove_radius: radius of the trochlear groove, tangent to both ridges.
+        ridge_half_at_flange_top: ML distance of the ridges at the top of the flange.
+        groove_radius: radius of the trochlear groove, which is tangent to both condyles.
         width_half: half the outer width.
-        width_half_at_flange_top: the same at the top of the flange.
-        taper_phi: ridges and edges widen from the first to the last of these normals.
+        width_half_at_flange_top: half the outer width at the top of the flange.
+        taper_phi: angles of the normals between which ridges and outer edges widen.
         edge_fillet: radius of the rounded outer edge.
-        notch_phi: the notch (or box) opens at the first and is fully wide from the second on.
-        notch_half: half its width.
-        notch_fillet: radius of its rounded edge.
+        notch_phi: angles of the normals at which the notch (or box) begins and has its full width.
+        notch_half: half the width of the notch.
+        notch_fillet: radius of the rounded edge of the notch.
         thickness: thickness of the component.
-        thickness_at_flange_top: the same at the top of the flange.
-        blend_half: the groove within this distance blends unequal J-curves.
+        thickness_at_flange_top: thickness at the top of the flange.
+        blend_half: ML distance from the middle within which unequal J-curves blend.
         cam: cam of a posterior-stabilised component; None: no cam.
     """
 
@@ -268,13 +274,13 @@ class FemoralComponent:
 
     @cached_property
     def profile(self) -> SagittalProfile:
-        """Medial J-curve, its posterior arc's centre at the origin."""
+        """Medial J-curve. The centre of its arc at `origin_phi` is the origin."""
         start = SagittalProfile(self.medial_arcs)
         return start.moved(-start.centre_at(np.radians(self.origin_phi)))
 
     @cached_property
     def lateral_profile(self) -> SagittalProfile:
-        """Lateral J-curve; it reaches as far distally and posteriorly as the medial one."""
+        """Lateral J-curve. Its distal and posterior points are level with the medial ones."""
         if self.lateral_arcs == self.medial_arcs:
             return self.profile
         start = SagittalProfile(self.lateral_arcs)
@@ -292,16 +298,16 @@ class FemoralComponent:
         return np.asarray(top + (self.width_half - top) * self._taper(phi))
 
     def notch(self, phi: ArrayLike) -> Array:
-        """Return the ML distance of the notch's edge: an elliptic front, then parallel."""
+        """Return the ML distance of the notch's edge, elliptic in front, from the middle."""
         start, end = np.radians(self.notch_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         s = np.where(s < 1e-9, 0.0, s)
         return np.asarray(self.notch_half * np.sqrt(s * (2.0 - s)))
 
     def groove_depth(self, phi: ArrayLike) -> Array:
-        """Return the depth of the groove's floor below the ridges; both arcs are tangent."""
-        reach = self.groove_radius + self.coronal_radius
-        return np.asarray(reach - np.sqrt(reach**2 - self.ridge(phi) ** 2))
+        """Return the depth of the groove below the ridges. Groove and condyle arcs are tangent."""
+        radii = self.groove_radius + self.coronal_radius
+        return np.asarray(radii - np.sqrt(radii**2 - self.ridge(phi) ** 2))
 
     def depth(self, phi: ArrayLike, z: ArrayLike) -> Array:
         """Return the depth of the articular surface below the J-curve of the ridges."""
@@ -324,12 +330,12 @@ class FemoralComponent:
         return self._below(phi, z, self.depth(phi, z))
 
     def groove(self, phi: ArrayLike) -> Array:
-        """Return points (..., 2) of the groove's floor in the sagittal plane, mm."""
-        at = np.asarray(phi, float)
-        return np.asarray(self._below(at, np.zeros_like(at), self.groove_depth(at))[..., :2])
+        """Return points (..., 2) of the deepest line of the groove in the sagittal plane, mm."""
+        phi = np.asarray(phi, float)
+        return np.asarray(self._below(phi, np.zeros_like(phi), self.groove_depth(phi))[..., :2])
 
     def mesh(self) -> tuple[Array, NDArray[np.int64]]:
-        """Return a closed triangulation (vertices mm, faces) in the femoral frame."""
+        """Return a closed triangulation in the femoral frame: vertices, mm, and faces."""
         rows = self._rows()
         half = self._columns(rows)
         z = np.concatenate([-half[:, ::-1], half], axis=1)
@@ -347,14 +353,14 @@ class FemoralComponent:
         """Return the closed triangulation of `mesh` with the cam across its box.
 
         Raises:
-            InputError: the component has no cam, or none that the walls of the box can hold.
+            InputError: the component has no cam, or it cannot be joined to the walls of the box.
         """
         if self.cam is None:
             raise InputError("the femoral component has no cam", "[cam]", "give its dimensions")
         return joined(self.cam, self.notch_half, *self.mesh())
 
     def _below(self, phi: Array, z: Array, depth: Array) -> Array:
-        """Points (..., 3) at a depth below the J-curve that holds at z."""
+        """Return points (..., 3) at a depth below the J-curve, blended between condyles at z."""
         place = self.profile.point(phi, depth)
         if self.lateral_profile is not self.profile:
             s = np.clip(0.5 + 0.5 * np.asarray(z) / self.blend_half, 0.0, 1.0)
@@ -363,35 +369,34 @@ class FemoralComponent:
         return np.concatenate([place, np.asarray(z)[..., None]], axis=-1)
 
     def _bone_side(self, phi: Array, z: Array) -> Array:
-        """Points (..., 3) of the surface towards the bone."""
         top = self.thickness_at_flange_top
         thickness = top + (self.thickness - top) * self._taper(phi)
         return self._below(phi, z, thickness)
 
     def _taper(self, phi: ArrayLike) -> Array:
-        """0 at the top of the flange, 1 from the trochlea on, smooth (rad in)."""
+        """Return a smooth factor of phi, rad: 0 at the top of the flange, 1 behind the taper."""
         start, end = np.radians(self.taper_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         return np.asarray(s * s * (3.0 - 2.0 * s))
 
     def _columns(self, phi: Array) -> Array:
-        """ML stations (rows, columns) of the right half, from the notch's edge outwards."""
+        """Return z (rows, columns) of the vertices of the lateral half, from the notch outwards."""
         apex, outer, inner = (edge(phi)[:, None] for edge in (self.ridge, self.width, self.notch))
-        rest = outer - self.edge_fillet
-        near, far = apex - 9.0, apex + 0.8 * (rest - apex)
+        fillet = outer - self.edge_fillet
+        near, far = apex - 9.0, apex + 0.8 * (fillet - apex)
         turn = np.sin(np.radians(np.linspace(0.0, 90.0, 5)))[1:]
         return np.concatenate(
             [
                 inner + (near - inner) * np.linspace(0.0, 1.0, 13)[:-1],
                 near + (far - near) * np.linspace(0.0, 1.0, 24)[:-1],
-                far + (rest - far) * np.linspace(0.0, 1.0, 3),
-                rest + self.edge_fillet * turn,
+                far + (fillet - far) * np.linspace(0.0, 1.0, 3),
+                fillet + self.edge_fillet * turn,
             ],
             axis=1,
         )
 
     def _rows(self) -> Array:
-        """Normals of the rows: fine where the insert is met, and across the notch's front."""
+        """Return phi of the rows of vertices, rad; fine at the insert and the notch's front."""
         start, end = np.radians(self.notch_phi)
         front = start + (end - start) * (1.0 - np.cos(np.radians(np.linspace(0.0, 30.0, 5))))
         rows = self.profile.nodes(ROW_SPACING)
@@ -400,6 +405,6 @@ class FemoralComponent:
 
 
 def rounded_edge(distance: ArrayLike, radius: ArrayLike) -> Array:
-    """Return the drop of a rounded edge at `distance` from it; both mm."""
+    """Return how far a rounded edge lies below the surface, mm, at a distance from the edge, mm."""
     inside = np.clip(np.asarray(radius) - distance, 0.0, radius)
     return np.asarray(radius - np.sqrt(np.asarray(radius) ** 2 - inside**2))

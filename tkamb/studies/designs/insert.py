@@ -1,7 +1,7 @@
-"""An insert: a dished height field over a kidney-shaped outline, flat below, with or without post.
+"""An insert: a height field with two dishes over a kidney-shaped outline, flat below.
 
-Each dish is a coronal arc moved along a sagittal arc, so the two curvatures are exact at its low
-line; the eminence between the dishes is an arc tangent to both.
+Each dish is a coronal arc moved along a sagittal arc, so both curvatures are exact at its lowest
+line. The eminence between the dishes is an arc that is tangent to both. A post is optional.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ class InsertBlendSettings:
     """Inserts with dishes of unequal radii."""
 
     blend_half_width: float = 8.0
-    """mm; unequal dishes blend within this distance of the middle. Chosen: contacts lie farther
-    out."""
+    """mm: distance from the middle within which unequal dishes blend. Chosen because contacts lie
+    outside it."""
 
 
 INSERT_BLEND = InsertBlendSettings()
@@ -31,12 +31,12 @@ class Post:
     """A posterior-stabilising post; mm, insert frame.
 
     Args:
-        posterior: AP position of its posterior face at the foot.
-        anterior: position of its anterior face.
-        half_width: ML.
-        height: above the dishes' low point.
-        corner_radius: radius of the corners of its outline.
-        draft: the faces lean inwards by this much over the height.
+        posterior: AP position of the posterior face at the base.
+        anterior: AP position of the anterior face at the base.
+        half_width: half the ML width at the base.
+        height: height above the lowest points of the dishes.
+        corner_radius: radius of the corners of the outline.
+        draft: distance by which the faces lean inwards between base and top.
     """
 
     posterior: float
@@ -47,14 +47,14 @@ class Post:
     draft: float = 2.0
 
     def rise(self, x: ArrayLike, z: ArrayLike) -> Array:
-        """Return the height (...) of the post's surface above the dishes' low point; 0 outside.
+        """Return the height (...) of the post above the lowest points of the dishes; 0 outside.
 
-        The outline is a rectangle with rounded corners; d is the distance inside it.
+        The outline is a rectangle with rounded corners.
         """
         half = np.array([(self.anterior - self.posterior) / 2.0, self.half_width])
         middle = (self.anterior + self.posterior) / 2.0
-        reach = np.abs(np.stack(np.broadcast_arrays(np.asarray(x) - middle, z), axis=-1))
-        corner = reach - (half - self.corner_radius)
+        offset = np.abs(np.stack(np.broadcast_arrays(np.asarray(x) - middle, z), axis=-1))
+        corner = offset - (half - self.corner_radius)
         outside = np.linalg.norm(np.maximum(corner, 0.0), axis=-1)
         inside = np.minimum(corner.max(axis=-1), 0.0)
         distance = self.corner_radius - outside - inside
@@ -63,22 +63,23 @@ class Post:
 
 @dataclass(frozen=True)
 class Insert:
-    """A right insert; lengths mm, insert frame (x anterior, y superior, z lateral).
+    """A right insert; lengths in mm, insert frame (x anterior, y superior, z lateral).
 
     Args:
-        medial_dish_radii: sagittal radius in front of and behind the low point.
-        lateral_dish_radii: radii of the lateral dish.
+        medial_dish_radii: sagittal radii of the medial dish, anterior and posterior to its lowest
+            point.
+        lateral_dish_radii: sagittal radii of the lateral dish, in the same order.
         coronal_radius: coronal radius of both dishes.
-        thickness: at the thinnest.
+        thickness: smallest thickness.
         low_point_ap: anterior position of the lowest points of both dishes.
-        dish_half: ML distance of the dishes' low lines from the middle.
-        eminence_height: above the dishes.
+        dish_half: ML distance of the lowest lines of the dishes from the middle.
+        eminence_height: height of the eminence above the lowest points of the dishes.
         depth_half: half the AP depth.
         width_half: half the ML width.
         notch_depth: depth of the posterior notch.
-        notch_width: its width.
+        notch_width: half the ML width of the notch where its depth has fallen to 37 %.
         edge_fillet: radius of the rounded edge.
-        post: None for a design without.
+        post: posterior-stabilising post; None: no post.
     """
 
     medial_dish_radii: tuple[float, float]
@@ -96,12 +97,12 @@ class Insert:
     post: Post | None = None
 
     def eminence_radius(self) -> float:
-        """Return the radius of the arc of eminence height that is tangent to both dishes."""
+        """Return the radius of the eminence's arc, which is tangent to both dishes."""
         r, h, w = self.coronal_radius, self.eminence_height, self.dish_half
         return (w**2 + (r - h) ** 2 - r**2) / (2.0 * h)
 
     def height(self, x: ArrayLike, z: ArrayLike) -> Array:
-        """Return the height (mm) of the articular surface above the flat bottom."""
+        """Return the height of the articular surface above the flat bottom, mm."""
         x, z = np.broadcast_arrays(x, z)
         dishes = self._sagittal(x, z) + self._coronal(z)
         if self.post is not None:
@@ -109,7 +110,7 @@ class Insert:
         return np.asarray(self.thickness + dishes)
 
     def mesh(self) -> tuple[Array, NDArray[np.int64]]:
-        """Return a closed triangulation (vertices mm, faces) in the insert frame."""
+        """Return a closed triangulation in the insert frame: vertices, mm, and faces."""
         z, back, front = self._outline()
         fillet = np.minimum(self.edge_fillet, (front - back) / 4.0)
         turn = (1.0 - np.cos(np.radians(np.linspace(0.0, 90.0, 5)[:-1])))[:, None]
@@ -129,7 +130,7 @@ class Insert:
         return solids.close_sheets(top, bottom, [0, len(x) - 1], list(range(z.shape[1])))
 
     def tray(self, thickness: float = 4.0) -> tuple[Array, NDArray[np.int64]]:
-        """Return the flat plate below the insert, same outline, as a closed triangulation."""
+        """Return a closed triangulation of the flat tray below the insert, with its outline."""
         z, back, front = self._outline()
         x = back + (front - back) * np.linspace(0.0, 1.0, 5)[:, None]
         top = np.stack([x, np.zeros_like(x), np.broadcast_to(z, x.shape)], axis=-1)
@@ -159,7 +160,10 @@ class Insert:
         return np.asarray(np.where(u < tangent, hill, dish))
 
     def _outline(self) -> tuple[Array, Array, Array]:
-        """ML stations (n,), closer at the rounded ends, and both edges (n,) there, centred."""
+        """Return z, and x of the posterior and anterior edge at each z, each of shape (n,).
+
+        z is finer at the rounded ends. The outline is centred in x.
+        """
         inner = np.linspace(0.0, self.width_half - 4.0, 49)
         turn = np.sin(np.radians(np.linspace(0.0, 90.0, 13)))[1:]
         half = np.concatenate([inner, self.width_half - 4.0 + 4.0 * turn])

@@ -1,4 +1,4 @@
-"""Closed solids from two structured sheets, and binary STL files with fixed bytes."""
+"""Closed solids from two structured sheets of points, and reproducible binary STL files."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,7 +12,7 @@ from tkamb.geometry.frames import Array
 Ids = NDArray[np.int64]
 Node = tuple[int, int]
 HEADER = b"tkamb deep knee bend, millimetres".ljust(80)
-"""Of every STL file; it names the first model that was written with it."""
+"""Header of every STL file. It stays the same so that equal meshes give equal files."""
 
 
 def close_sheets(
@@ -25,26 +25,28 @@ def close_sheets(
     """Join two sheets of points (rows, columns, 3) into one closed triangulation.
 
     Args:
-        outer: the sheet that is kept whole.
-        inner: the opposite sheet on the same grid; only the kept rows and columns are used.
-        rows_kept: increasing row numbers with the first and last; also `fork`, if there is one.
-        columns_kept: increasing column numbers with the first, the last and the middle two.
-        fork: the middle two columns are one up to this row and apart behind it.
+        outer: sheet of which all points are used.
+        inner: opposite sheet on the same grid, of which a subset is used.
+        rows_kept: increasing numbers of the used rows of `inner`, including first, last and `fork`.
+        columns_kept: increasing numbers of the used columns of `inner`, including first, last and,
+            with `fork`, the middle two.
+        fork: last row in which the two middle columns coincide; behind it a notch separates them.
+            None: no notch.
 
     Returns:
-        vertices (n, 3) and faces (k, 3), outward by the right-hand rule.
+        Vertices (n, 3) and faces (k, 3) with outward normals by the right-hand rule.
     """
     rows, columns = outer.shape[:2]
     top = _ids(rows, columns, fork, 0)
     bottom = _ids(rows, columns, fork, rows * columns)
     middle = None if fork is None else columns // 2 - 1
-    everything = (np.arange(rows), np.arange(columns))
-    kept = (np.asarray(rows_kept), np.asarray(columns_kept))
+    full_grid = (np.arange(rows), np.arange(columns))
+    coarse_grid = (np.asarray(rows_kept), np.asarray(columns_kept))
     faces = np.concatenate(
         [
-            _sheet(top, *everything, middle),
-            _sheet(bottom, *kept, middle)[:, ::-1],
-            _wall(top, bottom, kept, fork),
+            _sheet(top, *full_grid, middle),
+            _sheet(bottom, *coarse_grid, middle)[:, ::-1],
+            _wall(top, bottom, coarse_grid, fork),
         ]
     )
     vertices = np.concatenate([outer.reshape(-1, 3), inner.reshape(-1, 3)])
@@ -54,7 +56,7 @@ def close_sheets(
 
 
 def _ids(rows: int, columns: int, fork: int | None, start: int) -> Ids:
-    """Vertex number of every grid node; the middle columns are welded up to the fork."""
+    """Return the vertex number of every grid node. Up to the fork the middle columns share one."""
     ids = start + np.arange(rows * columns).reshape(rows, columns)
     if fork is not None:
         ids[: fork + 1, columns // 2] = ids[: fork + 1, columns // 2 - 1]
@@ -62,7 +64,7 @@ def _ids(rows: int, columns: int, fork: int | None, start: int) -> Ids:
 
 
 def _sheet(ids: Ids, rows: Ids, columns: Ids, middle: int | None) -> Ids:
-    """Triangles of the grid, none between the two middle columns."""
+    """Return the triangles of a grid, with a gap between the column `middle` and the next."""
     pairs = [(a, b) for a, b in pairwise(columns) if a != middle]
     first, right = np.array(pairs).T
     up, down = rows[:-1, None], rows[1:, None]
@@ -72,7 +74,6 @@ def _sheet(ids: Ids, rows: Ids, columns: Ids, middle: int | None) -> Ids:
 
 
 def _loop(rows: list[int], columns: list[int], fork: int | None) -> list[Node]:
-    """Grid nodes (row, column) along the sheet's edge, once around."""
     last = rows[-1]
     path = [(rows[0], c) for c in columns] + [(r, columns[-1]) for r in rows[1:]]
     if fork is None:
@@ -87,15 +88,15 @@ def _loop(rows: list[int], columns: list[int], fork: int | None) -> list[Node]:
     return path + [(r, columns[0]) for r in rows[-2::-1]]
 
 
-def _wall(top: Ids, bottom: Ids, wall: tuple[Ids, Ids], fork: int | None) -> Ids:
-    """Triangles between the whole edge of one sheet and the thinned edge of the other."""
-    whole = _loop(list(range(top.shape[0])), list(range(top.shape[1])), fork)
-    thin = set(_loop(wall[0].tolist(), wall[1].tolist(), fork))
-    stations = [i for i, node in enumerate(whole) if node in thin]
+def _wall(top: Ids, bottom: Ids, coarse_grid: tuple[Ids, Ids], fork: int | None) -> Ids:
+    """Return the triangles between the edges of the full outer and the coarse inner sheet."""
+    fine = _loop(list(range(top.shape[0])), list(range(top.shape[1])), fork)
+    coarse = set(_loop(coarse_grid[0].tolist(), coarse_grid[1].tolist(), fork))
+    stations = [i for i, node in enumerate(fine) if node in coarse]
     triangles = []
     for start, end in pairwise(stations):
-        chain = [top[node] for node in whole[start : end + 1]]
-        first, second = bottom[whole[start]], bottom[whole[end]]
+        chain = [top[node] for node in fine[start : end + 1]]
+        first, second = bottom[fine[start]], bottom[fine[end]]
         half = len(chain) // 2
         for i in range(len(chain) - 1):
             triangles.append((chain[i], chain[i + 1], first if i < half else second))
@@ -104,13 +105,13 @@ def _wall(top: Ids, bottom: Ids, wall: tuple[Ids, Ids], fork: int | None) -> Ids
 
 
 def signed_volume(vertices: Array, faces: Ids) -> float:
-    """Volume, positive when the faces turn outwards."""
+    """Return the enclosed volume, positive if the normals of the faces point outwards."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
 
 def write_stl(path: Path, vertices: Array, faces: Ids) -> None:
-    """Write a binary STL."""
+    """Write a binary STL file."""
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("pad", "<u2")])
     triangles = np.zeros(len(faces), record)
     corners = vertices[faces].astype("<f4").astype(float)

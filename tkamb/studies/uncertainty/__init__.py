@@ -1,1 +1,1 @@
-"""Uncertainty of a run's results: its inputs are varied, and every result gets a band."""
+"""Uncertainty of the results of a run: varied inputs give every result a band."""

@@ -1,4 +1,4 @@
-"""From samples to bands, and to each input's share in the variance of each result."""
+"""Bands of the results over the samples, and the share of each input in their variance."""
 
 import re
 import warnings
@@ -22,39 +22,41 @@ from tkamb.run.results import PERCENTILES, STATISTICS_LIMITS
 
 ENDS = ("p05", "p95")
 TOTALS_N = ("force_si_N", "force_total_N")
-"""Columns of results.csv with the total force, of which the first that is there is taken."""
+"""Columns of results.csv with the total force. The first one present is used."""
 ROUND_OFF = 1e-9
-"""1: a result with a smaller standard deviation over magnitude counts as constant."""
+"""Ratio of standard deviation to magnitude below which a result counts as constant."""
 SAMPLES_PER_INPUT = 6
-"""Smallest number of samples per input for a regression; with fewer its shares would be random."""
+"""Smallest number of samples per input for a joint regression. With fewer samples the shares are
+mostly chance."""
 NUMBER = re.compile(r"[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 MOST_CAUSES = 3
 
 
 def varies(variance: float, square: float) -> bool:
-    """Say whether a variance is more than round-off of values of this mean square."""
+    """Return whether a variance is above round-off, given the mean square of the values."""
     return variance > ROUND_OFF**2 * square
 
 
 def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Array]:
-    """Return p05, p50 and p95 over samples, each of the shape of one sample.
+    """Return p05, p50 and p95 over samples, each with the shape of one sample.
 
-    Of the n samples that have a number the p quantile is at place p (n + 1) of the ordered ones,
-    linear between them: a value that is drawn like the samples then lies between p05 and p95 with
-    a probability of 0.90 whatever n is. At place 1 + p (n - 1), which is usual for describing a
-    sample, it would be 0.81 of 20 samples and 0.87 of 60. NaN where fewer than
-    `STATISTICS_LIMITS.min_samples` have a number, or where more than
-    `STATISTICS_LIMITS.max_failed_share` of all failed.
+    The p quantile has the rank p (n + 1) among the n finite values, with linear interpolation. A
+    new draw then lies between p05 and p95 with a probability of 0.90 for any n. The usual rank
+    1 + p (n - 1) gives only 0.81 for 20 samples and 0.87 for 60.
+
+    The result is NaN if fewer than `STATISTICS_LIMITS.min_samples` values are finite, or if more
+    than `STATISTICS_LIMITS.max_failed_share` of the samples failed.
 
     Args:
-        values: (n, ...) NaN where a sample has no number.
-        failed: (n, ...) of the last axes of `values`, which samples failed; None: none.
+        values: values of the samples, shape (n, ...); NaN for a missing value.
+        failed: whether each sample failed, with the shape of `values`; None: no failures.
 
     Reference: Hyndman & Fan, Am Stat 50:361 (1996), doi:10.1080/00031305.1996.10473566, their
     sixth definition.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # nothing but NaN, hidden below
+        # a column of NaN gives NaN, which is intended
+        warnings.simplefilter("ignore", RuntimeWarning)
         limits = np.nanpercentile(
             values, list(PERCENTILES.values()), axis=0, method=QUANTILE_METHOD
         )
@@ -66,30 +68,30 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
 
 
 def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, Any] | None:
-    """Return how the nominal peak lies among its samples; None: no frame has a number.
+    """Return the band of a result at the frame where its nominal value is largest.
 
     Args:
-        nominal: (f,) of the run with the inputs as given; the frame of its largest value counts.
-        values: (n, f) of the samples, NaN where one has none.
-        failed: (n, f) which frames of which samples failed.
+        nominal: nominal values of the result, shape (f,).
+        values: values of the samples, shape (n, f); NaN for a missing value.
+        failed: whether each frame of each sample failed, shape (n, f).
 
     Returns:
-        frame, nominal, samples, failed_samples (at that frame), median, p05, p95 (None: no band),
-        nominal_percentile (per cent of the samples below the nominal value; equal ones count half),
-        and the same in words.
+        Frame, nominal value, number of samples and of failed samples, median, p05 and p95 (None:
+        no band), per cent of the samples below the nominal value (with half of the equal ones), and
+        a sentence. None if no nominal value is finite.
     """
     if not np.isfinite(nominal).any():
         return None
     frame = int(np.nanargmax(nominal))
-    there, level = values[:, frame], float(nominal[frame])
-    finite = there[np.isfinite(there)]
+    at_peak, level = values[:, frame], float(nominal[frame])
+    finite = at_peak[np.isfinite(at_peak)]
     bands = percentiles(values[:, frame : frame + 1], failed[:, frame : frame + 1])
     low, middle, high = (float(bands[name][0]) for name in ("p05", "p50", "p95"))
     below = (finite < level).sum() + 0.5 * (finite == level).sum()
     limits = {
         "frame": frame,
         "nominal": level,
-        "samples": len(there),
+        "samples": len(at_peak),
         "failed_samples": int(failed[:, frame].sum()),
         "median": middle if np.isfinite(middle) else None,
         "p05": low if np.isfinite(low) else None,
@@ -100,7 +102,6 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
 
 
 def _peak_words(peak: Mapping[str, Any]) -> str:
-    """Return where the nominal peak lies among its samples, and how many failed, in words."""
     share = peak["failed_samples"] / peak["samples"]
     failed = f"{peak['failed_samples']} of {peak['samples']} samples failed there ({share:.0%})"
     if peak["median"] is None:
@@ -116,13 +117,13 @@ def _peak_words(peak: Mapping[str, Any]) -> str:
 def band_columns(
     time: Array, names: Sequence[str], values: Array, failed: np.ndarray
 ) -> dict[str, Array]:
-    """Return the columns of bands.csv, one entry per frame.
+    """Return the columns of bands.csv, with one entry per frame.
 
     Args:
-        time: (f,) s.
-        names: (m,) columns of results.csv.
-        values: (n, m, f) of each sample.
-        failed: (n, f) which frames of which samples failed.
+        time: times of the frames, s, shape (f,).
+        names: names of m columns of results.csv.
+        values: values of the samples, shape (n, m, f).
+        failed: whether each frame of each sample failed, shape (n, f).
     """
     columns = {"time_s": time, "failed_share": failed.mean(axis=0)}
     solved = np.maximum((~failed).sum(axis=0), 1)
@@ -139,16 +140,16 @@ def band_columns(
 def discrepancy_columns(
     names: Sequence[str], values: Array, summary: Mapping[str, Any], body_weight: float
 ) -> dict[str, Array]:
-    """Return the columns `<name>_discrepancy_p05`, `_p95`: band of inputs and discrepancy.
+    """Return the columns `<name>_discrepancy_p05` and `_p95`: the band of inputs and discrepancy.
 
-    Empty where nothing is known of the run's discrepancy; NaN where a force, or the total force of
-    which the discrepancy is a share, has no band.
+    There are no columns if the discrepancy of the run is unknown. Values are NaN where the force or
+    the total force has no band.
 
     Args:
-        names: (m,) columns of results.csv.
-        values: (n, m, f) of each sample.
+        names: names of m columns of results.csv.
+        values: values of the samples, shape (n, m, f).
         summary: summary of the run.
-        body_weight: N.
+        body_weight: body weight, N.
     """
     discrepancy = discrepancy_of(summary)
     totals = [name for name in TOTALS_N if name in names]
@@ -163,7 +164,8 @@ def discrepancy_columns(
         unit = body_weight if name.endswith("_BW") else 1.0
         ends = band_with_discrepancy(values[:, index], spread, load / unit)
         ends[:, np.isnan(percentiles(values[:, index])["p50"])] = np.nan
-        columns |= {f"{name}_discrepancy_{end}": one for end, one in zip(ENDS, ends, strict=True)}
+        for end, limit in zip(ENDS, ends, strict=True):
+            columns[f"{name}_discrepancy_{end}"] = limit
     return columns
 
 
@@ -173,17 +175,17 @@ def peak_bands(
     compared: Mapping[str, str],
     body_weight: float,
 ) -> dict[str, dict[str, Any]]:
-    """Return force -> its nominal peak with its bands at that frame, in body weights.
+    """Return the nominal peak of each force and its bands at that frame, in body weights.
 
     Args:
         columns: columns of results.csv.
         bands: columns of bands.csv.
-        compared: force -> column of results.csv, in N.
-        body_weight: N.
+        compared: force -> column of results.csv, N.
+        body_weight: body weight, N.
 
     Returns:
-        Force -> frame, nominal, median, p05, p95, discrepancy_p05, discrepancy_p95, of which
-        those are None that have no band.
+        Force -> frame, nominal, median, p05, p95, discrepancy_p05 and discrepancy_p95. Limits
+        without a band are None.
     """
     rows: dict[str, dict[str, Any]] = {}
     for force, name in compared.items():
@@ -202,34 +204,34 @@ def peak_bands(
 
 
 def causes(problems: np.ndarray) -> dict[str, float]:
-    """Return why frames failed: cause -> its share of those that did, the most frequent first.
+    """Return cause -> its share of the failed frames, for the most frequent causes.
 
     Args:
-        problems: text, why a frame failed; empty where it did not. Only the last clause of a text
-        is used, without the numbers in it, which differ from frame to frame.
+        problems: reason why each frame failed, "" if it did not. Its last clause is the cause,
+            without numbers, because numbers differ from frame to frame.
     """
-    last = [text.rsplit("; ", 1)[-1] for text in problems.ravel() if text]
-    count = Counter(NUMBER.sub("…", text) for text in last)
-    return {text: times / len(last) for text, times in count.most_common(MOST_CAUSES)}
+    clauses = [text.rsplit("; ", 1)[-1] for text in problems.ravel() if text]
+    count = Counter(NUMBER.sub("…", text) for text in clauses)
+    return {text: times / len(clauses) for text, times in count.most_common(MOST_CAUSES)}
 
 
 def measured_inside(
     columns: Mapping[str, Any], bands: Mapping[str, Array], compared: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Return, for each measured force, the share of frames in which it lies within the band.
+    """Return the share of frames in which each measured force lies within its band.
 
     Args:
-        columns: columns of results.csv, `measured_<name>_N` among them.
+        columns: columns of results.csv, including `measured_<name>_N`.
         bands: columns of bands.csv.
-        compared: force -> what it is compared with, as in the summary's `measured`.
+        compared: force -> its comparison, as in `measured` of the summary.
 
     Returns:
-        Force -> frames that have both, and the share of them inside, NaN of none: in the band of
-        inputs, and, where there is one, in that of inputs and discrepancy.
+        Force -> number of frames with force and band, share of them inside the band of inputs (NaN
+        without frames), and inside the band of inputs and discrepancy if that exists.
     """
     rows: dict[str, dict[str, Any]] = {}
-    for name, one in compared.items():
-        measured, column = columns[f"measured_{name}_N"], one["predicted"]
+    for name, comparison in compared.items():
+        measured, column = columns[f"measured_{name}_N"], comparison["predicted"]
         missing = np.full(len(measured), np.nan)
         low, high = (bands.get(f"{column}_{end}", missing) for end in ENDS)
         frames, share = coverage(low, high, measured)
@@ -247,10 +249,10 @@ class Influence:
 
     Args:
         result: column of results.csv.
-        name: the input, or "rest": the variance that no function of one input explains.
-        share: share of the result's variance over samples, all frames together.
-        change: of the result per standard deviation of the input, its linear part, where the
-            result's median is largest; NaN for the rest.
+        name: name of the input, or "rest" for variance that no function of one input explains.
+        share: share of the variance of the result, summed over all frames.
+        change: linear change of the result per standard deviation of the input, at the frame of the
+            largest median of the result; NaN for "rest".
     """
 
     result: str
@@ -262,30 +264,33 @@ class Influence:
 def influences(
     results: Sequence[str], inputs: Sequence[str], values: Array, errors: Array
 ) -> list[Influence]:
-    """Return the tornado table: each input's share in each result's variance, largest first.
+    """Return the tornado table: the share of each input in the variance of each result.
 
-    Regression: at each frame y = a + sum_i (b_i x_i + c_i x_i²) + e by least squares, x_i the
-    errors in standard deviations. The square covers results that rise in both directions, as a
-    force does on either flank. An input's part of var(y) is cov(b_i x_i + c_i x_i², y), which for
-    independent inputs is b_i² var(x_i) + c_i² var(x_i²). For correlated inputs it includes their
-    joint effect and may be negative (Li et al. 2010). Parts and variances are summed over the
-    frames. The rest is due to kinks, interactions and chance. A result that varies by round-off
-    only has no rows. With fewer than `SAMPLES_PER_INPUT` samples per input, each input is
-    regressed alone, and the share that chance explains in n samples, 2/(n - 1) of the variance, is
-    subtracted from its part.
+    The inputs of a result are sorted by their share. The table comes from a least-squares fit of
+    y = a + sum_i (b_i x_i + c_i x_i²) + e at each frame, where x_i are the errors of the inputs in
+    standard deviations. The squares describe results that increase for errors of both signs.
+
+    The part of an input in var(y) is cov(b_i x_i + c_i x_i², y). For independent inputs it is
+    b_i² var(x_i) + c_i² var(x_i²). For correlated inputs it includes their joint effect and may be
+    negative (Li et al. 2010). Parts and variances are summed over the frames. The rest of the
+    variance is due to other nonlinearity, interactions and chance. A result that is constant apart
+    from round-off has no rows.
+
+    With fewer than `SAMPLES_PER_INPUT` samples per input, each input is regressed alone. The share
+    2/(n - 1) of the variance, which chance explains in n samples, is then subtracted from its part.
 
     Args:
-        results: (m,) names.
-        inputs: (d,) names.
-        values: (n, m, f) NaN where a sample has no number.
-        errors: (n, f, d) in standard deviations.
+        results: names of the m results.
+        inputs: names of the d inputs.
+        values: values of the samples, shape (n, m, f); NaN for a missing value.
+        errors: errors of the inputs in standard deviations, shape (n, f, d).
 
     Reference: Li et al., J Phys Chem A 114:6022 (2010), doi:10.1021/jp9096919.
     """
     influences: list[Influence] = []
     for index, result in enumerate(results):
-        of_frames = [_regression(values[:, index, k], errors[:, k]) for k in range(errors.shape[1])]
-        frames = [(k, *one) for k, one in enumerate(of_frames) if one is not None]
+        fits = [_regression(values[:, index, k], errors[:, k]) for k in range(errors.shape[1])]
+        frames = [(k, *fit) for k, fit in enumerate(fits) if fit is not None]
         total = sum(variance for _, _, _, variance in frames)
         square = sum(float(np.nanmean(values[:, index, k] ** 2)) for k, *_ in frames)
         if not varies(total, square):
@@ -297,13 +302,16 @@ def influences(
             Influence(result, name, float(share), float(slope))
             for name, share, slope in zip(inputs, explained, slopes, strict=True)
         ]
-        rows.sort(key=lambda one: -one.share)
+        rows.sort(key=lambda row: -row.share)
         influences += [*rows, Influence(result, "rest", float(1.0 - explained.sum()), float("nan"))]
     return influences
 
 
 def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
-    """Return slopes (d,), the variance that each explains (d,), and y's; None: too few."""
+    """Return the slopes (d,), the explained variance of each input (d,), and the variance of y.
+
+    None if fewer than `STATISTICS_LIMITS.min_samples` values are finite.
+    """
     finite, count = np.isfinite(y), errors.shape[1]
     if finite.sum() < STATISTICS_LIMITS.min_samples:
         return None
@@ -319,7 +327,7 @@ def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
 
 
 def _one_by_one(y: Array, x: Array) -> tuple[Array, Array, float]:
-    """Return the same for each input alone, if there are too few samples for a joint regression."""
+    """Return the result of `_regression` from a separate regression on each input."""
     variance, slopes, parts = float(y.var()), np.zeros(x.shape[1]), np.zeros(x.shape[1])
     for i, column in enumerate(x.T):
         terms: Any = np.column_stack([column, column**2])

@@ -1,4 +1,4 @@
-"""The inputs of a case that vary, their standard deviations, and their errors in one sample."""
+"""The varied inputs of a case, their standard deviations, and their errors in one sample."""
 
 from dataclasses import dataclass
 
@@ -12,17 +12,17 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 AXES = ("ap", "si", "ml")
 COP_AXES = {"ap": 0, "ml": 2}
-"""Of the laboratory."""
+"""Direction -> axis of the laboratory frame."""
 UNITS = {"mm": MILLIMETRE, "deg": DEGREE}
 PATELLAR_LIGAMENT = "patellar_ligament"
 MARKED = ("shank", "thigh")
-"""Segments whose markers vary."""
+"""Segments with varied marker positions."""
 LINE_ENDS = ("origin", "insertion")
-"""Of a line that pulls the patella."""
+"""Ends of the line of a muscle that pulls the patella."""
 GROUP_ENDS = ("shank", "thigh")
-"""Where the lines of a group leave shank and thigh."""
+"""Segments to which the lines of a muscle group are attached."""
 ACROSS_KNEE = ("thigh to shank", "thigh to foot")
-"""Groups of muscles with lines across the knee, see `tkamb.run.muscles.leg`."""
+"""Muscle groups with lines across the knee, see `tkamb.run.muscles.leg`."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class VariedInput:
     """One input that varies.
 
     Args:
-        name: name in the tornado table.
-        deviation: its standard deviation, in `unit`.
-        unit: "mm", "deg", "relative", or "1".
+        name: name of the input in the tornado table.
+        deviation: standard deviation of the input, in `unit`.
+        unit: unit of the deviation: "mm", "deg", "relative", or "1" for a number without unit.
     """
 
     name: str
@@ -41,27 +41,25 @@ class VariedInput:
 
 
 def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
-    """Return the inputs that vary: those with a deviation that the case has.
+    """Return the inputs of a case that have a standard deviation above 0.
 
     Pose coordinates come first, in the order of `KNEE_COORDINATES`.
 
     Raises:
-        InputError: none is left.
+        InputError: every standard deviation is 0.
     """
-    inputs = tuple(one for one in _all_inputs(case) if one.deviation > 0)
+    inputs = tuple(varied for varied in _all_inputs(case) if varied.deviation > 0)
     if not inputs:
         raise InputError(
-            "no input varies", "[uncertainty]", "give a standard deviation above 0 to one"
+            "no input varies", "[uncertainty]", "give an input a standard deviation above 0"
         )
     return inputs
 
 
 def held_inputs(case: Case) -> tuple[str, ...]:
-    """Return the names of inputs that the case has and that do not vary: deviation 0."""
-    constants = [one for one in _all_inputs(case) if one.deviation == 0]
-    names = (
-        f"{one.name.partition('.')[0]}{'_angles' * ('.about_' in one.name)}" for one in constants
-    )
+    """Return the names of the inputs with standard deviation 0, as "dome" for "dome.ap"."""
+    constants = [constant.name for constant in _all_inputs(case) if constant.deviation == 0]
+    names = (f"{name.partition('.')[0]}{'_angles' * ('.about_' in name)}" for name in constants)
     return tuple(dict.fromkeys(names))
 
 
@@ -77,40 +75,40 @@ def _all_inputs(case: Case) -> list[VariedInput]:
 
 
 def uncertainty_of(case: Case) -> UncertaintyTable:
-    """Return the scene's table, or its defaults, with those of its kind of recording."""
+    """Return the table [uncertainty] of the scene, completed with the default deviations."""
     table = case.scene.uncertainty or UncertaintyTable()
     return table.completed(from_markers=case.scene.motion.markers is not None)
 
 
 def pose_names(inputs: tuple[VariedInput, ...]) -> list[str]:
-    """Return the knee coordinates among the inputs."""
-    return [one.name for one in inputs if one.name in KNEE_COORDINATES]
+    """Return the names of the inputs that are knee coordinates."""
+    return [varied.name for varied in inputs if varied.name in KNEE_COORDINATES]
 
 
 def _pose_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
     contact, markers = case.scene.contact, case.scene.motion.markers
-    free = (*contact.released, "si") if contact and contact.released else ()  # found with them
+    # the equilibrium finds the superior-inferior position together with the released coordinates
+    solved = (*contact.released, "si") if contact and contact.released else ()
     stated = (case.scene.uncertainty or UncertaintyTable()).model_fields_set
     inputs = []
     for name in KNEE_COORDINATES:
         unit = "mm" if name in AXES else "deg"
         key = f"{name}_{unit}"
-        # a coordinate that is taken from the markers varies with them
+        # the errors of the markers already vary a coordinate that is computed from them
         with_markers = markers is not None and name in markers.coordinates and key not in stated
-        if name not in free and not with_markers:
+        if name not in solved and not with_markers:
             inputs.append(VariedInput(name, getattr(table, key), unit))
     return inputs
 
 
 def _marker_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
-    """Return those of each marker on shank and thigh."""
     markers = case.scene.motion.markers
     by_segment = {"shank": SKIN_MARKER_ERROR.shank_mm, "thigh": SKIN_MARKER_ERROR.thigh_mm}
     inputs: list[VariedInput] = []
     for segment in markers.segment if markers else ():
         if segment.name in MARKED:
-            given = table.markers_mm
-            deviation = by_segment[segment.name] if given is None else given
+            stated = table.markers_mm
+            deviation = by_segment[segment.name] if stated is None else stated
             for label in segment.markers_mm:
                 inputs += _places(f"marker.{label}", AXES, deviation)
     return inputs
@@ -134,7 +132,6 @@ def _load_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
 
 
 def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
-    """Return strengths by group, and attachments by line or group."""
     inputs: list[VariedInput] = []
     groups: tuple[str, ...] = ()
     if case.scene.muscles is not None:
@@ -147,7 +144,7 @@ def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
             VariedInput(f"muscle_strength.{group}", table.muscle_strength, "relative")
             for group in groups
         ]
-    ends = [(one.name, end) for one in case.muscles for end in LINE_ENDS]
+    ends = [(muscle.name, end) for muscle in case.muscles for end in LINE_ENDS]
     ends += [(group, end) for group in groups if group in ACROSS_KNEE for end in GROUP_ENDS]
     inputs += [
         VariedInput(f"tendon_band.{name}", table.tendon_band_mm, "mm")
@@ -160,8 +157,7 @@ def _muscle_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
 
 
 def _wrapped_tendons(case: Case) -> list[str]:
-    """Return the names of the tendons that wrap a part by sections of a band."""
-    names = [one.name for one in case.muscles if one.wrap and one.wrap.band > 0]
+    names = [muscle.name for muscle in case.muscles if muscle.wrap and muscle.wrap.band > 0]
     ligament = case.patellar_ligament
     if ligament is not None and ligament.wrap and ligament.wrap.band > 0:
         names.append(PATELLAR_LIGAMENT)
@@ -199,10 +195,10 @@ class Draw:
     """The errors of the inputs in one sample.
 
     Args:
-        inputs: those that vary.
-        normal: (d,) standard normal, one per input.
-        noise: (f, p) standard normal per frame of the motion, of the pose inputs in their order.
-        constant_share: share of a pose error's variance that is the same in all frames.
+        inputs: the d varied inputs.
+        normal: standard normal value of each input, shape (d,).
+        noise: standard normal value of each of the p pose inputs at each frame, shape (f, p).
+        constant_share: share of the variance of a pose error that is constant over the frames.
     """
 
     inputs: tuple[VariedInput, ...]
@@ -211,33 +207,33 @@ class Draw:
     constant_share: float
 
     def standardised(self) -> Array:
-        """Return (f, d): each input's error at each frame in its standard deviations."""
+        """Return the errors of the inputs at each frame, in standard deviations, shape (f, d)."""
         values = np.tile(self.normal, (len(self.noise), 1))
-        poses = [i for i, one in enumerate(self.inputs) if one.name in KNEE_COORDINATES]
+        poses = [i for i, varied in enumerate(self.inputs) if varied.name in KNEE_COORDINATES]
         share = self.constant_share
         values[:, poses] *= np.sqrt(share)
         values[:, poses] += np.sqrt(1.0 - share) * self.noise
         return values
 
     def error(self, name: str) -> float:
-        """Return an input's error in SI, or 0 if it does not vary; not for poses."""
-        for one, value in zip(self.inputs, self.normal, strict=True):
-            if one.name == name:
-                return float(value) * one.deviation * UNITS.get(one.unit, 1.0)
+        """Return the error of an input in SI units; 0 if it does not vary. Not for poses."""
+        for varied, value in zip(self.inputs, self.normal, strict=True):
+            if varied.name == name:
+                return float(value) * varied.deviation * UNITS.get(varied.unit, 1.0)
         return 0.0
 
     def factor(self, name: str) -> float:
-        """Return a positive factor of mean 1 with the input's relative standard deviation."""
-        for one, value in zip(self.inputs, self.normal, strict=True):
-            if one.name == name:
-                spread = np.log1p(one.deviation**2)
-                return float(np.exp(np.sqrt(spread) * value - 0.5 * spread))
+        """Return a log-normal factor of mean 1 with the relative deviation of the input."""
+        for varied, value in zip(self.inputs, self.normal, strict=True):
+            if varied.name == name:
+                log_variance = np.log1p(varied.deviation**2)
+                return float(np.exp(np.sqrt(log_variance) * value - 0.5 * log_variance))
         return 1.0
 
     def place(self, name: str) -> Array:
-        """Return the error (3,) m of a place: ap, si, ml."""
+        """Return the error of a position, m, shape (3,): ap, si, ml."""
         return np.array([self.error(f"{name}.{axis}") for axis in AXES])
 
     def turn(self, name: str) -> Array:
-        """Return the error of a direction as a rotation vector (3,) rad: about ap, si, ml."""
+        """Return the error of an orientation as a rotation vector, rad, shape (3,): ap, si, ml."""
         return np.array([self.error(f"{name}.about_{axis}") for axis in AXES])

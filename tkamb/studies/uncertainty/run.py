@@ -1,7 +1,7 @@
-"""An uncertainty analysis, from a scene to bands and written files.
+"""An uncertainty analysis, from a scene to the written bands.
 
-Workers compute the samples. Each finished sample is stored at once, so that an interrupted run can
-be resumed. The samples give bands, tornado and, where asked for, Sobol' indices.
+Workers compute the samples. Each finished sample is stored immediately, so that an interrupted
+analysis can be resumed. The samples give bands, tornado table and optional Sobol' indices.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 
 def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
-    """Write the nominal results and, beside them, bands, tornado, samples and indices together.
+    """Write nominal results, bands, tornado table, samples and indices together.
 
     Raises:
         InputError: the folder cannot be written.
@@ -68,14 +68,15 @@ def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
     def write_samples(path: Path) -> None:
         with new_hdf5(path) as file:
             file["result_names"] = uncertainty.names
-            file["input_names"] = [one.name for one in uncertainty.inputs]
-            file["input_units"] = [one.unit for one in uncertainty.inputs]
-            file["input_standard_deviations"] = [one.deviation for one in uncertainty.inputs]
+            inputs, samples = uncertainty.inputs, uncertainty.samples
+            file["input_names"] = [varied.name for varied in inputs]
+            file["input_units"] = [varied.unit for varied in inputs]
+            file["input_standard_deviations"] = [varied.deviation for varied in inputs]
             file["time_s"] = uncertainty.results["time_s"]
             for name, dtype in (("values", float), ("failed", bool), ("errors", float)):
-                content = np.array([getattr(one, name) for one in uncertainty.samples], dtype)
+                content = np.array([getattr(sample, name) for sample in samples], dtype)
                 file.create_dataset(name, data=content, compression="gzip")
-            problems = [one.problems.tolist() for one in uncertainty.samples]
+            problems = [sample.problems.tolist() for sample in samples]
             text = h5py.string_dtype()
             file.create_dataset("problems", data=problems, dtype=text, compression="gzip")
 
@@ -95,23 +96,23 @@ def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[str]]:
 
 
 def _tornado_rows(uncertainty: "Uncertainty") -> list[Sequence[str]]:
-    by_name = {one.name: one for one in uncertainty.inputs}
+    by_name = {varied.name: varied for varied in uncertainty.inputs}
     rows: list[Sequence[str]] = [
         ("result", "input", "standard_deviation", "unit", "variance_share", "change_per_sd")
     ]
-    for one in uncertainty.tornado:
-        varied = by_name.get(one.name)
+    for row in uncertainty.tornado:
+        varied = by_name.get(row.name)
         deviation, unit = (_cell(varied.deviation), varied.unit) if varied else ("", "")
-        rows.append((one.result, one.name, deviation, unit, _cell(one.share), _cell(one.change)))
+        rows.append((row.result, row.name, deviation, unit, _cell(row.share), _cell(row.change)))
     return rows
 
 
 def _index_rows(indices: "Sequence[SobolIndex]") -> list[Sequence[str]]:
     head = ("result", "input", "first_order", "first_order_se", "total", "total_se", "rows")
     rows: list[Sequence[str]] = [head]
-    for one in indices:
-        numbers = (one.first, one.first_error, one.total, one.total_error)
-        rows.append((one.result, one.name, *map(_cell, numbers), str(one.rows)))
+    for index in indices:
+        numbers = (index.first, index.first_error, index.total, index.total_error)
+        rows.append((index.result, index.name, *map(_cell, numbers), str(index.rows)))
     return rows
 
 
@@ -126,17 +127,18 @@ TORNADO_RESULTS = (
     *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
 )
 PEAK = "force_total_BW"
-"""Column whose peak is the headline."""
+"""Column of which the summary gives the peak and its band."""
 NO_BAND = (
     *("time_s", "cycle_percent", "iterations", "coupling_iterations", "coupling_change_N"),
     *("coupling_change_mm", "contact_trials", "split_determined", "condition_number"),
     *("medial_force_per_adduction_N_per_deg", "adjust_restored"),
 )
-"""Columns that are not results of the knee, or are not computed for a sample."""
+"""Columns without a band: they do not describe the knee, or samples do not compute them."""
 NOT_SAMPLED = ("_seconds", "_slip_mm", "_velocity_mm_per_s")
-"""Endings of columns without a band: computing times, and sums over frames that a sample skips."""
+"""Endings of columns without a band: computing times, and values that depend on frames that a
+sample does not compute."""
 RECORDED = ("measured_", "envelope_")
-"""Beginnings: what was recorded beside the run."""
+"""Beginnings of columns with recorded data, which have no band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,13 +146,14 @@ class Uncertainty:
     """Result of `estimate_uncertainty`.
 
     Args:
-        results: results of the scene as given; its summary says what varied.
-        bands: columns of bands.csv.
+        results: nominal results. Their summary lists the varied inputs.
+        bands: name -> column of bands.csv.
         tornado: influence of each input on each result.
         names: columns of results.csv that have a band.
-        inputs: those that varied.
-        samples: in the order of their numbers; those of Saltelli's design after the others.
-        indices: Sobol' indices, where they were asked for.
+        inputs: varied inputs.
+        samples: samples in the order of their numbers. Those of Saltelli's design that are not
+            independent come last.
+        indices: Sobol' indices; empty if they were not requested.
     """
 
     results: Results
@@ -177,30 +180,31 @@ def estimate_uncertainty(
     force: bool = False,
     progress: Progress = lambda samples, count: samples,
 ) -> Uncertainty:
-    """Vary the inputs of a scene as its table [uncertainty] says and return bands.
+    """Vary the inputs of a scene as described in its table [uncertainty] and return bands.
 
-    The same numbers whatever the number of workers; more samples keep the earlier ones.
+    The results do not depend on the number of workers. A larger number of samples includes the
+    samples of a smaller one.
 
     Args:
-        scene: a scene, or the path of its file.
-        samples: how many, at least 20.
-        workers: processes; 1 computes in this one.
-        dask: address of a Dask scheduler that has the samples computed, or "local" for one on this
-            machine with `workers` processes.
+        scene: scene, or the path of its file.
+        samples: number of samples, at least 20.
+        workers: number of processes; 1: compute in this process.
+        dask: address of a Dask scheduler, or "local" for a scheduler on this computer with
+            `workers` processes.
         method: "lhs" or "sobol", see `tkamb.studies.uncertainty.sampling`.
-        indices: find Sobol' indices too, by Saltelli's design: `samples` (d + 2) are computed
-            with d inputs, and the bands are those of twice `samples`.
-        frames: which frames; default all.
-        directory: folder for all results; None keeps them in memory.
-        scene_path: where the scene came from, for the summary.
-        resume: go on with the samples that an interrupted run left in the folder.
-        force: write into the folder even if it holds things that are not tkamb's.
-        progress: wraps the samples as they come.
+        indices: whether to compute Sobol' indices with Saltelli's design. With d inputs
+            `samples` (d + 2) samples are computed, and the bands use 2 `samples` of them.
+        frames: slice of the frames; default: all.
+        directory: folder for all results; None: results stay in memory.
+        scene_path: path of the scene file, for the summary.
+        resume: whether to use the samples that an interrupted run stored in the folder.
+        force: whether to write into a folder that contains files of other programs.
+        progress: wrapper of the iterator of the finished samples.
 
     Raises:
-        InputError: bad input, another run to resume, or a folder that cannot be claimed.
-        ComputationError: a worker ended before its sample.
-        KeyboardInterrupt: what is finished is kept in the folder.
+        InputError: the input is invalid, the folder holds another run, or cannot be claimed.
+        ComputationError: a worker process ended during a sample.
+        KeyboardInterrupt: interrupted. The finished samples stay in the folder.
     """
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
@@ -211,7 +215,7 @@ def estimate_uncertainty(
             "samples",
         )
     if directory is None and resume:
-        raise InputError("there is no folder to go on in", "resume", "give a directory")
+        raise InputError("there is no folder to resume from", "resume", "give a directory")
     crew.check()
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))
@@ -225,40 +229,41 @@ def estimate_uncertainty(
             claim = claimed_directory(directory, force, "uncertainty")
             folder = stack.enter_context(claim)
         task = Task(BandWorker, (case.scene, chosen))
-        team = stack.enter_context(crew.team(task, len(points)))  # prepares meanwhile
+        # the workers prepare the scene during the nominal run
+        team = stack.enter_context(crew.team(task, len(points)))
         nominal = simulate(scene, frames=frames, scene_path=scene_path)
         job = _Job(case, nominal, inputs, points, crossed, method, team, progress)
         if folder is None:
             return job.run(None)
         identity = nominal.summary["identity"] | {"method of sampling": job.design}
-        found = job.run(Shards(folder, identity, resume))
-        write_uncertainty(found, folder)
-    return found
+        uncertainty = job.run(Shards(folder, identity, resume))
+        write_uncertainty(uncertainty, folder)
+    return uncertainty
 
 
 def _check_correlation(case: Case, inputs: Sequence[VariedInput], indices: bool) -> None:
-    """Raise where inputs cannot err together so, or indices are asked of such inputs."""
+    """Raise if the correlations are impossible, or combined with Sobol' indices."""
     tables = uncertainty_of(case).correlation
     correlation_root(tables, [one.name for one in inputs])
     if tables and indices:
         raise InputError(
-            "Sobol' indices are those of independent inputs",
+            "Sobol' indices need independent inputs",
             "--indices with [[uncertainty.correlation]]",
-            "leave out one of them; tornado.csv has shares of correlated inputs",
+            "leave out one of the two; tornado.csv has shares of correlated inputs",
         )
 
 
 def _points(method: str, samples: int, dimensions: int, seed: int, crossed: bool) -> list[Point]:
     if not crossed:
         normal = normal_samples(method, samples, dimensions, seed)
-        return [Point.of(number, one) for number, one in enumerate(normal)]
-    both = normal_samples(method, samples, 2 * dimensions, seed)
-    return crossed_points(both[:, :dimensions], both[:, dimensions:])
+        return [Point.of(number, row) for number, row in enumerate(normal)]
+    pairs = normal_samples(method, samples, 2 * dimensions, seed)
+    return crossed_points(pairs[:, :dimensions], pairs[:, dimensions:])
 
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """The samples of one scene; with `crossed` rows of Saltelli's design, if that is not 0."""
+    """The samples of one scene. `crossed` is the number of rows of Saltelli's design, or 0."""
 
     case: Case
     nominal: Results
@@ -271,17 +276,17 @@ class _Job:
 
     @property
     def design(self) -> str:
-        """Return what identifies sample n: the method and, for a design, the number of samples."""
+        """Return the sampling method. With Saltelli's design it includes the number of rows."""
         return (
             f"{self.method}, Saltelli's design of {self.crossed}" if self.crossed else self.method
         )
 
     def run(self, shards: Shards | None) -> Uncertainty:
-        """Compute the samples that are not there yet and return all with their bands."""
+        """Compute the samples that are not stored yet and return the result of all samples."""
         names = banded_names(self.nominal)
         count = len(self.points)
         shape = (len(names), len(self.nominal), len(self.inputs))
-        samples = _kept(shards, count, shape)
+        samples = _stored(shards, count, shape)
         remaining = [n for n in range(count) if n not in samples]
         new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
         try:
@@ -295,24 +300,24 @@ class _Job:
                 raise
             words = f"{len(samples)} of {count} samples are kept; go on with resume=True"
             raise KeyboardInterrupt(words) from None
-        return self._found(names, [samples[n] for n in range(count)])
+        return self._evaluate(names, [samples[n] for n in range(count)])
 
-    def _found(self, names: list[str], samples: list[Sample]) -> Uncertainty:
-        wanted = [name for name in TORNADO_RESULTS if name in names]
-        rows = [names.index(name) for name in wanted]
-        input_names = [one.name for one in self.inputs]
+    def _evaluate(self, names: list[str], samples: list[Sample]) -> Uncertainty:
+        results = [name for name in TORNADO_RESULTS if name in names]
+        rows = [names.index(name) for name in results]
+        input_names = [varied.name for varied in self.inputs]
         indices: list[SobolIndex] = []
         if self.crossed:
-            every = np.array([one.values[rows] for one in samples])
+            design_values = np.array([sample.values[rows] for sample in samples])
             seed = uncertainty_of(self.case).seed
-            indices = sobol_indices(wanted, input_names, every, self.crossed, seed)
-        plain = samples[: 2 * self.crossed or len(samples)]  # those that are independent
-        values = np.array([one.values for one in plain])
-        problems = np.array([one.problems for one in plain])
+            indices = sobol_indices(results, input_names, design_values, self.crossed, seed)
+        independent = samples[: 2 * self.crossed or len(samples)]
+        values = np.array([sample.values for sample in independent])
+        problems = np.array([sample.problems for sample in independent])
         failed = problems != ""
-        errors = np.array([one.errors for one in plain])
+        errors = np.array([sample.errors for sample in independent])
         bands = band_columns(self.nominal["time_s"], names, values, failed)
-        tornado = influences(wanted, input_names, values[:, rows], errors)
+        tornado = influences(results, input_names, values[:, rows], errors)
         summary, weight = self.nominal.summary, self.case.body_weight
         bands |= discrepancy_columns(names, values, summary, weight)
         summary["uncertainty"] = self._summary(problems, tornado)
@@ -325,8 +330,8 @@ class _Job:
         if summary.get("measured"):
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside
-        results = replace(self.nominal, bands=bands)
-        return Uncertainty(results, bands, tornado, names, self.inputs, samples, indices)
+        nominal = replace(self.nominal, bands=bands)
+        return Uncertainty(nominal, bands, tornado, names, self.inputs, samples, indices)
 
     def _summary(self, problems: np.ndarray, tornado: list[Influence]) -> dict[str, Any]:
         failed = problems != ""
@@ -334,7 +339,7 @@ class _Job:
             "samples": len(failed),
             "method": self.method,
             "table": uncertainty_of(self.case).model_dump(mode="json"),
-            "varied": [one.name for one in self.inputs],
+            "varied": [varied.name for varied in self.inputs],
             "not_varied": held_inputs(self.case),
             "failed_share": float(failed.mean()),
             "largest_failed_share": float(failed.mean(axis=0).max()),
@@ -344,15 +349,15 @@ class _Job:
 
 
 def shares_of_variance(tornado: Sequence[Influence]) -> dict[str, dict[str, float]]:
-    """Return result -> input -> its share of the result's variance, largest first."""
+    """Return result -> input -> its share of the variance of the result, largest first."""
     rows: dict[str, dict[str, float]] = {}
-    for one in tornado:
-        rows.setdefault(one.result, {})[one.name] = one.share
+    for row in tornado:
+        rows.setdefault(row.result, {})[row.name] = row.share
     return rows
 
 
 def banded_names(results: Results) -> list[str]:
-    """Return the columns that get a band: numbers that the scene models and a sample computes."""
+    """Return the numeric columns that have a band."""
     return [
         name
         for name in results.columns
@@ -363,22 +368,12 @@ def banded_names(results: Results) -> list[str]:
     ]
 
 
-def _kept(shards: Shards | None, count: int, shape: tuple[int, int, int]) -> dict[int, Sample]:
-    """Return the samples that an earlier run left.
-
-    Args:
-        shards: None: nothing is kept.
-        count: number of samples.
-        shape: number of columns, of frames and of inputs of a sample.
-
-    Raises:
-        InputError: a kept sample has other arrays than a `Sample` of that shape.
-    """
+def _stored(shards: Shards | None, count: int, shape: tuple[int, int, int]) -> dict[int, Sample]:
     samples: dict[int, Sample] = {}
     if shards is None or not shards.resumed:
         return samples
     for number in range(count):
-        shard = shards.get(number, lambda one: _is_sample(one.contact or {}, shape))
+        shard = shards.get(number, lambda stored: _is_sample(stored.contact or {}, shape))
         if shard is not None and shard.contact is not None:
             samples[number] = Sample(**shard.contact)
     return samples

@@ -1,12 +1,12 @@
-"""One sample of a scene: its inputs with errors, its results as one array.
+"""One sample of a scene: inputs with errors, and the results as one array.
 
-The errors are applied to the case that was read, in SI, as for a right knee; no file is read again.
-Meshes, search trees and the prepared contact are those of the scene as given. Only a varied modulus
-of the insert needs a new preparation of the contact.
+The errors are applied to the loaded case, in SI units and for a right knee, so no file is read
+again. Meshes, search trees and the prepared contact are those of the nominal scene. Only a varied
+modulus of the insert needs a new preparation of the contact.
 
-Each skin marker is displaced on its segment by an error that is the same in all frames. The rigid
-fit of the segment's markers is then off by the pose that best maps the true places to the displaced
-ones (`method = "segments"`). A kinematic chain spreads the same errors over more segments.
+Each skin marker has an error on its segment that is constant over the frames. The pose of a segment
+is then wrong by the rigid fit of the displaced markers to their nominal positions
+(`method = "segments"`). A kinematic chain distributes the same errors over more segments.
 """
 
 from collections.abc import Sequence
@@ -63,18 +63,17 @@ if TYPE_CHECKING:
 
 
 def varied_case(case: Case, draw: Draw) -> Case:
-    """Return the case with varied inputs; rates and accelerations stay as recorded.
+    """Return the case with varied inputs. Velocities and accelerations are those of the recording.
 
-    The insert's modulus and the shared muscles are not in a case:
-    `tkamb.studies.uncertainty.sample` varies them.
+    A case contains neither the insert's modulus nor the shared muscles. `Sampler` varies these.
     """
     tibia, coordinates = displaced_by_markers(case, draw)
     varied = replace(case, tibia=tibia, motion=replace(case.motion, coordinates=coordinates))
     changes: dict[str, Any] = {"motion": _motion(varied, draw), "scene": _scene(case, draw)}
     if tibia is not None:
-        place = tibia.pose.copy()
-        place[:, :3, 3] += tibia.pose[:, :3, :3] @ draw.place("knee_centre")
-        changes["tibia"] = replace(tibia, pose=place)
+        pose = tibia.pose.copy()
+        pose[:, :3, 3] += tibia.pose[:, :3, :3] @ draw.place("knee_centre")
+        changes["tibia"] = replace(tibia, pose=pose)
     if case.ground is not None:
         changes["ground"] = _ground(case.ground, draw)
     changes["chain"] = case.chain.changed(
@@ -82,8 +81,8 @@ def varied_case(case: Case, draw: Draw) -> Case:
         draw.place("insert_placement"),
         Rotation.from_rotvec(draw.turn("insert_placement")).as_matrix(),
     )
-    changes["ligaments"] = tuple(_ligament(case, one, draw) for one in case.ligaments)
-    changes["muscles"] = tuple(_muscle(case, one, draw) for one in case.muscles)
+    changes["ligaments"] = tuple(_ligament(case, bundle, draw) for bundle in case.ligaments)
+    changes["muscles"] = tuple(_muscle(case, muscle, draw) for muscle in case.muscles)
     if case.patellar_ligament is not None:
         end = case.patellar_ligament.distal
         distal = LinkPoint(end.link, end.position + draw.place("tuberosity"))
@@ -93,7 +92,6 @@ def varied_case(case: Case, draw: Draw) -> Case:
 
 
 def _scene(case: Case, draw: Draw) -> Scene:
-    """Return the scene with the numbers that are read from it."""
     scene = case.scene
     if scene.contact is None:
         return scene
@@ -124,10 +122,10 @@ def _ground(ground: "GroundReaction", draw: Draw) -> "GroundReaction":
 def _motion(case: Case, draw: Draw) -> "KneeMotion":
     motion, errors = case.motion, draw.standardised()
     coordinates = motion.coordinates.copy()
-    for i, one in enumerate(draw.inputs):
-        if one.name in KNEE_COORDINATES:
-            scale = one.deviation * UNITS[one.unit]
-            coordinates[:, KNEE_COORDINATES.index(one.name)] += scale * errors[:, i]
+    for i, varied in enumerate(draw.inputs):
+        if varied.name in KNEE_COORDINATES:
+            scale = varied.deviation * UNITS[varied.unit]
+            coordinates[:, KNEE_COORDINATES.index(varied.name)] += scale * errors[:, i]
     patella = motion.patella
     if patella is not None:
         patella = patella + np.array([draw.error("dome.ap"), draw.error("dome.si"), 0.0])
@@ -141,7 +139,8 @@ def _ligament(case: Case, bundle: Ligament, draw: Draw) -> Ligament:
         proximal=_on_femur(case, bundle.proximal, draw),
         distal=_on_femur(case, bundle.distal, draw),
         stiffness=bundle.stiffness * draw.factor(f"ligament_stiffness.{bundle.name}"),
-        slack_length=bundle.slack_length / (1.0 + strain),  # one of the two is NaN and stays so
+        # either the slack length or the reference strain is NaN and remains NaN
+        slack_length=bundle.slack_length / (1.0 + strain),
         reference_strain=bundle.reference_strain + strain,
     )
 
@@ -155,30 +154,29 @@ def _muscle(case: Case, muscle: Muscle, draw: Draw) -> Muscle:
 
 
 def _wrap(wrap: SagittalWrap | None, name: str, draw: Draw) -> SagittalWrap | None:
-    """Return how a tendon wraps, its band wider or narrower by the draw's error."""
     error = draw.error(f"tendon_band.{name}")
     return wrap if wrap is None or not error else replace(wrap, band=max(0.0, wrap.band + error))
 
 
 def varied_muscles(muscles: SharedMuscles | None, draw: Draw) -> SharedMuscles | None:
-    """Return shared muscles with their groups' strengths and attachments moved.
+    """Return shared muscles with varied strengths and attachments of their groups.
 
-    Their motion and the rows of hip and ankle stay as recorded.
+    Their motion and their moment arms at hip and ankle stay nominal.
     """
     if muscles is None:
         return None
     names = muscles.trial.muscles
     factors, shifts = np.ones(len(names)), np.zeros((len(GROUP_ENDS), len(names), 3))
     for group, members in muscles.groups.items():
-        own = np.isin(names, members)
-        factors[own] = draw.factor(f"muscle_strength.{group}")
+        in_group = np.isin(names, members)
+        factors[in_group] = draw.factor(f"muscle_strength.{group}")
         for shift, end in zip(shifts, GROUP_ENDS, strict=True):
-            shift[own] = draw.place(f"muscle_attachment.{group}.{end}")
+            shift[in_group] = draw.place(f"muscle_attachment.{group}.{end}")
     return muscles.changed(factors, *shifts)
 
 
 def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
-    """Return a point moved with the femur, if it is on it."""
+    """Return a point, moved by the error of the femoral placement if it belongs to the femur."""
     shift = draw.place("femoral_placement")
     if not shift.any() or case.chain.carrier(end.link) != "femur":
         return end
@@ -187,23 +185,23 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
 
 
 def thinnable(case: Case) -> bool:
-    """Say whether a frame needs no other frame of the motion.
+    """Return whether each frame can be computed without the other frames of the motion.
 
-    It needs others if a solved patella is differentiated in time, or if a reference strain refers
-    to another frame.
+    A solved patella needs them for its derivatives in time, a reference strain for the frame to
+    which it refers.
     """
     solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
-    return not solved and all(np.isfinite(one.slack_length) for one in case.ligaments)
+    return not solved and all(np.isfinite(bundle.slack_length) for bundle in case.ligaments)
 
 
 def thinned(case: Case, frames: range) -> Case:
-    """Return the case with only these frames of its motion."""
+    """Return the case with only the given frames of its motion."""
     count, chosen = len(case.motion.time), list(frames)
 
     def at_frames(recording: Any) -> Any:
         if recording is None:
             return None
-        values = {one.name: getattr(recording, one.name) for one in fields(recording)}
+        values = {field.name: getattr(recording, field.name) for field in fields(recording)}
         series = {
             name: value[chosen]
             for name, value in values.items()
@@ -220,24 +218,24 @@ def thinned(case: Case, frames: range) -> Case:
 
 
 def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Array]":
-    """Return the shank, and the knee coordinates (f, 6), with the markers' errors in them.
+    """Return shank motion and knee coordinates (f, 6) with the errors of the markers.
 
-    Only coordinates that are taken from the markers change.
+    Only coordinates that are computed from the markers change.
 
     Args:
-        case: the case.
-        draw: the errors of its inputs, `marker.<label>` among them.
+        case: the nominal case.
+        draw: errors of the inputs, including `marker.<label>`.
     """
     markers, tibia, coordinates = case.scene.motion.markers, case.tibia, case.motion.coordinates
     if (
         markers is None
         or tibia is None
-        or not any(one.name.startswith("marker.") for one in draw.inputs)
+        or not any(varied.name.startswith("marker.") for varied in draw.inputs)
     ):
         return tibia, coordinates
-    tables = {one.name: one for one in markers.segment}
+    tables = {segment.name: segment for segment in markers.segment}
     is_left = case.scene.patient.side == "left"
-    shank, thigh = (_misfit(tables[name], draw, is_left) for name in MARKED)
+    shank, thigh = (_fit_error(tables[name], draw, is_left) for name in MARKED)
     insert, knee = case.chain.insert_in_tibia, knee_pose(coordinates)
     thigh_pose = inverse(shank @ insert) @ insert @ knee @ thigh
     change = knee_coordinates(thigh_pose) - knee_coordinates(knee)
@@ -247,8 +245,8 @@ def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Ar
     return replace(tibia, pose=tibia.pose @ shank), varied
 
 
-def _misfit(segment: MarkerSegmentTable, draw: Draw, is_left: bool) -> Array:
-    """Return the pose (4, 4) of the fitted segment in the true one, as a right leg's."""
+def _fit_error(segment: MarkerSegmentTable, draw: Draw, is_left: bool) -> Array:
+    """Return the pose (4, 4) of the fitted segment in the nominal one, mirrored to a right leg."""
     points = np.array(list(segment.markers_mm.values())) * MILLIMETRE
     points = points @ MIRROR if is_left else points
     errors = np.array([draw.place(f"marker.{label}") for label in segment.markers_mm])
@@ -262,9 +260,10 @@ class Sample:
     """Results of one sample.
 
     Args:
-        values: (names, frames) in the order asked for; NaN where a frame failed or has no number.
-        problems: (frames,) text, why the frame failed; empty where it did not.
-        errors: (frames, d) the inputs' errors in their standard deviations.
+        values: values of the requested columns, shape (names, frames); NaN if a frame failed or has
+            no value.
+        problems: reason why each frame failed, "" if it did not, shape (frames,).
+        errors: errors of the inputs in standard deviations, shape (frames, d).
     """
 
     values: Array
@@ -273,7 +272,7 @@ class Sample:
 
     @property
     def failed(self) -> np.ndarray:
-        """Whether each frame failed (frames,)."""
+        """Whether each frame failed, shape (frames,)."""
         return self.problems != ""
 
 
@@ -282,16 +281,16 @@ class Sampler:
 
     Args:
         scene: the scene.
-        frames: frames of the motion.
-        names: columns of results.csv that are wanted.
+        frames: numbers of the frames to compute.
+        names: requested columns of results.csv.
 
     Attributes:
-        names: wanted columns, as given.
-        case: the scene's case, only with the chosen frames where that is possible.
-        inputs: inputs that vary.
+        names: requested columns.
+        case: nominal case. It contains only the frames to compute if `thinnable` allows it.
+        inputs: varied inputs.
 
     Raises:
-        TkambError: whatever is wrong with the scene.
+        TkambError: the scene is invalid.
     """
 
     def __init__(self, scene: Scene, frames: range, names: Sequence[str]) -> None:
@@ -303,7 +302,7 @@ class Sampler:
         )
         self.inputs: tuple[VariedInput, ...] = varied_inputs(self.case)
         self._root = correlation_root(
-            uncertainty_of(self.case).correlation, [one.name for one in self.inputs]
+            uncertainty_of(self.case).correlation, [varied.name for varied in self.inputs]
         )
         self._split = self.case.split
         self._mechanics = mechanics_of(self.case)
@@ -311,24 +310,24 @@ class Sampler:
         self._side = contact_side(self.case, self._mechanics) if contact else None
 
     def draw(self, point: Point) -> Draw:
-        """Return what the sample at a point makes of the inputs."""
+        """Return the errors of the inputs at a point."""
         table = uncertainty_of(self.case)
-        count = len(pose_names(self.inputs))  # they come first
-        # on the whole recording's clock: the same whichever frames are asked for
+        count = len(pose_names(self.inputs))  # the pose inputs come first
+        # noise of all recorded frames, so that it does not depend on the requested frames
         per_frame = noise_of_point(point, range(count), self._time, table.correlation_s, table.seed)
         if len(self.case.motion.time) < len(self._time):
             per_frame = per_frame[list(self._chosen)]
-        if point.noise_of is None:  # one input at a time: correlated inputs stay
+        if point.noise_of is None:  # a screening varies one input, also of correlated ones
             return Draw(self.inputs, point.normal, per_frame, 1.0)
         noise = per_frame @ self._root[:count, :count].T
         return Draw(self.inputs, self._root @ point.normal, noise, table.constant_share)
 
     def __call__(self, number: int, point: Point) -> Sample:
-        """Return the sample at a point; a frame begins its search at the one before.
+        """Return the sample at a point. Each frame has a warm start from the preceding frame.
 
         Args:
-            number: number of the sample; workers need it, but it does not change the sample.
-            point: where it lies.
+            number: number of the sample, which has no effect.
+            point: point of the sample in the space of the inputs.
         """
         draw = self.draw(point)
         errors = draw.standardised()[list(self._frames)]
@@ -343,7 +342,7 @@ class Sampler:
             mechanics, side = mechanics_of(case, self._shared(draw), contact=contact), None
             if self._side is not None:
                 side = contact_side(case, mechanics, sensitivity=False, post=self._side.post)
-        except TkambError as error:  # the varied inputs cannot be used: no frame has a number
+        except TkambError as error:  # the varied inputs are invalid, so every frame fails
             return Sample(values, np.full(len(self._frames), str(error)), errors)
         problems: list[str] = []
         before: list[FrameContact] = []
@@ -362,26 +361,26 @@ class Sampler:
 
     def _varied(self, draw: Draw) -> Case:
         case = varied_case(self.case, draw)
-        case.__dict__["split"] = self._split  # of the same femoral component: found once
+        case.__dict__["split"] = self._split  # cached: the femoral component is the same
         return case
 
 
 class BandWorker:
-    """Computes samples; it is prepared before the columns with a band are known.
+    """Computes samples in a worker. It can be prepared before the column names are known.
 
     Args:
         scene: the scene.
-        frames: frames of the motion.
+        frames: numbers of the frames to compute.
     """
 
     def __init__(self, scene: Scene, frames: range) -> None:
         self._scene, self._frames = scene, frames
         self._sampler: Sampler | None = None
-        with suppress(TkambError):  # the run of the scene as given reports the error
+        with suppress(TkambError):  # the nominal run reports the error
             self._sampler = Sampler(scene, frames, ())
 
     def __call__(self, number: int, job: tuple[Point, list[str]]) -> Sample:
-        """Return the sample at a point, with the columns of these names."""
+        """Return the sample of a job, which is a point and the names of the columns."""
         point, names = job
         sampler = self._sampler or Sampler(self._scene, self._frames, names)
         sampler.names = names
@@ -395,7 +394,10 @@ def _frame(
     k: int,
     before: list[FrameContact],
 ) -> tuple[dict[str, Any], str]:
-    """Return frame k's row of results.csv and why it failed; its contact joins those before it."""
+    """Return the row of frame k in results.csv, and the reason if it failed.
+
+    `before` holds the contacts of the last two frames and is updated.
+    """
     contact = None
     if side is None:
         body = mechanics.frame(k)

@@ -1,12 +1,11 @@
 """Samples of standard normal inputs, independent or correlated.
 
-Sample n depends on its number alone, not on the number of samples. More samples therefore keep the
-earlier ones, and the order in which workers finish does not matter.
+Sample n does not depend on the number of samples. A larger number therefore includes the samples of
+a smaller one.
 
-Correlated inputs ([[uncertainty.correlation]]): z = L x, with x independent standard normal and
+Correlated inputs ([[uncertainty.correlation]]) are z = L x, with x independent standard normal and
 L L^T the correlation matrix (Cholesky). This is a Gaussian copula, because every input is a
-function of its own normal error. The method of Iman & Conover (1982) keeps the strata of every
-input, but its samples depend on their number.
+function of one normal error. Samples by Iman & Conover (1982) would depend on their number.
 
 References: Cario & Nelson, Modeling and generating random vectors with arbitrary marginal
 distributions and correlation matrix, Northwestern University (1997); Iman & Conover, Commun Stat
@@ -27,36 +26,37 @@ from tkamb.io.scene.uncertainty import CorrelationTable
 
 TABLE = "[[uncertainty.correlation]]"
 ROUNDING = 1e-10
-"""An eigenvalue, or a remaining variance, above minus this counts as not negative."""
+"""Round-off of an eigenvalue of the correlation matrix, or of a remaining variance."""
 
 
 def correlation_root(tables: Sequence[CorrelationTable], names: Sequence[str]) -> Array:
-    """Return L (d, d), lower triangular, with L L^T the correlation matrix of the inputs.
+    """Return the Cholesky factor L (d, d) of the correlation matrix of the inputs.
 
     Args:
-        tables: the pairs that are correlated; all others are not.
-        names: (d,) of the inputs that vary.
+        tables: pairs of correlated inputs. All other pairs are uncorrelated.
+        names: names of the d varied inputs.
 
     Raises:
-        InputError: an input that does not vary, a pair given twice, or no correlation matrix.
+        InputError: an input does not vary, a pair occurs twice, or the coefficients contradict
+            each other.
     """
     matrix = np.eye(len(names))
     for table in tables:
-        row, column = (_place(name, names) for name in table.between)
+        row, column = (_index(name, names) for name in table.between)
         if matrix[row, column] != 0.0:
-            raise InputError(f"'{table.between[0]}' and '{table.between[1]}' twice", TABLE)
+            raise InputError(f"has '{table.between[0]}' and '{table.between[1]}' twice", TABLE)
         matrix[row, column] = matrix[column, row] = table.coefficient
     least = float(np.linalg.eigvalsh(matrix)[0])
     if least < -ROUNDING:
         raise InputError(
-            f"do not give a correlation matrix (smallest eigenvalue {least:.3g})",
+            f"does not give a correlation matrix (smallest eigenvalue {least:.3g})",
             TABLE,
-            "give smaller coefficients, or those of the other pairs too",
+            "give smaller coefficients, or also the coefficients of other pairs",
         )
     return _cholesky(matrix)
 
 
-def _place(name: str, names: Sequence[str]) -> int:
+def _index(name: str, names: Sequence[str]) -> int:
     if name in names:
         return names.index(name)
     raise InputError(
@@ -65,34 +65,37 @@ def _place(name: str, names: Sequence[str]) -> int:
 
 
 def _cholesky(matrix: Array) -> Array:
-    """Return L of a positive semi-definite matrix; a column of zeros where nothing is left."""
+    """Return the Cholesky factor of a positive semi-definite matrix.
+
+    A column is zero if the earlier inputs determine its input.
+    """
     root = np.zeros_like(matrix)
     for k in range(len(matrix)):
-        rest = matrix[k, k] - root[k, :k] @ root[k, :k]
-        if rest > ROUNDING:
-            root[k, k] = np.sqrt(rest)
+        remaining = matrix[k, k] - root[k, :k] @ root[k, :k]
+        if remaining > ROUNDING:
+            root[k, k] = np.sqrt(remaining)
             root[k + 1 :, k] = (matrix[k + 1 :, k] - root[k + 1 :, :k] @ root[k, :k]) / root[k, k]
     return root
 
 
 Method = Literal["lhs", "sobol"]
 BLOCK = 64
-"""Samples of one Latin hypercube; the next ones make the next hypercube."""
+"""Number of samples in a Latin hypercube. Further samples form further hypercubes."""
 SMALLEST_TAIL = 1e-9
-"""Smallest probability that is mapped to a normal quantile: Sobol' points may be 0, whose quantile
-is not finite."""
+"""Smallest probability that is mapped to a normal quantile. Sobol' points may be 0, and the
+quantile of 0 is infinite."""
 NOISE = 1
-"""Number that separates the seeds of the noise from those of the hypercubes."""
+"""Part of the seed of the noise. Hypercubes have 0 instead."""
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Where in the space of inputs a sample lies.
+    """Point of a sample in the space of the inputs.
 
     Args:
-        normal: (d,) standard normal, one per input.
-        noise_of: (d,) numbers of the samples whose noise per frame each input has; None: no
-            noise, the whole deviation of a pose is the same in all frames.
+        normal: standard normal value of each input, shape (d,).
+        noise_of: number of the sample that defines the noise of each input over the frames, length
+            d; None: no noise.
     """
 
     normal: Array
@@ -100,58 +103,59 @@ class Point:
 
     @classmethod
     def of(cls, number: int, normal: Array) -> "Point":
-        """Return the point of a sample with its own noise."""
+        """Return the point of a sample that defines the noise of all inputs."""
         return cls(normal, (number,) * len(normal))
 
 
 def crossed_points(first: Array, second: Array) -> list[Point]:
-    """Return the points of Saltelli's design: A, B, and A with each column from B.
+    """Return the points of Saltelli's design: A, B, and A with one column from B for each input.
 
-    A point's noise goes with its column. Order: n of A, n of B, then n per input.
+    The noise of an input is taken from the same matrix as its column. The points are sorted: n of
+    A, n of B, then n for each input.
 
     Args:
-        first: (n, d) standard normal, A.
-        second: (n, d) of B.
+        first: matrix A of standard normal values, shape (n, d).
+        second: matrix B of standard normal values, shape (n, d).
 
     Reference: Saltelli et al., Comput Phys Commun 181:259 (2010),
     doi:10.1016/j.cpc.2009.09.018.
     """
     count, dimensions = first.shape
-    points = [Point.of(n, one) for n, one in enumerate(np.concatenate([first, second]))]
+    points = [Point.of(n, row) for n, row in enumerate(np.concatenate([first, second]))]
     for i in range(dimensions):
         for n in range(count):
-            normal, own = first[n].copy(), [n] * dimensions
-            normal[i], own[i] = second[n, i], count + n
-            points.append(Point(normal, tuple(own)))
+            normal, noise_of = first[n].copy(), [n] * dimensions
+            normal[i], noise_of[i] = second[n, i], count + n
+            points.append(Point(normal, tuple(noise_of)))
     return points
 
 
 def one_at_a_time(dimensions: int) -> list[Point]:
-    """Return the points of a screening: none moved, then each input by -1 and +1 deviation."""
+    """Return the points of a screening: nominal, then each input at -1 and +1 deviation."""
     steps = np.repeat(np.eye(dimensions), 2, axis=0)
     steps[::2] *= -1.0
-    return [Point(one, None) for one in np.concatenate([np.zeros((1, dimensions)), steps])]
+    return [Point(row, None) for row in np.concatenate([np.zeros((1, dimensions)), steps])]
 
 
 def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array:
     """Return samples (count, dimensions) of independent standard normal inputs.
 
-    "lhs": Latin hypercubes of 64 samples each, every one with a seed of its own. "sobol": one
-    scrambled Sobol' sequence. Both are mapped through the normal quantile.
+    "lhs" makes Latin hypercubes of `BLOCK` samples, "sobol" one scrambled Sobol' sequence. The
+    normal quantile maps their probabilities to values.
 
     Args:
-        method: "lhs" or "sobol".
+        method: sampling method, "lhs" or "sobol".
         count: number of samples, at least 1.
-        dimensions: inputs.
-        seed: seed of all draws.
+        dimensions: number of inputs.
+        seed: seed of the random numbers.
 
     Raises:
-        InputError: unknown method, or no samples.
+        InputError: the method is unknown, or the number of samples is below 1.
     """
     if count < 1:
-        raise InputError(f"{count} is no number of samples", "samples", "give at least 1")
+        raise InputError(f"{count} is not a number of samples", "samples", "give at least 1")
     if method == "sobol":
-        # random_base2 draws whole powers of two, for which the sequence is balanced
+        # the Sobol' sequence is balanced for powers of two only
         uniform = qmc.Sobol(dimensions, seed=seed).random_base2((count - 1).bit_length())
     elif method == "lhs":
         uniform = np.concatenate(
@@ -172,36 +176,36 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
 def noise_of_point(
     point: Point, columns: Sequence[int], time: Array, correlation_time: float, seed: int
 ) -> Array:
-    """Return the noise (f, p) of the inputs in these columns at a point.
+    """Return the noise (f, p) of some inputs at a point.
 
     Args:
-        point: the sample's point.
-        columns: (p,) of the inputs that have noise.
-        time: (f,) s, rising.
-        correlation_time: s.
-        seed: seed of all draws.
+        point: point of the sample.
+        columns: numbers of the p inputs that have noise.
+        time: increasing times of the frames, s, shape (f,).
+        correlation_time: correlation time of the noise, s.
+        seed: seed of the random numbers.
     """
-    found = np.zeros((len(time), len(columns)))
+    result = np.zeros((len(time), len(columns)))
     for number in dict.fromkeys(point.noise_of or ()):
         draws = noise(number, time, len(columns), correlation_time, seed)
-        for place, column in enumerate(columns):
+        for i, column in enumerate(columns):
             if point.noise_of is not None and point.noise_of[column] == number:
-                found[:, place] = draws[:, place]
-    return found
+                result[:, i] = draws[:, i]
+    return result
 
 
 def noise(number: int, time: Array, dimensions: int, correlation_time: float, seed: int) -> Array:
-    """Return AR(1) noise (f, dimensions) of unit variance, that of one sample.
+    """Return AR(1) noise (f, dimensions) of unit variance for one sample.
 
-    x_0 = e_0, x_k = rho_k x_{k-1} + sqrt(1 - rho_k²) e_k, rho_k = exp(-(t_k - t_{k-1})/tau):
-    stationary whatever the steps in time.
+    x_0 = e_0 and x_k = rho_k x_{k-1} + sqrt(1 - rho_k²) e_k with rho_k = exp(-(t_k - t_{k-1})/tau).
+    The noise is stationary for any time steps.
 
     Args:
         number: number of the sample.
-        time: (f,) s, rising.
-        dimensions: independent series.
-        correlation_time: tau, s; 0: white.
-        seed: seed of all draws.
+        time: increasing times of the frames, s, shape (f,).
+        dimensions: number of independent series.
+        correlation_time: correlation time tau, s; 0: white noise.
+        seed: seed of the random numbers.
     """
     draws = np.random.default_rng([seed, NOISE, number]).standard_normal((len(time), dimensions))
     if correlation_time == 0.0:

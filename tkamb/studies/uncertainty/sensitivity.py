@@ -1,7 +1,7 @@
-"""Sensitivity of the results to the inputs: Sobol' indices, and screening.
+"""Sensitivity of the results to the inputs: Sobol' indices and screening.
 
-Indices come from Saltelli's design. Screening changes one input at a time by one standard deviation
-up and down.
+The indices come from Saltelli's design. Screening changes one input at a time by plus and minus one
+standard deviation.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ from tkamb.studies.uncertainty.sample import Sample, Sampler
 from tkamb.studies.uncertainty.sampling import one_at_a_time
 
 RESAMPLED = 200
-"""Bootstrap samples for the standard errors."""
+"""Number of bootstrap samples for the standard errors."""
 
 
 @dataclass(frozen=True)
 class SobolIndex:
-    """Share of an input in a result's variance.
+    """Share of an input in the variance of a result.
 
     Args:
         result: column of results.csv.
         name: name of the input.
-        first: share of the input alone: Var(E(y | x_i)) / Var(y).
-        first_error: its standard error.
-        total: with all its interactions: E(Var(y | all but x_i)) / Var(y).
-        total_error: its standard error.
-        rows: number of rows of the design in which every needed sample has a number.
+        first: first-order index, the share of the input alone: Var(E(y | x_i)) / Var(y).
+        first_error: standard error of the first-order index.
+        total: total index, which includes all interactions: E(Var(y | all but x_i)) / Var(y).
+        total_error: standard error of the total index.
+        rows: number of rows of the design that were used.
     """
 
     result: str
@@ -50,26 +50,25 @@ class SobolIndex:
 def sobol_indices(
     results: Sequence[str], inputs: Sequence[str], values: Array, count: int, seed: int
 ) -> list[SobolIndex]:
-    """Return the indices of every input on every result, largest total first.
+    """Return the indices of every input for every result, with the largest total index first.
 
-    With y_A, y_B and y_AB the results at A, at B, and at A with the input's column from B, less
-    their mean, sums over the rows of the design:
+    y_A and y_B are the results at A and B, and y_AB those at A with the column of the input from B,
+    all without their mean. With sums over the rows of the design the indices are
 
         first = sum y_B (y_AB - y_A) / sum y²      (Saltelli et al. 2010)
         total = sum (y_A - y_AB)² / (2 sum y²)     (Jansen 1999)
 
-    sum y² the mean over A and B. Of a result with many frames, numerators and denominators are
-    summed over the frames (Gamboa et al. 2014): a frame counts with its variance. Rows where a
-    needed sample failed are left out; the indices are then those among possible poses. Standard
-    errors by bootstrap over the rows. A result without variance, or of fewer than
-    `STATISTICS_LIMITS.min_samples` rows, has none.
+    where sum y² is the mean over A and B. Numerators and denominators are summed over the frames
+    (Gamboa et al. 2014). Rows with a failed sample are omitted. Standard errors come from a
+    bootstrap over the rows. A result has no indices if it does not vary, or if fewer than
+    `STATISTICS_LIMITS.min_samples` rows remain.
 
     Args:
-        results: (m,) names.
-        inputs: (d,) names.
-        values: (n (d + 2), m, f) in the order of
-        `tkamb.studies.uncertainty.sampling.crossed_points`.
-        count: n.
+        results: names of the m results.
+        inputs: names of the d inputs.
+        values: values of the samples, shape (n (d + 2), m, f), in the order of
+            `tkamb.studies.uncertainty.sampling.crossed_points`.
+        count: number n of rows of the design.
         seed: seed of the bootstrap.
 
     References:
@@ -88,14 +87,14 @@ def sobol_indices(
             for i, name in enumerate(inputs)
             if (row := _index(result, name, blocks[0], blocks[1], blocks[2 + i], weights))
         ]
-        indices += sorted(rows, key=lambda one: -one.total)
+        indices += sorted(rows, key=lambda row: -row.total)
     return indices
 
 
 def _index(
     result: str, name: str, a: Array, b: Array, crossed: Array, weights: Array
 ) -> SobolIndex | None:
-    """Return one input's indices from (n, f) values; None where nothing can be said."""
+    """Return the indices of one input from values (n, f); None: too few rows, or no variance."""
     finite = np.isfinite(a) & np.isfinite(b) & np.isfinite(crossed)
     enough = finite.sum(axis=0) >= STATISTICS_LIMITS.min_samples
     if not enough.any():
@@ -105,7 +104,7 @@ def _index(
     middle = np.where(finite, a[:, enough] + b[:, enough], 0.0).sum(axis=0) / (
         2 * finite.sum(axis=0)
     )
-    a, b, crossed = (np.where(finite, one[:, enough] - middle, 0.0) for one in (a, b, crossed))
+    a, b, crossed = (np.where(finite, y[:, enough] - middle, 0.0) for y in (a, b, crossed))
     variance = weights @ (0.5 * (a**2 + b**2)).sum(axis=1)
     if not varies(variance[0], square):
         return None
@@ -130,10 +129,11 @@ SCREENED = (
 
 @dataclass(frozen=True)
 class ScreeningSettings:
-    """What a screening prints."""
+    """Printed table of a screening."""
 
     least_share: float = 0.01
-    """Share of the largest change of a result; inputs that change it less are only counted."""
+    """Share of the largest change of a result. Inputs with smaller changes are counted, but not
+    listed."""
 
 
 SCREENING = ScreeningSettings()
@@ -145,11 +145,11 @@ class Screened:
 
     Args:
         result: column of results.csv.
-        nominal: its largest value, of the scene as it stands.
-        flexion: deg, where that is.
+        nominal: largest nominal value of the result.
+        flexion: flexion of the frame with this value, deg.
         varied: the input.
-        minus: change of the result there by minus one deviation; NaN where the frame failed.
-        plus: likewise by plus one.
+        minus: change at this frame for minus one standard deviation; NaN if the frame failed.
+        plus: change for plus one standard deviation.
     """
 
     result: str
@@ -161,7 +161,7 @@ class Screened:
 
     @property
     def slope(self) -> float:
-        """Central difference: change per deviation."""
+        """Change per standard deviation, from the central difference."""
         return 0.5 * (self.plus - self.minus)
 
 
@@ -172,24 +172,24 @@ def screen(
     crew: PoolOptions | None = None,
     progress: Progress = lambda samples, count: samples,
 ) -> list[Screened]:
-    """Move one input at a time by one standard deviation and return what that changes.
+    """Vary one input at a time by one standard deviation and return the changes of the results.
 
-    2 d + 1 samples of d inputs. A pose is moved as a whole, without noise per frame. Interactions
-    of inputs do not show; `estimate_uncertainty` includes them.
+    With d inputs 2 d + 1 samples are computed. Pose errors are constant over the frames.
+    Interactions of inputs are not included; `estimate_uncertainty` includes them.
 
     Args:
         scene: the scene.
-        frames: which frames; default all.
-        crew: who computes; default: this process.
-        progress: wraps the samples as they come.
+        frames: slice of the frames; default: all.
+        crew: worker pool settings; default: this process.
+        progress: wrapper of the iterator of the finished samples.
 
     Returns:
-        Of each result the inputs, largest change first. A result that the scene does not model
-        or that failed in every frame as it stands is left out.
+        The inputs of each result, with the largest change first. A result without a nominal value
+        in any frame is omitted.
 
     Raises:
-        InputError: bad input.
-        ComputationError: a worker ended before its sample.
+        InputError: the input is invalid.
+        ComputationError: a worker process ended during a sample.
     """
     crew = crew or PoolOptions()
     crew.check()
@@ -212,11 +212,11 @@ def screen(
 def _of_result(
     result: str, values: Array, flexion: float, inputs: Sequence[VariedInput]
 ) -> list[Screened]:
-    """Return the inputs' changes of a result at a frame (1 + 2 d,), the largest first."""
+    """Return the effect of each input from `values` (1 + 2 d,), with the largest change first."""
     changes = values[1:] - values[0]
     rows = [
-        Screened(result, float(values[0]), float(flexion), one, float(minus), float(plus))
-        for one, (minus, plus) in zip(inputs, changes.reshape(-1, 2), strict=True)
+        Screened(result, float(values[0]), float(flexion), varied, float(minus), float(plus))
+        for varied, (minus, plus) in zip(inputs, changes.reshape(-1, 2), strict=True)
     ]
     # An input that makes the frame fail counts as the largest change.
     return sorted(
@@ -225,24 +225,21 @@ def _of_result(
 
 
 def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
-    """Return the tornado as text: a bar either way per input that moves the result notably.
+    """Return the lines of the printed tornado table, with a bar for each input.
 
-    Inputs that move it by less than `SCREENING.least_share` of the largest change are counted.
-
-    Args:
-        rows: rows that `screen` returned.
-        width: length of the longest bar, in characters.
+    Inputs with less than `SCREENING.least_share` of the largest change are counted in one line.
+    `rows` come from `screen`; `width` is the length of the longest bar in characters.
     """
     lines: list[str] = []
     names = max((len(_named(row)) for row in rows), default=0)
     for result in dict.fromkeys(row.result for row in rows):
-        own = [row for row in rows if row.result == result]
-        lines.append(f"{result}: {own[0].nominal:.4g} at {own[0].flexion:.0f} deg")
-        sizes = np.abs([[row.minus, row.plus] for row in own])
+        group = [row for row in rows if row.result == result]
+        lines.append(f"{result}: {group[0].nominal:.4g} at {group[0].flexion:.0f} deg")
+        sizes = np.abs([[row.minus, row.plus] for row in group])
         largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
-        # an input whose frame failed is NaN here, and not below
+        # NaN of a failed frame is not small, so its input is listed
         small = (sizes < SCREENING.least_share * largest).all(axis=1) | (sizes == 0.0).all(axis=1)
-        for row in (row for row, hidden in zip(own, small, strict=True) if not hidden):
+        for row in (row for row, hidden in zip(group, small, strict=True) if not hidden):
             bar = _bar(row, largest, width)
             lines.append(
                 f"  {_named(row):<{names}} {_change(row.minus)} {_change(row.plus)}  {bar}"
@@ -254,8 +251,8 @@ def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
             )
     if any(not np.isfinite([row.minus, row.plus]).all() for row in rows):
         lines.append(
-            "failed: with this error of the input the frame has no result, often because no load "
-            "balances the pose; the change is not known, so the input is listed first"
+            "failed: with this error of the input the frame has no result, often because the pose "
+            "has no equilibrium; the change is unknown, so the input is listed first"
         )
     return lines
 
@@ -270,8 +267,8 @@ def _change(value: float) -> str:
 
 
 def _bar(row: Screened, largest: float, width: int) -> str:
-    """Return the bar to both sides of the nominal value."""
-    changes = [one for one in (row.minus, row.plus) if np.isfinite(one)]
+    """Return the bar of an input, with decreases to the left and increases to the right."""
+    changes = [change for change in (row.minus, row.plus) if np.isfinite(change)]
     scale = width / largest if largest > 0 else 0.0
     below, above = (round(scale * max([0.0, *(sign * c for c in changes)])) for sign in (-1, 1))
     return f"{'#' * below:>{width}}|{'#' * above}".rstrip()

@@ -1,1 +1,1 @@
-"""Wear, creep and a virtual knee simulator: many cycles of one motion on a wearing insert."""
+"""Wear, creep and a virtual knee simulator: many cycles of one motion on an insert that wears."""

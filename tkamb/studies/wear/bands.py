@@ -1,9 +1,8 @@
-"""Uncertainty of a worn volume: samples of the simulation, and bands of its rows.
+"""Uncertainty of wear: samples of the simulation, and bands of the rows of its table.
 
-Sampling, inputs and percentiles are those of `tkamb uncertainty`. These inputs vary: the wear
-factor, the constants of creep, the modulus of the insert, and the place of the whole cycle (the
-constant part of each pose error). Noise that differs from frame to frame averages out over millions
-of cycles. Loads do not vary.
+Sampling and percentiles are those of `tkamb uncertainty`. The varied inputs are the wear factor,
+the constants of creep, the modulus of the insert and the position of the whole cycle (the constant
+part of each pose error). Noise over the frames averages out.
 """
 
 import math
@@ -34,19 +33,14 @@ from tkamb.studies.wear.sliding import SlidingHistory
 BANDED = ("volume_mm3", "mass_mg", "max_depth_mm", "creep_depth_mm", "creep_volume_mm3")
 """Columns of wear.csv that have a band."""
 POSES = {"ap": "mm", "ml": "mm", "adduction": "deg", "axial_rotation": "deg", "flexion": "deg"}
-"""Knee coordinates that a pressed motion prescribes."""
+"""Knee coordinates that a motion prescribes -> unit. The load gives the remaining coordinate."""
 
 Rows = Mapping[str, Array]
 
 
 @dataclass(frozen=True)
 class Scaled(WearLaw):
-    """Another law times a factor.
-
-    Args:
-        law: wear law.
-        factor: factor on every depth.
-    """
+    """A wear law with a factor on the worn depth."""
 
     name: ClassVar[str] = "scaled"
     assumes: ClassVar[str] = "another law times a factor"
@@ -55,47 +49,51 @@ class Scaled(WearLaw):
     factor: float
 
     def depth(self, history: SlidingHistory) -> Array:
-        """Return the depth of the other law times the factor, (n,) m."""
+        """Return the factor times the depth of the law, m, shape (n,)."""
         return self.factor * self.law.depth(history)
 
 
 def varied_wear_inputs(
     table: UncertaintyTable, motion: CycleMotion, creep: LogarithmicCreep | None, profile: bool
 ) -> tuple[VariedInput, ...]:
-    """Return the inputs of a wear simulation that vary.
+    """Return the varied inputs of a wear simulation.
 
     Args:
-        table: the scene's [uncertainty].
-        motion: what its drive finds has no error of its own.
-        creep: None: not modelled.
-        profile: the motion is a simulator's. Its place varies only by what the table states: the
-            defaults are those of a recorded pose.
+        table: table [uncertainty] of the scene.
+        motion: motion of the cycle. Coordinates in equilibrium have no error of their own.
+        creep: creep law; None: creep is not modelled.
+        profile: whether the motion is a simulator's profile. Its pose then varies only by stated
+            deviations, because the defaults are those of recorded poses.
 
     Raises:
-        InputError: none varies.
+        InputError: every standard deviation is 0.
     """
-    result = () if motion.drive is None else motion.drive.names
+    in_equilibrium = () if motion.drive is None else motion.drive.names
     if not profile:
         table = table.completed(from_markers=False)
     inputs = [
         VariedInput(name, getattr(table, f"{name}_{unit}"), unit)
         for name, unit in POSES.items()
-        if name not in result and getattr(table, f"{name}_{unit}") is not None
+        if name not in in_equilibrium and getattr(table, f"{name}_{unit}") is not None
     ]
     inputs.append(VariedInput("young_modulus", table.young_modulus, "relative"))
     inputs.append(VariedInput("wear_factor", table.wear_factor, "relative"))
     if creep is not None:
         inputs.append(VariedInput("creep", table.creep, "relative"))
-    varied = tuple(one for one in inputs if one.deviation > 0)
+    varied = tuple(candidate for candidate in inputs if candidate.deviation > 0)
     if not varied:
-        raise InputError("nothing of a wear simulation varies", "[uncertainty]", "--samples 0")
+        raise InputError(
+            "nothing of a wear simulation varies",
+            "[uncertainty]",
+            "give a standard deviation above 0, or --samples 0",
+        )
     return varied
 
 
 def moved_case(case: WearCase, draw: Draw) -> WearCase:
-    """Return a case with its inputs moved as a sample has them."""
-    place = [draw.error(name) if name in POSES else 0.0 for name in KNEE_COORDINATES]
-    offset = math.sqrt(draw.constant_share) * np.array(place)
+    """Return a case with the errors of a sample applied to its inputs."""
+    errors = [draw.error(name) if name in POSES else 0.0 for name in KNEE_COORDINATES]
+    offset = math.sqrt(draw.constant_share) * np.array(errors)
     motion, drive, engine, creep = case.motion, case.motion.drive, case.engine, case.creep
     if offset.any():
         poses = knee_pose(knee_coordinates(motion.poses) + offset)
@@ -105,10 +103,10 @@ def moved_case(case: WearCase, draw: Draw) -> WearCase:
         if path is not None:
             path = path._replace(poses=knee_pose(knee_coordinates(path.poses) + offset))
         motion = replace(motion, poses=poses, path=path, drive=drive)
-    if (stiffer := draw.factor("young_modulus")) != 1.0:
+    if (modulus_factor := draw.factor("young_modulus")) != 1.0:
         assert isinstance(engine, ContactEngine)
         material = engine.material
-        material = replace(material, young_modulus=material.young_modulus * stiffer)
+        material = replace(material, young_modulus=material.young_modulus * modulus_factor)
         engine = replace(engine, material=material)
     if creep is not None:
         creep = creep.times(draw.factor("creep"))
@@ -120,9 +118,9 @@ class WearSampler:
     """Computes samples of one wear simulation.
 
     Args:
-        simulation: the case as it stands, cycles, and updates of the geometry.
-        inputs: inputs that vary.
-        constant_share: share of a pose error's variance that is the same in all frames.
+        simulation: nominal case, number of cycles, and number of updates of the geometry.
+        inputs: the d varied inputs.
+        constant_share: share of the variance of a pose error that is constant over the frames.
     """
 
     def __init__(
@@ -134,17 +132,17 @@ class WearSampler:
         self._simulation, self._inputs, self._share = simulation, inputs, constant_share
 
     def __call__(self, number: int, normal: Array) -> Rows:
-        """Return the columns of a sample's table; none where it has no contact.
+        """Return the columns of the table of a sample; empty if it has no contact.
 
         Args:
-            number: number of the sample; it does not change the sample.
-            normal: (d,) errors of the inputs in standard deviations.
+            number: number of the sample. It has no effect.
+            normal: errors of the inputs in standard deviations, shape (d,).
         """
         case, cycles, updates = self._simulation
         draw = Draw(self._inputs, normal, np.zeros((1, 0)), self._share)
         try:
             state, _ = simulate_wear(moved_case(case, draw), cycles, updates)
-        except InputError:  # the displaced femur lies beside the insert
+        except InputError:  # the displaced femoral component is beside the insert
             return {}
         return {key: np.array([row[key] for row in state.rows]) for key in ("cycles", *BANDED)}
 
@@ -154,23 +152,24 @@ class WearBandSettings:
     """Bands of wear from samples."""
 
     samples: int = 32
-    """Number of samples unless the user asks for another. Chosen: the 5th and 95th percentiles are
-    then inside the sample."""
+    """Default number of samples. Chosen because the 5th and 95th percentiles then lie between the
+    smallest and the largest sample."""
     max_samples: int = 10_000
-    """Largest number of samples that is accepted. Chosen: more take too long."""
+    """Largest number of samples that is accepted. Chosen because more take too long."""
 
 
 WEAR_BAND = WearBandSettings()
 
-SAID = (
+PRINTED_BANDS = (
     ("volume_mm3", "volume", "mm3"),
     ("max_depth_mm", "depth", "mm"),
     ("creep_depth_mm", "creep", "mm"),
 )
 """Column, word and unit of the bands that are printed."""
 NOT_VARIED = (
-    "loads, what of a pose's error differs from frame to frame, the law's form and its cross-shear "
-    "and pressure dependence, friction, the insert's shape, and the contact model's own error"
+    "loads, the noise of the pose over the frames, the form of the wear law with its dependence on "
+    "cross-shear and pressure, friction, the shape of the insert, and the error of the contact "
+    "model"
 )
 
 Progress = Callable[[Iterable[Numbered], int], Iterable[Numbered]]
@@ -178,14 +177,15 @@ Progress = Callable[[Iterable[Numbered], int], Iterable[Numbered]]
 
 @dataclass(frozen=True, eq=False)
 class WearBands:
-    """5 to 95 % of the samples, and their median.
+    """5th, 50th and 95th percentile of the samples of a wear simulation.
 
     Args:
-        varied: what varied, by how much.
-        samples: how many.
-        failed: number of samples without contact before the first cycle; they are in no band.
-        ended: number of samples that ended before the last cycle; they are in no later band.
-        rows: one per row of the table, "<column>_p05", "_p50" and "_p95"; NaN: too few samples.
+        varied: varied inputs.
+        samples: number of samples.
+        failed: number of samples without contact. The bands exclude them.
+        ended: number of samples that ended before the last cycle. Later bands exclude them.
+        rows: for each row of the table "<column>_p05", "_p50" and "_p95" -> percentile; NaN with
+            too few samples.
     """
 
     varied: tuple[VariedInput, ...]
@@ -195,7 +195,7 @@ class WearBands:
     rows: tuple[dict[str, float], ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what varied, and the bands after the last cycle."""
+        """Return the varied inputs and the bands after the last cycle."""
         return {
             "samples": self.samples,
             "samples_without_contact": self.failed,
@@ -208,7 +208,7 @@ class WearBands:
     def lines(self) -> list[str]:
         """Return the bands after the last cycle as lines of text."""
         last, result = self.rows[-1], []
-        for name, what, unit in SAID:
+        for name, what, unit in PRINTED_BANDS:
             low, high = last.get(f"{name}_p05", math.nan), last.get(f"{name}_p95", math.nan)
             if math.isfinite(low):
                 result.append(f"{what} {low:.4g} to {high:.4g} {unit}")
@@ -217,29 +217,31 @@ class WearBands:
         return [f"5 to 95 % of {self.samples} samples: {text}; varied: {varied}"]
 
     def questions(self) -> list[str]:
-        """Return what a reader must know before using the bands."""
+        """Return sentences on samples that the bands exclude."""
         questions = []
         if self.failed:
-            questions.append(f"{self.failed} of {self.samples} samples have no contact: in no band")
+            questions.append(
+                f"{self.failed} of {self.samples} samples have no contact; the bands exclude them"
+            )
         if self.ended:
             questions.append(
-                f"{self.ended} of {self.samples} samples wore through or lost their contact: from "
-                "there on the bands are those of the others"
+                f"{self.ended} of {self.samples} samples wore through or lost their contact; the "
+                "bands of later cycles exclude them"
             )
         return questions
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """The samples of a simulation; sample n does not depend on their number or on the worker.
+    """The samples of a wear simulation. Sample n does not depend on the number of samples.
 
     Args:
-        inputs: inputs that vary.
-        root: (d, d) makes independent errors correlated, see
-        `tkamb.studies.uncertainty.sampling`.
-        samples: how many.
-        seed: seed of all draws.
-        constant_share: share of a pose error's variance that is the same in all frames.
+        inputs: the d varied inputs.
+        root: Cholesky factor of the correlation matrix, shape (d, d), see
+            `tkamb.studies.uncertainty.sampling`.
+        samples: number of samples.
+        seed: seed of the random numbers.
+        constant_share: share of the variance of a pose error that is constant over the frames.
     """
 
     inputs: tuple[VariedInput, ...]
@@ -250,15 +252,15 @@ class Sampling:
 
     @classmethod
     def of(cls, setup: WearSetup, case: WearCase, samples: int) -> "Sampling":
-        """Return the samples that a scene's [uncertainty], or its defaults, ask for.
+        """Return the sampling with the table [uncertainty] of the scene, or its defaults.
 
         Raises:
-            InputError: nothing varies, or inputs cannot err together so.
+            InputError: no input varies, or the correlations contradict each other.
         """
         table = setup.uncertainty or UncertaintyTable()
         inputs = varied_wear_inputs(table, case.motion, case.creep, setup.simulated)
-        names = [one.name for one in inputs]
-        pairs = [one for one in table.correlation if set(one.between) <= set(names)]
+        names = [varied.name for varied in inputs]
+        pairs = [pair for pair in table.correlation if set(pair.between) <= set(names)]
         root = correlation_root(pairs, names)
         return cls(inputs, root, samples, table.seed, table.constant_share)
 
@@ -270,17 +272,17 @@ class Sampling:
         shards: Shards | None = None,
         progress: Progress = lambda samples, count: samples,
     ) -> WearBands:
-        """Simulate with varied inputs and return bands at the rows of a table.
+        """Simulate the samples and return their bands at the rows of the nominal table.
 
         Args:
-            simulation: the case as given, cycles, and updates of the geometry.
-            rows: rows of the table of the case as given.
-            crew: who computes; default: this process.
-            shards: where samples are kept.
-            progress: wraps the samples as they come.
+            simulation: nominal case, number of cycles, and number of updates of the geometry.
+            rows: rows of the nominal table.
+            crew: worker pool settings; default: this process.
+            shards: store of the finished samples; None: they stay in memory.
+            progress: wrapper of the iterator of the finished samples.
 
         Raises:
-            KeyboardInterrupt: saying how many samples are kept.
+            KeyboardInterrupt: interrupted. The finished samples stay in `shards`.
         """
         count = self.samples
         normal = normal_samples("lhs", count, len(self.inputs), self.seed) @ self.root.T
@@ -307,7 +309,6 @@ class Sampling:
 
 
 def _is_sample(shard: Shard) -> bool:
-    """Return whether a kept shard has the columns that a `WearSampler` returns."""
     columns = shard.contact or {}
     if not columns:
         return True
@@ -325,32 +326,35 @@ def _bands(
     rows: Sequence[Mapping[str, float]],
     cycles: int,
 ) -> WearBands:
-    """Return bands at the table's cycles; between the blocks of a sample its columns are linear."""
     names = [name for name in BANDED if np.isfinite(rows[-1][name])]
-    at = np.array([row["cycles"] for row in rows])
-    values = np.full((len(samples), len(names), len(at)), np.nan)
-    for sample, result in zip(samples, values, strict=True):
-        for column, name in zip(result, names, strict=True):
+    row_cycles = np.array([row["cycles"] for row in rows])
+    values = np.full((len(samples), len(names), len(row_cycles)), np.nan)
+    for sample, sample_values in zip(samples, values, strict=True):
+        for column, name in zip(sample_values, names, strict=True):
             if sample:
-                column[:] = np.interp(at, sample["cycles"], sample[name], right=np.nan)
+                column[:] = np.interp(row_cycles, sample["cycles"], sample[name], right=np.nan)
     bands = percentiles(values, np.isnan(values[:, 0]))
-    made = [
+    band_rows = [
         {
-            f"{name}_{end}": float(result[m, r])
+            f"{name}_{end}": float(limits[m, r])
             for m, name in enumerate(names)
-            for end, result in bands.items()
+            for end, limits in bands.items()
         }
-        for r in range(len(at))
+        for r in range(len(row_cycles))
     ]
     failed = sum(not sample for sample in samples)
     ended = sum(bool(sample) and bool(sample["cycles"][-1] < cycles) for sample in samples)
-    return WearBands(inputs, len(samples), failed, ended, tuple(made))
+    return WearBands(inputs, len(samples), failed, ended, tuple(band_rows))
 
 
 def check_samples(samples: int) -> None:
-    """Raise an InputError for a number of samples that gives no band; 0: none is wanted."""
+    """Check the number of samples of a wear simulation; 0: no bands.
+
+    Raises:
+        InputError: the number is out of range.
+    """
     if samples and not STATISTICS_LIMITS.min_samples <= samples <= WEAR_BAND.max_samples:
-        hint = "or 0, for no bands"
+        hint = "or give 0 for no bands"
         raise InputError(
             f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {WEAR_BAND.max_samples}",
             "--samples",

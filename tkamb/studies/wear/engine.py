@@ -1,4 +1,4 @@
-"""Contact for wear: pressure maps of a cycle, and their pressure at the insert's vertices."""
+"""Contact in a wear computation: the pressure maps of a cycle at the insert's vertices."""
 
 from dataclasses import dataclass
 
@@ -17,24 +17,25 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.frames import pose as pose_of
 from tkamb.geometry.surface import Surface
 from tkamb.studies.wear.motion import CycleMotion
-from tkamb.studies.wear.simulator import RestingPoses
+from tkamb.studies.wear.simulator import EquilibriumPoses
 
 GRID = (-0.012, -0.006, 0.0, 0.006, 0.012)
-"""m along x where the search for the dwell position begins."""
+"""m: positions along x of the initial guesses of the dwell position."""
 
 
 @dataclass(frozen=True)
 class WearGridSettings:
-    """Grid on which wear is summed."""
+    """Grid of the initial guesses of the dwell position."""
 
     spacing_z: float = 0.002
-    """m; spacing along z (medial to lateral). Chosen: a scar is several times as wide."""
+    """m: spacing of the initial guesses along z (mediolateral). Chosen because a wear scar is
+    several times as wide."""
 
 
 WEAR_GRID = WearGridSettings()
 
 SEARCH = {"xatol": 1e-5, "fatol": 1e-9, "maxfev": 120}
-"""The search ends within 10 µm."""
+"""Options of the simplex search: x and z to 10 µm (xatol), height to 1 nm (fatol)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +43,11 @@ class CycleMaps:
     """Pressure maps of a cycle.
 
     Args:
-        points: (m, 3) m, map points on the insert.
-        triangles: (k, 3) between them.
-        pressure: (f, m) Pa.
-        poses: (f, 4, 4) at which the maps hold; the given ones where nothing is loaded.
-        failed: frame -> why its contact, or its equilibrium, was not found.
+        points: map points on the insert, m, shape (m, 3).
+        triangles: point numbers of the triangles between them, shape (k, 3).
+        pressure: contact pressure, Pa, shape (f, m).
+        poses: femoral poses of the maps, shape (f, 4, 4); the prescribed pose without load.
+        failed: frame -> reason why its contact or equilibrium failed.
     """
 
     points: Array
@@ -58,14 +59,7 @@ class CycleMaps:
 
 @dataclass(frozen=True, eq=False)
 class ContactEngine:
-    """A contact model with femoral component and material; the insert's shape is an argument.
-
-    Args:
-        model: any contact model.
-        femoral: rigid femoral component, in the femoral frame.
-        material: material of the insert.
-        bearing: fixed or mobile.
-    """
+    """A contact model with femoral component and insert material, for any shape of the insert."""
 
     model: ContactModel
     femoral: Surface
@@ -73,23 +67,23 @@ class ContactEngine:
     bearing: Bearing = "fixed"
 
     def maps(self, insert: Surface, motion: CycleMotion) -> CycleMaps:
-        """Press the loads of a motion into an insert, frame by frame.
+        """Return the pressure maps of all frames of a motion on an insert.
 
-        The poses of a driven motion are found on this insert first.
+        If the motion has a drive, equilibrium on this insert gives the poses.
         """
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
         state = self.model.prepare(pair)
         pressure = np.zeros((len(motion), len(state.points)))
         poses, failed, start = motion.poses.copy(), {}, None
         drive = motion.drive
-        resting = None if drive is None else RestingPoses(self.model, state, drive)
+        equilibrium = None if drive is None else EquilibriumPoses(self.model, state, drive)
         for k, (pose, load) in enumerate(zip(motion.poses, motion.load, strict=True)):
             if load <= 0:
                 continue
-            if resting is not None:
-                pose, why = resting.at(k, float(load), start)
-                if why:
-                    failed[k] = why
+            if equilibrium is not None:
+                pose, reason = equilibrium.at(k, float(load), start)
+                if reason:
+                    failed[k] = reason
                     continue
             result, end = self.model.press_from(state, float(load), pose, start)
             if result.status is not ContactStatus.OK:
@@ -99,17 +93,17 @@ class ContactEngine:
         return CycleMaps(state.points, state.triangles, pressure, poses, failed)
 
     def dwell(self, insert: Surface, rotation: Array) -> tuple[float, float]:
-        """Return x and z (m) at which the femoral component lies lowest on an insert.
+        """Return the dwell position: x and z, m, where the femoral component lies lowest.
 
-        The height of first touch is lowered from the lowest place of a coarse grid (simplex
-        search). A simulator counts AP and ML from there.
+        A simplex search minimises the height of first touch, from the best of the initial guesses.
+        AP and ML of a simulator are relative to the dwell position.
 
         Args:
-            insert: in the insert frame.
-            rotation: (3, 3) of the femoral component.
+            insert: insert in the insert frame.
+            rotation: orientation of the femoral component, shape (3, 3).
 
         Raises:
-            InputError: it lies over the insert nowhere.
+            InputError: the femoral component is not above the insert at any initial guess.
         """
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
 
@@ -118,17 +112,17 @@ class ContactEngine:
             return result if np.isfinite(result) else 1.0
 
         middle = self.femoral.moved(pose_of(rotation, [0.0] * 3)).bounds.mean(axis=0)
-        # the grid is centred where the bounding boxes' middles meet, and where the origins do
+        # one grid has the origins above each other, the other the middle of the femoral bounds
         starts = [
-            np.array([x, z]) - start
-            for start in (np.zeros(2), middle[[0, 2]])
+            np.array([x, z]) - offset
+            for offset in (np.zeros(2), middle[[0, 2]])
             for x in GRID
             for z in (-WEAR_GRID.spacing_z, 0.0, WEAR_GRID.spacing_z)
         ]
         heights = [height(start) for start in starts]
         best = starts[int(np.argmin(heights))]
         if min(heights) >= 1.0:
-            raise InputError("lies nowhere over the insert", self.femoral.name, "check the axes")
+            raise InputError("is not above the insert", self.femoral.name, "check the axes")
         result = minimize(height, best, method="Nelder-Mead", options=SEARCH)
         return float(result.x[0]), float(result.x[1])
 
@@ -136,30 +130,30 @@ class ContactEngine:
 def interpolation(map_points: Array, points: Array) -> csr_array:
     """Return weights (n, m) that interpolate values at map points (m, 3) to points (n, 3).
 
-    Both are seen from above: linear on the Delaunay triangles of the map points' x and z, zero
-    outside their hull. Second order in the map's spacing.
+    The interpolation in x and z is linear on the Delaunay triangles of the map points, and zero
+    outside their hull.
     """
-    flat = Delaunay(map_points[:, [0, 2]])
-    places = points[:, [0, 2]]
-    simplex = flat.find_simplex(places)
+    triangulation = Delaunay(map_points[:, [0, 2]])
+    positions = points[:, [0, 2]]
+    simplex = triangulation.find_simplex(positions)
     inside = np.flatnonzero(simplex >= 0)
-    affine = flat.transform[simplex[inside]]
-    two = np.einsum("nij,nj->ni", affine[:, :2], places[inside] - affine[:, 2])
-    weights = np.column_stack([two, 1.0 - two.sum(axis=1)])
+    affine = triangulation.transform[simplex[inside]]
+    barycentric = np.einsum("nij,nj->ni", affine[:, :2], positions[inside] - affine[:, 2])
+    weights = np.column_stack([barycentric, 1.0 - barycentric.sum(axis=1)])
     weights = np.nan_to_num(np.clip(weights, 0.0, 1.0))  # NaN: a triangle without area
-    columns = flat.simplices[simplex[inside]]
+    columns = triangulation.simplices[simplex[inside]]
     rows = np.repeat(inside, 3)
     shape = (len(points), len(map_points))
     return csr_array((weights.ravel(), (rows, columns.ravel())), shape=shape)
 
 
-def carried(pressure: Array, projected: Array, load: Array) -> tuple[Array, float]:
-    """Scale maps (f, n) so that each carries its load, and return the largest change.
+def scaled_to_load(pressure: Array, projected: Array, load: Array) -> tuple[Array, float]:
+    """Return pressure maps scaled to their loads, and the largest relative change.
 
     Args:
-        pressure: (f, n) Pa.
-        projected: (n,) m², the area of each point seen from above.
-        load: (f,) N along -y.
+        pressure: pressure maps, Pa, shape (f, n).
+        projected: tributary area of each point, projected on the xz plane, m², shape (n,).
+        load: load of each map along -y, N, shape (f,).
     """
     force = pressure @ projected
     scale = np.divide(load, force, out=np.ones_like(force), where=(force > 0) & (load > 0))

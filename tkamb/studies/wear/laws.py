@@ -1,8 +1,7 @@
-"""Wear laws: depth that the pressures and the sliding of a cycle remove at each point of the
-insert.
+"""Wear laws: worn depth at each point of the insert from pressure and sliding in one cycle.
 
-A law is a frozen dataclass of its parameters. `wear_law` finds it by name, the built-in ones and
-those of other packages:
+A law is a frozen dataclass of its parameters. `wear_law` finds built-in laws by name, and those
+that other packages register:
 
     [project.entry-points."tkamb.wear"]
     my-law = "my_package.my_module:MyLaw"
@@ -25,52 +24,55 @@ from tkamb.studies.wear.sliding import SlidingHistory
 from tkamb.units import MEGAPASCAL
 
 PER_NEWTON_METRE = 1e-9
-"""m³/(N m) per mm³/(N m)."""
+"""Factor from mm³/(N m) to m³/(N m)."""
 
 
 @dataclass(frozen=True)
 class WearLawSettings:
-    """Which wear factors are accepted."""
+    """Accepted parameters of wear laws."""
 
     max_wear_factor: float = 1e-3
-    """mm³/(N m); a hundred times the largest that was measured for polyethylene in a joint."""
+    """mm³/(N m): largest accepted wear factor. Chosen as a hundred times the largest value measured
+    for polyethylene in a joint."""
 
 
 WEAR_LAW = WearLawSettings()
 
 
 class WearLaw(ABC):
-    """Worn depth per cycle from the history of one cycle.
+    """Worn depth per cycle from the sliding history of one cycle.
 
-    A subclass is a frozen dataclass whose fields are its parameters, with their units in their
-    names: they are the keys of a material's table.
+    A subclass is a frozen dataclass. Its fields are the parameters of the law and the keys in the
+    table of a material. The name of a field includes its unit.
     """
 
     name: ClassVar[str]
     assumes: ClassVar[str]
-    geometry: ClassVar[str] = "the law does not say how its volume follows the insert's geometry"
-    """How the worn volume depends on the insert's geometry, in words that are printed beside it."""
+    geometry: ClassVar[str] = (
+        "the law does not state how the volume depends on the geometry of the insert"
+    )
+    """Printed sentence on how the worn volume depends on the geometry of the insert."""
 
     @abstractmethod
     def depth(self, history: SlidingHistory) -> Array:
-        """Return the depth that one cycle wears off along the insert's normal, (n,) m."""
+        """Return the worn depth of one cycle along the insert's normal, m, shape (n,)."""
 
 
 @dataclass(frozen=True)
 class Archard(WearLaw):
-    """Archard: h = k sum over steps of p s, whatever the direction.
+    """Archard's law: depth h = k sum p s over the steps, for any direction of sliding.
 
     Args:
-        wear_factor_mm3_per_Nm: k.
+        wear_factor_mm3_per_Nm: wear factor k, mm³/(N m).
 
     Reference: Archard, J Appl Phys 24:981 (1953), doi:10.1063/1.1721448.
     """
 
     name: ClassVar[str] = "archard"
-    assumes: ClassVar[str] = "h = k sum p s; one k, whatever the direction"
+    assumes: ClassVar[str] = "h = k sum p s; the same k for any direction of sliding"
     geometry: ClassVar[str] = (
-        "volume = k x sum of load x sliding path: the contact area cancels, so the volume hardly "
-        "follows conformity and not thickness; they show in the depth"
+        "volume = k x sum of load x sliding path: the contact area cancels, so conformity hardly "
+        "affects the volume and thickness does not; they affect the depth"
     )
 
     wear_factor_mm3_per_Nm: float
@@ -79,30 +81,31 @@ class Archard(WearLaw):
         check_factor(self.wear_factor_mm3_per_Nm, "wear_factor_mm3_per_Nm")
 
     def depth(self, history: SlidingHistory) -> Array:
-        """Return k sum p s, (n,) m."""
+        """Return k sum p s, m, shape (n,)."""
         return self.wear_factor_mm3_per_Nm * PER_NEWTON_METRE * history.total_work
 
 
 @dataclass(frozen=True)
 class CrossShear(WearLaw):
-    """Work across the principal direction wears `ratio` times as much as work along it.
+    """Wear factor that increases with the cross-shear ratio CS.
 
         h = k(CS) sum p s,      k(CS) = k_iso 2 (1 + (ratio - 1) CS) / (1 + ratio)
 
-    which is k_along W_along + k_across W_across with k_across = ratio k_along. The wear factor
-    is what a test on a circular path finds, where CS = 1/2; k(0) is 2/(1 + ratio) of it.
+    This is h = k_along W_along + k_across W_across with k_across = ratio k_along and the work W of
+    friction along and across the principal direction of sliding. A test on a circular path
+    (CS = 1/2) gives k_iso.
 
     Args:
-        wear_factor_mm3_per_Nm: k_iso, in multidirectional sliding with CS = 1/2.
-        across_to_along: ratio, at least 1.
+        wear_factor_mm3_per_Nm: wear factor k_iso at CS = 1/2, mm³/(N m).
+        across_to_along: ratio of the wear factors across and along, at least 1.
     """
 
     name: ClassVar[str] = "cross-shear"
     assumes: ClassVar[str] = "h = k(CS) sum p s; work across the principal direction wears more"
     geometry: ClassVar[str] = (
-        "volume = k(CS) x sum of load x sliding path: the contact area cancels, so the volume "
-        "follows the insert's geometry only by the path and the cross-shear ratio; conformity and "
-        "thickness show in the depth"
+        "volume = k(CS) x sum of load x sliding path: the contact area cancels, so the geometry of "
+        "the insert affects the volume only through the path and the cross-shear ratio; "
+        "conformity and thickness affect the depth"
     )
 
     wear_factor_mm3_per_Nm: float
@@ -116,7 +119,7 @@ class CrossShear(WearLaw):
             )
 
     def depth(self, history: SlidingHistory) -> Array:
-        """Return k(CS) sum p s, (n,) m."""
+        """Return k(CS) sum p s, m, shape (n,)."""
         ratio = self.across_to_along
         share = 2.0 * (1.0 + (ratio - 1.0) * history.cross_shear) / (1.0 + ratio)
         return self.wear_factor_mm3_per_Nm * PER_NEWTON_METRE * share * history.total_work
@@ -124,21 +127,22 @@ class CrossShear(WearLaw):
 
 @dataclass(frozen=True)
 class PressureCrossShear(WearLaw):
-    """A measured table k(CS, p): h = sum over steps of k(CS, p) p s.
+    """Measured table of wear factors k(CS, p): depth h = sum k(CS, p) p s over the steps.
 
-    Bilinear between the table's points; beyond them the value at its edge holds.
+    The table is interpolated bilinearly. Outside its range the value at its edge is used.
 
     Args:
-        cross_shear: rising, within 0 to 0.5.
-        pressure_MPa: rising, not negative.
-        wear_factor_mm3_per_Nm: one row per cross-shear ratio, one column per pressure.
+        cross_shear: increasing cross-shear ratios between 0 and 0.5.
+        pressure_MPa: increasing pressures, MPa, at least 0.
+        wear_factor_mm3_per_Nm: wear factors, mm³/(N m), with one row per cross-shear ratio and one
+            column per pressure.
     """
 
     name: ClassVar[str] = "pressure-cross-shear"
-    assumes: ClassVar[str] = "h = sum k(CS, p) p s; k by a measured table"
+    assumes: ClassVar[str] = "h = sum k(CS, p) p s; k from a measured table"
     geometry: ClassVar[str] = (
-        "volume = sum of k(CS, p) x load x sliding path: it follows the insert's geometry as far "
-        "as the table's k follows the pressure"
+        "volume = sum of k(CS, p) x load x sliding path: the geometry of the insert affects the "
+        "volume as far as k depends on pressure"
     )
 
     cross_shear: tuple[float, ...]
@@ -158,38 +162,38 @@ class PressureCrossShear(WearLaw):
             )
 
     def depth(self, history: SlidingHistory) -> Array:
-        """Return sum k(CS, p) p s, (n,) m."""
+        """Return sum k(CS, p) p s, m, shape (n,)."""
         axes = (np.array(self.cross_shear), np.array(self.pressure_MPa) * MEGAPASCAL)
         table = RegularGridInterpolator(axes, np.array(self.wear_factor_mm3_per_Nm))
         shear = np.broadcast_to(history.cross_shear, history.pressure.shape)
-        places = np.stack(
+        table_points = np.stack(
             [np.clip(v, a[0], a[-1]) for v, a in zip((shear, history.pressure), axes, strict=True)],
             axis=-1,
         )
-        depth = (table(places) * history.work).sum(axis=0)
+        depth = (table(table_points) * history.work).sum(axis=0)
         return np.asarray(history.passes * PER_NEWTON_METRE * depth)
 
 
 @dataclass(frozen=True)
 class ContactArea(WearLaw):
-    """Volume by area and path, whatever the pressure: W = C(CS) A s, so h = C(CS) sum s.
+    """Wear volume proportional to contact area and path: W = C(CS) A s, so depth h = C(CS) sum s.
 
-    The path counts while there is contact. C is linear between the given ratios and constant
-    beyond them.
+    Only the path in contact counts. C is linear between the given cross-shear ratios and constant
+    outside them.
 
     Args:
-        cross_shear: rising, within 0 to 0.5.
-        coefficient: C at those ratios, m of depth per m of path.
+        cross_shear: increasing cross-shear ratios between 0 and 0.5.
+        coefficient: C at these ratios, m of depth per m of path.
 
     Reference: Liu, Fisher & Jin, Proc Inst Mech Eng J 226:552 (2012),
     doi:10.1177/1350650112441908.
     """
 
     name: ClassVar[str] = "contact-area"
-    assumes: ClassVar[str] = "W = C(CS) A s; wear by area and path, whatever the pressure"
+    assumes: ClassVar[str] = "W = C(CS) A s; pressure has no effect"
     geometry: ClassVar[str] = (
         "volume = C(CS) x contact area x sliding path: a more conforming or softer insert wears "
-        "more, and the load counts only by the area"
+        "more, and the load has an effect only through the area"
     )
 
     cross_shear: tuple[float, ...]
@@ -201,15 +205,15 @@ class ContactArea(WearLaw):
             raise InputError("has another length than cross_shear", "coefficient")
 
     def depth(self, history: SlidingHistory) -> Array:
-        """Return C(CS) sum s, (n,) m."""
+        """Return C(CS) sum s, m, shape (n,)."""
         return np.interp(history.cross_shear, self.cross_shear, self.coefficient) * history.distance
 
 
 def check_factor(value: Any, where: str) -> float:
-    """Return a wear factor or coefficient.
+    """Return a wear factor or coefficient after a check.
 
     Raises:
-        InputError: it is negative, not finite, or beyond all that was measured.
+        InputError: it is negative, not finite, or above `WEAR_LAW.max_wear_factor`.
     """
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and math.isfinite(value) and 0 <= value <= WEAR_LAW.max_wear_factor):
@@ -219,7 +223,7 @@ def check_factor(value: Any, where: str) -> float:
 
 
 def check_factors(values: Any, where: str) -> list[float]:
-    """Return each of a row of wear factors; see `check_factor`."""
+    """Return a list of wear factors after a check; see `check_factor`."""
     if not isinstance(values, tuple | list):
         raise InputError(f"cannot be {values}", where, "give a list of numbers")
     return [check_factor(value, where) for value in values]
@@ -235,19 +239,21 @@ def _rows(law: PressureCrossShear) -> Any:
 def _check_cross_shears(values: Any) -> None:
     _check_rising(values, "cross_shear")
     if values[-1] > 0.5:
-        raise InputError(f"holds {values[-1]}", "cross_shear", "the ratio lies within 0 to 0.5")
+        raise InputError(f"contains {values[-1]}", "cross_shear", "give ratios from 0 to 0.5")
 
 
 def _check_rising(values: Any, where: str) -> None:
-    sound = (
+    valid = (
         isinstance(values, tuple | list)
         and len(values) >= 2
         and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
         and values[0] >= 0
         and all(a < b for a, b in pairwise(values))
     )
-    if not sound:
-        raise InputError(f"cannot be {values}", where, "give at least two rising numbers from 0")
+    if not valid:
+        raise InputError(
+            f"cannot be {values}", where, "give at least two increasing numbers, none below 0"
+        )
 
 
 BUILT_IN = {
@@ -266,39 +272,40 @@ WEAR_LAWS = NamedClasses(
 
 
 def law_names() -> tuple[str, ...]:
-    """Return the names of all wear laws, built-in ones first."""
+    """Return the names of all wear laws. Built-in laws come first."""
     return WEAR_LAWS.names()
 
 
 def law_class(name: str) -> type[WearLaw]:
-    """Return the class behind a name.
+    """Return the class of a wear law.
 
     Raises:
-        InputError: no such name, a name clash, or the class cannot be loaded or is no law.
+        InputError: the name is unknown or ambiguous, or the class cannot be loaded or is not a
+            wear law.
     """
     return WEAR_LAWS.find(name)
 
 
 def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> WearLaw:
-    """Return the law of that name with its parameters.
+    """Return the wear law with a name and parameters.
 
     Args:
-        name: one of `law_names()`.
-        parameters: the law's fields by name; all of them.
-        where: the file or material they come from, for messages.
+        name: name of the law, one of `law_names()`.
+        parameters: parameter -> value, for all parameters of the law.
+        where: file or material of the parameters, for messages.
 
     Raises:
-        InputError: no such law, a parameter that is missing or unknown, or a bad value.
+        InputError: the law is unknown, a parameter is missing or unknown, or a value is invalid.
     """
     result = law_class(name)
-    own = [field.name for field in fields(result)]  # type: ignore[arg-type]
+    names = [field.name for field in fields(result)]  # type: ignore[arg-type]
     table = f"[laws.{name}]" if where is None else f"{where}: [laws.{name}]"
     for key in parameters:
-        if key not in own:
-            raise InputError(f"has no parameter '{key}'", table, names_near(key, own))
-    for key in own:
+        if key not in names:
+            raise InputError(f"has no parameter '{key}'", table, names_near(key, names))
+    for key in names:
         if key not in parameters:
-            raise InputError(f"does not give '{key}'", table, f"it needs: {', '.join(own)}")
+            raise InputError(f"does not give '{key}'", table, f"it needs: {', '.join(names)}")
     try:
         return result(**parameters)
     except InputError as error:

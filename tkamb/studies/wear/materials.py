@@ -1,4 +1,4 @@
-"""Wear properties of the insert's material: wear laws with parameters, density, creep."""
+"""Wear properties of the insert's material: parameters of wear laws, density and creep."""
 
 import math
 import tomllib
@@ -21,18 +21,18 @@ MINUTE = 60.0
 
 @dataclass(frozen=True)
 class LogarithmicCreep:
-    """Creep strain proportional to pressure, and to the logarithm of time under it.
+    """Creep strain proportional to pressure and linear in the logarithm of time.
 
         strain(t) = p (c + b log10(t / t_ref)),        depth = strain times thickness
 
-    p the time-mean pressure of the cycle. Before the time at which the bracket is zero the
-    strain is zero. Where the pressure changes from block to block, each block adds the strain of
-    the law between its own two times (time hardening).
+    p is the time-mean pressure of the cycle. The strain is zero while the bracket is negative. If
+    the pressure changes between blocks of cycles, each block adds the strain of the law between its
+    first and last time (time hardening).
 
     Args:
-        compliance_per_MPa: c, strain per MPa at the reference time.
-        per_decade_per_MPa: b, strain per MPa and tenfold time.
-        reference_min: t_ref, minutes.
+        compliance_per_MPa: c, strain at the reference time, 1/MPa.
+        per_decade_per_MPa: b, strain per tenfold time, 1/MPa.
+        reference_min: reference time t_ref, min.
     """
 
     compliance_per_MPa: float
@@ -55,48 +55,49 @@ class LogarithmicCreep:
         return LogarithmicCreep(compliance * factor, per_decade * factor, self.reference_min)
 
     def strain_per_pascal(self, time: float) -> float:
-        """Return the strain per Pa of constant pressure after `time` (s)."""
+        """Return the strain per constant pressure, 1/Pa, after `time`, s."""
         if time <= 0:
             return 0.0
         decades = math.log10(time / (self.reference_min * MINUTE))
-        rise = self.compliance_per_MPa + self.per_decade_per_MPa * decades
-        return max(rise, 0.0) / MEGAPASCAL
+        strain_per_MPa = self.compliance_per_MPa + self.per_decade_per_MPa * decades
+        return max(strain_per_MPa, 0.0) / MEGAPASCAL
 
     def depth(self, pressure: Array, thickness: Array, begin: float, end: float) -> Array:
-        """Return the depth (n,) m that creep adds between two times (s).
+        """Return the depth that creep adds between two times, m, shape (n,).
 
         Args:
-            pressure: (n,) Pa, mean over time.
-            thickness: (n,) m, of the insert under each point, along its normal.
-            begin: s since the first load.
-            end: s since the first load.
+            pressure: time-mean pressure, Pa, shape (n,).
+            thickness: thickness of the insert under each point, m, shape (n,).
+            begin: first time, s since the first load.
+            end: last time, s since the first load.
         """
-        rise = self.strain_per_pascal(end) - self.strain_per_pascal(begin)
-        return np.asarray(rise * pressure * thickness)
+        strain = self.strain_per_pascal(end) - self.strain_per_pascal(begin)
+        return np.asarray(strain * pressure * thickness)
 
 
 DEFAULT_MATERIAL = "conventional"
 DENSITY_RANGE = (500.0, 3000.0)
-"""kg/m³ that a bearing polymer may have."""
+"""kg/m³: accepted densities of a bearing polymer."""
 TWO_EITHER_WAY = (0.5, 2.0)
-ASSUMED_RANGE = "a factor of two either way: by that much and more laboratories differ (assumption)"
+ASSUMED_RANGE = "a factor of two either way, an assumption: laboratories differ by this and more"
 
 
 @dataclass(frozen=True)
 class WearMaterial:
-    """A wear material with where its numbers come from.
+    """A wear material with the sources of its numbers.
 
     Args:
         name: name in messages.
-        text: in words.
-        density_kg_per_m3: turns volume into mass.
-        law: the default law.
-        laws: law -> its parameters.
-        sources: one line per number.
-        caution: what a reader must know before using the numbers; may be empty.
-        creep: parameters of `LogarithmicCreep`; None: creep is not modelled.
-        factor_range: lowest and highest factor on every law's depth that its sources allow.
-        range_source: where that range comes from.
+        text: description.
+        density_kg_per_m3: density, kg/m³.
+        law: name of the default law.
+        laws: name of a law -> its parameters.
+        sources: sources of the numbers, one line per number.
+        caution: warning that is printed with the results; may be empty.
+        creep: creep law; None: creep is not modelled.
+        factor_range: lowest and highest factor on the worn depth within the uncertainty of the
+            sources.
+        range_source: source of this range.
     """
 
     name: str
@@ -111,23 +112,23 @@ class WearMaterial:
     range_source: str = ASSUMED_RANGE
 
     def with_own_factor(self) -> "WearMaterial":
-        """Return the material with the range of a wear factor that the user gives."""
+        """Return the material for a wear factor of the user: default range, no caution."""
         return replace(self, factor_range=TWO_EITHER_WAY, range_source=ASSUMED_RANGE, caution="")
 
     def all_laws(self) -> dict[str, WearLaw]:
-        """Return every law that the material has parameters for."""
+        """Return name -> wear law for every law with parameters in the material."""
         return {name: wear_law(name, table, self.name) for name, table in self.laws.items()}
 
     def wear_law(self, name: str | None = None, wear_factor: float | None = None) -> WearLaw:
-        """Return one of its laws.
+        """Return a wear law with the parameters of the material.
 
         Args:
-            name: name of the law; None: the law that the material names.
-            wear_factor: mm³/(N m), in place of the material's `wear_factor_mm3_per_Nm`.
+            name: name of the law; None: the default law of the material.
+            wear_factor: wear factor that replaces the one of the material, mm³/(N m).
 
         Raises:
-            InputError: no such law, the material has no parameters for it, or the law has no
-                single wear factor.
+            InputError: the law is unknown, the material has no parameters for it, or a wear factor
+                is given for a law that does not have exactly one.
         """
         name = name or self.law
         parameters = dict(self.laws.get(name, {}))
@@ -141,7 +142,7 @@ class WearMaterial:
                 )
             parameters[key] = wear_factor
         elif name not in self.laws:
-            law_class(name)  # an unknown name is another mistake, with its own message
+            law_class(name)  # an unknown name has another message
             raise InputError(
                 f"material '{self.name}' has no parameters for the law '{name}'",
                 hint=f"it has: {', '.join(self.laws)}; give the others in a material file",
@@ -155,10 +156,10 @@ def material_names() -> tuple[str, ...]:
 
 
 def wear_material(name: str | Path) -> WearMaterial:
-    """Return a built-in wear material, or what a TOML file says.
+    """Return a built-in wear material, or the material of a TOML file.
 
     Raises:
-        InputError: no such name or file, an unknown key, or a bad value.
+        InputError: the name or file does not exist, a key is unknown, or a value is invalid.
     """
     built_in = _built_in()
     if str(name) in built_in:
@@ -176,14 +177,14 @@ def _built_in() -> dict[str, Any]:
 
 
 def _material(name: str, content: dict[str, Any], where: object) -> WearMaterial:
-    own = [field.name for field in fields(WearMaterial) if field.name != "name"]
+    keys = [field.name for field in fields(WearMaterial) if field.name != "name"]
     for key in content:
-        if key not in own:
-            raise InputError(f"unknown key '{key}'", where, names_near(key, own))
+        if key not in keys:
+            raise InputError(f"unknown key '{key}'", where, names_near(key, keys))
     for key in ("density_kg_per_m3", "law", "laws", "sources"):
         if key not in content:
             raise InputError(
-                f"'{key}' is missing", where, f"add it; a material has the keys {', '.join(own)}"
+                f"'{key}' is missing", where, f"add it; a material has the keys {', '.join(keys)}"
             )
     density, laws = content["density_kg_per_m3"], content["laws"]
     low, high = DENSITY_RANGE
@@ -215,34 +216,32 @@ def _factor_range(content: dict[str, Any], where: object) -> tuple[float, float]
     limits = content.get("factor_range")
     if limits is None:
         return TWO_EITHER_WAY
-    sound = (
+    valid = (
         isinstance(limits, list)
         and len(limits) == 2
-        and all(isinstance(one, int | float) and math.isfinite(one) for one in limits)
+        and all(isinstance(limit, int | float) and math.isfinite(limit) for limit in limits)
         and 0 < limits[0] <= 1 <= limits[1]
     )
-    if not sound:
-        hint = "give two factors, at most 1 and at least 1, e.g. [0.5, 2.0]"
+    if not valid:
+        hint = "give a first factor of at most 1 and a second of at least 1, e.g. [0.5, 2.0]"
         raise InputError(f"cannot be {limits}", f"{where}: factor_range", hint)
     if "range_source" not in content:
-        raise InputError("'range_source' is missing", where, "say where the range comes from")
+        raise InputError("'range_source' is missing", where, "give the source of the range")
     return float(limits[0]), float(limits[1])
 
 
 def _sources(value: Any, where: object) -> tuple[str, ...]:
     if not (isinstance(value, list) and value and all(isinstance(line, str) for line in value)):
-        raise InputError(
-            "sources is not a list of texts", where, "say where each number comes from"
-        )
+        raise InputError("sources is not a list of texts", where, "give the source of each number")
     return tuple(value)
 
 
 def _creep(table: Any, where: object) -> LogarithmicCreep | None:
     if table is None:
         return None
-    own = [field.name for field in fields(LogarithmicCreep)]
-    if not isinstance(table, dict) or sorted(table) != sorted(own):
-        raise InputError("[creep] is not complete", where, f"it needs: {', '.join(own)}")
+    keys = [field.name for field in fields(LogarithmicCreep)]
+    if not isinstance(table, dict) or sorted(table) != sorted(keys):
+        raise InputError("[creep] is not complete", where, f"it needs: {', '.join(keys)}")
     for key, value in table.items():
         if not isinstance(value, int | float) or not math.isfinite(value):
             raise InputError(f"cannot be {value}", f"{where}: [creep] {key}", "give a number")

@@ -1,4 +1,4 @@
-"""The motion that one cycle consists of: poses of the femoral component, and the load at each."""
+"""The motion of one cycle: poses of the femoral component, and the load at each pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,35 +20,36 @@ CLOSINGS: tuple[Closing, ...] = get_args(Closing)
 
 @dataclass(frozen=True)
 class CycleMotionSettings:
-    """How the motion of a wear cycle is read."""
+    """Closing of a recorded motion to a cycle."""
 
     lever_arm: float = 0.025
-    """m; displacement of a condyle per rotation, to compare rotations with translations. Chosen:
-    half the distance of the condyles."""
+    """m: displacement per rotation in rad, to add rotations to translations. Chosen as half the
+    distance between the condyles."""
     notable_gap: float = 0.1
-    """1: share of the motion's extent. If the ends of a cycle lie farther apart, the report
-    mentions it; the cycle is not changed. Chosen: recorded cycles close better."""
+    """Share of the extent of the motion: distance between its ends above which the report asks
+    about it. The cycle is not changed. Chosen because recorded cycles close better."""
 
 
 CYCLE_MOTION = CycleMotionSettings()
 
 
 class Path(NamedTuple):
-    """Path of the femoral component, with more poses than frames.
+    """Path of the femoral component, with more poses than the computed frames.
 
     Args:
-        poses: (g, 4, 4) pose_femoral_in_insert; y is not used, it follows from the load.
-        place: (g,) of each pose among the frames: 2.5 is midway between frames 2 and 3.
+        poses: pose_femoral_in_insert, shape (g, 4, 4). Their y is not used; the load gives it.
+        place: position of each pose among the frames, shape (g,). 2.5 is midway between frames 2
+            and 3.
     """
 
     poses: Array
     place: Array
 
     def weights(self, rows: Sequence[int]) -> Array:
-        """Return (g, n) that interpolate values at n of the frames to the poses of the path."""
+        """Return weights (g, n) that interpolate values at the n frames `rows` to the path."""
         place = np.interp(self.place, rows, np.arange(len(rows)))
         return np.array(
-            [np.interp(place, np.arange(len(rows)), one) for one in np.eye(len(rows))]
+            [np.interp(place, np.arange(len(rows)), unit) for unit in np.eye(len(rows))]
         ).T
 
 
@@ -57,19 +58,17 @@ class CycleMotion:
     """One cycle.
 
     Args:
-        poses: (f, 4, 4) pose_femoral_in_insert; the press keeps rotation, x and z.
-        load: (f,) N along -y.
-        duration: s of a cycle.
-        passes: how often a cycle passes the frames: 1 for a closed cycle, 2 for a motion there and
-        back.
-        notes: what a reader must know about it.
-        drive: finds the poses on every insert from forces; None: they are prescribed. The poses
-        of a driven motion are initial guesses.
-        seconds: (f - 1,) duration of each step in one pass; None: all steps are equally long.
-        path: poses at the frames and between them, if the motion is known there; None: a screw
-        motion from frame to frame.
-        closing: how the recorded frames became a cycle; empty: it is a simulator's profile.
-        questions: what a reader must decide before using the numbers.
+        poses: pose_femoral_in_insert, shape (f, 4, 4). The press keeps rotation, x and z.
+        load: load along -y, N, shape (f,).
+        duration: duration of a cycle, s.
+        passes: passes through the frames per cycle: 2 for a motion there and back, else 1.
+        notes: notes on the cycle for the report.
+        drive: loads from which equilibrium on each insert gives the poses. `poses` are then initial
+            guesses. None: the poses are prescribed.
+        seconds: duration of each step in one pass, s, shape (f - 1,); None: equal steps.
+        path: poses at and between the frames; None: a screw motion from frame to frame.
+        closing: closing of the recorded frames to a cycle; "" for a simulator's profile.
+        questions: questions on the cycle for the report.
     """
 
     poses: Array
@@ -96,35 +95,33 @@ class CycleMotion:
         interval: float | None = None,
         track: tuple[Array, Array] | None = None,
     ) -> "CycleMotion":
-        """Return the cycle that recorded frames stand for.
+        """Return the cycle of recorded frames.
 
-        The cycle depends on `closing` alone, never on the frames' number or on how far apart
-        their ends are:
+        `closing` gives the way from the last frame to the first, for any number of frames and any
+        distance between the ends:
 
-        - "interpolate": the femoral component goes from the last frame to the first by one
-          screw motion, the load linearly. That way is divided into steps no longer than the
-          longest step between frames.
-        - "there-and-back": the frames are gone through forwards, then backwards.
-        - "as recorded": the frames alone. Nothing leads from the last to the first.
+        - "interpolate": one screw motion, with a linear load. It is divided into steps that are
+          at most as long as the longest step between frames.
+        - "there-and-back": the frames in reverse order.
+        - "as recorded": none. The motion starts again at the first frame.
 
         Args:
-            time: (f,) s.
-            poses: (f, 4, 4); NaN where a frame failed.
-            load: (f,) N; NaN where a frame failed.
+            time: times of the frames, s, shape (f,).
+            poses: pose_femoral_in_insert, shape (f, 4, 4); NaN for a failed frame.
+            load: load along -y, N, shape (f,); NaN for a failed frame.
             closing: see above.
-            interval: s that the way from the last frame to the first takes; None: the mean
-                interval between the frames.
-            track: times (g,) s and poses (g, 4, 4) of the whole recording, of which the frames
-                are a part; None: no more is known than the frames.
+            interval: duration of the screw motion, s; None: the mean interval between the frames.
+            track: times, s, shape (g,), and poses, shape (g, 4, 4), of the whole recording;
+                None: only the poses of the frames are known.
 
         Raises:
-            InputError: fewer than two frames are left, or there is no such closing.
+            InputError: fewer than two frames have a contact, or the closing is unknown.
         """
         check_closing(closing)
         finite = np.isfinite(load) & np.isfinite(poses).all(axis=(1, 2))
         notes, questions = [], []
         if missing := int((~finite).sum()):
-            notes.append(f"{missing} of {len(finite)} frames failed and are left out of the cycle")
+            notes.append(f"{missing} of {len(finite)} frames failed; the cycle omits them")
         time, poses, load = time[finite], poses[finite], load[finite]
         if len(time) < 2:
             raise InputError("fewer than two frames have a contact", "wear", "see the run's status")
@@ -152,9 +149,9 @@ class CycleMotion:
             )
         if gap > CYCLE_MOTION.notable_gap * extent:
             questions.append(
-                f"{apart}, {gap / extent:.0%} of its extent; the cycle closes by one screw motion "
-                "from the last frame to the first; check that this is meant (otherwise --close "
-                "there-and-back, or 'as recorded')"
+                f"{apart}, {gap / extent:.0%} of its extent, and the cycle closes with one screw "
+                "motion from the last frame to the first; check that this is intended (otherwise "
+                "--close there-and-back, or 'as recorded')"
             )
         longest = max(distance(a, b) for a, b in pairwise(poses))
         pieces = 1 if longest == 0 else max(1, int(np.ceil(gap / longest - 1e-9)))
@@ -181,9 +178,9 @@ class CycleMotion:
         )
 
     def refined(self) -> "CycleMotion":
-        """Return the motion with a frame in the middle of each step, linear in between.
+        """Return the motion with an additional frame in the middle of each step.
 
-        Knee coordinates, load and applied forces are linear, as a simulator's profile is.
+        Knee coordinates, load and applied forces are interpolated linearly, like a profile.
         """
         poses = knee_pose(_with_middles(knee_coordinates(self.poses)))
         drive = self.drive
@@ -202,22 +199,22 @@ class CycleMotion:
 
     @property
     def every_second(self) -> list[int]:
-        """Indices of every second frame, and of the last."""
+        """Indices of every second frame, and of the last frame."""
         chosen = list(range(0, len(self), 2))
         return chosen if chosen[-1] == len(self) - 1 else [*chosen, len(self) - 1]
 
     @property
     def step_seconds(self) -> Array:
-        """Duration of each step in one pass, (f - 1,) s."""
+        """Duration of each step in one pass, s, shape (f - 1,)."""
         if self.seconds is not None:
             return self.seconds
         steps = len(self) - 1
         return np.full(steps, self.duration / self.passes / steps)
 
     def seconds_between(self, rows: list[int]) -> Array:
-        """Return the durations (n - 1,) s from each of n frames to the next one chosen.
+        """Return the durations from each of the n frames `rows` to the next, s, shape (n - 1,).
 
-        A frame that lies before its predecessor is reached in the next cycle.
+        A frame with a smaller number than its predecessor belongs to the next cycle.
         """
         times = np.concatenate([[0.0], np.cumsum(self.step_seconds)])
         between = np.diff(times[rows])
@@ -225,7 +222,7 @@ class CycleMotion:
 
 
 def check_closing(closing: str) -> None:
-    """Raise an InputError where there is no such way to close a cycle."""
+    """Raise an InputError if the closing of a cycle is unknown."""
     if closing not in CLOSINGS:
         raise InputError(
             f"no way '{closing}' to close a cycle", "--close", names_near(closing, CLOSINGS)
@@ -233,9 +230,10 @@ def check_closing(closing: str) -> None:
 
 
 def chosen_frames(count: int, most: int) -> list[range]:
-    """Return at most `most` of `count` frames, the first and the last among them.
+    """Return at most `most` of `count` frames, including the first and the last.
 
-    Two ranges one after the other, whose steps differ by one: as even as whole frames allow.
+    The frames are as evenly spaced as possible: up to two successive ranges with strides that
+    differ by one.
     """
     if count <= most:
         return [range(count)]
@@ -250,16 +248,14 @@ def chosen_frames(count: int, most: int) -> list[range]:
 
 
 def _path(time: Array, track: tuple[Array, Array]) -> Path | None:
-    """Return the recorded poses from the first frame to the last; None: one of them is unknown."""
-    moments, poses = track
-    inside = (moments >= time[0]) & (moments <= time[-1])
+    recorded, poses = track
+    inside = (recorded >= time[0]) & (recorded <= time[-1])
     if not np.isfinite(poses[inside]).all():
         return None
-    return Path(poses[inside], np.interp(moments[inside], time, np.arange(len(time))))
+    return Path(poses[inside], np.interp(recorded[inside], time, np.arange(len(time))))
 
 
 def _way(begin: Array, end: Array, pieces: int) -> Array:
-    """Return the poses (pieces + 1, 4, 4) of the screw motion from one pose to another."""
     twist = pinocchio.log6(pinocchio.SE3(end @ inverse(begin)))
     shares = np.linspace(0.0, 1.0, pieces + 1)
     way = np.array([pinocchio.exp6(pinocchio.Motion(s * twist.vector)).homogeneous for s in shares])
@@ -269,14 +265,14 @@ def _way(begin: Array, end: Array, pieces: int) -> Array:
 
 
 def _with_middles(values: Array) -> Array:
-    """Return rows (f, n) with the mean of each two neighbours between them, (2 f - 1, n)."""
+    """Return rows (f, n) with the mean of each two neighbours inserted, shape (2 f - 1, n)."""
     dense = np.empty((2 * len(values) - 1, values.shape[1]))
     dense[::2], dense[1::2] = values, 0.5 * (values[:-1] + values[1:])
     return dense
 
 
-def distance(one: Array, other: Array) -> float:
-    """Return how far apart two poses (4, 4) are, m, a turn counted at `CYCLE_MOTION.lever_arm`."""
-    move = inverse(one) @ other
-    turn = np.linalg.norm(Rotation.from_matrix(move[:3, :3]).as_rotvec())
-    return float(np.linalg.norm(move[:3, 3]) + CYCLE_MOTION.lever_arm * turn)
+def distance(first: Array, second: Array) -> float:
+    """Return the distance between two poses (4, 4), m: translation plus lever arm times angle."""
+    move = inverse(first) @ second
+    angle = np.linalg.norm(Rotation.from_matrix(move[:3, :3]).as_rotvec())
+    return float(np.linalg.norm(move[:3, 3]) + CYCLE_MOTION.lever_arm * angle)

@@ -1,4 +1,4 @@
-"""Output of a wear simulation: table, summary, maps, the worn insert, a picture."""
+"""Output of a wear simulation: table, summary, maps, worn insert and figure."""
 
 import json
 import math
@@ -29,36 +29,37 @@ if TYPE_CHECKING:
 
 MILLION = 1e6
 STATE_NAME, SAMPLES_NAME = ".wear.npz", ".wear_samples"
-"""File of the last finished block, and folder of the finished samples, of an unfinished
-simulation."""
+"""Of an unfinished simulation: file of the last finished block, and folder of the finished
+samples."""
 FIRST = (
     "Worn volume, mass and depth are proportional to the wear factor, which differs by a factor of "
     "two and more between laboratories."
 )
-"""Sentence before all numbers."""
+"""First sentence of every wear report."""
 PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
-"""Columns that are proportional to the wear factor, apart from the effect of the worn shape."""
+"""Columns that are proportional to the wear factor if the change of the shape is neglected."""
 
 
 @dataclass(frozen=True)
 class WearReportSettings:
-    """Limits from which a wear report adds a question."""
+    """Limits above which a wear report adds a question."""
 
     max_frame_change: float = 0.02
-    """1: share of a cycle's volume by which it may change with half as many frames; beyond that the
-    report says that the frames are too few. Chosen: smaller than the error of a wear law."""
+    """Relative change of the volume of a cycle with half as many frames. Above it the report asks
+    for more frames. Chosen below the error of a wear law."""
     max_map_correction: float = 0.05
-    """1: share of a map's force that its correction may have; beyond that the report says that the
-    map is too coarse. Chosen: smaller than the error of a wear law."""
+    """Relative correction of the force of a map. Above it the report asks for a finer resolution.
+    Chosen below the error of a wear law."""
     max_published_ratio: float = 3.0
-    """Times the published rates; a higher rate is asked about."""
+    """Ratio to the published wear rates. The report asks about rates above the highest published
+    rate times the ratio, or below the lowest over the ratio."""
 
 
 WEAR_REPORT = WearReportSettings()
 
 PUBLISHED_RATES = (1.6, 4.4)
-"""mm³ per million cycles of one whole knee in two tests: Dreyer et al. (2023),
-doi:10.1101/2023.05.09.23289712."""
+"""mm³ per million cycles: lowest and highest rate of a whole knee in two tests, Dreyer et al.
+(2023), doi:10.1101/2023.05.09.23289712."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +67,15 @@ class WearReport:
     """A finished wear simulation.
 
     Args:
-        setup: bodies, motion, contact.
-        case: what was worn, by what law.
-        material: with sources.
-        state: at the end.
-        last: what the next cycle would do.
-        cycles: asked for.
-        updates: asked for.
-        first: what is known of the first cycle.
-        bands: beside the rows; None: not asked for.
+        setup: bodies, motion and contact.
+        case: bodies, motion and laws of the simulation.
+        material: wear material with its sources.
+        state: insert at the end.
+        last: wear of one cycle on the insert at the end.
+        cycles: requested number of cycles.
+        updates: requested number of updates of the geometry.
+        first: checks of the first cycle.
+        bands: bands of the rows of the table; None: not requested.
     """
 
     setup: WearSetup
@@ -88,7 +89,7 @@ class WearReport:
     bands: WearBands | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `tkamb wear --json` prints; None stands for what is not modelled."""
+        """Return the content of `tkamb wear --json`. None: not modelled or not computed."""
         last = {key: _known(value) for key, value in self.state.rows[-1].items()}
         law = self.case.law
         return {
@@ -133,13 +134,11 @@ class WearReport:
         }
 
     def _rows(self) -> list[dict[str, float]]:
-        """Return the table, with its bands where there are any."""
         rows = self.state.rows
-        beside = [{}] * len(rows) if self.bands is None else self.bands.rows
-        return [row | band for row, band in zip(rows, beside, strict=True)]
+        bands = [{}] * len(rows) if self.bands is None else self.bands.rows
+        return [row | band for row, band in zip(rows, bands, strict=True)]
 
     def _control(self) -> dict[str, Any]:
-        """Return what was prescribed, what was found in equilibrium, and where."""
         drive = self.case.motion.drive
         if drive is None:
             return {"control": "displacement", "found_in_equilibrium": []}
@@ -155,12 +154,12 @@ class WearReport:
 
     @property
     def rate(self) -> float:
-        """Volume per cycle, mm³ per million cycles."""
+        """Worn volume, mm³ per million cycles."""
         last = self.state.rows[-1]
         return last["volume_mm3"] * MILLION / last["cycles"] if last["cycles"] else 0.0
 
     def ranges(self) -> dict[str, list[float]]:
-        """Return the range of each number that is proportional to the wear factor."""
+        """Return the range of each result that is proportional to the wear factor."""
         last = self.state.rows[-1]
         values = {key: last[key] for key in PROPORTIONAL}
         values["volume_mm3_per_Mc"] = self.rate
@@ -170,7 +169,7 @@ class WearReport:
         }
 
     def side_by_side(self) -> list[dict[str, Any]]:
-        """Return what each law of the material takes off the unworn insert, with its range."""
+        """Return the rate of each law of the material on the unworn insert, with its range."""
         result = []
         for name, law in self.material.all_laws().items():
             if name not in self.first.volumes:
@@ -188,23 +187,23 @@ class WearReport:
         return result
 
     def questions(self) -> list[str]:
-        """Return what a reader must know before using the numbers."""
+        """Return the questions and warnings that the report prints."""
         questions = [] if not self.material.caution else [self.material.caution]
         questions += self.case.motion.questions
         if self.first.frames_change > WEAR_REPORT.max_frame_change:
             questions.append(
-                f"half as many frames per cycle move its volume by {self.first.frames_change:.1%}: "
-                "take more with --frames-per-cycle"
+                f"half as many frames per cycle change its volume by {self.first.frames_change:.1%}"
+                ": increase --frames-per-cycle"
             )
         if self.state.map_error > WEAR_REPORT.max_map_correction:
             questions.append(
-                f"maps had to be scaled by up to {self.state.map_error:.0%} to carry their load: "
-                "take a finer resolution"
+                f"pressure maps were scaled by up to {self.state.map_error:.0%} to sum to their "
+                "load: use a finer resolution"
             )
         if self.state.unsettled:
             questions.append(
-                f"in {self.state.unsettled} blocks the pressure moved away from the worn places, "
-                "even in the shortest block: take more --updates"
+                f"in {self.state.unsettled} blocks the pressure moved away from the worn area, "
+                "even in the shortest block: increase --updates"
             )
         low, high = PUBLISHED_RATES
         if (
@@ -213,18 +212,18 @@ class WearReport:
             <= high * WEAR_REPORT.max_published_ratio
         ):
             questions.append(
-                f"{self.rate:.3g} mm3 a million cycles is far from a whole knee's {low:g} (ISO) to "
-                f"{high:g} (in-vivo loads) mm3 (Dreyer 2023): check the wear factor"
+                f"{self.rate:.3g} mm3 per million cycles is far from the measured {low:g} (ISO) to "
+                f"{high:g} (in-vivo loads) mm3 of a whole knee (Dreyer 2023): check the wear factor"
             )
-        most = max(row.get("failed_rows", 0.0) for row in self.state.rows)
-        if most:
-            why = next(iter(self.last.failed.values()), "in blocks before the last")
+        failed_rows = max(row.get("failed_rows", 0.0) for row in self.state.rows)
+        if failed_rows:
+            reason = next(iter(self.last.failed.values()), "in blocks before the last")
             questions.append(
-                f"up to {most:.0f} of {len(self.case.motion)} rows of the profile failed and are "
-                f"left out of the cycle: {why}"
+                f"up to {failed_rows:.0f} of {len(self.case.motion)} rows of the profile failed, "
+                f"and the cycle omits them: {reason}"
             )
         if self.setup.engine.bearing == "mobile":
-            questions.append("the backside of a mobile bearing wears too and is not modelled")
+            questions.append("the wear of the back of a mobile bearing is not modelled")
         if self.bands is not None:
             questions += self.bands.questions()
         if self.case.creep is None:
@@ -239,43 +238,43 @@ class WearReport:
         low, high = result["volume_mm3_range"]
         slow, fast = result["volume_mm3_per_Mc_range"]
         others = [
-            f"{one['law']} {one['first_volume_mm3_per_Mc']:.3g} "
-            f"({one['first_volume_mm3_per_Mc_range'][0]:.3g} to "
-            f"{one['first_volume_mm3_per_Mc_range'][1]:.3g})"
-            for one in result["laws_side_by_side"]
+            f"{law['law']} {law['first_volume_mm3_per_Mc']:.3g} "
+            f"({law['first_volume_mm3_per_Mc_range'][0]:.3g} to "
+            f"{law['first_volume_mm3_per_Mc_range'][1]:.3g})"
+            for law in result["laws_side_by_side"]
         ]
         return [
             FIRST,
             f"{result['cycles']:.6g} cycles in {result['blocks']} blocks, {result['law']}, "
             f"{result['material']}: {result['status']}",
-            f"worn off {result['volume_mm3']:.4g} mm3, {result['mass_mg']:.4g} mg, "
+            f"worn volume {result['volume_mm3']:.4g} mm3, {result['mass_mg']:.4g} mg, "
             f"{result['max_depth_mm']:.4g} mm deep at most, over {result['worn_area_mm2']:.4g} mm2",
             f"rate {self.rate:.4g} mm3 per million cycles; creep {text}",
             f"range by the wear factor alone: {low:.3g} to {high:.3g} mm3, {slow:.3g} to "
             f"{fast:.3g} mm3 per million cycles ({self.material.range_source})",
             f"geometry: {self.case.law.geometry}",
             *(
-                [f"laws side by side, mm3 per million cycles of the first: {', '.join(others)}"]
+                [f"laws on the unworn insert, mm3 per million cycles: {', '.join(others)}"]
                 if others
                 else []
             ),
             *([] if self.bands is None else self.bands.lines()),
-            *self._found_lines(),
+            *self._control_lines(),
             *(f"note: {note}" for note in result["notes"]),
         ]
 
-    def _found_lines(self) -> list[str]:
-        """Return where force control found the knee on the last cycle; nothing without it."""
+    def _control_lines(self) -> list[str]:
+        """Return the ranges of the coordinates in equilibrium in the last cycle; empty: none."""
         drive = self.case.motion.drive
         if drive is None:
             return []
         result = drive.ranges(self.last.poses, self.last.failed)
-        places = (
+        ranges = (
             f"{name} {result[f'{name}_low_{unit}']:.3g} to "
             f"{result[f'{name}_high_{unit}']:.3g} {unit}"
             for name, unit in ((name, UNITS[name][0]) for name in drive.names)
         )
-        return [f"force control: {', '.join(places)}; {len(self.last.failed)} rows failed"]
+        return [f"force control: {', '.join(ranges)}; {len(self.last.failed)} rows failed"]
 
     def write(self, folder: Path) -> None:
         """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none.
@@ -296,19 +295,17 @@ class WearReport:
         remove_shards(folder, SAMPLES_NAME)
 
     def _worn(self) -> Surface:
-        """Return the worn insert; a left knee's as it is, not mirrored."""
         surface = self.case.articular.lowered(self.state.fall)
         if self.setup.side == "right":
             return surface
         return Surface(surface.vertices @ MIRROR, surface.faces[:, ::-1], surface.name)
 
     def _maps(self) -> dict[str, Array]:
-        """Return the maps over all vertices of the insert, zero where nothing can wear."""
-        state, places = self.state, self.case.articular.vertices
-        crept = {} if self.case.creep is None else {"creep_depth_mm": state.creep / MILLIMETRE}
+        state, vertices = self.state, self.case.articular.vertices
+        creep = {} if self.case.creep is None else {"creep_depth_mm": state.creep / MILLIMETRE}
         named = {
             "wear_depth_mm": state.wear / MILLIMETRE,
-            **crept,
+            **creep,
             "sliding_mm_per_cycle": self.last.history.distance / MILLIMETRE,
             "cross_shear_ratio": self.last.history.cross_shear,
             "peak_pressure_MPa": self.last.peak_pressure / MEGAPASCAL,
@@ -316,18 +313,16 @@ class WearReport:
         maps = {}
         for name, values in named.items():
             maps[name] = np.zeros(len(self.case.articular.surface.vertices))
-            maps[name][places] = values
+            maps[name][vertices] = values
         return maps
 
     def _mean_cross_shear(self) -> float:
-        """Return the mean cross-shear ratio, weighted by what the last cycle wears off."""
         weight = self.last.rate * self.last.area
         total = float(weight.sum())
         return float(weight @ self.last.history.cross_shear) / total if total else math.nan
 
 
 def _table(rows: Sequence[dict[str, float]]) -> list[list[str]]:
-    """Return names, then the rows as cells; NaN is an empty one."""
     cells = [["" if math.isnan(value) else repr(value) for value in row.values()] for row in rows]
     return [list(rows[0]), *cells]
 
@@ -348,14 +343,14 @@ LABELS = {
 def draw_wear(
     surface: Surface, maps: dict[str, Array], rows: Sequence[Mapping[str, float]], path: Path
 ) -> None:
-    """Draw the maps over the insert from above, anterior up, the subject's right at the right.
+    """Draw the maps of the insert in a superior view, with anterior at the top and right at right.
 
-    The last panel is the worn volume over the cycles, with its band where the rows have one.
+    The last panel shows the worn volume over the cycles, with its band if the rows have one.
 
     Args:
-        surface: the insert, insert frame.
-        maps: name -> value per vertex; what is not modelled is not among them.
-        rows: the table.
+        surface: insert in the insert frame.
+        maps: name -> values at the vertices.
+        rows: rows of the table.
         path: PNG file to write.
     """
     from matplotlib.figure import Figure
@@ -364,29 +359,29 @@ def draw_wear(
     x, z = surface.vertices[:, 0] / MILLIMETRE, surface.vertices[:, 2] / MILLIMETRE
     columns = (len(maps) + 2) // 2
     figure = Figure(figsize=(5.5 * columns, 8), layout="constrained")
-    places = figure.subplots(2, columns).ravel()
-    for axes, (name, values) in zip(places, maps.items(), strict=False):
+    panels = figure.subplots(2, columns).ravel()
+    for axes, (name, values) in zip(panels, maps.items(), strict=False):
         top = float(np.max(values)) or 1.0
-        drawn = axes.tripcolor(
+        image = axes.tripcolor(
             z, x, surface.faces[facing], values, shading="gouraud", vmin=0, vmax=top
         )
         axes.set(
             aspect="equal", title=LABELS[name], xlabel="z (right), mm", ylabel="x (anterior), mm"
         )
-        figure.colorbar(drawn, ax=axes, shrink=0.7)
-    draw_volume(places[len(maps)], rows)
-    for axes in places[len(maps) + 1 :]:
+        figure.colorbar(image, ax=axes, shrink=0.7)
+    draw_volume(panels[len(maps)], rows)
+    for axes in panels[len(maps) + 1 :]:
         axes.axis("off")
     figure.savefig(path, dpi=110, format="png")
 
 
 def draw_volume(axes: "Axes", rows: Sequence[Mapping[str, float]]) -> None:
-    """Draw the worn volume over the cycles; shaded: 5 to 95 % of the samples, dotted: median."""
+    """Draw the worn volume over the cycles, the 5 to 95 % band (shaded) and the median (dotted)."""
     cycles = np.array([row["cycles"] for row in rows]) / 1e6
-    axes.plot(cycles, [row["volume_mm3"] for row in rows], "k.-", label="as given")
+    axes.plot(cycles, [row["volume_mm3"] for row in rows], "k.-", label="nominal")
     if "volume_mm3_p05" in rows[-1]:
         low, middle, high = ([row[f"volume_mm3_p{p}"] for row in rows] for p in ("05", "50", "95"))
         axes.fill_between(cycles, low, high, color="0.8", label="5 to 95 % of the samples")
-        axes.plot(cycles, middle, "k:", label="their median")
+        axes.plot(cycles, middle, "k:", label="median of the samples")
         axes.legend()
     axes.set(title="worn volume, mm³", xlabel="million cycles", xlim=(0, None), ylim=(0, None))

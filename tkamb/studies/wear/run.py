@@ -1,6 +1,6 @@
-"""A wear simulation, from the user's options to the written files.
+"""A wear simulation, from the user's options to the report.
 
-Each finished block of cycles is stored in the folder, so that a kill loses one block.
+Each finished block of cycles is stored in the folder. An interruption loses at most one block.
 """
 
 import hashlib
@@ -40,7 +40,7 @@ from tkamb.studies.wear.simulation import (
 
 
 def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -> str:
-    """Return the hash that identifies a simulation: bodies, motion, laws, numbers, code."""
+    """Return the SHA-256 of bodies, motion, laws, numbers and code of a simulation."""
     digest = hashlib.sha256()
     bodies = (setup.engine.femoral, case.articular.surface)
     arrays = [array for body in bodies for array in (body.vertices, body.faces)]
@@ -48,7 +48,7 @@ def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -
     if drive is not None:
         arrays += [drive.coordinates, drive.applied, drive.zero]
     motion = case.motion
-    arrays += [one for one in (motion.seconds, *(motion.path or ())) if one is not None]
+    arrays += [array for array in (motion.seconds, *(motion.path or ())) if array is not None]
     for array in (*arrays, case.motion.poses, case.motion.load):
         digest.update(np.ascontiguousarray(array, "<f8").tobytes())
     words = (setup.engine.model, setup.engine.material, setup.engine.bearing, case.law, case.creep)
@@ -60,7 +60,7 @@ def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -
 
 
 def keep_state(folder: Path, state: WearState, identity: str) -> None:
-    """Put the state in the folder, whole or not at all.
+    """Store the state in the folder. An interruption leaves the earlier state in place.
 
     Raises:
         InputError: the folder cannot be written.
@@ -72,15 +72,15 @@ def keep_state(folder: Path, state: WearState, identity: str) -> None:
 
 
 def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
-    """Return the state that a folder keeps; None where there is none.
+    """Return the state that is stored in a folder; None if there is none.
 
     Args:
         folder: folder of the simulation.
-        identity: hash of the simulation to go on with, from `wear_identity`.
+        identity: hash of the simulation, from `wear_identity`.
         count: number of articular vertices.
 
     Raises:
-        InputError: it is of another simulation, or cannot be read.
+        InputError: the state belongs to another simulation, or is damaged.
     """
     path = folder / STATE_NAME
     if not path.is_file():
@@ -95,25 +95,24 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
     try:
         rows = json.loads(str(content.pop("rows")))
         values: dict[str, Any] = {
-            name: one.item() if one.ndim == 0 else one for name, one in content.items()
+            name: array.item() if array.ndim == 0 else array for name, array in content.items()
         }
         state = WearState(rows=tuple(rows), **values)
-        whole = bool(rows) and all(_is_row(row, rows[0]) for row in rows)
+        is_valid = bool(rows) and all(_is_row(row, rows[0]) for row in rows)
     except (ValueError, KeyError, TypeError) as error:
         raise _damaged(path, str(error)) from None
-    arrays = {name: one for name, one in content.items() if one.ndim}
+    arrays = {name: array for name, array in content.items() if array.ndim}
     if not have(arrays, dict.fromkeys(("wear", "creep", "fall"), ("f", (count,)))):
         raise _damaged(path, f"its arrays are not of {count} vertices")
     numbers = (state.cycles, state.step, state.volume, state.creep_volume, state.map_error)
-    whole &= all(isinstance(one, float) and math.isfinite(one) for one in numbers)
-    whole &= type(state.unsettled) is int and isinstance(state.end, str)
-    if not (whole and all(np.isfinite(one).all() for one in arrays.values())):
+    is_valid &= all(isinstance(number, float) and math.isfinite(number) for number in numbers)
+    is_valid &= type(state.unsettled) is int and isinstance(state.end, str)
+    if not (is_valid and all(np.isfinite(array).all() for array in arrays.values())):
         raise _damaged(path, "its values are not numbers")
     return state
 
 
 def _is_row(row: Any, first: Any) -> bool:
-    """Return whether a row of the kept table has numbers, and the columns of the first row."""
     return (
         isinstance(row, dict)
         and {"cycles", *BANDED} <= row.keys() == first.keys()
@@ -121,21 +120,21 @@ def _is_row(row: Any, first: Any) -> bool:
     )
 
 
-def _damaged(path: Path, why: str) -> InputError:
-    return InputError(f"is damaged ({why})", path, "leave out resume=True to begin again")
+def _damaged(path: Path, reason: str) -> InputError:
+    return InputError(f"is damaged ({reason})", path, "leave out resume=True to begin again")
 
 
 @dataclass(frozen=True, eq=False)
 class WearRun:
-    """A wear simulation that is ready to begin.
+    """A wear simulation with checked inputs.
 
     Args:
-        setup: bodies, motion, contact.
-        case: what is worn, by what law.
-        material: with sources.
-        cycles: how many.
+        setup: bodies, motion and contact.
+        case: bodies, motion and laws.
+        material: wear material.
+        cycles: number of cycles.
         updates: number of updates of the geometry.
-        sampling: for bands; None: none.
+        sampling: samples for bands; None: no bands.
     """
 
     setup: WearSetup
@@ -157,15 +156,15 @@ class WearRun:
         """Simulate and return the report.
 
         Args:
-            folder: where the state is kept after each block; None: nowhere.
-            resume: go on with the state that the folder keeps.
-            progress: called with the number of finished cycles.
-            crew: who computes the samples; default: this process.
-            sample_progress: wraps the samples as they come.
+            folder: folder in which the state is stored after each block; None: it stays in memory.
+            resume: whether to use the state that is stored in the folder.
+            progress: function that is called with the number of finished cycles.
+            crew: worker pool settings for the samples; default: this process.
+            sample_progress: wrapper of the iterator of the finished samples.
 
         Raises:
-            InputError: what the folder keeps is of another simulation, or no contact is found.
-            KeyboardInterrupt: with a folder, saying what is kept there.
+            InputError: the folder holds another simulation, or there is no contact.
+            KeyboardInterrupt: interrupted. Finished blocks and samples stay in the folder.
         """
         identity = ""
         if folder is not None:
@@ -198,12 +197,12 @@ class WearRun:
         resume: bool,
         progress: Callable[[float], None],
     ) -> tuple[WearState, CycleWear]:
-        """Return the end of the simulation, kept in the folder block by block."""
+        """Return the state at the end and the wear of a further cycle; store each block."""
 
-        def keep(done: WearState) -> None:
-            progress(done.cycles)
+        def keep(state: WearState) -> None:
+            progress(state.cycles)
             if folder is not None:
-                keep_state(folder, done, identity)
+                keep_state(folder, state, identity)
 
         count, state = len(self.case.articular.vertices), None
         if folder is not None and resume:
@@ -212,35 +211,29 @@ class WearRun:
             with interrupt_as_such():
                 return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
         except KeyboardInterrupt:
-            kept = None
+            stored = None
             if folder is not None:
                 with suppress(InputError):  # the state of another simulation is not reported
-                    kept = kept_state(folder, identity, count)
-            if kept is None:
+                    stored = kept_state(folder, identity, count)
+            if stored is None:
                 raise
-            done = f"{kept.cycles:.6g} cycles are kept"
-            raise KeyboardInterrupt(f"{done}; go on with resume=True") from None
+            words = f"{stored.cycles:.6g} cycles are kept"
+            raise KeyboardInterrupt(f"{words}; go on with resume=True") from None
 
 
 @dataclass(eq=False)
-class _Asked:
-    """Material and law: of the call, otherwise of the scene's [wear].
-
-    Args:
-        law: name; None: not asked for.
-        material: name or file; None: not asked for.
-        wear_factor: mm³/(N m); None: not asked for.
-    """
+class _MaterialChoice:
+    """Names of law and material, and wear factor, mm³/(N m); None: that of [wear] in the scene."""
 
     law: str | None
     material: str | Path | None
     wear_factor: float | None
 
     def check(self, table: WearTable, scene: Path) -> None:
-        """Find the material and the law, with the scene's table where nothing is asked for.
+        """Set `material_and_law` from the call and the table [wear] of a scene file.
 
         Raises:
-            InputError: there is no such material or law, or the material has no such law.
+            InputError: the material or law is unknown, or the material has no such law.
         """
         name = self.material
         if name is None and table.material is not None:
@@ -248,11 +241,11 @@ class _Asked:
             if name.endswith(".toml"):
                 name = scene.parent / name
         factor = table.wear_factor_mm3_per_Nm if self.wear_factor is None else self.wear_factor
-        made_of = wear_material(name or DEFAULT_MATERIAL)
-        chosen = made_of.wear_law(self.law or table.law, factor)
+        material = wear_material(name or DEFAULT_MATERIAL)
+        law = material.wear_law(self.law or table.law, factor)
         if factor is not None:
-            made_of = made_of.with_own_factor()
-        self.material_and_law: tuple[WearMaterial, WearLaw] = (made_of, chosen)
+            material = material.with_own_factor()
+        self.material_and_law: tuple[WearMaterial, WearLaw] = (material, law)
 
 
 def prepare_wear(
@@ -267,38 +260,39 @@ def prepare_wear(
     period: float = 1.0,
     **setup: Any,
 ) -> WearRun:
-    """Return a wear simulation, everything about it checked.
+    """Return a wear simulation with checked inputs.
 
     Args:
-        path: a scene file, or a folder that `tkamb run` wrote.
-        cycles: how many.
-        updates: how often the insert's geometry follows.
-        law: a name of `tkamb.studies.wear.laws`; None: the scene's [wear] law, or the material's
-        own.
-        material: a name of `tkamb.studies.wear.materials`, or a material file; None: the scene's,
-            or "conventional".
-        wear_factor: mm³/(N m), in place of the scene's or the material's.
-        samples: for bands, at least 20; 0: none; None: 32 where the scene has [uncertainty].
-        period: s of a simulator's cycle.
-        setup: simulator, springs, contact, …: see `tkamb.studies.wear.setup.wear_setup`.
+        path: scene file, or folder that `tkamb run` wrote.
+        cycles: number of cycles.
+        updates: number of updates of the insert's geometry.
+        law: name of a wear law (`tkamb.studies.wear.laws`); None: that of [wear] in the scene, or
+            the default law of the material.
+        material: name (`tkamb.studies.wear.materials`) or file of a wear material; None: that of
+            [wear] in the scene, or "conventional".
+        wear_factor: wear factor that replaces that of scene or material, mm³/(N m).
+        samples: number of samples for bands, at least 20; 0: no bands; None: 32 if the scene has
+            [uncertainty].
+        period: duration of a simulator's cycle, s.
+        setup: further arguments of `tkamb.studies.wear.setup.wear_setup`.
 
     Raises:
-        InputError: whatever of it cannot be used.
+        InputError: an argument or the scene is invalid.
     """
     check_blocks(cycles, updates)
     check_samples(samples or 0)
     if not (math.isfinite(period) and 0.05 <= period <= 3600):
-        raise InputError(f"{period} s", "--period", "give 0.05 to 3600 s a cycle")
-    asked = _Asked(law, material, wear_factor)
+        raise InputError(f"{period} s", "--period", "give 0.05 to 3600 s per cycle")
+    choice = _MaterialChoice(law, material, wear_factor)
     if material is not None:
-        asked.check(WearTable(), Path())  # as early as possible
-    ready = wear_setup(path, period=period, check=asked.check, **setup)
-    made_of, chosen = asked.material_and_law
-    case = _case(ready, made_of, chosen)
+        choice.check(WearTable(), Path())  # before the scene is read
+    inputs = wear_setup(path, period=period, check=choice.check, **setup)
+    chosen_material, chosen_law = choice.material_and_law
+    case = _case(inputs, chosen_material, chosen_law)
     if samples is None:
-        samples = WEAR_BAND.samples if ready.uncertainty else 0
-    sampling = Sampling.of(ready, case, samples) if samples else None
-    return WearRun(ready, case, made_of, cycles, updates, sampling)
+        samples = WEAR_BAND.samples if inputs.uncertainty else 0
+    sampling = Sampling.of(inputs, case, samples) if samples else None
+    return WearRun(inputs, case, chosen_material, cycles, updates, sampling)
 
 
 def wear_of_results(
@@ -306,27 +300,27 @@ def wear_of_results(
 ) -> WearReport:
     """Return the wear of an insert by the motion of results in memory.
 
-    Material, law and closing of the cycle are those of the scene's [wear].
+    Material, law and closing of the cycle are those of [wear] in the scene.
 
     Args:
-        scene: scene of the results, with the contact that they were computed with.
-        path: file of the scene.
-        results: with their maps.
-        cycles: how many.
-        updates: how often the insert's geometry follows.
-        frames: most frames of a cycle.
+        scene: scene of the results, with their contact model.
+        path: path of the scene file.
+        results: results with pressure maps.
+        cycles: number of cycles.
+        updates: number of updates of the insert's geometry.
+        frames: largest number of frames of a cycle.
 
     Raises:
-        InputError: whatever of it cannot be used.
+        InputError: an argument, the scene or the results are invalid.
     """
     check_blocks(cycles, updates)
-    asked = _Asked(None, None, None)
-    asked.check(scene.wear or WearTable(), path)
-    made_of, chosen = asked.material_and_law
-    ready = setup_of_results(scene, path, results, frames)
-    return WearRun(ready, _case(ready, made_of, chosen), made_of, cycles, updates).compute()
+    choice = _MaterialChoice(None, None, None)
+    choice.check(scene.wear or WearTable(), path)
+    material, law = choice.material_and_law
+    setup = setup_of_results(scene, path, results, frames)
+    return WearRun(setup, _case(setup, material, law), material, cycles, updates).compute()
 
 
-def _case(ready: WearSetup, made_of: WearMaterial, law: WearLaw) -> WearCase:
-    density, creep = made_of.density_kg_per_m3, made_of.creep
-    return WearCase(ready.engine, ready.articular, ready.motion, law, density, creep)
+def _case(setup: WearSetup, material: WearMaterial, law: WearLaw) -> WearCase:
+    density, creep = material.density_kg_per_m3, material.creep
+    return WearCase(setup.engine, setup.articular, setup.motion, law, density, creep)

@@ -1,4 +1,4 @@
-"""From a scene, a folder of results or a simulator's profile to the inputs of a wear simulation."""
+"""Inputs of a wear simulation from a scene, a folder of results or a simulator's profile."""
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -32,28 +32,28 @@ from tkamb.units import MILLIMETRE
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
 AFTER_A_RUN = ("wear",)
-"""Tables of a scene that a run does not read; they may be changed for a folder of results."""
+"""Tables of a scene that do not affect a run. They may be changed for a folder of results."""
 
 
 @dataclass(frozen=True, eq=False)
 class WearSetup:
-    """The bodies, the motion and the contact of a wear simulation.
+    """Bodies, motion and contact of a wear simulation.
 
     Args:
-        engine: contact model, femoral component, material.
-        articular: the insert's surface.
-        motion: one cycle.
-        side: side of the knee; the bodies of a left knee are mirrored.
+        engine: contact model, femoral component and material.
+        articular: articular surface of the insert.
+        motion: motion of one cycle.
+        side: side of the knee. The bodies of a left knee are mirrored.
         contact: name of the contact model.
-        resolution_mm: spacing of the points of its map.
-        source: the file or folder that the motion comes from.
-        scene_sha256: of the scene as it was given and with the contact that was asked for; a
-            run's summary has one of them.
-        files_sha256: of the files that the scene names, likewise.
-        run_frames: first, last and step of the frames of the run whose maps are worn; None: the
-            motion is the scene's or a simulator's.
-        uncertainty: the scene's table; None: it has none.
-        simulated: the motion is a simulator's.
+        resolution_mm: spacing of the model's map points, mm.
+        source: file or folder of the motion.
+        scene_sha256: SHA-256 of the scene, without and with the requested contact model. The
+            summary of a run of the scene contains one of them.
+        files_sha256: SHA-256 of the files that the scene names.
+        run_frames: start, stop and step of the frames of the run with the maps; None: the motion
+            does not come from a folder of results.
+        uncertainty: table [uncertainty] of the scene; None: the scene has none.
+        simulated: whether the motion is a simulator's profile.
     """
 
     engine: ContactEngine
@@ -84,52 +84,52 @@ def wear_setup(
     check: Callable[[WearTable, Path], None] = lambda table, path: None,
     progress: Progress = lambda indices: indices,
 ) -> WearSetup:
-    """Return the bodies, the motion and the contact of a wear simulation.
+    """Return bodies, motion and contact of a wear simulation.
 
     Args:
-        path: a scene file, or a folder that `tkamb run` wrote.
-        simulator: a profile (`tkamb.studies.wear.simulator`) in place of the scene's motion.
-        springs: a file of its springs (`tkamb.studies.wear.simulator`), for force control.
-        contact: contact model, in place of the scene's.
-        resolution_mm: in place of the scene's.
-        frames: largest number of frames of a recorded cycle, smallest of a simulator's; the cycle
-        itself does not depend on it.
-        period: s of a simulator's cycle.
-        close: how recorded frames become a cycle (`tkamb.studies.wear.motion`), in place of the
-            scene's [wear] close.
-        overrides: dotted key -> value of the scene. A folder of results takes only keys of
-            [wear]: the others would be of another run.
-        check: is given the scene's [wear] and path before any frame is run.
-        progress: wraps the frames of a scene that has to be run.
+        path: scene file, or folder that `tkamb run` wrote.
+        simulator: file of a profile (`tkamb.studies.wear.simulator`) that replaces the motion of
+            the scene.
+        springs: file of the springs of the simulator for force control.
+        contact: name of the contact model that replaces that of the scene.
+        resolution_mm: resolution that replaces that of the scene, mm.
+        frames: largest number of frames of a recorded cycle, or smallest number of a profile.
+        period: duration of a simulator's cycle, s.
+        close: closing of recorded frames to a cycle (`tkamb.studies.wear.motion`) that replaces
+            `close` of [wear] in the scene.
+        overrides: dotted key of the scene -> value. A folder of results accepts only keys of
+            [wear], because other keys need another run.
+        check: function of [wear] and the path of the scene that is called before frames are run.
+        progress: wrapper of the iterator of the frames to run.
 
     Raises:
-        InputError: the scene, folder or profile cannot be used, has no contact, or one of a post.
+        InputError: the scene, folder or profile is invalid, or has no contact, or a post.
     """
     if frames < 2:
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
     path = Path(path)
     if springs is not None and simulator is None:
         raise InputError("springs without a simulator", "--springs", "also give --simulator")
-    given_keys = dict(overrides or {})
+    keys = dict(overrides or {})
     if close is not None:
         if simulator is not None:
-            raise InputError("a simulator's profile is a cycle already", "--close", "leave it out")
+            raise InputError("a simulator's profile is already closed", "--close", "leave it out")
         check_closing(close)
-        given_keys["wear.close"] = close
+        keys["wear.close"] = close
     motion: CycleMotion | None = None
     run_frames: tuple[int, ...] | None = None
     if os.path.isdir(path) and simulator is None:
-        case, motion, run_frames, scene_path = _of_results(path, frames, given_keys)
+        case, motion, run_frames, scene_path = _of_results(path, frames, keys)
         hashes = _hashes(case, case.scene)
     else:
-        of_run: dict[str, Any] = {}
+        run_keys: dict[str, Any] = {}
         preset: str | None = None
         if os.path.isdir(path):
             summary = read_results(path).summary
             preset = preset_of_run(summary)
-            path, of_run = _scene_of(summary, path), overrides_of_run(summary)
+            path, run_keys = _scene_of(summary, path), overrides_of_run(summary)
         scene_path = path
-        scene = load_scene(path, of_run | given_keys, preset)
+        scene = load_scene(path, run_keys | keys, preset)
         case = load_case(_with_contact(scene, contact, resolution_mm, path))
         hashes = _hashes(case, scene)
     check(_wear_table(case.scene), scene_path)
@@ -159,16 +159,16 @@ def wear_setup(
 
 
 def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) -> WearSetup:
-    """Return what is worn by the motion of results that are at hand, all of whose frames count.
+    """Return bodies, motion and contact of a wear simulation from results in memory.
 
     Args:
-        scene: scene of the results, with the contact that they were computed with.
-        path: file of the scene.
-        results: with their maps.
-        frames: most frames of a cycle.
+        scene: scene of the results, with their contact model.
+        path: path of the scene file.
+        results: results with pressure maps.
+        frames: largest number of frames of a cycle.
 
     Raises:
-        InputError: there is no contact, or one of a post.
+        InputError: there is no contact, or there is contact with a post.
     """
     case, table = load_case(scene), scene.contact
     if table is None or results.maps is None or case.insert is None:
@@ -191,12 +191,11 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
 
 def _refuse_post(case: Case) -> None:
     if case.post is not None:
-        hint = "leave the key out: the dishes' wear alone is modelled"
-        raise InputError("the post does not wear", "[contact] post", hint)
+        hint = "leave the key out to compute the wear of the dishes alone"
+        raise InputError("the wear of a post is not modelled", "[contact] post", hint)
 
 
 def _cycle_of_maps(maps: ContactMaps, scene: Scene, most: int) -> CycleMotion:
-    """Return the cycle of at most so many frames of a run's."""
     track = _Track.of_maps(maps)
     frames = [*chain(*chosen_frames(len(track.time), most))]
     return _cycle_of(track, frames, scene, track.time, (track.time, track.poses))
@@ -207,54 +206,46 @@ def _wear_table(scene: Scene) -> WearTable:
 
 
 def _hashes(case: Case, scene: Scene) -> tuple[str, ...]:
-    """Return the hashes that a run of the scene has: as given, and with the contact asked for."""
-    scenes = (scene, case.scene)
-    return tuple(dict.fromkeys(scene_hash(replace(case, scene=one)) for one in scenes))
+    hashes = (scene_hash(replace(case, scene=variant)) for variant in (scene, case.scene))
+    return tuple(dict.fromkeys(hashes))
 
 
 def _of_profile(
     profile: Profile, springs: Springs | None, engine: ContactEngine, case: Case, period: float
 ) -> CycleMotion:
-    """Return a simulator's cycle, in displacement or in force control."""
     assert case.insert is not None and case.scene.contact is not None
-    profile.drive((0.0, 0.0), springs)  # springs that do not suit are refused before any search
+    profile.drive((0.0, 0.0), springs)  # raises for unsuitable springs before the search
     dwell = engine.dwell(case.insert, profile.rotation)
     drive = profile.drive(dwell, springs)
     notes = ["a simulator's cycle in displacement control; AP and ML from the dwell position"]
     if drive is not None:
-        result = ", ".join(drive.names)
-        notes = [f"a simulator's cycle in force control: {result} in equilibrium, without friction"]
+        names = ", ".join(drive.names)
+        notes = [f"a simulator's cycle in force control: {names} in equilibrium, without friction"]
         if friction := case.scene.contact.friction:
-            notes.append(f"the scene's friction of {friction:g} is left out of force control")
+            notes.append(f"force control neglects the friction of {friction:g} of the scene")
     seconds = np.diff(profile.percent) / 100.0 * period
     poses = profile.poses(dwell)
     return CycleMotion(poses, profile.load, period, 1, tuple(notes), drive, seconds)
 
 
 def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleMotion:
-    """Run a scene, or some of its frames, the first and the last among them; return its cycle."""
+    """Run at most `most` frames of a scene, including the first and the last; return the cycle."""
     case = load_case(scene)
     recorded = case.motion.time
     count = len(recorded)
-    chosen = [slice(one.start, one.stop, one.step) for one in chosen_frames(count, most)]
-    runs = [simulate(scene, frames=one, scene_path=path, progress=progress) for one in chosen]
+    chosen = [slice(part.start, part.stop, part.step) for part in chosen_frames(count, most)]
+    runs = [simulate(scene, frames=part, scene_path=path, progress=progress) for part in chosen]
     tracks = [_Track.of_maps(run.maps) for run in runs if run.maps is not None]
     track = _Track(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
     contact = scene.contact
     assert contact is not None
-    changed = contact.released or contact.adjust  # other poses than the recorded ones
+    changed = contact.released or contact.adjust  # the computed poses differ from the recording
     whole = None if changed else (recorded, knee_pose(case.motion.coordinates))
     return _cycle_of(track, range(len(track.time)), scene, recorded, whole)
 
 
 class _Track(NamedTuple):
-    """Recorded frames.
-
-    Args:
-        time: (f,) s.
-        poses: (f, 4, 4) pose_femoral_in_insert.
-        load: (f,) N along -y.
-    """
+    """Computed frames: times, s, (f,); pose_femoral_in_insert (f, 4, 4); load along -y, N, (f,)."""
 
     time: Array
     poses: Array
@@ -273,14 +264,14 @@ def _cycle_of(
     recorded: Array,
     whole: tuple[Array, Array] | None,
 ) -> CycleMotion:
-    """Return the cycle that some frames of a track stand for.
+    """Return the cycle of some computed frames.
 
     Args:
-        track: what was computed.
-        chosen: frames of it.
-        scene: says how they become a cycle.
-        recorded: (g,) s, times of the whole recording.
-        whole: those times and the poses (g, 4, 4) at them; None: the poses are not known.
+        track: computed frames.
+        chosen: numbers of the frames of the cycle.
+        scene: scene with the closing of the cycle.
+        recorded: times of the recording, s, shape (g,).
+        whole: times and poses (g, 4, 4) of the recording; None: the poses are unknown.
     """
     frames, count = list(chosen), len(recorded)
     time, poses, load = (values[frames] for values in track)
@@ -291,18 +282,17 @@ def _cycle_of(
     motion = CycleMotion.of_frames(time, poses, load, closing, interval, whole)
     if len(frames) == count:
         return motion
-    note = f"{len(frames)} of its {count} frames are computed, the first and the last among them"
+    note = f"{len(frames)} of its {count} frames are used, including the first and the last"
     return replace(motion, notes=(*motion.notes, note))
 
 
 def _of_results(
     folder: Path, most: int, overrides: Mapping[str, Any]
 ) -> tuple[Case, CycleMotion, tuple[int, ...], Path]:
-    """Return the case, the cycle, the choice of frames and the scene of a folder of results."""
     for key in overrides:
         if key.partition(".")[0] not in AFTER_A_RUN:
-            what = f"'{key}' is not of the run in this folder"
-            raise InputError(what, f"--set {key}", "give the scene in place of the folder")
+            what = f"'{key}' cannot be changed after the run in this folder"
+            raise InputError(what, f"--set {key}", "give the scene instead of the folder")
     results = read_results(folder)
     if results.maps is None:
         raise InputError("has no contact maps", folder, "run the scene with [contact]")
@@ -321,8 +311,8 @@ def _of_results(
         scene = scene.model_copy(update={"contact": contact})
     case = load_case(scene)
     if scene_hash(case) != results.summary.get("scene_sha256"):
-        what = "was run with another scene than its file says now"
-        raise InputError(what, folder, "run it again, or give the scene")
+        what = "was computed with an earlier version of the scene file"
+        raise InputError(what, folder, "run the scene again, or give the scene file")
     chosen = (results.summary.get("identity") or {}).get("choice of frames") or ()
     motion = _cycle_of_maps(results.maps, scene, most)
     return case, motion, tuple(chosen), scene_path
@@ -331,14 +321,17 @@ def _of_results(
 def _scene_of(summary: dict[str, Any], folder: Path) -> Path:
     scene = summary.get("scene")
     if not isinstance(scene, str):
-        raise InputError("does not say which scene it is of", folder, "give the scene")
+        raise InputError("does not name its scene", folder, "give the scene file")
     return Path(scene)
 
 
 def _with_contact(
     scene: Scene, model: str | None, resolution_mm: float | None, path: Path
 ) -> Scene:
-    """Return the scene with another contact model; the former one's options do not go along."""
+    """Return the scene with another contact model and resolution.
+
+    Another model has its default options.
+    """
     if scene.contact is None:
         raise InputError("the scene has no [contact]", path, "add the table: wear needs pressure")
     changes: dict[str, Any] = {}
@@ -354,7 +347,7 @@ def _engine(case: Case, table: ContactTable) -> ContactEngine:
     assert insert is not None and case.femoral is not None
     options = dict(table.options)
     if "cache" in contact_options(table.model):
-        options["cache"] = False  # every update has an operator of its own, used once
+        options["cache"] = False  # each update of the geometry needs another operator
     model = contact_model(table.model, table.resolution_mm, **options)
     return ContactEngine(
         model, case.femoral, given_material(case.scene.insert_material), insert.bearing

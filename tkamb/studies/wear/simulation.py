@@ -1,4 +1,4 @@
-"""Many cycles in blocks: contact, wear and creep on the insert after the last block."""
+"""Wear over many cycles, in blocks that begin with the contact on the worn insert."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -10,7 +10,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
-from tkamb.studies.wear.engine import CycleMaps, carried, interpolation
+from tkamb.studies.wear.engine import CycleMaps, interpolation, scaled_to_load
 from tkamb.studies.wear.laws import WearLaw
 from tkamb.studies.wear.materials import LogarithmicCreep
 from tkamb.studies.wear.motion import CycleMotion
@@ -21,43 +21,43 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class WearSimulationSettings:
-    """The simulation of wear over many cycles."""
+    """Simulation of wear over many cycles."""
 
     max_cycles: float = 10**9
-    """Largest number of cycles that is accepted. Chosen: a thousand years of walking."""
+    """Largest number of cycles that is accepted. Chosen as a thousand years of walking."""
     max_updates: int = 10_000
-    """Largest number of updates of the surface that is accepted. Chosen: files of results stay
-    readable."""
+    """Largest number of updates of the geometry that is accepted. Chosen to limit the size of the
+    results."""
     min_thickness: float = 1e-4
-    """m; an insert that is thinner counts as worn through. Chosen: no contact model holds for a
-    thinner layer."""
+    """m: thickness at which the insert counts as worn through. Chosen because no contact model is
+    valid for a thinner layer."""
     min_depth: float = 1e-9
-    """m: a smaller depth counts as no wear. Chosen: above the rounding of a mesh."""
+    """m: depth below which a point counts as unworn. Chosen above the round-off of a mesh."""
     max_pattern_change: float = 0.2
-    """1: share of the worn volume that may lie elsewhere after a block of cycles; a block with more
-    is halved. Chosen: smaller than the error of a wear law."""
+    """Share of the wear rate that may move to other points during a block, or the block is halved.
+    Larger: fewer blocks, less accurate. Chosen below the error of a wear law."""
     max_block_division: int = 256
-    """Ratio of the longest block to the shortest one that is tried. Chosen: eight halvings."""
+    """Largest ratio of the longest block to a halved block. Chosen to allow eight halvings."""
     min_row_share: float = 0.5
-    """Share of the rows of a force-controlled profile that must be computed for a cycle to count.
-    Chosen: with less, the cycle is not known."""
+    """Share of the rows of a force-controlled profile that must converge. Chosen because fewer rows
+    do not describe the cycle."""
     min_improvement: float = 1.1
-    """Factor by which halving a block has to lessen the change for another halving. Chosen: with
-    less, more halvings do not help."""
+    """Factor by which halving a block must reduce the share `max_pattern_change`, or the block is
+    not halved again. Chosen because further halvings then have no effect."""
 
 
 WEAR_SIMULATION = WearSimulationSettings()
 
 MILLIGRAM = 1e-6
 """kg."""
-MEND = "check load and poses, or another contact model"
+CONTACT_HINT = "check load and poses, or use another contact model"
 
 
 class Maps(Protocol):
-    """Source of the pressure maps of a cycle: `tkamb.studies.wear.engine.ContactEngine`."""
+    """Interface of `tkamb.studies.wear.engine.ContactEngine`."""
 
     def maps(self, insert: Surface, motion: CycleMotion) -> CycleMaps:
-        """Return the maps of a motion's frames on an insert."""
+        """Return the pressure maps of the frames of a motion on an insert."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +65,12 @@ class WearCase:
     """Bodies, motion and laws of a wear simulation.
 
     Args:
-        engine: gives pressure maps.
-        articular: the insert's surface, unworn.
-        motion: one cycle.
+        engine: contact of the femoral component with an insert.
+        articular: articular surface of the unworn insert.
+        motion: motion of one cycle.
         law: wear law.
-        density: kg/m³.
-        creep: law of creep; None: not modelled.
+        density: density of the insert, kg/m³.
+        creep: creep law; None: creep is not modelled.
     """
 
     engine: Maps
@@ -83,20 +83,20 @@ class WearCase:
 
 @dataclass(frozen=True, eq=False)
 class WearState:
-    """The insert after some cycles. Arrays are per articular vertex.
+    """The insert after some cycles. Arrays have one entry per articular vertex.
 
     Args:
-        wear: (n,) m, worn off along the normal.
-        creep: (n,) m, crept along y.
-        fall: (n,) m, by which the vertices have moved down, wear and creep together.
-        cycles: how many cycles are done.
-        step: cycles that the next block tries.
-        volume: m³, worn off.
-        creep_volume: m³, displaced by creep.
-        map_error: largest relative correction of a map's force.
-        unsettled: blocks whose pressures changed too much even at the shortest length.
-        rows: the table so far, one row per block.
-        end: why it ended before the last cycle; empty: it did not.
+        wear: worn depth along the normal, m, shape (n,).
+        creep: creep depth along y, m, shape (n,).
+        fall: downward displacement of the vertices by wear and creep, m, shape (n,).
+        cycles: number of finished cycles.
+        step: length of the next block, cycles.
+        volume: worn volume, m³.
+        creep_volume: volume displaced by creep, m³.
+        map_error: largest relative correction of the force of a map.
+        unsettled: number of blocks that exceed `max_pattern_change` after all halvings.
+        rows: rows of the table, one before the first cycle and one per block.
+        end: reason why the simulation ended before the last cycle; "" if it did not.
     """
 
     wear: Array
@@ -119,16 +119,16 @@ class WearState:
 
 @dataclass(frozen=True, eq=False)
 class CycleWear:
-    """Wear of one cycle on the present insert. Arrays are per articular vertex.
+    """Wear of one cycle on the current insert. Arrays have one entry per articular vertex.
 
     Args:
-        rate: (n,) m a cycle, along the normal.
-        history: pressures and sliding.
-        normals: (n, 3) unit normals.
-        area: (n,) m².
-        map_error: largest relative correction of a map's force.
-        poses: (f, 4, 4) of the motion's frames.
-        failed: frame -> why it is left out of the cycle.
+        rate: worn depth per cycle along the normal, m, shape (n,).
+        history: pressure and sliding in the cycle.
+        normals: unit normals, shape (n, 3).
+        area: tributary areas, m², shape (n,).
+        map_error: largest relative correction of the force of a map.
+        poses: femoral poses of the frames of the motion, shape (f, 4, 4).
+        failed: frame -> reason why it failed.
     """
 
     rate: Array
@@ -141,18 +141,18 @@ class CycleWear:
 
     @property
     def peak_pressure(self) -> Array:
-        """Largest pressure of a step, (n,) Pa."""
+        """Largest pressure of a step, Pa, shape (n,)."""
         return np.asarray(self.history.pressure.max(axis=0))
 
     def change_to(self, other: "CycleWear") -> float:
-        """Return how much of the volume that a cycle wears off lies elsewhere in another cycle."""
-        mine, theirs = self.rate * self.area, other.rate * other.area
-        total = float(mine.sum())
-        return 0.5 * float(np.abs(theirs - mine).sum()) / total if total > 0 else 0.0
+        """Return the share of the worn volume per cycle that is at other points in `other`."""
+        volumes, other_volumes = self.rate * self.area, other.rate * other.area
+        total = float(volumes.sum())
+        return 0.5 * float(np.abs(other_volumes - volumes).sum()) / total if total > 0 else 0.0
 
 
 def check_blocks(cycles: int, updates: int) -> None:
-    """Raise an InputError for numbers of cycles or updates that make no simulation."""
+    """Raise an InputError if the number of cycles or updates is out of range."""
     if not 1 <= cycles <= WEAR_SIMULATION.max_cycles:
         raise InputError(
             f"{cycles} cycles", "--cycles", f"give 1 to {WEAR_SIMULATION.max_cycles:.0e}"
@@ -171,81 +171,78 @@ def simulate_wear(
     keep: Callable[[WearState], None] = lambda state: None,
     most_change: float = WEAR_SIMULATION.max_pattern_change,
 ) -> tuple[WearState, CycleWear]:
-    """Return the insert after `cycles`, and what the next cycle would do to it.
+    """Return the insert after a number of cycles, and the wear of a further cycle.
 
-    A block takes the maps of the insert as it is at the block's begin and adds their depth per
-    cycle times the block's cycles (explicit Euler, first order in the block). No block is longer
-    than cycles / updates. A block is rejected and repeated at half its length if there is no
-    contact after it, or if more than `most_change` of the worn volume lies elsewhere. (If a block
-    removes more than the compression of the contact, the pressure leaves the worn place and returns
-    to it in the next block.) The simulation ends early, with the reason in `end`, if the insert is
-    worn through or its contact is lost.
+    A block adds the worn depth per cycle at its beginning times its number of cycles (explicit
+    Euler, first order). It has at most cycles / updates cycles. It is repeated with half its length
+    if there is no contact after it, or if more than `most_change` of the worn volume per cycle
+    moves to other points. (A block that removes more than the compression of the contact moves the
+    pressure away from the worn area.) The simulation ends early if the insert is worn through or
+    contact is lost. `end` then contains the reason.
 
     Args:
-        case: what is worn.
-        cycles: at least 1.
+        case: bodies, motion and laws.
+        cycles: number of cycles, at least 1.
         updates: smallest number of blocks.
-        state: where an earlier simulation of the same case stopped.
-        keep: called with the state after each block.
-        most_change: half the sum of absolute changes over the sum; 1: never reject a block.
+        state: state of an earlier simulation of the case, to resume it; None: unworn.
+        keep: function that is called with the state after each block.
+        most_change: share of the worn volume per cycle, from 0 to 1. 1: never repeat a block.
 
     Raises:
-        InputError: impossible numbers, or no contact before or after the shortest first block.
+        InputError: a number is out of range, or there is no contact before the first block or after
+            its shortest length.
     """
     check_blocks(cycles, updates)
     state = state or WearState.unworn(len(case.articular.vertices), cycles / updates)
-    now = _cycle(case, state)
-    if isinstance(now, str):
-        raise InputError(now, "wear", MEND)
+    current = _cycle(case, state)
+    if isinstance(current, str):
+        raise InputError(current, "wear", CONTACT_HINT)
     if not state.rows:
-        state = replace(state, rows=(_row(case, state, now),))
-    before = math.inf
+        state = replace(state, rows=(_row(case, state, current),))
+    previous_change = math.inf
     while state.cycles < cycles and not state.end:
         step = min(state.step, cycles - state.cycles)
-        tried = _worn(case, state, now, step)
-        after = _cycle(case, tried)
-        failed = isinstance(after, str)
-        change = math.inf if isinstance(after, str) else now.change_to(after)
-        shorter = step / 2 >= cycles / updates / WEAR_SIMULATION.max_block_division
-        if shorter and (
-            failed
-            or (change > most_change and not before <= change * WEAR_SIMULATION.min_improvement)
-        ):
-            state, before = replace(state, step=step / 2), change
+        trial = _after_block(case, state, current, step)
+        following = _cycle(case, trial)
+        failed = isinstance(following, str)
+        change = math.inf if isinstance(following, str) else current.change_to(following)
+        may_halve = step / 2 >= cycles / updates / WEAR_SIMULATION.max_block_division
+        stagnates = previous_change <= change * WEAR_SIMULATION.min_improvement
+        if may_halve and (failed or (change > most_change and not stagnates)):
+            state, previous_change = replace(state, step=step / 2), change
             continue
-        if isinstance(after, str):
+        if isinstance(following, str):
             if not state.cycles:
-                raise InputError(f"after {step:.3g} cycles: {after}", "wear", MEND)
-            return replace(state, end=f"after {state.cycles:.6g} cycles: {after}"), now
-        # the next block may be longer again where this one changed little
+                raise InputError(f"after {step:.3g} cycles: {following}", "wear", CONTACT_HINT)
+            return replace(state, end=f"after {state.cycles:.6g} cycles: {following}"), current
+        # the next block becomes longer if this one changed the pattern little
         longer = step * min(2.0, 0.8 * most_change / max(change, 1e-9))
-        settled = change <= most_change
-        tried = replace(
-            tried,
-            step=min(cycles / updates, max(longer, step / 2) if settled else step),
-            unsettled=tried.unsettled + (not settled),
-            map_error=max(tried.map_error, now.map_error),
-            rows=(*tried.rows, _row(case, tried, after)),
+        accepted = change <= most_change
+        trial = replace(
+            trial,
+            step=min(cycles / updates, max(longer, step / 2) if accepted else step),
+            unsettled=trial.unsettled + (not accepted),
+            map_error=max(trial.map_error, current.map_error),
+            rows=(*trial.rows, _row(case, trial, following)),
         )
-        state, now, before = tried, after, math.inf
+        state, current, previous_change = trial, following, math.inf
         keep(state)
-    return state, now
+    return state, current
 
 
 def _cycle(case: WearCase, state: WearState) -> CycleWear | str:
-    """Return the wear of a cycle on the present insert; a text: why it has no contact."""
+    """Return the wear of a cycle on the current insert, or the reason why there is no contact."""
     insert = case.articular.lowered(state.fall)
     maps = case.engine.maps(insert, case.motion)
     rows = _rows(maps, case.motion)
-    return rows if isinstance(rows, str) else _worn_by(case, insert, maps, rows)
+    return rows if isinstance(rows, str) else _cycle_wear(case, insert, maps, rows)
 
 
-def _worn_by(case: WearCase, insert: Surface, maps: CycleMaps, rows: list[int]) -> CycleWear:
-    """Return the wear of a cycle through some rows of the maps on an insert."""
+def _cycle_wear(case: WearCase, insert: Surface, maps: CycleMaps, rows: list[int]) -> CycleWear:
     points = insert.vertices[case.articular.vertices]
     normals, area = case.articular.normals_and_areas(insert)
     pressure = maps.pressure[rows] @ interpolation(maps.points, points).T
-    pressure, error = carried(pressure, area * normals[:, 1], case.motion.load[rows])
+    pressure, error = scaled_to_load(pressure, area * normals[:, 1], case.motion.load[rows])
     poses, path, seconds = maps.poses[rows], case.motion.path, case.motion.seconds_between(rows)
     if path is not None:
         weights = path.weights(rows)
@@ -264,10 +261,10 @@ class FirstCycle:
     """Checks of the first cycle, on the unworn insert.
 
     Args:
-        frames_change: by how much half as many steps change the cycle's volume, relative to it.
-            Of a simulator's profile: the steps of the simulation against steps half as long. NaN:
-            a frame of it failed, or nothing wears.
-        volumes: law -> m³ a cycle, of the laws that were asked for.
+        frames_change: relative change of the worn volume if a recorded cycle has half as many
+            steps, or if a simulator's profile has the steps of the simulation instead of twice as
+            many. NaN: a frame failed, or nothing wears.
+        volumes: law -> worn volume per cycle, m³.
     """
 
     frames_change: float
@@ -275,55 +272,55 @@ class FirstCycle:
 
 
 def first_cycle(case: WearCase, laws: Mapping[str, WearLaw]) -> FirstCycle:
-    """Return how much the number of frames matters, and what other laws say of the first cycle.
+    """Return the effect of the number of frames, and the worn volumes of several laws.
 
     Args:
-        case: what is worn.
-        laws: name -> law.
+        case: bodies, motion and laws.
+        laws: name -> wear law.
     """
     recorded = bool(case.motion.closing)
     fine = case if recorded else replace(case, motion=case.motion.refined())
     insert = case.articular.lowered(np.zeros(len(case.articular.vertices)))
     maps = case.engine.maps(insert, fine.motion)
-    every = _rows(maps, fine.motion)
-    if isinstance(every, str):
+    rows = _rows(maps, fine.motion)
+    if isinstance(rows, str):
         return FirstCycle(math.nan, {})
-    whole = _worn_by(fine, insert, maps, every)
-    volumes = {name: float(law.depth(whole.history) @ whole.area) for name, law in laws.items()}
+    full = _cycle_wear(fine, insert, maps, rows)
+    volumes = {name: float(law.depth(full.history) @ full.area) for name, law in laws.items()}
     if maps.failed:
         return FirstCycle(math.nan, volumes)
-    half = _worn_by(fine, insert, maps, fine.motion.every_second)
-    total, coarse = (float(one.rate @ one.area) for one in (whole, half))
+    half = _cycle_wear(fine, insert, maps, fine.motion.every_second)
+    total, coarse = (float(wear.rate @ wear.area) for wear in (full, half))
     return FirstCycle(abs(coarse / total - 1.0) if total > 0 else math.nan, volumes)
 
 
 def _rows(maps: CycleMaps, motion: CycleMotion) -> list[int] | str:
-    """Return the frames that the cycle goes through; a text: why there is none.
+    """Return the frames of the cycle, or the reason why there is no cycle.
 
-    Failed rows of a force-controlled profile are left out, and the first remaining row closes the
-    cycle. Of a prescribed motion every frame is needed.
+    Failed rows of a force-controlled profile are omitted. If an end failed, the first remaining row
+    closes the cycle. A prescribed motion needs every frame.
     """
-    every = range(len(motion))
-    good = [k for k in every if k not in maps.failed]
+    frames = range(len(motion))
+    successful = [k for k in frames if k not in maps.failed]
     if not maps.failed:
-        return good
-    if motion.drive is None or len(good) < WEAR_SIMULATION.min_row_share * len(motion):
-        frame, why = next(iter(maps.failed.items()))
+        return successful
+    if motion.drive is None or len(successful) < WEAR_SIMULATION.min_row_share * len(motion):
+        frame, reason = next(iter(maps.failed.items()))
         words = f"no contact in {len(maps.failed)} of {len(motion)} frames"
-        return f"{words}, the first of them {frame}: {why}"
-    ends = good[0] == every[0] and good[-1] == every[-1]
-    return good if ends else [*good, good[0]]
+        return f"{words}, the first of them {frame}: {reason}"
+    has_ends = successful[0] == frames[0] and successful[-1] == frames[-1]
+    return successful if has_ends else [*successful, successful[0]]
 
 
-def _worn(case: WearCase, state: WearState, now: CycleWear, step: float) -> WearState:
+def _after_block(case: WearCase, state: WearState, current: CycleWear, step: float) -> WearState:
     """Return the state after `step` more cycles, or fewer if the insert is worn through."""
-    wear, creep = now.rate * step, np.zeros_like(now.rate)
+    wear, creep = current.rate * step, np.zeros_like(current.rate)
     thickness = case.articular.thickness - state.fall
     if case.creep is not None:
         begin = state.cycles * case.motion.duration
         end = begin + step * case.motion.duration
-        creep = case.creep.depth(now.history.mean_pressure, thickness, begin, end)
-    fall = wear / now.normals[:, 1] + creep
+        creep = case.creep.depth(current.history.mean_pressure, thickness, begin, end)
+    fall = wear / current.normals[:, 1] + creep
     share = _until_worn_through(thickness, fall)
     cycles = state.cycles + share * step
     return replace(
@@ -332,15 +329,15 @@ def _worn(case: WearCase, state: WearState, now: CycleWear, step: float) -> Wear
         wear=state.wear + share * wear,
         creep=state.creep + share * creep,
         fall=state.fall + share * fall,
-        volume=state.volume + share * float(wear @ now.area),
-        creep_volume=state.creep_volume + share * float(creep @ (now.area * now.normals[:, 1])),
+        volume=state.volume + share * float(wear @ current.area),
+        creep_volume=state.creep_volume
+        + share * float(creep @ (current.area * current.normals[:, 1])),
         end=f"worn through after {cycles:.6g} cycles" if share < 1.0 else "",
     )
 
 
 def _until_worn_through(thickness: Array, fall: Array) -> float:
-    """Return the share of a block after which somewhere only `WEAR_SIMULATION.min_thickness` is
-    left; 1: nowhere."""
+    """Return the share of a block after which the insert is worn through, at most 1."""
     falls = fall > 0
     if not falls.any():
         return 1.0
@@ -348,25 +345,24 @@ def _until_worn_through(thickness: Array, fall: Array) -> float:
     return float(np.clip(share.min(), 0.0, 1.0))
 
 
-def _row(case: WearCase, state: WearState, now: CycleWear) -> dict[str, float]:
-    """Return one row of the table: the insert after the state's cycles."""
+def _row(case: WearCase, state: WearState, current: CycleWear) -> dict[str, float]:
     articular, worn_nodes = case.articular, state.wear > WEAR_SIMULATION.min_depth
-    area = float(now.area[worn_nodes].sum())
+    area = float(current.area[worn_nodes].sum())
     medial = articular.surface.vertices[articular.vertices, 2] < 0
-    each = state.wear * now.area
-    crept, drive = case.creep is not None, case.motion.drive
+    volumes = state.wear * current.area
+    has_creep, drive = case.creep is not None, case.motion.drive
     volume_lost = volume(articular.surface) - volume(articular.lowered(state.fall))
     return {
         "cycles": state.cycles,
         "volume_mm3": state.volume / MILLIMETRE**3,
         "mass_mg": case.density * state.volume / MILLIGRAM,
         "max_depth_mm": float(state.wear.max()) / MILLIMETRE,
-        "mean_depth_mm": float(each.sum()) / area / MILLIMETRE if area else 0.0,
+        "mean_depth_mm": float(volumes.sum()) / area / MILLIMETRE if area else 0.0,
         "worn_area_mm2": area / MILLIMETRE**2,
-        "medial_share": float(each[medial].sum() / each.sum()) if area else math.nan,
-        "creep_depth_mm": float(state.creep.max()) / MILLIMETRE if crept else math.nan,
-        "creep_volume_mm3": state.creep_volume / MILLIMETRE**3 if crept else math.nan,
+        "medial_share": float(volumes[medial].sum() / volumes.sum()) if area else math.nan,
+        "creep_depth_mm": float(state.creep.max()) / MILLIMETRE if has_creep else math.nan,
+        "creep_volume_mm3": state.creep_volume / MILLIMETRE**3 if has_creep else math.nan,
         "mesh_volume_lost_mm3": volume_lost / MILLIMETRE**3,
-        "peak_pressure_MPa": float(now.peak_pressure.max()) / MEGAPASCAL,
-        **({} if drive is None else drive.ranges(now.poses, now.failed)),
+        "peak_pressure_MPa": float(current.peak_pressure.max()) / MEGAPASCAL,
+        **({} if drive is None else drive.ranges(current.poses, current.failed)),
     }

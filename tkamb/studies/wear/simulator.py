@@ -1,18 +1,17 @@
 """A virtual knee simulator: profiles of loads and displacements, springs, and force control.
 
-A profile is a CSV file with loads and displacements against the percentage of the cycle. Flexion
-and the knee coordinates q (`tkamb.geometry.frames`) that the profile prescribes are given. The
-other coordinates, always including the superior-inferior one, follow from equilibrium:
+A profile is a CSV file with loads and displacements over the percentage of the cycle. It prescribes
+flexion and some of the knee coordinates q (`tkamb.geometry.frames`). The other coordinates, always
+including the superior-inferior one, are released and follow from equilibrium:
 
     r_i(q) = F_i - S_i(q_i) - J_i(q) . w_contact(q) = 0
 
-with
-
-- F_i: force (N, along the axis of the insert through the origin of the femoral mesh) or torque
-  (N·m, about the axis of the coordinate through that origin) of the machine on the femoral
-  component. The axial force acts on the superior-inferior coordinate as -F;
-- S_i: force of the spring that stands for the ligaments;
-- J: see `knee_axes`;
+- r_i: residual of the released coordinate i.
+- F_i: load of the machine on the femoral component through the origin of its mesh. It is a force,
+  N, along the axis of the insert or a torque, N·m, about the axis of the coordinate. The axial
+  force F is -F on the superior-inferior coordinate.
+- S_i: force of the spring that replaces the ligaments.
+- J_i: twist of the femoral component per unit rate of coordinate i, see `knee_axes`.
 - w_contact: contact wrench on the insert.
 
 The equilibrium is quasi-static and without friction.
@@ -40,7 +39,7 @@ KINDS = {
     "ap": ("stiffness_N_per_mm", "gap_mm", MILLIMETRE, 1e3, 30.0),
     "axial_rotation": ("stiffness_Nm_per_deg", "gap_deg", DEGREE, 50.0, 45.0),
 }
-"""Coordinate -> key of stiffness and of gap, unit, and the largest value of both."""
+"""Coordinate -> keys of stiffness and gap, unit in SI, and largest stiffness and gap."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,8 @@ class Spring:
         force = -k sign(q) max(|q| - g, 0)
 
     Args:
-        stiffness: k, N/m or N·m/rad.
-        gap: g, m or rad: how far it goes either way before the spring is met.
+        stiffness: stiffness k, N/m or N·m/rad.
+        gap: displacement g in each direction without spring force, m or rad.
     """
 
     stiffness: float
@@ -63,9 +62,9 @@ class Springs:
     """The springs of a simulator.
 
     Args:
-        springs: coordinate, "ap" or "axial_rotation", -> spring.
-        sources: where the numbers come from.
-        table: the springs as the file gives them, in its units.
+        springs: coordinate, "ap" or "axial_rotation" -> spring.
+        sources: sources of the numbers.
+        table: coordinate -> key of the file -> value in the units of the file.
     """
 
     springs: Mapping[str, Spring]
@@ -74,15 +73,15 @@ class Springs:
 
 
 def read_springs(path: str | Path) -> Springs:
-    """Read springs from a TOML file: [ap], [axial_rotation], either or both, and `sources`.
+    """Read a TOML file of springs: `sources`, and [ap], [axial_rotation] or both.
 
     Raises:
-        InputError: an unknown or missing key, or a stiffness or gap that is none.
+        InputError: a key is unknown or missing, or a value is invalid.
     """
     content = read_toml(path, what="springs")
     sources = content.pop("sources", None)
     if not (isinstance(sources, list) and sources and all(isinstance(s, str) for s in sources)):
-        raise InputError("sources is not a list of texts", path, "say where each number comes from")
+        raise InputError("sources is not a list of texts", path, "give the source of each number")
     if not content:
         raise InputError("has no spring", path, f"give {' or '.join(f'[{k}]' for k in KINDS)}")
     springs = {name: _spring(name, table, path) for name, table in content.items()}
@@ -113,7 +112,7 @@ UNITS = {
     "adduction": ("deg", DEGREE),
     "flexion": ("deg", DEGREE),
 }
-"""Coordinate -> unit as a profile has it, and its size."""
+"""Coordinate -> unit in a profile, and this unit in SI."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +120,13 @@ class ForceDrive:
     """Loads of a force-controlled machine on the knee, for each row of the profile.
 
     Args:
-        coordinates: (f, 6) m and rad; the free ones are where the first search begins.
-        applied: (f, 6) N and N·m on the femoral component, along each free coordinate.
-        free: indices of the free coordinates, the superior-inferior one among them.
-        zero: (6,) m and rad, origin of AP, ML and the springs.
+        coordinates: prescribed coordinates, and initial guesses of the released ones, m and rad,
+            shape (f, 6).
+        applied: load along each released coordinate, N and N·m, shape (f, 6).
+        free: indices of the released coordinates, including the superior-inferior one.
+        zero: coordinates of the dwell position, m and rad, shape (6,).
         springs: springs of the machine; None: no springs.
-        percent: (f,) of the cycle at each row; None: the rows are evenly spaced.
+        percent: percentage of the cycle at each row, shape (f,); None: evenly spaced rows.
     """
 
     coordinates: Array
@@ -138,64 +138,67 @@ class ForceDrive:
 
     @property
     def names(self) -> list[str]:
-        """The coordinates that are found, but the superior-inferior one."""
+        """Names of the released coordinates without the superior-inferior one."""
         return [KNEE_COORDINATES[i] for i in self.free if i != SI]
 
     def joint(self, k: int) -> "MachineJoint":
-        """Return what acts at row k."""
+        """Return the loads of the machine at row k."""
         stiffness, gap = np.zeros(6), np.zeros(6)
         for name, spring in (self.springs.springs if self.springs else {}).items():
-            place = KNEE_COORDINATES.index(name)
-            stiffness[place], gap[place] = spring.stiffness, spring.gap
+            i = KNEE_COORDINATES.index(name)
+            stiffness[i], gap[i] = spring.stiffness, spring.gap
         return MachineJoint(self.free, self.applied[k], stiffness, gap, self.zero)
 
     def ranges(self, poses: Array, failed: Mapping[int, str]) -> dict[str, float]:
-        """Return the lowest and highest place of each coordinate that is found, mm and deg.
+        """Return the number of failed rows, and the range of each released coordinate, mm and deg.
 
         Args:
-            poses: (f, 4, 4) that were found.
-            failed: row -> why it has none; they are counted.
+            poses: femoral poses of the rows, shape (f, 4, 4).
+            failed: row -> reason why it failed.
         """
-        counted = self._counted(poses)
-        good = [k for k in range(len(poses)) if k not in failed]
+        positions = self._positions(poses)
+        successful = [k for k in range(len(poses)) if k not in failed]
         ranges: dict[str, float] = {"failed_rows": len(failed)}
         for name in self.names:
             unit = UNITS[name][0]
-            ranges[f"{name}_low_{unit}"] = float(counted[f"{name}_{unit}"][good].min())
-            ranges[f"{name}_high_{unit}"] = float(counted[f"{name}_{unit}"][good].max())
+            ranges[f"{name}_low_{unit}"] = float(positions[f"{name}_{unit}"][successful].min())
+            ranges[f"{name}_high_{unit}"] = float(positions[f"{name}_{unit}"][successful].max())
         return ranges
 
     def rows(self, poses: Array, failed: Mapping[int, str]) -> list[dict[str, Any]]:
-        """Return each row's position as a profile counts it; None where the row failed."""
-        counted = self._counted(poses)
+        """Return percentage, status and coordinates of each row; None if the row failed.
+
+        The coordinates have the origin and the units of a profile.
+        """
+        positions = self._positions(poses)
         percent = np.linspace(0.0, 100.0, len(poses)) if self.percent is None else self.percent
         return [
             {
                 "cycle_percent": float(percent[k]),
                 "status": f"failed: {failed[k]}" if k in failed else "ok",
-                **{key: None if k in failed else float(v[k]) for key, v in counted.items()},
+                **{key: None if k in failed else float(v[k]) for key, v in positions.items()},
             }
             for k in range(len(poses))
         ]
 
-    def _counted(self, poses: Array) -> dict[str, Array]:
-        off = knee_coordinates(poses) - self.zero
+    def _positions(self, poses: Array) -> dict[str, Array]:
+        offset = knee_coordinates(poses) - self.zero
         return {
-            f"{name}_{unit}": off[:, KNEE_COORDINATES.index(name)] / size
+            f"{name}_{unit}": offset[:, KNEE_COORDINATES.index(name)] / size
             for name, (unit, size) in UNITS.items()
         }
 
 
 @dataclass(frozen=True, eq=False)
 class MachineJoint:
-    """Loads on the free coordinates at one row, beside the contact; see the module.
+    """Loads on the released coordinates at one row, without the contact; see the module.
 
     Args:
-        released: indices of the n free coordinates.
-        applied: (6,) N and N·m.
-        stiffness: (6,) N/m and N·m/rad; zero where there is no spring.
-        gap: (6,) m and rad.
-        zero: (6,) m and rad, where the springs are in the middle of their gaps.
+        released: indices of the n released coordinates.
+        applied: load of the machine along each coordinate, N and N·m, shape (6,).
+        stiffness: stiffness of the springs, N/m and N·m/rad, shape (6,); zero without a spring.
+        gap: gaps of the springs, m and rad, shape (6,).
+        zero: coordinates in the middle of the gaps, m and rad, shape (6,).
     """
 
     released: tuple[int, ...]
@@ -205,54 +208,57 @@ class MachineJoint:
     zero: Array
 
     def imbalance(self, coordinates: Array, contact: Array) -> Array:
-        """Return r (..., n) at coordinates (..., 6) with w_contact (6,)."""
-        off = coordinates - self.zero
-        spring = self.stiffness * np.sign(off) * np.maximum(np.abs(off) - self.gap, 0.0)
-        driven = self.applied - spring - knee_axes(coordinates) @ contact
-        return np.asarray(driven[..., list(self.released)])
+        """Return the residuals r (..., n) at coordinates (..., 6) with contact wrench (6,)."""
+        offset = coordinates - self.zero
+        spring = self.stiffness * np.sign(offset) * np.maximum(np.abs(offset) - self.gap, 0.0)
+        residual = self.applied - spring - knee_axes(coordinates) @ contact
+        return np.asarray(residual[..., list(self.released)])
 
     def contact_gain(self, coordinates: Array) -> Array:
-        """Return d r / d w_contact (n, 6) at coordinates (6,)."""
+        """Return the derivative d r / d w_contact (n, 6) at coordinates (6,)."""
         return np.asarray(-knee_axes(coordinates)[list(self.released)])
 
 
-class RestingPoses:
-    """Finds the poses of a drive's rows on one insert, in order, each from the last one found.
+class EquilibriumPoses:
+    """Solves the equilibrium of the rows of a drive on one insert.
+
+    The initial guess of a row is the last equilibrium.
 
     Args:
         model: contact model.
-        state: what its `prepare` returned for the insert.
-        drive: what the machine does.
+        state: prepared contact of the model with the insert.
+        drive: loads of the machine.
     """
 
     def __init__(self, model: ContactModel, state: Any, drive: ForceDrive) -> None:
         self._model, self._state, self._drive = model, state, drive
-        self._found: Array | None = None
+        self._last: Array | None = None
         self._stiffness: Array | None = None
 
     def at(self, k: int, load: float, start: Guess | None) -> tuple[Array, str]:
-        """Return the equilibrium pose (4, 4) of row k, and why there is none; empty: there is one.
+        """Return the equilibrium pose (4, 4) of row k and "", or a pose and the reason of failure.
 
         Args:
-            k: row.
-            load: N, axial.
-            start: an earlier contact, or its warm start.
+            k: number of the row.
+            load: axial load, N.
+            start: warm start of the contact, or an earlier contact.
         """
-        place = self._drive.coordinates[k].copy()
-        if self._found is not None:
+        coordinates = self._drive.coordinates[k].copy()
+        if self._last is not None:
             free = list(self._drive.free)
-            place[free] = self._found[free]
-        first, start = self._model.press_from(self._state, load, knee_pose(place), start)
+            coordinates[free] = self._last[free]
+        first, start = self._model.press_from(self._state, load, knee_pose(coordinates), start)
         if first.status is not ContactStatus.OK:
-            why = "; ".join(first.flags) or first.status.value
-            return knee_pose(place), f"where the search begins: {why}"
-        place[SI] = first.pose[1, 3]
-        forces = FreeForces(self._drive.joint(k), self._model.probe(self._state, start), place)
+            reason = "; ".join(first.flags) or first.status.value
+            return knee_pose(coordinates), f"no contact at the initial guess: {reason}"
+        coordinates[SI] = first.pose[1, 3]
+        probe = self._model.probe(self._state, start)
+        forces = FreeForces(self._drive.joint(k), probe, coordinates)
         balance = forces.balance(self._stiffness)
         if balance.status is not BalanceStatus.OK:
-            return knee_pose(place), f"no equilibrium: {balance.status.value}"
-        self._found, self._stiffness = forces.at(balance), balance.stiffness
-        return knee_pose(self._found), ""
+            return knee_pose(coordinates), f"no equilibrium: {balance.status.value}"
+        self._last, self._stiffness = forces.at(balance), balance.stiffness
+        return knee_pose(self._last), ""
 
 
 PERCENT, LOAD = "cycle_percent", "axial_force_N"
@@ -263,14 +269,14 @@ COORDINATES = {
     "adduction_deg": (DEGREE, 4),
     "flexion_deg": (DEGREE, 5),
 }
-"""Column -> unit, and its place among the knee coordinates."""
+"""Column -> unit in SI, and index of the knee coordinate."""
 FORCES = {
     "ap_force_N": "ap_mm",
     "ml_force_N": "ml_mm",
     "axial_torque_Nm": "axial_rotation_deg",
     "adduction_torque_Nm": "adduction_deg",
 }
-"""Column of force control -> the column whose place it takes."""
+"""Column of force control -> column of displacement control that it replaces."""
 LIMITS = {
     "ap_mm": 30.0,
     "ml_mm": 20.0,
@@ -281,21 +287,21 @@ LIMITS = {
     "axial_torque_Nm": 50.0,
     "adduction_torque_Nm": 100.0,
 }
-"""Largest size of a column's values."""
+"""Column -> largest magnitude of its values."""
 FLEXION_LIMITS = (-30.0, 170.0)
 
 
 @dataclass(frozen=True)
 class WearProfileSettings:
-    """Which load profiles of a simulator are accepted."""
+    """Checks of the profile of a simulator."""
 
     max_force: float = 1e4
-    """N: largest force. Chosen: fifteen body weights."""
+    """N: largest axial force. Chosen as fifteen body weights."""
     step_tolerance: float = 1e-9
-    """Share of a step by which it may exceed the longest one. Chosen: above rounding."""
+    """Share of the largest step by which a step may exceed it. Chosen above round-off."""
     closure_tolerance: float = 0.01
-    """Share of a column's range by which its last row may differ from its first. Chosen: noise of a
-    profile is smaller."""
+    """Share of the range of a column: largest difference between its first and last row. Chosen
+    above the noise of a profile."""
 
 
 WEAR_PROFILE = WearProfileSettings()
@@ -303,18 +309,18 @@ WEAR_PROFILE = WearProfileSettings()
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """One cycle of a simulator: all rows of its file, and more between them.
+    """One cycle of a simulator: all rows of its file, and interpolated rows between them.
 
     Args:
-        percent: (f,) of the cycle, from 0 to 100.
-        load: (f,) N, axial.
-        coordinates: (f, 6) knee coordinates (`tkamb.geometry.frames`), m and rad; AP and ML from
-            the dwell position, SI zero: the load finds it; zero where a force is given instead.
-        applied: (f, 6) N and N·m on the femoral component along each coordinate that is found,
-            the axial force on SI among them.
-        free: indices of the coordinates that a force or torque is given for; none: displacement
-            control.
-        source: the file.
+        percent: percentage of the cycle, from 0 to 100, shape (f,).
+        load: axial load, N, shape (f,).
+        coordinates: knee coordinates, m and rad, shape (f, 6), AP and ML relative to the dwell
+            position. Released coordinates and the superior-inferior one are zero.
+        applied: load along each released coordinate, including the axial force, N and N·m, shape
+            (f, 6).
+        free: indices of the coordinates with a force or torque in the file; empty with
+            displacement control.
+        source: path of the file.
     """
 
     percent: Array
@@ -326,30 +332,32 @@ class Profile:
 
     @property
     def rotation(self) -> Array:
-        """The femoral component's rotation (3, 3) in the first row."""
+        """Orientation of the femoral component in the first row, shape (3, 3)."""
         return np.asarray(knee_pose(self.coordinates[0])[:3, :3])
 
     def poses(self, dwell: tuple[float, float]) -> Array:
-        """Return pose_femoral_in_insert (f, 4, 4), AP and ML counted from `dwell` (x, z), m."""
+        """Return pose_femoral_in_insert (f, 4, 4) for a dwell position (x, z), m."""
         return knee_pose(self.coordinates + zero_at(dwell))
 
     def drive(self, dwell: tuple[float, float], springs: Springs | None) -> ForceDrive | None:
-        """Return the force control, with `dwell` (x, z), m, as origin; None: displacement control.
+        """Return the loads of force control for a dwell position (x, z), m.
+
+        Returns None with displacement control.
 
         Raises:
-            InputError: a spring on a coordinate that is not found from a force.
+            InputError: a spring acts on a coordinate without force or torque.
         """
         names = [KNEE_COORDINATES[i] for i in self.free]
         for name in springs.springs if springs else ():
             if name not in names:
                 what = f"there is a spring for '{name}', but the profile gives no force or torque"
-                raise InputError(what, self.source, "a spring acts under force control alone")
+                raise InputError(what, self.source, "springs act only with force control")
         if not self.free:
             return None
         zero = zero_at(dwell)
         free = tuple(sorted((*self.free, SI)))
-        places = self.coordinates + zero
-        return ForceDrive(places, self.applied, free, zero, springs, self.percent)
+        coordinates = self.coordinates + zero
+        return ForceDrive(coordinates, self.applied, free, zero, springs, self.percent)
 
 
 def zero_at(dwell: tuple[float, float]) -> Array:
@@ -358,26 +366,24 @@ def zero_at(dwell: tuple[float, float]) -> Array:
 
 
 def read_profile(path: str | Path, frames: int) -> Profile:
-    """Read a profile: all of its rows, and rows between them where they lie far apart.
+    """Read a profile from a CSV file.
 
-    A row's values are the file's own, so that no turning point is lost. Between two rows of the
-    file the profile is linear; evenly spaced rows are put there until no step is longer than
-    100/(frames - 1) per cent.
+    The profile contains all rows of the file. Rows are interpolated linearly between them until no
+    step is longer than 100/(frames - 1) per cent of the cycle.
 
-    The file has a header and rows from 0 to 100 % of the cycle: cycle_percent, axial_force_N,
-    flexion_deg, and any of ap_mm, ml_mm, axial_rotation_deg, adduction_deg; what is not given is
-    zero. In place of each of these there may be its force or torque: ap_force_N, ml_force_N,
-    axial_torque_Nm, adduction_torque_Nm. Signs and frames are tkamb's: the femoral component's
-    motion on the insert, and what acts on the femoral component.
+    The file has a header and rows from 0 to 100 % of the cycle. The columns are cycle_percent,
+    axial_force_N, flexion_deg and optionally ap_mm, ml_mm, axial_rotation_deg and adduction_deg,
+    which are otherwise zero. A force or torque may replace each optional column: ap_force_N,
+    ml_force_N, axial_torque_Nm or adduction_torque_Nm. Motions and forces are those of the femoral
+    component on the insert, with tkamb's signs.
 
     Args:
-        path: the file.
+        path: path of the file.
         frames: smallest number of frames of a cycle, at least 2.
 
     Raises:
-        InputError: a column that is missing or unknown, a displacement and its force together,
-            a gap, a value out of range, per cents that do not run from 0 to 100, a cycle that
-            does not close, or force control without axial force.
+        InputError: a column is missing or unknown, a displacement and its force are both given, a
+            value is invalid, the cycle does not close, or force control lacks axial force.
     """
     table = read_table(Path(path), "csv")
     names = (PERCENT, LOAD, *COORDINATES, *FORCES)
@@ -394,7 +400,7 @@ def read_profile(path: str | Path, frames: int) -> Profile:
     for name, values in columns.items():
         _check_range(name, values, path)
         _check_closed(name, values, path)
-    rows = _divided(percent, 100.0 / (frames - 1))
+    rows = _subdivided(percent, 100.0 / (frames - 1))
     load = np.interp(rows, percent, columns[LOAD])
     if free and not (columns[LOAD] > 0).all():
         row = int(np.flatnonzero(columns[LOAD] <= 0)[0])
@@ -403,17 +409,17 @@ def read_profile(path: str | Path, frames: int) -> Profile:
     coordinates, applied = np.zeros((2, len(rows), 6))
     applied[:, SI] = -load
     for name, values in columns.items():
-        steps = np.interp(rows, percent, values)
+        interpolated = np.interp(rows, percent, values)
         if name in COORDINATES:
-            unit, place = COORDINATES[name]
-            coordinates[:, place] = steps * unit
+            unit, i = COORDINATES[name]
+            coordinates[:, i] = interpolated * unit
         elif name in FORCES:
-            applied[:, COORDINATES[FORCES[name]][1]] = steps
+            applied[:, COORDINATES[FORCES[name]][1]] = interpolated
     return Profile(rows, load, coordinates, applied, free, str(path))
 
 
-def _divided(rows: Array, longest: float) -> Array:
-    """Return rising numbers with others evenly between them, so that no step exceeds `longest`."""
+def _subdivided(rows: Array, longest: float) -> Array:
+    """Return increasing numbers with evenly inserted ones, so that no step exceeds `longest`."""
     pieces = np.maximum(1, np.ceil(np.diff(rows) / longest - WEAR_PROFILE.step_tolerance)).astype(
         int
     )
@@ -425,7 +431,7 @@ def _divided(rows: Array, longest: float) -> Array:
 
 
 def _free(table: Table) -> tuple[int, ...]:
-    """Return the indices of the coordinates that a force or torque is given for."""
+    """Return the indices of the coordinates with a force or torque in the table."""
     forces = [name for name in FORCES if name in table.columns]
     for name in forces:
         if FORCES[name] in table.columns:
@@ -458,4 +464,4 @@ def _check_range(name: str, values: Array, path: str | Path) -> None:
 def _check_closed(name: str, values: Array, path: str | Path) -> None:
     if abs(values[-1] - values[0]) > WEAR_PROFILE.closure_tolerance * np.ptp(values):
         what = f"does not close: '{name}' is {values[0]:g} at 0 % and {values[-1]:g} at 100 %"
-        raise InputError(what, path, "the last row repeats the first")
+        raise InputError(what, path, "let the last row repeat the first")

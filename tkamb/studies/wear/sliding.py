@@ -1,4 +1,4 @@
-"""Sliding of the femoral component over points of the insert, from the poses of a motion."""
+"""Sliding of the femoral component over points of the insert, from femoral poses."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,32 +10,31 @@ from tkamb.geometry.frames import Array, inverse
 
 
 def step_twists(poses: Array) -> Array:
-    """Return the spatial twist (f - 1, 6) of the screw that leads from each pose to the next.
-
-    Linear part (m, velocity of the femoral material at the insert's origin times the step's
-    duration), then angular part (rad), both in the insert frame:
+    """Return the spatial twist of the screw motion from each pose to the next, shape (f - 1, 6).
 
         exp(twist) = pose_{k+1} pose_k^-1
 
+    The linear part, m, comes first. It is the velocity of the femoral material at the origin of the
+    insert frame times the duration of the step. The angular part, rad, follows.
+
     Args:
-        poses: (f, 4, 4) pose_femoral_in_insert.
+        poses: pose_femoral_in_insert, shape (f, 4, 4).
     """
     moves = poses[1:] @ inverse(poses[:-1])
     return np.array([pinocchio.log6(pinocchio.SE3(move)).vector for move in moves]).reshape(-1, 6)
 
 
 def step_sliding(poses: Array, points: Array, normals: Array) -> Array:
-    """Return how far the femoral surface slides over each point in each step, (f - 1, n, 3) m.
+    """Return the sliding path of the femoral surface over each point, m, shape (f - 1, n, 3).
 
-    Under a screw motion the material that passes through a fixed point x has the constant
-    velocity v + omega × x, so that the step's path is exact for a translation and for a
-    rotation of any size: an arc r·phi, no chord. What is along the insert's normal is no
-    sliding and is taken off. Where the femur rolls, v + omega × x is zero.
+    In a screw motion the femoral material at a fixed point x has the constant velocity
+    v + omega × x, which is zero for pure rolling. The path of a step is therefore exact for
+    rotations of any size. The component along the insert's normal is removed.
 
     Args:
-        poses: (f, 4, 4) pose_femoral_in_insert.
-        points: (n, 3) m on the insert.
-        normals: (n, 3) unit outward normals of the insert there.
+        poses: pose_femoral_in_insert, shape (f, 4, 4).
+        points: points on the insert, m, shape (n, 3).
+        normals: unit outward normals of the insert at the points, shape (n, 3).
     """
     twists = step_twists(poses)
     path = twists[:, None, :3] + np.cross(twists[:, None, 3:], points[None])
@@ -45,15 +44,14 @@ def step_sliding(poses: Array, points: Array, normals: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SlidingHistory:
-    """Pressure and sliding at the points of the insert in one cycle, step by step.
+    """Pressure and sliding at points of the insert in each step of a cycle.
 
     Args:
-        pressure: (s, n) Pa, mean of both ends of each step; zero: no contact.
-        sliding: (s, n, 3) m, of the femoral surface over the point, in the tangent plane.
-        normals: (n, 3) unit outward normals of the insert.
-        passes: how often the steps are gone through in a cycle; 2 where the way back is the
-            way out.
-        seconds: (s,) duration of each step; None: all are equally long.
+        pressure: mean pressure of each step, Pa, shape (s, n); zero without contact.
+        sliding: sliding path of the femoral surface in the tangent plane, m, shape (s, n, 3).
+        normals: unit outward normals of the insert, shape (n, 3).
+        passes: passes through the steps per cycle: 2 for a motion there and back.
+        seconds: duration of each step, s, shape (s,); None: equal steps.
     """
 
     pressure: Array
@@ -72,69 +70,69 @@ class SlidingHistory:
         passes: int = 1,
         seconds: Array | None = None,
     ) -> "SlidingHistory":
-        """Return the history of frames (f,) whose maps (f, n) hold at poses (f, 4, 4).
+        """Return the history of frames with poses (f, 4, 4) and pressure maps (f, n).
 
-        The pressure of a step is the mean of its two frames: sums over the cycle are the
-        trapezoidal rule, of second order in the step.
+        The pressure of a step is the mean of its two frames. Sums over the cycle are therefore
+        trapezoidal rules, of second order in the step.
         """
         between = 0.5 * (pressure[:-1] + pressure[1:])
         return cls(between, step_sliding(poses, points, normals), normals, passes, seconds)
 
     @cached_property
     def length(self) -> Array:
-        """Path of each step, (s, n) m."""
+        """Path length of each step, m, shape (s, n)."""
         return np.linalg.norm(self.sliding, axis=2)
 
     @cached_property
     def work(self) -> Array:
-        """Pressure times path, (s, n) N/m: frictional work per area at a friction of one."""
+        """Pressure times path, N/m, shape (s, n): work of friction per area for coefficient 1."""
         return self.pressure * self.length
 
     @cached_property
     def total_work(self) -> Array:
-        """The same summed over the cycle, (n,) N/m."""
+        """Sum of `work` over the cycle, N/m, shape (n,)."""
         return self.passes * self.work.sum(axis=0)
 
     @cached_property
     def distance(self) -> Array:
-        """Path over each point while it is in contact, (n,) m a cycle."""
+        """Path over each point in contact per cycle, m, shape (n,)."""
         return self.passes * np.where(self.pressure > 0, self.length, 0.0).sum(axis=0)
 
     @cached_property
     def mean_pressure(self) -> Array:
-        """Time-mean pressure over the whole cycle, (n,) Pa."""
+        """Time-mean pressure of the whole cycle, Pa, shape (n,)."""
         return np.average(self.pressure, axis=0, weights=self.seconds)
 
     @cached_property
     def cross_shear(self) -> Array:
-        """Cross-shear ratio (n,), see `cross_shear_ratio`; zero where nothing slides."""
+        """Cross-shear ratio, shape (n,), see `cross_shear_ratio`; zero without sliding."""
         return cross_shear_ratio(self.work, self.sliding, self.normals)
 
 
 def cross_shear_ratio(work: Array, sliding: Array, normals: Array) -> Array:
-    """Return the share of frictional work done across the principal direction, (n,), 0 to 0.5.
+    """Return the share of the work of friction across the principal direction, shape (n,).
 
-    A step's work w in the direction (cos t, sin t) of the tangent plane does w cos²(t - a) along
-    and w sin²(t - a) across a direction a. Sums over the cycle are the quadratic forms of
+    The work w of a step in the direction t of the tangent plane has the parts w cos²(t - a) along
+    and w sin²(t - a) across a direction a. Their sums over the cycle are the quadratic forms of
 
         M = sum over steps of w d dᵀ,      d the unit direction of sliding
 
-    so that the principal direction, which has the greatest work along it, is the eigenvector of
-    the larger eigenvalue, and
+    The principal direction has the largest work along it. It is the eigenvector of the larger
+    eigenvalue of M, and the cross-shear ratio is
 
         CS = lambda_min / (lambda_min + lambda_max)
 
-    On a rectangular path of sides A <= B under constant pressure CS = A/(A + B), on a circle
-    1/2, on a line 0.
+    Under constant pressure CS is A/(A + B) for a rectangular path with sides A <= B, 1/2 for a
+    circle and 0 for a line.
 
     Args:
-        work: (s, n) pressure times path.
-        sliding: (s, n, 3) m in the tangent plane.
-        normals: (n, 3) unit normals.
+        work: pressure times path, N/m, shape (s, n).
+        sliding: sliding path in the tangent plane, m, shape (s, n, 3).
+        normals: unit normals, shape (n, 3).
 
     References:
-        Wang, Wear 248:38 (2001): molecules align with the principal direction of sliding, work
-        across it tears them; Turell et al., Wear 259:984 (2005): rectangular paths, A/(A + B).
+        Wang, Wear 248:38 (2001): molecules align with the principal direction of sliding and are
+        torn by work across it; Turell et al., Wear 259:984 (2005): rectangular paths, A/(A + B).
     """
     first, second = _tangents(normals)
     u = np.einsum("snj,nj->sn", sliding, first)
@@ -143,13 +141,13 @@ def cross_shear_ratio(work: Array, sliding: Array, normals: Array) -> Array:
     share = np.divide(work, square, out=np.zeros_like(work), where=square > 0)
     uu, vv, uv = ((share * a).sum(axis=0) for a in (u * u, v * v, u * v))
     total = uu + vv
-    apart = np.hypot(uu - vv, 2.0 * uv)
-    ratio = np.divide(total - apart, 2.0 * total, out=np.zeros_like(total), where=total > 0)
+    difference = np.hypot(uu - vv, 2.0 * uv)  # of the eigenvalues
+    ratio = np.divide(total - difference, 2.0 * total, out=np.zeros_like(total), where=total > 0)
     return np.clip(ratio, 0.0, 0.5)
 
 
 def _tangents(normals: Array) -> tuple[Array, Array]:
-    """Return two unit vectors (n, 3) that span the plane across each normal."""
+    """Return two perpendicular unit vectors (n, 3) in the tangent plane of each normal."""
     axis = np.eye(3)[np.abs(normals).argmin(axis=1)]  # the axis farthest from the normal
     first = np.cross(normals, axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

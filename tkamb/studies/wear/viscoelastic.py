@@ -1,18 +1,17 @@
-"""Linear viscoelastic polyethylene: a Prony series, alone and on the lattice.
+"""Linear viscoelastic polyethylene: a Prony series, for one point and for the lattice.
 
-On the lattice all springs relax by the same series M(t)/M_0, so Poisson's ratio is constant in
-time. The surface displacement u and the nodal forces f then obey, with the elastic compliance C_0,
+On the lattice all springs relax with the same series M(t)/M_0, so Poisson's ratio is constant in
+time. With the elastic compliance C_0, the surface displacement u and the nodal forces f satisfy
 
     C_0 f(t) = integral of M(t - s)/M_0 du(s)
 
-at every node. Nodes that the femoral component has left carry no force and recover by the same
-equation. Over a step in which u is linear in time it reads
+at every node. Nodes outside the contact have no force and recover by the same equation. For a step
+in which u is linear in time the equation at the end of the step is
 
     C_0 f' = slope u' + memory
 
-where `PronySeries.response` gives the slope and how the memory evolves. A step is therefore an
-elastic contact with the compliance C_0/slope, on a surface that is already displaced by
--memory/slope. The solver of `lattice-linear` solves it.
+`PronySeries.response` gives slope and memory. A step is therefore an elastic contact with the
+compliance C_0/slope and the initial displacement -memory/slope, which `lattice-linear` solves.
 
 Reference: Lee & Radok, J Appl Mech 27:438 (1960), doi:10.1115/1.3644020.
 """
@@ -39,43 +38,44 @@ class PronySeries:
         M(t)/M_0 = 1 - sum g_i + sum g_i exp(-t/tau_i)
 
     Args:
-        fractions: g_i, positive, below 1 together.
-        times: tau_i, s.
+        fractions: positive fractions g_i with a sum below 1.
+        times: relaxation times tau_i, s.
     """
 
     fractions: tuple[float, ...]
     times: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        shares = all(math.isfinite(g) and g > 0 for g in self.fractions)
-        if not shares or sum(self.fractions) >= 1 or len(self.fractions) != len(self.times):
+        positive = all(math.isfinite(g) and g > 0 for g in self.fractions)
+        if not positive or sum(self.fractions) >= 1 or len(self.fractions) != len(self.times):
             raise InputError(
-                f"fractions {self.fractions} and times {self.times} are no Prony series",
+                f"fractions {self.fractions} and times {self.times} are not a Prony series",
                 "viscoelastic",
-                "as many positive fractions, below 1 together, as times",
+                "give one positive fraction for each time, with a sum below 1",
             )
         if not all(math.isfinite(tau) and tau > 0 for tau in self.times):
             raise InputError(f"times {self.times}", "viscoelastic", "give seconds above 0")
 
     @property
     def equilibrium(self) -> float:
-        """M(infinity)/M_0."""
+        """Relaxed modulus over the instantaneous one, M(infinity)/M_0."""
         return 1.0 - sum(self.fractions)
 
     def relaxation(self, time: float) -> float:
-        """Return M(t)/M_0 at a time (s)."""
+        """Return M(t)/M_0 at a time, s."""
         pairs = zip(self.fractions, self.times, strict=True)
         return self.equilibrium + sum(g * math.exp(-time / tau) for g, tau in pairs)
 
     def response(self, step: float) -> tuple[float, Array, Array]:
-        """Return how the stress follows from the strain over a step of `step` s.
+        """Return the coefficients of the stress after a step of `step` s.
 
-        With the strain linear in time over the step the hereditary integral is exact:
+        Primes denote the end of the step. For a strain that is linear in time over the step the
+        hereditary integral is exactly
 
             q_i' = a_i q_i + b_i (eps' - eps),    sigma'/M_0 = equilibrium eps' + sum q_i'
 
         Returns:
-            Slope d sigma'/d eps' relative to M_0, factors a (i,) and b (i,).
+            Slope d sigma'/d eps' over M_0, and the factors a and b of the terms of the series.
         """
         ratio = step / np.array(self.times)
         decay = np.exp(-ratio)
@@ -83,13 +83,13 @@ class PronySeries:
         return self.equilibrium + float(weights.sum()), decay, weights
 
     def stress(self, time: Array, strain: Array) -> Array:
-        """Return the stress relative to M_0 (f, ...) of strains (f, ...), linear between times.
+        """Return the stress over M_0 for a strain that is linear between times, shape (f, ...).
 
-        The strain jumps from nothing to its first value at the first time.
+        At the first time the strain jumps from zero to its first value.
 
         Args:
-            time: (f,) s, rising.
-            strain: (f, ...).
+            time: increasing times, s, shape (f,).
+            strain: strain at these times, shape (f, ...).
         """
         strain = np.asarray(strain, float)
         memory = np.multiply.outer(np.array(self.fractions), strain[0])
@@ -103,13 +103,13 @@ class PronySeries:
 
 @dataclass(frozen=True, eq=False)
 class ViscoelasticContact:
-    """The contact after a step. Arrays are per contact node, insert frame.
+    """Contact after a step. Arrays have one entry per contact node, in the insert frame.
 
     Args:
-        pose: (4, 4) pose_femoral_in_insert, y as found.
-        pressure: (c,) Pa, force over the node's own area.
-        force: (c, 3) N on the insert.
-        displacement: (c, 3) m, of the contact nodes, in contact or not.
+        pose: pose_femoral_in_insert, shape (4, 4), with the y of the deformed contact.
+        pressure: force over tributary area, Pa, shape (c,).
+        force: force on the insert, N, shape (c, 3).
+        displacement: displacement of the contact nodes, also outside the contact, m, shape (c, 3).
     """
 
     pose: Array
@@ -119,68 +119,67 @@ class ViscoelasticContact:
 
 
 class ViscoelasticLattice:
-    """An insert of springs and dampers under a rigid femoral component, step by step.
+    """A viscoelastic insert under a rigid femoral component, computed in time steps.
 
-    Limits: linear (small strain, no yield), frictionless, Poisson's ratio constant: modulus and
-    compressibility relax alike.
+    Limits: small strain, no yield, no friction, and constant Poisson's ratio.
 
     Args:
-        model: the linear lattice, with its resolution.
-        pair: both bodies; the material's modulus is the instantaneous one, M_0.
-        series: how every spring relaxes.
+        model: linear lattice, with its resolution.
+        pair: both bodies. Young's modulus of the material is the instantaneous one.
+        series: relaxation of all springs.
 
     Attributes:
-        points: (c, 3) m, contact nodes, undeformed.
+        points: undeformed contact nodes, m, shape (c, 3).
     """
 
     def __init__(self, model: LinearLattice, pair: ContactPair, series: PronySeries) -> None:
         self._series, self._settings = series, model.settings
         self._state = model.prepare(pair)
         self.points = self._state.problem.surface_points
-        self._moved = np.zeros_like(self.points)
+        self._displacement = np.zeros_like(self.points)
         self._memory = np.zeros((len(series.times), *self.points.shape))
 
     def press(self, load: float, pose: Array, step: float) -> ViscoelasticContact:
-        """Go on by `step` s to a load (N along -y) at a pose whose y is free.
+        """Advance by `step` s to a load along -y, N, at a pose (4, 4); its y follows from the load.
 
         Raises:
-            InputError: a load that cannot be, or the femoral component is not over the insert.
+            InputError: the load is invalid, or the femoral component is not above the insert.
             ComputationError: the contact does not converge.
         """
         check_load(load)
         return self._step(load, pose, step)
 
     def hold(self, pose: Array, step: float) -> ViscoelasticContact:
-        """Go on by `step` s to a pose (4, 4); see `press`."""
+        """Advance by `step` s to a prescribed pose (4, 4); see `press`."""
         return self._step(None, pose, step)
 
     def _step(self, load: float | None, pose: Array, step: float) -> ViscoelasticContact:
         if not step > 0:
             raise InputError(f"a step of {step:g} s", "viscoelastic", "give seconds above 0")
         slope, decay, weights = self._series.response(step)
-        relaxed = np.tensordot(decay, self._memory, 1) - weights.sum() * self._moved
-        pose, force = self._contact(load, np.array(pose, float), slope, -relaxed / slope)
+        memory = np.tensordot(decay, self._memory, 1) - weights.sum() * self._displacement
+        pose, force = self._contact(load, np.array(pose, float), slope, -memory / slope)
         problem = self._state.problem
         applied = np.zeros_like(problem.solid.nodes)
         applied[problem.contact_nodes] = force
         elastic = problem.operator.solve(applied)[problem.contact_nodes]
-        displacement = (elastic - relaxed) / slope
-        change = np.multiply.outer(weights, displacement - self._moved)
+        displacement = (elastic - memory) / slope
+        change = np.multiply.outer(weights, displacement - self._displacement)
         self._memory = (self._memory.T * decay).T + change
-        self._moved = displacement
+        self._displacement = displacement
         pressure = np.linalg.norm(force, axis=1) / self._state.surface.area
         return ViscoelasticContact(pose, pressure, force, displacement)
 
     def _contact(
         self, load: float | None, pose: Array, slope: float, offset: Array
     ) -> tuple[Array, Array]:
-        """Return the pose and the forces (c, 3) N of a step.
+        """Return the pose and the nodal forces of a step, N, shape (c, 3).
 
         Args:
-            load: N; None: the pose is given.
-            pose: (4, 4).
-            slope: stiffness of the springs over a step, relative to the instantaneous one.
-            offset: (c, 3) m, displacement of the nodes without contact forces.
+            load: load along -y, N; None: the pose is prescribed.
+            pose: pose_femoral_in_insert, shape (4, 4).
+            slope: stiffness of the springs in the step over the instantaneous stiffness.
+            offset: displacement of the nodes without contact forces, m, shape (c, 3).
         """
         gaps, planes = undeformed(self._state.problem, pose)
         lowest, force = float(gaps.min()), np.zeros_like(offset)
@@ -200,16 +199,17 @@ class ViscoelasticLattice:
         self,
         load: float | None,
         pose: Array,
-        rest: tuple[Array, TangentPlanes],
+        undeformed_gaps: tuple[Array, TangentPlanes],
         slope: float,
         offset: Array,
     ) -> Solution:
         """Solve with growing sets of candidates until they cover the approach."""
-        (gaps, planes), state = rest, self._state
-        sunk = -float(offset[:, 1].min())  # crept nodes lie deeper than their gaps
+        (gaps, planes), state = undeformed_gaps, self._state
+        creep_depth = -float(offset[:, 1].min())  # the undeformed gaps do not include creep
         depth = -float(gaps.min())
         if load is not None:
-            depth = guessed_depth(state.problem, gaps, state.surface.area, load / slope) + sunk
+            guess_depth = guessed_depth(state.problem, gaps, state.surface.area, load / slope)
+            depth = guess_depth + creep_depth
         for _ in range(self._settings.max_expansions):
             guess = initial_guess(state.compliance, gaps, planes, depth, load is None)
             result = solve(state.problem, pose, load, _softer(guess, slope, offset), self._settings)
@@ -223,6 +223,5 @@ class ViscoelasticLattice:
 
 
 def _softer(guess: InitialGuess, slope: float, offset: Array) -> InitialGuess:
-    """Return the initial guess of the solver on softer, already displaced springs."""
     response = replace(guess.response, compliance=guess.response.compliance / np.float32(slope))
     return replace(guess, response=response, offset=offset[guess.candidates])

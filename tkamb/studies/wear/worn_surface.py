@@ -1,4 +1,4 @@
-"""The insert's articular surface, finely enough divided, as wear and creep change it."""
+"""Articular surface of the insert: refinement, tributary areas, and change by wear and creep."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,16 +19,17 @@ DOWN = np.array([0.0, -1.0, 0.0])
 
 @dataclass(frozen=True)
 class WornSurfaceSettings:
-    """The surface from which wear is removed."""
+    """Surface from which wear is removed."""
 
     min_normal_y: float = 0.1
-    """1: smallest y component of the normal of a face that can be worn from above. Chosen: 84 deg
-    from the horizontal."""
+    """Smallest y component of the unit normal of a face that can wear. Chosen because such a face
+    is inclined by 84 deg."""
     ray_offset: float = 1e-6
-    """m; rays through the insert start so far below its surface. Chosen: above the rounding of a
-    mesh."""
+    """m: depth below the surface at which rays through the insert begin. Chosen above the round-off
+    of a mesh."""
     max_halvings: int = 12
-    """Halvings of an edge. Chosen: one of a metre ends at a quarter of a millimetre."""
+    """Largest number of halvings of an edge. Chosen because they reduce one metre to a quarter of a
+    millimetre."""
 
 
 WORN_SURFACE = WornSurfaceSettings()
@@ -36,22 +37,21 @@ WORN_SURFACE = WornSurfaceSettings()
 
 @dataclass(frozen=True, eq=False)
 class ArticularSurface:
-    """The vertices of the insert that face upwards, with their tributary areas.
+    """The upward-facing vertices of the insert, with their tributary areas.
 
-    A vertex owns a third of each of its triangles. Its normal n is the direction of the summed
-    area vectors of those that face upwards. Its area is the sum of the y components of all, over
-    n_y: a rim has the normal of the surface, not of the wall. A depth h along the normal is
-    removed by moving the vertex down by h/n_y. x and z do not change, and the volume of a closed
-    surface is then linear in y, so that
+    A vertex has a third of the area vector of each of its triangles. Its normal n is the direction
+    of the sum over its upward-facing triangles, so at the rim the wall has no effect. Its area is
+    the y component of the sum over all its triangles, over n_y.
+
+    A worn depth h along the normal moves the vertex down by h/n_y. The volume of a closed surface
+    is linear in y, so for any depth exactly
 
         volume removed = sum over vertices of h times area
 
-    exactly, however far it is worn.
-
     Args:
-        surface: the insert, refined where it can be worn, insert frame.
-        vertices: (n,) numbers of the vertices that can be worn.
-        thickness: (n,) m of the unworn insert below each, along y.
+        surface: insert in the insert frame, refined where it can wear.
+        vertices: numbers of the n vertices that can wear, shape (n,).
+        thickness: thickness of the unworn insert below each vertex along y, m, shape (n,).
     """
 
     surface: Surface
@@ -60,10 +60,10 @@ class ArticularSurface:
 
     @classmethod
     def of_insert(cls, insert: Surface, spacing: float) -> "ArticularSurface":
-        """Return the articular surface of an insert with no edge longer than `spacing` (m).
+        """Return the articular surface of an insert, with edges of at most `spacing`, m.
 
         Raises:
-            InputError: nothing of the insert faces upwards.
+            InputError: no face of the insert faces upwards.
         """
         merged = insert.mesh.copy()
         merged.merge_vertices()
@@ -72,41 +72,42 @@ class ArticularSurface:
             spacing,
             lambda s: s.face_normals[:, 1] > WORN_SURFACE.min_normal_y,
         )
-        upward, whole = area_vectors(surface)
+        upward, total = area_vectors(surface)
         length = np.linalg.norm(upward, axis=1)
-        up = np.flatnonzero((upward[:, 1] > WORN_SURFACE.min_normal_y * length) & (whole[:, 1] > 0))
+        up = np.flatnonzero((upward[:, 1] > WORN_SURFACE.min_normal_y * length) & (total[:, 1] > 0))
         points = surface.vertices[up]
         caster = RayCaster(surface)
         above = points.copy()
         above[:, 1] = surface.bounds[1, 1] + 1e-3
         first = caster.first(above, DOWN)[0]
+        # a vertex below another part of the insert cannot wear
         top = np.abs(above[:, 1] - first - points[:, 1]) < 10 * WORN_SURFACE.ray_offset
         thickness = (
             WORN_SURFACE.ray_offset + caster.first(points + WORN_SURFACE.ray_offset * DOWN, DOWN)[0]
         )
-        sampled = top & np.isfinite(thickness)
-        if not sampled.any():
+        can_wear = top & np.isfinite(thickness)
+        if not can_wear.any():
             raise InputError("no part of it faces upwards", insert.name, "check the mesh's axes")
-        return cls(surface, up[sampled], thickness[sampled])
+        return cls(surface, up[can_wear], thickness[can_wear])
 
     def lowered(self, fall: Array) -> Surface:
-        """Return the insert with its articular vertices moved down by `fall` (n,) m."""
+        """Return the insert with its articular vertices moved down by `fall`, m, shape (n,)."""
         vertices = self.surface.vertices.copy()
         vertices[self.vertices, 1] -= fall
         return Surface(vertices, self.surface.faces, self.surface.name)
 
     def normals_and_areas(self, lowered: Surface) -> tuple[Array, Array]:
-        """Return unit normals (n, 3) and areas (n,) m² of the vertices of a lowered surface."""
-        upward, whole = (vectors[self.vertices] for vectors in area_vectors(lowered))
+        """Return unit normals (n, 3) and areas, m², (n,) of the vertices of a lowered surface."""
+        upward, total = (vectors[self.vertices] for vectors in area_vectors(lowered))
         normals = upward / np.linalg.norm(upward, axis=1)[:, None]
-        return normals, whole[:, 1] / normals[:, 1]
+        return normals, total[:, 1] / normals[:, 1]
 
 
 def area_vectors(surface: Surface) -> tuple[Array, Array]:
-    """Return a third of the area vectors of each vertex's triangles, summed, (n, 3) m².
+    """Return a third of the summed area vectors of the triangles at each vertex, m², shape (n, 3).
 
     Returns:
-        The sums over those that face upwards, and over all.
+        Sums over the upward-facing triangles, and over all triangles.
     """
     a, b, c = np.moveaxis(surface.triangles, 1, 0)
     vector = np.cross(b - a, c - a) / 6.0
@@ -126,15 +127,15 @@ def volume(surface: Surface) -> float:
 
 
 def refined(surface: Surface, longest: float, chosen: Chosen) -> Surface:
-    """Return the surface with the edges of chosen faces halved until none exceeds `longest` (m).
+    """Return the surface with the edges of chosen faces halved until none exceeds `longest`.
 
-    Both faces of an edge see the same new vertex, so that a closed surface stays closed; points
-    of the surface stay where they are. First vertices are those of the surface.
+    Both faces of an edge get the same new vertex, so a closed surface stays closed. The shape does
+    not change, and the original vertices come first.
 
     Args:
-        surface: mesh whose faces share their vertices.
-        longest: m.
-        chosen: says of a surface's faces (k,) which are to be refined.
+        surface: mesh with shared vertices.
+        longest: largest length of an edge, m.
+        chosen: function of a surface that returns whether to refine each face, shape (k,).
     """
     for _ in range(WORN_SURFACE.max_halvings):
         halved = _halved(surface, longest, chosen(surface))
@@ -145,7 +146,6 @@ def refined(surface: Surface, longest: float, chosen: Chosen) -> Surface:
 
 
 def _halved(surface: Surface, longest: float, chosen: NDArray[np.bool_]) -> Surface | None:
-    """Return the surface with every long edge of chosen faces halved; None: there is none."""
     faces, vertices = surface.faces, surface.vertices
     edge, count = edge_use(faces)
     edge = edge.reshape(-1, 3)  # edges 01, 12, 20 of each face
@@ -166,29 +166,33 @@ def _halved(surface: Surface, longest: float, chosen: NDArray[np.bool_]) -> Surf
 
 
 def _split(faces: NDArray[np.int64], middle: NDArray[np.int64], points: Array) -> NDArray[np.int64]:
-    """Return the faces cut at the middles (k, 3) of their edges; -1: not halved."""
+    """Return the faces after a division of their edges.
+
+    `middle` has the number of the vertex in the middle of each edge, shape (k, 3); -1: not divided.
+    """
     cut = middle >= 0
-    many = cut.sum(axis=1)
-    parts = [faces[many == 0]]
-    for count, first in ((1, cut), (2, ~cut)):  # turn each face so that its odd edge comes first
-        rows = np.flatnonzero(many == count)
-        turn = (first[rows].argmax(axis=1)[:, None] + np.arange(3)) % 3
-        a, b, c = np.take_along_axis(faces[rows], turn, axis=1).T
-        ab, bc, ca = np.take_along_axis(middle[rows], turn, axis=1).T
+    cuts = cut.sum(axis=1)
+    parts = [faces[cuts == 0]]
+    # the first edge of a rotated face is its only divided or its only undivided edge
+    for count, first in ((1, cut), (2, ~cut)):
+        rows = np.flatnonzero(cuts == count)
+        order = (first[rows].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(faces[rows], order, axis=1).T
+        ab, bc, ca = np.take_along_axis(middle[rows], order, axis=1).T
         if count == 1:
             parts += [np.stack([a, ab, c], 1), np.stack([ab, b, c], 1)]
             continue
-        # a-b is whole: the tip c comes off, the rest is cut along its shorter diagonal
+        # a-b is undivided: cut off the corner c, then divide the rest along its shorter diagonal
         parts.append(np.stack([ca, bc, c], 1))
         shorter = np.linalg.norm(points[a] - points[bc], axis=1) <= np.linalg.norm(
             points[b] - points[ca], axis=1
         )
-        one = np.stack(
+        first_half = np.stack(
             [np.where(shorter, a, b), np.where(shorter, b, bc), np.where(shorter, bc, ca)]
         )
-        two = np.stack([a, np.where(shorter, bc, b), ca])
-        parts += [one.T, two.T]
-    rows = np.flatnonzero(many == 3)
+        second_half = np.stack([a, np.where(shorter, bc, b), ca])
+        parts += [first_half.T, second_half.T]
+    rows = np.flatnonzero(cuts == 3)
     (a, b, c), (ab, bc, ca) = faces[rows].T, middle[rows].T
     parts += [np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
     return np.concatenate(parts)
