@@ -87,7 +87,7 @@ def check_made_again_with_one_notice(folder, caplog, words=""):
     caplog.clear()
     assert cached()[1]
     assert len(caplog.records) == 1, caplog.text
-    assert "the operator is made again" in caplog.text and words in caplog.text
+    assert "the operator is computed again" in caplog.text and words in caplog.text
     assert not cached()[1]
     assert only_file(folder).is_file() and not only_file(folder).is_symlink()
 
@@ -127,7 +127,7 @@ def test_words_that_changed_places_are_noticed(folder, caplog):
     assert words[first] != words[second]
     words[[first, second]] = words[[second, first]]
     path.write_bytes(words.tobytes())
-    check_made_again_with_one_notice(folder, caplog, "other sums")
+    check_made_again_with_one_notice(folder, caplog, "its sums differ")
 
 
 def test_an_operator_under_another_name_is_noticed(folder, caplog):
@@ -160,7 +160,7 @@ def test_sizes_are_checked_before_anything_is_read(folder, caplog):
     whole = bytearray(path.read_bytes())
     whole[32:40] = (800_000_000_000).to_bytes(8, "little")
     path.write_bytes(whole)
-    check_made_again_with_one_notice(folder, caplog, "no such header")
+    check_made_again_with_one_notice(folder, caplog, "no valid header")
     os.truncate(path, 800_000_000_000)
     check_made_again_with_one_notice(folder, caplog, "MB large")
 
@@ -273,4 +273,4 @@ def test_a_folder_that_cannot_be_written_is_said(folder, caplog):
     folder.parent.mkdir(exist_ok=True)
     folder.write_text("a file")
     assert cached()[1]
-    assert "not kept" in caplog.text
+    assert "not stored" in caplog.text

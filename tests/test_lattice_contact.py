@@ -137,7 +137,7 @@ def test_a_contact_that_outgrows_its_candidates_is_solved_again(name, monkeypatc
         assert (solved > 1) is (load == 4000.0)
         assert after.approach == pytest.approx(alone.approach, rel=1e-3)
         assert after.pressure == pytest.approx(alone.pressure, abs=2e-3 * alone.pressure.max())
-    monkeypatch.setattr(lattice_model, "REACH", 1e-9)
+    monkeypatch.setattr(lattice_model, "COVERED_APPROACH", 1e-9)
     wrong, _ = pressed(4000.0, light)
     assert wrong.approach > 1.02 * alone.approach
 
@@ -180,7 +180,7 @@ def test_active_nodes_end_on_the_femoral_surface():
     found, start = model.press_from(state, 15e3, rough.pose)
     assert found.status is ContactStatus.OK
     touching = found.pressure > 0
-    moved = start.moved[touching]
+    moved = start.displacement[touching]
     there = state.problem.surface_points[touching] + moved
     gap = tangent_planes(state.problem, there, found.pose, None).gap(there)
     assert np.abs(gap).max() / np.abs(moved).max() <= 4 * model.settings.gap_tolerance

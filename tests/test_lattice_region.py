@@ -9,7 +9,7 @@ from lattice_bodies import condyles, dished_insert, pair
 from tkamb.contact.lattice.initial_guess import LatticeStart, initial_guess, lattice_start
 from tkamb.contact.lattice.linear import compliance
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component, unknowns_of
-from tkamb.contact.lattice.nonlinear_balance import elements_that_count
+from tkamb.contact.lattice.nonlinear_balance import largest_shares
 from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.contact.lattice.solver import solve
@@ -58,7 +58,7 @@ def solved(state, x, tolerance, before=None):
         start = replace(
             start,
             loads=before.loads,
-            moved=own,
+            displacement=own,
             region=before.region,
         )
     return solve(state.problem, pose, LOAD, start, settings(tolerance))
@@ -110,10 +110,10 @@ def test_few_elements_count_and_the_loads_of_the_others_are_left_out(state):
 
 def test_elements_are_left_out_up_to_the_bound():
     size = np.array([3.0, 0.1, 5.0, 0.2, 0.0])
-    assert np.flatnonzero(elements_that_count(size, 0.2)).tolist() == [0, 2, 3]
-    assert np.flatnonzero(elements_that_count(size, 0.23)).tolist() == [0, 2]
-    assert np.flatnonzero(elements_that_count(size, 0.0)).tolist() == [0, 1, 2, 3]
-    assert np.flatnonzero(elements_that_count(size, 10.0)).tolist() == []
+    assert np.flatnonzero(largest_shares(size, 0.2)).tolist() == [0, 2, 3]
+    assert np.flatnonzero(largest_shares(size, 0.23)).tolist() == [0, 2]
+    assert np.flatnonzero(largest_shares(size, 0.0)).tolist() == [0, 1, 2, 3]
+    assert np.flatnonzero(largest_shares(size, 10.0)).tolist() == []
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +184,7 @@ def test_the_compliance_grows_node_by_node(state, monkeypatch):
         found = cache.among(nodes).compliance
         assert found == pytest.approx(whole, rel=1e-5, abs=1e-6 * np.abs(whole).max())
         force = np.random.default_rng(1).normal(size=(2, 3))
-        moved = cache.moved(nodes[[1, 3, 6]], nodes[[2, 3]], force)
+        moved = cache.displacement(nodes[[1, 3, 6]], nodes[[2, 3]], force)
         mine = np.einsum("aibj,jb->ia", whole[:, [1, 3, 6]][..., [2, 3]], force)
         assert moved == pytest.approx(mine, rel=1e-4, abs=1e-6 * np.abs(mine).max())
 
