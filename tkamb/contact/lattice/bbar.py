@@ -30,8 +30,8 @@ _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
 class BbarHexahedra(Solid):
     """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
 
-    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e. The bulk is elastic.
-    `Solid` has the arguments.
+    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e. The bulk is elastic. See
+    `Solid` for the arguments and `ShearCurve` for q.
 
     Raises:
         InputError: the Jacobian is not positive at a Gauss point.
@@ -69,7 +69,7 @@ class BbarHexahedra(Solid):
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return the nodal forces of the stress 2 (mu - mu_s) dev eps, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
-        # The linear stiffness overestimates the deviatoric stress by this share.
+        # The linear stiffness overestimates the deviatoric stress by 2 (mu - mu_s) dev eps.
         lost_modulus = self.material.shear_modulus - self.curve.modulus(equivalent)
         strain *= (lost_modulus * elements_of(self.weights, chosen))[..., None]
         return self._per_cell_forces(strain, chosen)
@@ -103,5 +103,5 @@ class BbarHexahedra(Solid):
         return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
 
     def _per_cell_forces(self, stress: Array, chosen: Index | None) -> Array:
-        """Return nodal forces (k, 24) from stresses times weights (k, 8, 5), as R eps."""
+        """Return nodal forces (k, 24) from R eps times modulus and weight (k, 8, 5)."""
         return np.einsum("cgrj,cgr->cj", elements_of(self.shear, chosen), stress)

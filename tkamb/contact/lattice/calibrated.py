@@ -13,8 +13,9 @@ A uniform strain then stores the energy of an isotropic solid with lambda = mu
 
     K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P
 
-B̄ gives the strain of the cell's mean displacement gradient. P subtracts the linear field of
-this gradient from the displacement. So the patch test is exact for sheared cells too.
+B̄ gives the strain of the cell's mean displacement gradient, and I_dev its deviatoric part. P
+subtracts the linear field of this gradient from the displacement. K_spr is the matrix of the
+springs. So the patch test is exact for sheared cells too.
 """
 
 from collections.abc import Iterator
@@ -341,7 +342,7 @@ def box_corners(edges: Array) -> Array:
 
 
 def body_diagonal_stiffness(edges: Array) -> float:
-    """Return the k_b, m per unit shear modulus, with which the cell's softest mode is stiffest.
+    """Return the best stiffness k_b of the body diagonals, m per unit shear modulus.
 
     It maximises the smallest of the 18 eigenvalues that are not rigid motions, among all k_b
     without a negative spring (if there are any). At the upper bound V L²/(4 max pair product) a
@@ -369,7 +370,7 @@ def body_diagonal_stiffness(edges: Array) -> float:
 
 
 class CalibratedNetwork(Solid):
-    """Cells with the secant stiffness mu_s K_d + K V g gᵀ.
+    """Cells with the secant stiffness mu_s K_d + K V g gᵀ (g · u: mean dilatation).
 
     The cell's equivalent strain e² = uᵀ K_d u / (3 V) gives 3 mu_s = q(e)/e. The forces derive
     from an energy, so the tangent is symmetric. `Solid` has the arguments.

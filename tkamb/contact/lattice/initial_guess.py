@@ -18,7 +18,7 @@ class LatticeStart(WarmStart):
     Args:
         problem: the problem that was solved. Other problems ignore the warm start.
         loads: nonlinear loads h + r, N, shape (n, 3); None for a linear material.
-        displacement: displacement of the contact nodes, m, shape (c, 3); 0 unless candidates.
+        displacement: displacement of the contact nodes, m, shape (c, 3); 0 except at candidates.
         depth: distance of the femoral component below the lowest contact node, m.
         region: elements outside of which h is zero, or None.
         softening: s, see `Residual`.
@@ -126,7 +126,7 @@ def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: floa
     thickness = np.maximum(problem.surface_points[order, 1], 1e-3)
     height, k = gaps[order], problem.solid.material.young_modulus * areas[order] / thickness
     total, moment = np.cumsum(k), np.cumsum(k * height)
-    # The force of the springs in contact, when the next spring comes into contact, is searched.
+    # total * height - moment is the force of the foundation when each spring comes into contact.
     last = int(np.searchsorted(total * height - moment, load))
     last = max(min(last, len(order)) - 1, 0)
     return float((load + moment[last]) / total[last] - height[0])

@@ -50,7 +50,7 @@ from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
 LEAST_OVERLAP = 1e-13
-"""m: a smaller overlap of the bodies has no force. It would be 1e-6 N at 1e7 N/m."""
+"""m: smaller overlaps count as no contact. With 1e7 N/m their force is below 1e-6 N."""
 COARSE = 1e-3
 """1: from this `tolerance` on the factor is stored in 16-bit integers.
 `LatticeSolverSettings.force_tolerance` states their rounding residual."""

@@ -31,7 +31,7 @@ REGION_HOLDS_WITHIN = 0.1
 the region is evaluated, in half the time. The residual of the whole solid is then at most 1.2 times
 the tolerance (`tests/test_lattice_probe.py`)."""
 REGION_HOLDS_TO = 1.1
-"""1: largest ratio of the contact forces to those at that pose, for the same purpose."""
+"""1: largest ratio of the contact forces to those at that pose, with the region alone."""
 LEVER_ARM = 0.03
 """m: distance from the femoral axis to the contact. It converts a rotation to a distance."""
 

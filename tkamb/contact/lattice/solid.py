@@ -173,30 +173,18 @@ class Scatter:
         elements = elements_of(self.elements, chosen)
         return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
 
-    def sum(self, forces: Array, chosen: Index | None = None, which: Index | None = None) -> Array:
+    def sum(self, forces: Array, chosen: Index | None = None) -> Array:
         """Return the nodal sums (n, 3), N, of element forces.
 
         Args:
             forces: forces of the chosen elements, N, shape (k, 3p).
             chosen: numbers of these elements, shape (k,); by default all.
-            which: rows of `forces` that are added; by default all.
         """
         total = np.zeros((self.nodes, 3))
         elements = np.arange(len(self.elements)) if chosen is None else chosen
-        rows = np.arange(len(elements)) if which is None else which
         shape = len(elements), self.elements.shape[1], 3
-        _add_up(forces.reshape(shape), self.elements, elements, rows, total)
+        _add_up(forces.reshape(shape), self.elements, elements, total)
         return total
-
-    def mean(self, values: Array, forces: Array, chosen: Index) -> Array:
-        """Return the force-weighted mean (n,) of elements' values at nodes; 0 without elements.
-
-        Args:
-            values: values of the chosen elements, shape (k,).
-            forces: their forces, N, shape (k, 3p); the norms are the weights.
-            chosen: numbers of the elements, shape (k,).
-        """
-        return _mean_of(values, forces, self.elements, chosen, self.nodes)
 
 
 def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
@@ -205,32 +193,13 @@ def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
 
 
 @compiled
-def _add_up(parts: Array, elements: Index, chosen: Index, which: Index, total: Array) -> None:
-    """Add rows `which` of vectors (k, p, 3) of the chosen elements (k,) to nodal vectors (n, 3)."""
-    for k in which:
+def _add_up(parts: Array, elements: Index, chosen: Index, total: Array) -> None:
+    """Add vectors (k, p, 3) of the chosen elements (k,) to nodal vectors (n, 3)."""
+    for k in range(len(chosen)):
         element = chosen[k]
         for corner in range(parts.shape[1]):
             for axis in range(3):
                 total[elements[element, corner], axis] += parts[k, corner, axis]
-
-
-@compiled
-def _mean_of(values: Array, forces: Array, elements: Index, chosen: Index, nodes: int) -> Array:
-    """Return the nodes' weighted means (n,); see `Scatter.mean`."""
-    total, weight = np.zeros(nodes), np.zeros(nodes)
-    for k in range(len(chosen)):
-        size = 0.0
-        for i in range(forces.shape[1]):
-            size += forces[k, i] ** 2
-        size = np.sqrt(size)
-        for corner in range(elements.shape[1]):
-            node = elements[chosen[k], corner]
-            total[node] += size * values[k]
-            weight[node] += size
-    for node in range(nodes):
-        if weight[node] > 0.0:
-            total[node] /= weight[node]
-    return total
 
 
 @compiled

@@ -130,7 +130,7 @@ class SourceNetwork(Solid):
         return Tangent(self.material.tangent(strain) * self.factor, direction)
 
     def tangent_force(self, tangent: Tangent, displacement: Array) -> Array:
-        """Return the change of the nodal forces by a small displacement (n, 3), m, N, (n, 3)."""
+        """Return the change (n, 3), N, of nodal forces under a small displacement (n, 3), m."""
         total = np.zeros((len(self.nodes), 3))
         _add_tangent_forces(self.springs, tangent.direction, tangent.stiffness, displacement, total)
         return total

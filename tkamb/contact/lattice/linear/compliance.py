@@ -145,7 +145,7 @@ class HalfResponse:
 
     @cached_property
     def _edges(self) -> Index:
-        """Index in `places` at which each block begins, then their number, shape (b + 1,)."""
+        """Index in `places` at which each block begins, then the number of places (b + 1,)."""
         return np.cumsum(np.concatenate([[0], self.blocks[:, 3] - self.blocks[:, 2]]))
 
     @cached_property
@@ -193,10 +193,7 @@ def _add_products(
     begin: int,
     end: int,
 ) -> None:
-    """Add the products of columns [begin, end) with y to `products`.
-
-    They are computed in the precision of `values`.
-    """
+    """Add the products of columns [begin, end) with y to `products`, in the type of `values`."""
     for block in range(len(blocks)):
         first = blocks[block, 2]
         lower, upper = max(first, begin), min(blocks[block, 3], end)
@@ -276,7 +273,7 @@ class HalfSolves:
     compliances is 1e-6 of the largest.
 
     Args:
-        starts: first unknown of each front in elimination order, then their number, shape (f + 1,).
+        starts: first unknown of each front in elimination order, then the number of unknowns.
         parents: front above each front; -1 at a root.
         unknowns: positions in elimination order, shape (q,); -1 if held.
         precision: type of the numbers.
@@ -415,9 +412,7 @@ class ContactResponse:
 def displacement_under(vectors: Array, force: Array) -> Array:
     """Return the displacement (m, 3), m, under forces (m,), N, along normals.
 
-    Args:
-        vectors: displacement vectors of `ContactResponse.along`, m/N, shape (3, m, m).
-        force: N, shape (m,).
+    `vectors` (3, m, m), m/N, are the displacement vectors of `ContactResponse.along`.
     """
     return np.einsum("aij,j->ia", vectors, force.astype(vectors.dtype))
 

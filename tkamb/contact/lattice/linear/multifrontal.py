@@ -10,9 +10,8 @@ unknowns and passes the update of the other unknowns to its parent (Duff & Reid,
 forward or backward solve is one product per front. Forces on few nodes, and displacements of few
 nodes, need only their fronts and the fronts above.
 
-A solve reads every W once, without the zeros of L11⁻¹, and takes as long as this reading. A
-compiled loop over single rows reads at two thirds of the memory's speed. That is twice as fast as
-four rows at a time, and faster than `einsum` and BLAS.
+A solve takes as long as reading every W once, without the zeros of L11⁻¹. Compiled loops over
+single rows read at two thirds of the memory's speed, faster than `einsum` and BLAS.
 """
 
 from collections.abc import Iterator
@@ -308,7 +307,7 @@ def _forward(
 ) -> None:
     """Apply the fronts' steps of L⁻¹ x.
 
-    A step multiplies own unknowns by L11⁻¹ and subtracts L21 L11⁻¹ of them from those above.
+    A step subtracts L21 L11⁻¹ x₁ from the boundary, and replaces its own unknowns x₁ by L11⁻¹ x₁.
     """
     dtype = scale.dtype.type
     for front in fronts:
@@ -343,7 +342,7 @@ def _backward(
 ) -> None:
     """Apply the fronts' steps of L⁻ᵀ x, the last front first.
 
-    A step multiplies Wᵀ by the own unknowns and the negative unknowns of the boundary.
+    A step replaces its own unknowns x₁ by Wᵀ [x₁; -x₂], with the unknowns x₂ of the boundary.
     """
     dtype = scale.dtype.type
     for front in fronts[::-1]:
@@ -385,14 +384,9 @@ def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
 def _divided(fronts: Index, parents: Index, sizes: Index) -> Index:
     """Return the thread (k,) of each front: 0, 1, or 2 for the fronts above both.
 
-    In each trial the subtrees are dealt out, the largest first, to the thread with less work. Then
-    the largest subtree loses its top, which becomes a front above both. The fastest division is
-    returned.
-
-    Args:
-        fronts: numbers of the fronts, increasing, shape (k,).
-        parents: parent of every front; -1 at a root.
-        sizes: work of every front.
+    Each trial assigns the subtrees, the largest first, to the thread with less work. Then the
+    largest subtree loses its top, which becomes a front above both. The fastest division is
+    returned. `fronts` is increasing, `sizes` is the work of every front.
     """
     count = len(fronts)
     place = np.full(len(parents), -1)
@@ -468,14 +462,10 @@ def fronts_of(
 
 
 def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:
-    """Return the lower half of a symmetric matrix in elimination order, by columns.
+    """Return the lower half of a symmetric matrix (n, n) in elimination order, by columns.
 
-    The rows of a column are not sorted.
-
-    Args:
-        matrix: shape (n, n).
-        rank: place of each unknown, shape (n,); -1 if it is excluded.
-        count: number of unknowns that have a place.
+    The rows of a column are not sorted. `rank` is that of `fronts_of`, and `count` the number of
+    unknowns with a rank.
     """
     edges = np.zeros(count + 1, np.int64)
     _count_lower(matrix.indptr, matrix.indices, rank, edges)

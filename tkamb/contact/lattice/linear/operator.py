@@ -82,7 +82,7 @@ class TooLittleMemoryError(ComputationError):
         if least_size > MEMORY_NEED.largest_cell_size:
             return "free some memory"
         step = MEMORY_NEED.cell_size_step
-        # Rounded up, so that the proposed size fits. The 1e-9 keeps multiples of the step.
+        # Rounded up, so that the proposed size fits; with 1e-9, a multiple of the step stays.
         proposal = np.ceil(least_size / step * (1.0 - 1e-9)) * step
         return f"take {proposal / MILLIMETRE:g} mm or coarser"
 

@@ -1,7 +1,8 @@
 """The insert's nodes on every vertical grid line, by rules 7 to 9 of Sharma (2008).
 
-A line along y is inside the part over some intervals. The node nearest to an interval's end is
-moved onto the surface (half-cell rule). Intervals thinner than a cell follow rules 8 and 9.
+A line along y is inside the part (the insert) over some intervals. The node nearest to an
+interval's end is moved onto the surface (half-cell rule). Rules 8 and 9 are for intervals thinner
+than a cell.
 
 With level layers a dish would be a staircase. Wherever the number of cells in a column changes, a
 wedge under the surface would belong to no cell (3.4 to 4 % of the volume of real inserts at 1 mm).
@@ -10,9 +11,8 @@ column by column, as far as the edge ratio permits:
 
     y_j(x, z) = j H(x, z) / J          0 <= j <= J
 
-H is the height of the top where this is smooth. Under a post or an eminence H is continued
-smoothly. Above the reference layer (a post, an eminence) and below the bottom (a peg) the layers
-have the spacing of the grid.
+H is the height of the top where this is smooth, continued smoothly under a post or an eminence.
+Above the reference layer and below the bottom (a peg) the layers have the spacing of the grid.
 """
 
 from dataclasses import dataclass
@@ -116,7 +116,7 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
 def _smooth_part(height: Array, across: Array) -> Array:
     """Return the heights of the largest smooth patch of columns, and NaN elsewhere.
 
-    Neighbours in a patch are joined by slopes of at most `LAYER.max_slope`.
+    Slopes between neighbours of a patch are at most `LAYER.max_slope`.
     """
     number = np.arange(height.size).reshape(height.shape)
     links = []
@@ -216,9 +216,9 @@ class NodeField:
         upper_end: mask of the upper ends of intervals.
         top: mask of the upper ends of the highest intervals.
         interval: number of each node's interval; -1 if there is none.
-        mended: number of lines whose crossings were corrected from their neighbours.
-        closed_gaps: number of gaps that are narrower than a cell and were filled.
-        thin: number of intervals thinner than half a cell, which have one node.
+        mended: number of lines with crossings corrected from their neighbours.
+        closed_gaps: number of filled gaps, narrower than a cell.
+        thin: number of intervals thinner than half a cell, with one node.
     """
 
     lines: tuple[Array, Array]
@@ -284,8 +284,8 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
                           the next node outside is moved to the other end
 
     Args:
-        low: lower ends, shape (m,).
-        high: upper ends, shape (m,).
+        low: lower ends (m,).
+        high: upper ends (m,).
         count: number of nodes of a line.
     """
     first = np.floor(low + 0.5 + COLUMN.tie).astype(np.int64)
@@ -383,8 +383,8 @@ def refired_inwards(
 ) -> Array:
     """Return the heights (n,), m, of nodes that are moved onto walls.
 
-    Walls of a mesh are rough, so that a vertical ray on a wall may miss the part. Then the target
-    is moved inside by `wall_inset`, and the ray is repeated there.
+    Walls of a mesh are rough, so that a vertical ray on a wall may miss the part. The ray is then
+    repeated inside by `wall_inset`, and the target moved there.
 
     Args:
         field: all nodes of the grid.

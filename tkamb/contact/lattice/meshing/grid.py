@@ -89,8 +89,8 @@ class MissingPart:
 
     Args:
         volume: m³.
-        extents: extents along x, y and z, m, shape (3,).
-        centre: centre of its bounding box, m, shape (3,).
+        extents: extents along x, y and z, m.
+        centre: centre of its bounding box, m.
     """
 
     volume: float
@@ -107,13 +107,7 @@ class MissingPart:
 def missing_part(nodes: Array, cells: Index, spacing: Array, insert: Surface) -> MissingPart | None:
     """Return the largest connected part of the mesh outside of all cells; None if there is none.
 
-    The search uses a grid of points with half the spacing of the lattice.
-
-    Args:
-        nodes: m, shape (n, 3).
-        cells: nodes of the cells, shape (c, 8).
-        spacing: spacing of the lattice, m, shape (3,).
-        insert: closed mesh, insert frame.
+    The search uses a grid of points with half the lattice's `spacing` (3,), m.
     """
     step = spacing / 2.0
     lines = [
@@ -150,7 +144,7 @@ def solid_volume(insert: Surface, centres: Array) -> float:
 
     Args:
         insert: closed mesh.
-        centres: points inside the mesh, m, shape (c, 3), about one per cubic millimetre.
+        centres: points in all its bodies, m, shape (c, 3), a few per cubic millimetre.
     """
     if not (insert.winding.at(centres) > 1).any():
         return insert.volume
@@ -226,11 +220,11 @@ class Lattice:
         origin: position of the grid's node (0, 0, 0), m, shape (3,).
         cells: nodes of the cells in the order of VTK's hexahedron, shape (c, 8).
         contact_triangles: nodes of outward triangles over the contact nodes, shape (k, 3).
-        dropped_nodes: number of nodes in the part that belong to no cell and are omitted.
+        dropped_nodes: number of omitted nodes, which belong to no cell.
         dropped_cells: number of omitted cells (inverted, across a gap, or in a loose piece).
-        mended_rays: number of vertical lines whose crossings were corrected from their neighbours.
-        closed_gaps: number of gaps that are narrower than a cell and were filled.
-        thin_intervals: number of intervals thinner than half a cell, which have one node.
+        mended_rays: number of vertical lines with crossings corrected from their neighbours.
+        closed_gaps: number of filled gaps, narrower than a cell.
+        thin_intervals: number of intervals thinner than half a cell, with one node.
         size_notices: notices about the cells' size, in words.
     """
 

@@ -118,7 +118,7 @@ class LatticeQuality:
             percentile, largest.
         least_jacobian: least scaled Jacobian at a corner of a cell (1 for a box).
         notices: corrections and omissions, in words.
-        post: post, without a model of its contact with a cam; None if there is none.
+        post: the post (its contact with a cam is not modelled), or None.
     """
 
     nodes: int

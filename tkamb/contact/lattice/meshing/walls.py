@@ -25,8 +25,8 @@ class NotchSettings:
     """Nodes that are moved into notches of the surface."""
 
     corner_margin: float = 0.1
-    """1: last share of the way to the line between its neighbours that a node is not moved. Chosen
-    because on the line the cell's corner would be flat."""
+    """1: a node is moved towards the line between its neighbours, except for this share of the way.
+    Chosen because on the line the cell's corner would be flat."""
     corner_inset: float = 1e-3
     """1: distance of a node from its corner, relative to the distance of the node across the
     diagonal. Chosen because vertical rays then meet the part."""
@@ -44,12 +44,8 @@ NOTCH = NotchSettings()
 def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
     """Make the fourth node of a grid square a member, if the other three are members.
 
-    Steps of the outline in a layer come first, then steps between layers.
-
-    Args:
-        field: nodes of the grid, changed in place.
-        before: positions of the nodes before moves onto walls, m, shape (nx, ny, nz, 3).
-        rays: ray caster of the part.
+    Steps of the outline in a layer come first, then steps between layers. `field` is changed in
+    place. `before` (nx, ny, nz, 3), m, are the nodes before moves onto walls.
     """
     for axes in ((0, 2), (0, 1), (2, 1)):
         member = field.member.copy()
@@ -81,8 +77,8 @@ class Notch:
     Args:
         axes: the two axes of the squares.
         node: missing nodes.
-        first: their neighbours along the first axis.
-        second: their neighbours along the second axis.
+        first: neighbours along the first axis.
+        second: neighbours along the second axis.
         across: nodes across the diagonal.
     """
 
@@ -137,9 +133,8 @@ def _towards(point: Array, other: Array, share: float, rise: Array | float) -> A
 def _add_members(field: NodeField, notch: Notch, target: Array, usable: Mask, flat: bool) -> None:
     """Make the usable nodes members at their target positions.
 
-    In a horizontal square, a node between two top nodes becomes a top node. Otherwise the upper
-    face of its cell would have no contact, and the forces on the face's other nodes would be too
-    large.
+    In a horizontal square, a node between two top nodes becomes a top node. Otherwise the forces on
+    the other nodes of its cell's upper face would be too large.
     """
     rejected, added = (tuple(n[mask] for n in notch.node) for mask in (~usable, usable))
     field.upper_end[rejected] = field.lower_end[rejected] = False
@@ -337,14 +332,8 @@ def _add_at(
 ) -> None:
     """Move nodes onto walls and make them members, if their rays meet the part.
 
-    Args:
-        field: nodes of the grid, changed in place.
-        nodes: indices of the n nodes.
-        before: positions of all nodes before moves onto walls, m, shape (nx, ny, nz, 3).
-        move: vectors to the walls along x and z, m, shape (n, 2); 0 without a wall.
-        ends: masks of all nodes that become lower ends, upper ends and top nodes.
-        height: heights for such ends, m, shape (nx, ny, nz).
-        rays: ray caster of the part.
+    `move` (n, 2), m, are vectors to the walls along x and z, 0 without a wall. `ends` are masks of
+    future lower ends, upper ends and top nodes, and `height` has the heights, m, of these ends.
     """
     start = before[nodes]
     target = start.copy()
