@@ -107,11 +107,11 @@ def _split_displacement(
 
 
 @compiled
-def _along(one: Array, other: Array) -> float:
+def _along(a: Array, b: Array) -> float:
     """Return the scalar product of two vectors of eight numbers."""
     total = 0.0
     for i in range(8):
-        total += one[i] * other[i]
+        total += a[i] * b[i]
     return total
 
 

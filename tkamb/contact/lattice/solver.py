@@ -11,8 +11,8 @@ f_int are the internal forces of the displaced solid under its nonlinear law. p 
 points. One pass is a modified Newton step with the factorised linear stiffness K:
 
 1. Femoral points and normals: vertical rays through the displaced nodes.
-2. Contact: a primal-dual active set on the compliance of the candidate nodes. The nonlinear loads
-   h displace the candidates by K⁻¹ h before contact (`active_set.py`).
+2. Contact: a primal-dual active set on the compliance of the candidate nodes. Gaps include the
+   displacement K⁻¹ h by the nonlinear loads h (`active_set.py`).
 3. Displacement: K u = f + h. Residual: r = f - f_int(u) (`nonlinear_balance.py`).
 4. Next loads: h + s r, accelerated by Anderson's method. The softening s is the ratio of secant
    and tangent stiffness along u, so that K/s approximates the tangent stiffness.

@@ -123,9 +123,9 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
     _add_members(field, notch, target, usable, flat)
 
 
-def _towards(point: Array, other: Array, share: float, rise: Array | float) -> Array:
-    """Return points moved sideways by a share of the way to others, and up by `rise`, m."""
-    result = point + share * (other - point)
+def _towards(point: Array, goal: Array, share: float, rise: Array | float) -> Array:
+    """Return points moved sideways by a share of the way to goals, and up by `rise`, m."""
+    result = point + share * (goal - point)
     result[:, 1] = point[:, 1] + rise
     return result
 
@@ -231,10 +231,10 @@ def _walls_beside(
         beside = cells[1:] if sign > 0 else cells[:-1]
         if axis == 2:
             beside = cells[:, :, 1:] if sign > 0 else cells[:, :, :-1]
-        other = 2 - axis
+        cross_axis = 2 - axis
         joined = beside[:, 1:] | beside[:, :-1]
-        joined = np.moveaxis(joined, other, 0)
-        joined = np.moveaxis(joined[1:] | joined[:-1], 0, other)
+        joined = np.moveaxis(joined, cross_axis, 0)
+        joined = np.moveaxis(joined[1:] | joined[:-1], 0, cross_axis)
         free = field.member & ~joined
         above, below = np.zeros_like(free), np.zeros_like(free)
         above[:, :-1], below[:, 1:] = free[:, 1:], free[:, :-1]
@@ -283,11 +283,11 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
     move = move * (1.0 - WALL_NODE.wall_inset)
     corner = start.copy()
     corner[:, [0, 2]] += move
-    both = np.flatnonzero((move != 0.0).all(axis=1))
-    if both.size:
-        tested = corner[both].copy()
-        tested[:, [0, 2]] -= 1e-3 * move[both]
-        cut = both[~rays.surface.winding.inside(tested)]
+    with_two_walls = np.flatnonzero((move != 0.0).all(axis=1))
+    if with_two_walls.size:
+        tested = corner[with_two_walls].copy()
+        tested[:, [0, 2]] -= 1e-3 * move[with_two_walls]
+        cut = with_two_walls[~rays.surface.winding.inside(tested)]
         u, w = move[cut].T
         foot = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
         corner[cut[:, None], [0, 2]] = start[cut][:, [0, 2]] + foot
@@ -358,8 +358,8 @@ def _foot(move: Array) -> Array:
     With two walls, a node moves to the foot of its perpendicular on the line through the hits.
     """
     move = move * (1.0 + WALL_NODE.wall_inset)
-    both = (move != 0.0).all(axis=1)
+    with_two_walls = (move != 0.0).all(axis=1)
     result = move.copy()
-    u, w = move[both].T
-    result[both] = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
+    u, w = move[with_two_walls].T
+    result[with_two_walls] = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
     return result
