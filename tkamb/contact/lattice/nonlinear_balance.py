@@ -129,6 +129,7 @@ class NonlinearBalance:
         """Set h (n, 3), N, on the nodes of the region, and 0 elsewhere."""
         self._h, nodes = np.zeros_like(h), self._region.nodes
         self._h[nodes] = h[nodes]
+        # L⁻¹ h in elimination order.
         self._half = self._problem.operator.start(self._h, self._region.fronts)
 
     @property
@@ -145,6 +146,7 @@ class NonlinearBalance:
         """
         operator, region, solid = self._problem.operator, self._region, self._problem.solid
         self._force, self.displacement = force, displacement
+        # First L⁻¹ (h + f), then K⁻¹ (h + f) in the unknowns of the region's fronts.
         self._x = self._half.copy()
         self._response.push(force, self._x)
         operator.factor.backward(self._x, region.fronts)
@@ -166,6 +168,7 @@ class NonlinearBalance:
             return
         solid, operator = self._problem.solid, self._problem.operator
         if not self._region.whole:
+            # The other fronts still lack the backward solve.
             fronts = self._problem.everywhere.fronts.fronts
             others = np.setdiff1d(fronts, self._region.fronts.fronts, assume_unique=True)
             operator.factor.backward(self._x, operator.factor.shared(others))

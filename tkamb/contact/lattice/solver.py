@@ -96,7 +96,15 @@ def solve(
     guess: InitialGuess,
     settings: LatticeSolverSettings,
 ) -> Solution:
-    """Return the contact at a pose under a load (N), or at approach 0 when load is None."""
+    """Return the contact at a pose under a load, or at approach 0 if the load is None.
+
+    Args:
+        problem: solid, boundary and femoral component.
+        pose: pose_femoral_in_insert, shape (4, 4).
+        load: force along -y, N, or None.
+        guess: initial guess.
+        settings: tolerances and largest number of passes.
+    """
     points = problem.surface_points[guess.candidates]
     balance: LinearBalance | NonlinearBalance
     if problem.solid.material.is_linear:
@@ -233,14 +241,14 @@ def solve_by_newton(
     settings: LatticeSolverSettings,
     field: Array | None = None,
 ) -> Solution:
-    """Return the contact at a pose under a load (N), or at approach 0 when load is None.
+    """Return the result of `solve` by the full Newton iteration.
 
     Args:
-        problem: solid, boundary and femoral component.
-        pose: pose_femoral_in_insert, shape (4, 4).
-        load: force along -y, N, or None.
+        problem: see `solve`.
+        pose: see `solve`.
+        load: see `solve`.
         guess: candidates and first active set; its compliance is not used.
-        settings: tolerances and largest number of steps.
+        settings: see `solve`.
         field: initial displacement, m, shape (n, 3); zero by default.
 
     Raises:

@@ -290,10 +290,10 @@ def solve_by_loops(
     solver: LatticeSolverSettings,
     settings: LoopSettings = LOOP,
 ) -> Solution:
-    """Return the contact at a pose under a load (N), or at approach 0 when load is None.
+    """Return the result of `solver.solve` by Sharma's loops.
 
-    `solver.solve` has the arguments. The problem's `direction` is "vertical", and only the
-    candidates and their depth are used of the guess.
+    `solver.solve` has the arguments. The problem's `direction` is "vertical". Of the guess, only
+    the candidates, their planes and their reach are used.
     """
     nodes = problem.contact_nodes[guess.candidates]
     points = problem.surface_points[guess.candidates]
