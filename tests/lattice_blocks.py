@@ -8,8 +8,8 @@ from tkamb.contact.lattice.meshing.cells import CORNERS, join_springs
 def block(counts, edges, stretch=0.0):
     """Return nodes (n, 3), index (n, 3), cells (c, 8) and springs (s, 2) of a block.
 
-    `stretch` lifts the upper nodes into a dish (columns stretched, cells sheared), as a share
-    of the height, and shifts the walls a little.
+    `stretch` is the rise of the corners relative to the height: it stretches the columns to a dish
+    and shears the cells.
     """
     sizes = np.asarray(counts) + 1
     index = np.stack(np.meshgrid(*[np.arange(n) for n in sizes], indexing="ij"), -1).reshape(-1, 3)

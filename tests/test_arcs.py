@@ -31,7 +31,7 @@ def torus_dish(major=0.03, minor=0.02, spacing=5e-4):
 
 
 def test_arc_length_on_a_cylinder():
-    """A section oblique to the axis is an arc of an ellipse; its exact length is by quadrature."""
+    """An oblique section is an arc of an ellipse. Quadrature gives its exact length."""
     radius = 0.05
     surface = trough(radius, spacing=5e-4)
     start = np.array([[-0.012, 0, -0.015], [-0.01, 0, 0.0], [0.0, 0, -0.01]])
@@ -78,7 +78,7 @@ def test_normals_of_uv_lines_on_a_paraboloid():
     np.testing.assert_allclose(lines.normals, exact, atol=1e-12)
 
 
-def test_the_sources_mean_normal_errs_by_half_the_slope():
+def test_mean_line_normals_of_sharma_err_by_half_the_slope():
     i, k = (v.ravel() for v in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
     slope = np.tan(np.radians(10.0))
     points = np.column_stack([1e-3 * i, slope * 1e-3 * i, 1e-3 * k])
@@ -87,7 +87,7 @@ def test_the_sources_mean_normal_errs_by_half_the_slope():
     np.testing.assert_allclose(np.degrees(np.arccos(cosine)), 5.0, atol=1e-6)
 
 
-def test_lines_stop_at_gaps_and_a_lone_point_has_no_slope():
+def test_lines_end_at_gaps_and_an_isolated_point_has_no_slope():
     i, k = np.array([0, 1, 2, 5, 6, 9]), np.zeros(6, int)
     x = 1e-3 * i
     lines = draw_uv_lines(np.column_stack([x, np.where(i < 4, x, -x), 0 * x]), i, k)
@@ -117,10 +117,10 @@ def test_profile_of_a_ring_is_a_circle():
     profile = condyle_profile(ring, 1e-6)
     flexion = np.radians(np.linspace(0, 150, 31))
     np.testing.assert_allclose(profile.lowest(flexion), 0.025 * flexion, atol=1.5e-4)
-    place = profile.at(profile.lowest(flexion))
+    points = profile.at(profile.lowest(flexion))
     exact = -0.025 * np.column_stack([np.sin(flexion), np.cos(flexion)])
-    np.testing.assert_allclose(place, exact, atol=1.5e-4)
-    np.testing.assert_allclose(profile.locate(place), profile.lowest(flexion), atol=1e-6)
+    np.testing.assert_allclose(points, exact, atol=1.5e-4)
+    np.testing.assert_allclose(profile.locate(points), profile.lowest(flexion), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["dm", "jw"])

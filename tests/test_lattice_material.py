@@ -1,4 +1,4 @@
-"""The nonlinear cell follows the material's own curve, and its tangent is its derivative."""
+"""Nonlinear cells follow the material's curve, and their tangent is the derivative."""
 
 import numpy as np
 import pytest
@@ -19,10 +19,10 @@ TABLE = tabulated_material(
 )
 
 
-def pressed_block(solid, mat, strain, confined):
+def pressed_block(kind, mat, strain, confined):
     """Return the mean axial stress of a block between frictionless plates."""
     nodes, index, cells, _ = block((2, 3, 2), np.array([1.0, 1.1, 0.9]) * MM)
-    made = solid(nodes, cells, np.array([1.0, 1.1, 0.9]) * MM, mat)
+    solid = kind(nodes, cells, np.array([1.0, 1.1, 0.9]) * MM, mat)
     held = np.zeros((len(nodes), 3), bool)
     top = index[:, 1] == index[:, 1].max()
     held[top | (index[:, 1] == 0), 1] = True
@@ -33,21 +33,21 @@ def pressed_block(solid, mat, strain, confined):
     u = np.zeros((len(nodes), 3))
     u[top, 1] = strain * np.ptp(nodes[:, 1])
     for _ in range(60):
-        force = made.internal_force(u).ravel()
-        step = linalg.spsolve(made.tangent(u)[free][:, free].tocsc(), force[free])
+        force = solid.internal_force(u).ravel()
+        step = linalg.spsolve(solid.tangent(u)[free][:, free].tocsc(), force[free])
         u.ravel()[free] -= step
         if np.abs(step).max() < 1e-14:
             break
     area = np.ptp(nodes[:, 0]) * np.ptp(nodes[:, 2])
-    return made.internal_force(u)[top, 1].sum() / area
+    return solid.internal_force(u)[top, 1].sum() / area
 
 
-@pytest.mark.parametrize("solid", SOLIDS)
+@pytest.mark.parametrize("kind", SOLIDS)
 @pytest.mark.parametrize("strain", STRAINS)
 @pytest.mark.parametrize("nu", [0.0, 0.25, 0.45, 0.4999])
-def test_free_block_follows_the_curve(solid, strain, nu):
+def test_free_block_follows_the_curve(kind, strain, nu):
     mat = material("polyethylene", poisson_ratio=nu)
-    assert pressed_block(solid, mat, strain, False) == pytest.approx(mat.stress(strain), rel=1e-6)
+    assert pressed_block(kind, mat, strain, False) == pytest.approx(mat.stress(strain), rel=1e-6)
 
 
 @pytest.mark.parametrize("strain", [-0.15, -0.02, 0.06])
@@ -56,61 +56,61 @@ def test_free_block_follows_a_table(strain):
     assert stress == pytest.approx(TABLE.stress(strain), rel=1e-4)
 
 
-@pytest.mark.parametrize("solid", SOLIDS)
+@pytest.mark.parametrize("kind", SOLIDS)
 @pytest.mark.parametrize("strain", [-0.1, -0.02, 0.02])
 @pytest.mark.parametrize("nu", [0.0, 0.45])
-def test_confined_block_follows_bulk_and_curve(solid, strain, nu):
-    """sigma = K eps + (2/3) q(2|eps|/3): the bulk stays elastic, the shear follows q(e)."""
+def test_confined_block_follows_bulk_and_curve(kind, strain, nu):
+    """The stress is K eps + (2/3) q(2|eps|/3), with elastic bulk and shear by q(e)."""
     mat = material("polyethylene", poisson_ratio=nu)
     e = 2 * abs(strain) / 3
     q = 3 * ShearCurve.of(mat).modulus(np.array([e]))[0] * e
     exact = mat.bulk_modulus * strain + np.sign(strain) * 2 * q / 3
-    assert pressed_block(solid, mat, strain, True) == pytest.approx(exact, rel=1e-7)
+    assert pressed_block(kind, mat, strain, True) == pytest.approx(exact, rel=1e-7)
 
 
 @pytest.mark.parametrize("strain", [0.003, 0.02, 0.08, 0.2, 0.4])
-def test_curve_inverts_the_split_of_strain(strain):
-    """e = eps - sigma/(9 K) and q = sigma."""
+def test_shear_curve_gives_the_uniaxial_stress(strain):
+    """At e = eps - sigma/(9 K) it is q = sigma."""
     mat = material("polyethylene")
     sigma = mat.stress(strain)
     e = np.array([strain - sigma / (9 * mat.bulk_modulus)])
     assert 3 * ShearCurve.of(mat).modulus(e)[0] * e[0] == pytest.approx(sigma, rel=1e-8)
 
 
-@pytest.mark.parametrize("solid", SOLIDS)
+@pytest.mark.parametrize("kind", SOLIDS)
 @pytest.mark.parametrize("stretch", [0.0, 0.6])
-def test_tangent_is_the_derivative_of_the_forces(solid, stretch):
+def test_tangent_is_the_derivative_of_the_forces(kind, stretch):
     edges = np.full(3, MM)
     nodes, _, cells, _ = block((3, 2, 2), edges, stretch)
-    made = solid(nodes, cells, edges, material("polyethylene"))
+    solid = kind(nodes, cells, edges, material("polyethylene"))
     generator = np.random.default_rng(4)
     u, d = generator.normal(size=(2, *nodes.shape)) * 3e-5
-    numeric = (made.internal_force(u + 1e-4 * d) - made.internal_force(u - 1e-4 * d)) / 2e-4
-    exact = (made.tangent(u) @ d.ravel()).reshape(-1, 3)
+    numeric = (solid.internal_force(u + 1e-4 * d) - solid.internal_force(u - 1e-4 * d)) / 2e-4
+    exact = (solid.tangent(u) @ d.ravel()).reshape(-1, 3)
     assert np.abs(numeric - exact).max() < 1e-6 * np.abs(exact).max()
-    tangent = made.tangent(u)
+    tangent = solid.tangent(u)
     assert abs(tangent - tangent.T).max() < 1e-12 * abs(tangent).max()
 
 
-def test_source_springs_carry_the_curve_along_themselves():
-    """One spring stretched: f = sigma(eps) C L0, from its true length."""
+def test_force_of_a_stretched_source_spring_follows_the_curve():
+    """The force is f = sigma(eps) C L0."""
     edges = np.full(3, MM)
     nodes, _, cells, springs = block((1, 1, 1), edges)
     mat = material("polyethylene")
-    made = SourceNetwork(nodes, cells, edges, mat, springs[:1])
+    solid = SourceNetwork(nodes, cells, edges, mat, springs[:1])
     a, b = springs[0]
     u = np.zeros_like(nodes)
     u[b] = 0.07 * (nodes[b] - nodes[a])
-    force = made.internal_force(u)
+    force = solid.internal_force(u)
     length = np.linalg.norm(nodes[b] - nodes[a])
-    assert np.linalg.norm(force[b]) == pytest.approx(mat.stress(0.07) * made.factor * length)
+    assert np.linalg.norm(force[b]) == pytest.approx(mat.stress(0.07) * solid.factor * length)
     assert force[a] == pytest.approx(-force[b])
 
 
-def test_linear_material_loses_nothing():
+def test_linear_material_has_no_nonlinear_residual():
     edges = np.full(3, MM)
     nodes, _, cells, _ = block((2, 2, 2), edges)
-    for solid in SOLIDS:
-        made = solid(nodes, cells, edges, material("polyethylene-linear"))
-        assert not made.residual_force(np.ones_like(nodes)).any()
-        assert not made.nonlinear_residual(np.ones_like(nodes)).any()
+    for kind in SOLIDS:
+        solid = kind(nodes, cells, edges, material("polyethylene-linear"))
+        assert not solid.residual_force(np.ones_like(nodes)).any()
+        assert not solid.nonlinear_residual(np.ones_like(nodes)).any()

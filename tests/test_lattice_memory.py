@@ -1,4 +1,4 @@
-"""Memory is counted before it is taken, and the resolution that fits is named."""
+"""The estimate of the memory of a lattice, and the proposed resolution."""
 
 import re
 import tracemalloc
@@ -23,8 +23,7 @@ LINEAR = material("polyethylene-linear")
 
 
 @pytest.mark.parametrize("counts", [(12, 6, 12), (30, 8, 20)])
-def test_the_count_bounds_what_is_taken(counts, monkeypatch):
-    """At least what numpy asks for at its peak, and less than three times as much."""
+def test_the_estimate_is_one_to_three_times_the_peak_memory(counts, monkeypatch):
     nodes, index, cells, _ = block(counts, np.full(3, 1e-3), 0.3)
     stiffness = CalibratedNetwork(nodes, cells, np.full(3, 1e-3), LINEAR).stiffness
     held = fixed_unknowns(nodes, np.flatnonzero(index[:, 1] == 0), "fixed")
@@ -38,47 +37,49 @@ def test_the_count_bounds_what_is_taken(counts, monkeypatch):
     assert peak < operator.MEMORY_NEED.safety_factor * needs[0] < 3 * peak
 
 
-def test_a_single_front_takes_its_matrix_in_8_bytes_and_in_4():
-    """30 nodes joined to each other: 90 unknowns as they are worked out and as they are kept."""
+def test_memory_of_one_front_is_its_matrix_in_8_bytes_and_in_4():
+    """It has 30 nodes, computed in 8 bytes per number and stored in 4."""
     nodes = np.arange(30)
     joined = sparse.csr_matrix(np.ones((30, 30)))
     tree = Dissection([nodes], [-1])
-    found = operator.factor_memory(tree, joined, np.zeros(30, bool), 4)
-    assert found == operator.MEMORY_NEED.entry_bytes * 90**2 + (8 + 4) * 90**2
+    need = operator.factor_memory(tree, joined, np.zeros(30, bool), 4)
+    assert need == operator.MEMORY_NEED.entry_bytes * 90**2 + (8 + 4) * 90**2
 
 
-def test_the_updates_of_two_fronts_wait_for_the_third():
-    """Two ends of 10 nodes each, apart, and 10 between: at the third front both updates lie."""
+def test_memory_includes_updates_that_wait_for_their_parent():
+    """Two fronts of 10 nodes have the same parent. The first one's update waits for it."""
     first, second, between = np.arange(10), np.arange(10, 20), np.arange(20, 30)
     joined = np.ones((30, 30))
     joined[:10, 10:20] = joined[10:20, :10] = 0.0
     tree = Dissection([first, second, between], [2, 2, -1])
-    found = operator.factor_memory(tree, sparse.csr_matrix(joined), np.zeros(30, bool), 4)
+    need = operator.factor_memory(tree, sparse.csr_matrix(joined), np.zeros(30, bool), 4)
     own, update = 60 * 30, 30 * 30
     last = 4 * (2 * own + 30**2) + 8 * (2 * update + 30**2)
     at_second = 4 * 2 * own + 8 * (update + own + update)
     assert at_second > last
-    assert found == operator.MEMORY_NEED.entry_bytes * 9 * joined.sum() + at_second
+    assert need == operator.MEMORY_NEED.entry_bytes * 9 * joined.sum() + at_second
 
 
-@pytest.mark.parametrize("left", [2e8, 6e7, 1.5e7])
-def test_what_does_not_fit_is_refused_with_what_does(monkeypatch, left):
+@pytest.mark.parametrize("available", [2e8, 6e7, 1.5e7])
+def test_the_proposed_resolution_fits_into_the_memory(monkeypatch, available):
     bodies = pair(sphere_cap(22e-3), box_insert(0.04, 0.01, 0.06), LINEAR)
-    monkeypatch.setattr(operator, "available_memory", lambda: left)
-    with pytest.raises(InputError, match=r"GB are left; take .* mm or coarser") as refused:
-        contact_model("lattice-linear", 0.5 if left > 1e8 else 1.0, cache=False).prepare(bodies)
-    fits = float(re.search(r"take ([\d.]+) mm", str(refused.value))[1])
-    contact_model("lattice-linear", fits, cache=False).prepare(bodies)
+    monkeypatch.setattr(operator, "available_memory", lambda: available)
+    size = 0.5 if available > 1e8 else 1.0
+    with pytest.raises(InputError, match=r"GB are left; take .* mm or coarser") as error:
+        contact_model("lattice-linear", size, cache=False).prepare(bodies)
+    proposal = float(re.search(r"take ([\d.]+) mm", str(error.value))[1])
+    contact_model("lattice-linear", proposal, cache=False).prepare(bodies)
 
 
-def test_no_size_helps_when_nothing_is_left(monkeypatch):
+def test_without_memory_no_resolution_is_proposed(monkeypatch):
     bodies = pair(sphere_cap(22e-3), box_insert(0.02, 0.01, 0.02), LINEAR)
     monkeypatch.setattr(operator, "available_memory", lambda: 1e3)
     with pytest.raises(InputError, match="free some memory"):
         contact_model("lattice-linear", 2.0, cache=False).prepare(bodies)
 
 
-def test_available_memory_is_the_least_of_three(tmp_path, monkeypatch):
+def test_available_memory_is_the_smallest_of_three_limits(tmp_path, monkeypatch):
+    """The limits are those of the machine, of the control group and of the process."""
     statistics = tmp_path / "meminfo"
     statistics.write_text("MemTotal: 9000 kB\nMemAvailable: 4000 kB\n")
     monkeypatch.setattr(memory, "STATISTICS", statistics)

@@ -1,4 +1,4 @@
-"""The uniform-strain patch: what every cell must get right before anything else counts."""
+"""The patch test with uniform strain, rigid modes and spring stiffnesses of the cells."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def material(nu):
 
 
 def cell_of(corners, edges):
-    """Return K_d (s, 24, 24), g (s, 24) and V (s,) of cells in a lattice of boxes."""
+    """Return K_d (s, 24, 24), g (s, 24) and V (s,) of cells with these corners."""
     gradients, volume = mean_gradient(corners)
     springs = spring_families(edges, body_diagonal_stiffness(edges))
     matrices = deviatoric_matrices(corners, gradients, volume, springs, PAIRS)
@@ -38,13 +38,13 @@ def cell_of(corners, edges):
 
 
 def sheared(edges, count=20):
-    """Return corners (count, 8, 3) of boxes whose corners have been moved about."""
+    """Return corners (count, 8, 3) of boxes, moved at random."""
     corners = np.repeat(box_corners(edges)[None], count, axis=0)
     return corners + np.random.default_rng(5).normal(size=corners.shape) * 0.1 * edges.min()
 
 
-def test_the_compiled_cell_is_the_formula():
-    """K_d = V Bᵀ (2 I_dev) B + Pᵀ K_spr P with whole matrices, on cells out of shape."""
+def test_the_compiled_stiffness_agrees_with_its_formula():
+    """K_d = V Bᵀ (2 I_dev) B + Pᵀ K_spr P is evaluated with matrices for sheared cells."""
     edges = np.array([1.0, 1.2, 0.9]) * MM
     corners = sheared(edges)
     at_points, weights = gauss_gradients(corners)
@@ -52,42 +52,42 @@ def test_the_compiled_cell_is_the_formula():
     gradients = np.einsum("cp,cpni->cni", weights, at_points) / volume[:, None, None]
     strain = strain_matrix(gradients)
     mean = volume[:, None, None] * (np.swapaxes(strain, 1, 2) @ DEVIATORIC @ strain)
-    rest = np.eye(8) - corners @ np.swapaxes(gradients, 1, 2)
-    rest = np.stack([np.kron(one, np.eye(3)) for one in rest])
+    projection = np.eye(8) - corners @ np.swapaxes(gradients, 1, 2)
+    projection = np.stack([np.kron(matrix, np.eye(3)) for matrix in projection])
     springs = spring_matrix(corners, spring_families(edges, body_diagonal_stiffness(edges)))
     matrices, g, v = cell_of(corners, edges)
     assert v == pytest.approx(volume, rel=1e-12)
     assert g == pytest.approx(gradients.reshape(-1, 24), rel=1e-9, abs=1e-12 / MM)
-    exact = mean + np.swapaxes(rest, 1, 2) @ springs @ rest
+    exact = mean + np.swapaxes(projection, 1, 2) @ springs @ projection
     assert np.abs(matrices - exact).max() < 1e-12 * np.abs(exact).max()
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.4999])
 @pytest.mark.parametrize("kind", [CalibratedNetwork, BbarHexahedra])
 def test_forces_summed_cell_by_cell_are_those_of_the_assembled_stiffness(kind, nu):
-    """What a stored operator is held against; single precision of K_d in the lattice."""
     edges = np.array([1.0, 1.2, 0.9]) * MM
     nodes, _, cells, _ = block((3, 2, 3), edges, 0.3)
-    made = kind(nodes, cells, edges, material(nu))
+    solid = kind(nodes, cells, edges, material(nu))
     u = np.random.default_rng(6).normal(size=nodes.shape)
-    force = made.stiffness @ u.ravel()
-    error = np.abs(made.linear_force(u).ravel() - force).max()
+    force = solid.stiffness @ u.ravel()
+    error = np.abs(solid.linear_force(u).ravel() - force).max()
     assert error < 1e-7 * np.abs(force).max()
 
 
 def boundary_of(index):
+    """Return the mask of nodes on the boundary of a block."""
     return ((index == 0) | (index == index.max(axis=0))).any(axis=1)
 
 
-@pytest.mark.parametrize("solid", [CalibratedNetwork, BbarHexahedra])
+@pytest.mark.parametrize("kind", [CalibratedNetwork, BbarHexahedra])
 @pytest.mark.parametrize("nu", RATIOS)
 @pytest.mark.parametrize("edges", BOXES)
-def test_free_uniaxial_patch_is_exact_on_boxes(solid, nu, edges):
-    """sigma_yy = E eps with free sides: no force but on the two ends, and there E eps A."""
+def test_free_uniaxial_patch_is_exact_on_boxes(kind, nu, edges):
+    """With free sides, the only forces are E eps A on the two ends."""
     nodes, index, cells, _ = block((3, 2, 3), np.array(edges) * MM)
-    made = solid(nodes, cells, np.array(edges) * MM, material(nu))
+    solid = kind(nodes, cells, np.array(edges) * MM, material(nu))
     u = uniform_strain(nodes, [-nu * 1e-3, 1e-3, -nu * 1e-3, 0, 0, 0])
-    force = (made.stiffness @ u.ravel()).reshape(-1, 3)
+    force = (solid.stiffness @ u.ravel()).reshape(-1, 3)
     area = np.prod((np.ptp(nodes, axis=0))[[0, 2]])
     scale = 561.5e6 * 1e-3 * area
     top = index[:, 1] == index[:, 1].max()
@@ -97,18 +97,18 @@ def test_free_uniaxial_patch_is_exact_on_boxes(solid, nu, edges):
     assert np.abs(force[ends][:, [0, 2]]).max() < 1e-10 * scale
 
 
-@pytest.mark.parametrize("solid", [CalibratedNetwork, BbarHexahedra])
+@pytest.mark.parametrize("kind", [CalibratedNetwork, BbarHexahedra])
 @pytest.mark.parametrize("nu", RATIOS)
 @pytest.mark.parametrize("stretch", [0.0, 0.8])
 @pytest.mark.parametrize("size", [0.25, 1.0, 4.0])
-def test_patch_reproduces_any_uniform_strain(solid, nu, stretch, size):
-    """Displacements given on the boundary alone: the inside follows, also on a dish."""
+def test_patch_reproduces_any_uniform_strain(kind, nu, stretch, size):
+    """With prescribed displacements on the boundary, inner nodes follow, also in sheared cells."""
     edges = np.array([1.0, 1.1, 0.9]) * size * MM
     nodes, index, cells, _ = block((4, 3, 4), edges, stretch)
-    made = solid(nodes, cells, edges, material(nu))
+    solid = kind(nodes, cells, edges, material(nu))
     exact = uniform_strain(nodes, STRAIN)
     held = np.repeat(boundary_of(index), 3)
-    k = made.stiffness
+    k = solid.stiffness
     inner = linalg.spsolve(k[~held][:, ~held].tocsc(), -k[~held][:, held] @ exact.ravel()[held])
     assert np.abs(inner - exact.ravel()[~held]).max() < 1e-10 * np.abs(exact).max()
 
@@ -117,7 +117,7 @@ def test_patch_reproduces_any_uniform_strain(solid, nu, stretch, size):
 @pytest.mark.parametrize("edges", BOXES)
 @pytest.mark.parametrize("shear", [0.0, 0.4])
 def test_cell_has_six_rigid_modes_and_no_other(nu, edges, shear):
-    """Eigenvalues: six zeros, eighteen well above them."""
+    """Six eigenvalues are zero, and the other eighteen are well above zero."""
     edges = np.array(edges) * MM
     corners = box_corners(edges)[None].copy()
     corners[0, [2, 3, 6, 7], 1] += shear * edges[1] * np.array([1.0, 0.0, 0.6, 0.3])
@@ -130,21 +130,21 @@ def test_cell_has_six_rigid_modes_and_no_other(nu, edges, shear):
 
 
 @pytest.mark.parametrize("edges", BOXES)
-def test_springs_alone_make_the_isotropic_solid_with_lambda_equal_mu(edges):
-    """Closed-form families for any body diagonal; none negative at the chosen one."""
+def test_springs_alone_are_the_isotropic_solid_with_lambda_equal_mu(edges):
+    """This holds for any body diagonal. With the default one no spring is negative."""
     edges = np.array(edges)
-    chosen = body_diagonal_stiffness(edges)
-    for body in (0.0, 0.5 * chosen, chosen):
+    default = body_diagonal_stiffness(edges)
+    for body in (0.0, 0.5 * default, default):
         k = spring_matrix(box_corners(edges)[None], spring_families(edges, body))[0]
         u = uniform_strain(box_corners(edges), STRAIN).ravel()
         e = STRAIN
         trace, square = e[:3].sum(), (e[:3] ** 2).sum() + 2 * (e[3:] ** 2).sum()
         assert u @ k @ u == pytest.approx(np.prod(edges) * (trace**2 + 2 * square), rel=1e-12)
-    assert spring_families(edges, chosen).min() >= 0
+    assert spring_families(edges, default).min() >= 0
 
 
-def test_projection_leaves_normal_strain_of_a_box_to_the_springs():
-    """On a box K_d is the springs less their bulk part, but for the twist that shear excites."""
+def test_stiffness_of_a_box_is_that_of_its_springs_without_bulk():
+    """This holds for forces under normal strain, and for the energy of every uniform strain."""
     edges = np.array([1.0, 1.2, 0.9])
     k_b = body_diagonal_stiffness(edges)
     deviatoric, g, volume = cell_of(box_corners(edges)[None], edges)
@@ -157,15 +157,15 @@ def test_projection_leaves_normal_strain_of_a_box_to_the_springs():
 
 
 def test_source_calibration_on_a_cube():
-    """k = E a/2.7 and nu = 0.35."""
+    """k = E a/2.7 on a cube of edge a."""
     assert source_factor(np.full(3, 1.5 * MM)) == pytest.approx(1.5 * MM / 2.7, rel=1e-12)
 
 
 @pytest.mark.parametrize(("count", "excess"), [(2, 0.78), (4, 0.36), (8, 0.18), (12, 0.12)])
-def test_source_lattice_shows_its_known_error(count, excess):
-    """A cube between frictionless plates, free sides: too stiff, less so with more cells."""
+def test_source_lattice_is_too_stiff_with_free_sides(count, excess):
+    """The excess stiffness of a cube between frictionless plates falls with more cells."""
     nodes, index, cells, springs = block((count,) * 3, np.full(3, MM))
-    made = SourceNetwork(nodes, cells, np.full(3, MM), material(0.35), springs)
+    solid = SourceNetwork(nodes, cells, np.full(3, MM), material(0.35), springs)
     top, bottom = index[:, 1] == count, index[:, 1] == 0
     held = np.zeros((len(nodes), 3), bool)
     held[top | bottom, 1] = True
@@ -174,7 +174,7 @@ def test_source_lattice_shows_its_known_error(count, excess):
     u = np.zeros((len(nodes), 3))
     u[top, 1] = -1e-3 * count * MM
     fixed = held.ravel()
-    k = made.stiffness
+    k = solid.stiffness
     u.ravel()[~fixed] = linalg.spsolve(
         k[~fixed][:, ~fixed].tocsc(), -k[~fixed][:, fixed] @ u.ravel()[fixed]
     )

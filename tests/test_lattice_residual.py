@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from independent_residual import difference, kept_solutions
+from independent_residual import difference, recorded_solutions
 from lattice_bodies import condyles, dished_insert, pair
 from random_presses import ALLOWED, prepared, presses
 from tkamb.contact.lattice import model as lattice_model
@@ -100,7 +100,7 @@ def test_the_reported_residual_of_frames_is_the_one_that_others_measure(scene):
         pytest.skip("the subjects' files are not beside the project")
     changes = {"contact.model": "lattice", "contact.resolution_mm": 3.0}
     solver = FrameSolver(load_case(load_scene(MODELS / scene, changes)))
-    with kept_solutions() as kept:
+    with recorded_solutions() as kept:
         for k in FRAMES[scene]:
             solver.solve(k)
     assert len(kept) >= len(FRAMES[scene])

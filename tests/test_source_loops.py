@@ -1,4 +1,4 @@
-"""Sharma's loops on the stored factor: what they solve, and what they do not need."""
+"""Sharma's loops, which solve with the stored factor."""
 
 from functools import partial
 
@@ -30,18 +30,18 @@ def bodies():
 
 @pytest.fixture(scope="module")
 def prepared(bodies):
-    """The loops at 2 mm with a tight tolerance: the factor is not rounded to 16 bits."""
+    """Return the model at 2 mm and its prepared state, with a factor in single precision."""
     model = contact_model("lattice-source", 2.0, loops="source", tolerance=1e-4, cache=False)
     return model, model.prepare(bodies)
 
 
 @pytest.fixture
 def held(prepared):
-    """The nodes about the middle of the top, held; the lattice as the load has left it."""
+    """Return the lattice with prescribed displacement of the nodes within 3 mm of the centre."""
     problem = prepared[1].problem
-    away = np.hypot(problem.surface_points[:, 0], problem.surface_points[:, 2])
-    candidates = np.flatnonzero(away < 5e-3)
-    active = away[candidates] < 3e-3
+    radius = np.hypot(problem.surface_points[:, 0], problem.surface_points[:, 2])
+    candidates = np.flatnonzero(radius < 5e-3)
+    active = radius[candidates] < 3e-3
     return HeldNodes(CandidateResponse(problem, candidates), active, EXACT)
 
 
@@ -54,51 +54,51 @@ def squeezed(nodes):
 
 
 def test_held_nodes_solve_as_the_assembled_tangent_does(prepared, held):
-    solid, chance = prepared[1].problem.solid, np.random.default_rng(0)
+    solid, generator = prepared[1].problem.solid, np.random.default_rng(0)
     u = squeezed(solid.nodes)
     tangent = solid.spring_tangent(u)
     assert tangent.stiffness.min() < 0.6 * tangent.stiffness.max()
-    force = chance.normal(size=u.shape)
-    found = held.solve(tangent, force).ravel()
+    force = generator.normal(size=u.shape)
+    displacement = held.solve(tangent, force).ravel()
     free = ~held.held
     matrix = solid.tangent(u)[free][:, free].tocsc()
-    direct = sparse_linalg.spsolve(matrix, force.ravel()[free])
-    assert found[free] == pytest.approx(direct, rel=1e-6, abs=1e-8 * np.abs(direct).max())
-    assert not found[held.held].any()
+    exact = sparse_linalg.spsolve(matrix, force.ravel()[free])
+    assert displacement[free] == pytest.approx(exact, rel=1e-6, abs=1e-8 * np.abs(exact).max())
+    assert not displacement[held.held].any()
 
 
 def test_a_given_displacement_spreads_as_in_the_undeformed_lattice(prepared, held):
     solid = prepared[1].problem.solid
-    given = -1e-4 * np.linspace(1.0, 2.0, len(held.unknowns))
-    found = held.spread(given).ravel()
-    assert (found[held.unknowns] == given).all()
+    prescribed = -1e-4 * np.linspace(1.0, 2.0, len(held.unknowns))
+    displacement = held.spread(prescribed).ravel()
+    assert (displacement[held.unknowns] == prescribed).all()
     free, stiffness = ~held.held, solid.stiffness
-    prescribed = np.zeros(solid.nodes.size)
-    prescribed[held.unknowns] = given
+    of_held = np.zeros(solid.nodes.size)
+    of_held[held.unknowns] = prescribed
     matrix = stiffness[free][:, free].tocsc()
-    direct = sparse_linalg.spsolve(matrix, -(stiffness @ prescribed)[free])
-    assert found[free] == pytest.approx(direct, abs=1e-5 * np.abs(given).max())
-    dummy = np.zeros(solid.nodes.size)
-    dummy[held.unknowns] = -1.0
-    dummy[free] = sparse_linalg.spsolve(matrix, -(stiffness @ dummy)[free])
-    assert held.slope == pytest.approx(-(stiffness @ dummy)[held.unknowns].sum(), rel=1e-4)
+    exact = sparse_linalg.spsolve(matrix, -(stiffness @ of_held)[free])
+    assert displacement[free] == pytest.approx(exact, abs=1e-5 * np.abs(prescribed).max())
+    unit = np.zeros(solid.nodes.size)
+    unit[held.unknowns] = -1.0
+    unit[free] = sparse_linalg.spsolve(matrix, -(stiffness @ unit)[free])
+    assert held.slope == pytest.approx(-(stiffness @ unit)[held.unknowns].sum(), rel=1e-4)
 
 
 def test_forces_are_the_slope_of_the_stored_energy(prepared):
-    """f = dU/du with U = sum of C L0² times the area under the curve; linear part: K u."""
+    """The energy is the sum of C L0² times the area under the stress-strain curve."""
     solid = prepared[1].problem.solid
-    u, chance = squeezed(solid.nodes), np.random.default_rng(1)
-    way = 1e-9 * chance.normal(size=u.shape)
+    u, generator = squeezed(solid.nodes), np.random.default_rng(1)
+    step = 1e-9 * generator.normal(size=u.shape)
 
     def energy(displacement):
         strain, _ = solid._state(displacement)
-        part = (np.arange(400) + 0.5) / 400  # the midpoint rule
-        under = np.mean([solid.material.stress(x * strain) * strain for x in part], axis=0)
-        return float(np.sum(solid.factor * solid.lengths**2 * under))
+        shares = (np.arange(400) + 0.5) / 400  # midpoint rule
+        area = np.mean([solid.material.stress(x * strain) * strain for x in shares], axis=0)
+        return float(np.sum(solid.factor * solid.lengths**2 * area))
 
-    change = energy(u + way) - energy(u - way)
-    assert float((solid.internal_force(u) * way).sum()) == pytest.approx(change / 2, rel=1e-3)
-    tiny = 1e-12 * chance.normal(size=u.shape)
+    change = energy(u + step) - energy(u - step)
+    assert float((solid.internal_force(u) * step).sum()) == pytest.approx(change / 2, rel=1e-3)
+    tiny = 1e-12 * generator.normal(size=u.shape)
     linear = (solid.stiffness @ tiny.ravel()).reshape(tiny.shape)
     size = np.abs(linear).max()
     assert np.abs(solid.internal_force(tiny) - linear).max() < 1e-4 * size
@@ -106,9 +106,7 @@ def test_forces_are_the_slope_of_the_stored_energy(prepared):
 
 
 def test_a_press_factorises_nothing(prepared, monkeypatch):
-    """What cost 99 % of the time: 80 factorisations in a press on the shipped insert."""
-
-    def forbidden(*_args, **_more):
+    def forbidden(*_args, **_options):
         raise AssertionError("the stiffness was factorised again")
 
     model, state = prepared
@@ -122,12 +120,12 @@ def test_a_press_factorises_nothing(prepared, monkeypatch):
 @pytest.mark.parametrize("law", ["linear", "nonlinear"])
 def test_where_the_loops_begin_changes_no_answer(bodies, monkeypatch, law):
     model = contact_model("lattice-source", 2.0, loops="source", law=law, cache=False)
-    state, found = model.prepare(bodies), []
+    state, results = model.prepare(bodies), []
     for first in (0.4, 0.8, 1.0):
-        begun = partial(loops.solve_by_loops, settings=LoopSettings(first_depth=first))
+        solve = partial(loops.solve_by_loops, settings=LoopSettings(first_depth=first))
         with monkeypatch.context() as patch:
-            patch.setattr(loops, "solve_by_loops", begun)
-            found.append(model.press(state, LOAD, above()))
-    for one in found[1:]:
-        assert one.approach == pytest.approx(found[0].approach, rel=2e-4)
-        assert one.pressure == pytest.approx(found[0].pressure, rel=1e-3, abs=1e4)
+            patch.setattr(loops, "solve_by_loops", solve)
+            results.append(model.press(state, LOAD, above()))
+    for result in results[1:]:
+        assert result.approach == pytest.approx(results[0].approach, rel=2e-4)
+        assert result.pressure == pytest.approx(results[0].pressure, rel=1e-3, abs=1e4)

@@ -1,1 +1,1 @@
-"""The insert as a lattice of springs: grid, cells, stiffness and solution."""
+"""Contact models whose insert is a lattice of cells: grid, stiffness and contact solver."""

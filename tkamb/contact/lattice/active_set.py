@@ -1,14 +1,13 @@
-"""Unilateral frictionless contact of a condensed elastic body: a dense active set.
+"""Frictionless contact of an elastic body that is condensed to its candidate nodes.
 
-Find pressures and approach with, for every candidate node,
+Find the normal forces lambda (and the approach D) such that, for every candidate,
 
     gamma = gap + A lambda + D c >= 0,   lambda >= 0,   gamma lambda = 0
 
-and, when the load is given, -cᵀ lambda = load; when it is not, D is given. A is the symmetric
-positive definite compliance along the normals, c the normals' y. Primal-dual active set
-(Hintermueller, Ito & Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558). Once a
-set comes a second time, only the worst node changes. The search ends without having converged
-after twice as many sets as there are candidates.
+Either D is given or the load is: -cᵀ lambda = load. A is the compliance along the normals,
+symmetric and positive definite; c has the y of the normals. Primal-dual active set (Hintermueller,
+Ito & Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558). Once a set recurs, only
+the node with the largest violation changes. The search ends after twice as many sets as candidates.
 """
 
 from dataclasses import dataclass
@@ -24,11 +23,11 @@ class ContactForces:
     """Solution of the contact problem.
 
     Args:
-        force: (n,) N, lambda along the normals, >= 0.
-        gap: (n,) m, gamma along the normals, >= 0.
-        approach: m, D.
-        active: (n,) whether a node is in contact.
-        sets: number of active sets that were solved.
+        force: lambda, N, shape (n,), >= 0.
+        gap: gamma, m, shape (n,), >= 0.
+        approach: D, m.
+        active: mask of the nodes in contact, shape (n,).
+        sets: number of active sets that were tried.
         converged: whether the active set has stopped changing.
     """
 
@@ -51,37 +50,37 @@ def solve_contact(
     """Return forces, gaps and approach that fulfil the contact conditions.
 
     Args:
-        compliance: (n, n) m/N, A.
-        gap: (n,) m, gap at zero force and approach.
-        normal_y: (n,) 1, c: y of the femoral normals, negative.
-        load: N along -y, or None when the approach is given.
-        active: (n,) first guess of the nodes in contact.
-        approach: m, used when the load is None.
+        compliance: A, m/N, shape (n, n).
+        gap: gaps at zero force and approach, m, shape (n,).
+        normal_y: c, y of the femoral normals, shape (n,), negative.
+        load: force along -y, N; None if the approach is given.
+        active: initial guess of the nodes in contact, shape (n,).
+        approach: m, used if the load is None.
 
     Raises:
         LinAlgError: the compliance of the nodes in contact is singular.
     """
-    active, seen, careful, done, sets = active.copy(), set[bytes](), False, False, 0
+    active, earlier_sets, one_by_one, sets = active.copy(), set[bytes](), False, 0
     while True:
         if load is not None and not active.any():
             active[np.argmin(gap / -normal_y)] = True
-        force, depth = _forces_of(compliance, gap, normal_y, load, active, approach)
-        opening = gap + compliance @ force + depth * normal_y
+        force, approach = _forces_of(compliance, gap, normal_y, load, active, approach)
+        opening = gap + compliance @ force + approach * normal_y
         opening[active] = 0.0
-        leave = active & (force < -1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300))
-        join = ~active & (opening < -1e-15)
-        done, sets = not (leave.any() or join.any()), sets + 1
-        if done or sets > 2 * len(active):
-            return ContactForces(np.maximum(force, 0), opening, depth, active, sets, done)
+        leaving = active & (force < -1e-12 * max(float(np.abs(force).max(initial=0)), 1e-300))
+        joining = ~active & (opening < -1e-15)
+        converged, sets = not (leaving.any() or joining.any()), sets + 1
+        if converged or sets > 2 * len(active):
+            return ContactForces(np.maximum(force, 0), opening, approach, active, sets, converged)
         key = active.tobytes()
-        careful = careful or key in seen
-        seen.add(key)
-        if not careful:
-            active = (active & ~leave) | join
-        elif leave.any():
-            active[np.argmin(np.where(leave, force, 0.0))] = False
+        one_by_one = one_by_one or key in earlier_sets
+        earlier_sets.add(key)
+        if not one_by_one:
+            active = (active & ~leaving) | joining
+        elif leaving.any():
+            active[np.argmin(np.where(leaving, force, 0.0))] = False
         else:
-            active[np.argmin(np.where(join, opening, 0.0))] = True
+            active[np.argmin(np.where(joining, opening, 0.0))] = True
 
 
 def _forces_of(
@@ -92,17 +91,17 @@ def _forces_of(
     active: Mask,
     approach: float,
 ) -> tuple[Array, float]:
-    """Return forces (n,) and approach that close the gap of the active nodes."""
+    """Return the forces (n,) and the approach at which the active nodes have no gap."""
     force = np.zeros(len(gap))
     if not active.any():
         return force, approach
-    chosen = np.flatnonzero(active)
-    right = np.column_stack([-gap[chosen], -normal_y[chosen]])
-    *_, solved, failed = dposv(compliance[chosen[:, None], chosen], right, lower=True)
-    if failed:
+    nodes = np.flatnonzero(active)
+    right_sides = np.column_stack([-gap[nodes], -normal_y[nodes]])
+    *_, solution, info = dposv(compliance[nodes[:, None], nodes], right_sides, lower=True)
+    if info:
         raise np.linalg.LinAlgError("the compliance of the nodes in contact is singular")
-    closing, per_depth = solved.T
+    at_zero, per_approach = solution.T
     if load is not None:
-        approach = (load + normal_y[active] @ closing) / -(normal_y[active] @ per_depth)
-    force[active] = closing + approach * per_depth
+        approach = (load + normal_y[active] @ at_zero) / -(normal_y[active] @ per_approach)
+    force[active] = at_zero + approach * per_approach
     return force, float(approach)

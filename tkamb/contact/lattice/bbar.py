@@ -1,7 +1,7 @@
 """B-bar hexahedra: eight Gauss points for shear, the cell's mean dilatation for bulk.
 
-The yardstick of the lattice, on the same grid, with the same material and contact.
-Reference: Hughes, Int J Numer Meth Eng 15:1413 (1980), doi:10.1002/nme.1620150914.
+They are the finite-element reference for the lattice, with the same grid, material and contact.
+Source: Hughes, Int J Numer Meth Eng 15:1413 (1980), doi:10.1002/nme.1620150914.
 """
 
 from collections.abc import Iterator
@@ -24,14 +24,14 @@ from tkamb.geometry.frames import Array, Index
 
 _VALUES, _VECTORS = np.linalg.eigh(DEVIATORIC)
 _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
-"""(5, 6) with rootᵀ root = the form 2 dev eps : dev eps."""
+"""R, shape (5, 6), with Rᵀ R = `DEVIATORIC`."""
 
 
 class BbarHexahedra(Solid):
     """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
 
-    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e; the bulk stays elastic.
-    See `Solid` for the arguments.
+    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e. The bulk is elastic. See
+    `Solid` for the arguments and `ShearCurve` for q.
 
     Raises:
         InputError: the Jacobian is not positive at a Gauss point.
@@ -42,7 +42,7 @@ class BbarHexahedra(Solid):
         gradients, self.weights = gauss_gradients(self.corners())
         if not (self.weights > 0).all():
             raise InputError("a hexahedron is turned inside out", "lattice", "use finer cells")
-        # The root of the deviatoric form turns strain into five numbers, whose squares sum to 3 e².
+        # R turns the strain into five numbers. Their squares sum to 3 e².
         self.shear = np.einsum("rq,cgqj->cgrj", _ROOT, strain_matrix(gradients))
         self.curve = ShearCurve.of(material)
 
@@ -52,12 +52,12 @@ class BbarHexahedra(Solid):
         return self.pattern.assemble(self._linear_matrices())
 
     def _linear_matrices(self) -> Iterator[Array]:
-        """Yield the linear stiffness (k, 24, 24), N/m, of some cells after the other."""
-        for some in chunks(len(self.cells)):
-            shear = np.sqrt(self.weights[some])[..., None, None] * self.shear[some]
+        """Yield the linear stiffness (k, 24, 24), N/m, of one chunk of cells after the other."""
+        for chunk in chunks(len(self.cells)):
+            shear = np.sqrt(self.weights[chunk])[..., None, None] * self.shear[chunk]
             flat = shear.reshape(-1, 40, 24)
             matrices = self.material.shear_modulus * (np.swapaxes(flat, 1, 2) @ flat)
-            yield matrices + self.bulk(some)
+            yield matrices + self.bulk(chunk)
 
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3); see `Solid`."""
@@ -67,12 +67,11 @@ class BbarHexahedra(Solid):
         return self.scatter.sum(force)
 
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
-        """Return the Gauss points' (mu - mu_s) times unit shear forces, N, (k, 24)."""
+        """Return the nodal forces of the stress 2 (mu - mu_s) dev eps, N, (k, 24)."""
         strain, equivalent = self._state(displacement, chosen)
-        # The residual is what the elastic operator has too much: (mu - mu_s) times the deviatoric
-        # strain.
-        softened = self.material.shear_modulus - self.curve.modulus(equivalent)
-        strain *= (softened * elements_of(self.weights, chosen))[..., None]
+        # The linear stiffness overestimates the deviatoric stress by 2 (mu - mu_s) dev eps.
+        lost_modulus = self.material.shear_modulus - self.curve.modulus(equivalent)
+        strain *= (lost_modulus * elements_of(self.weights, chosen))[..., None]
         return self._per_cell_forces(strain, chosen)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
@@ -81,28 +80,28 @@ class BbarHexahedra(Solid):
         secant, softening = self.curve.modulus(equivalent), self.curve.softening(equivalent)
 
         def matrices() -> Iterator[Array]:
-            for some in chunks(len(self.cells)):
-                result = self.bulk(some)
+            for chunk in chunks(len(self.cells)):
+                result = self.bulk(chunk)
                 for point in range(8):
-                    weight, shear = self.weights[some, point], self.shear[some, point]
-                    result += (weight * secant[some, point])[:, None, None] * (
+                    weight, shear = self.weights[chunk, point], self.shear[chunk, point]
+                    result += (weight * secant[chunk, point])[:, None, None] * (
                         np.swapaxes(shear, 1, 2) @ shear
                     )
-                    force = np.einsum("cri,cr->ci", shear, strain[some, point])
-                    # Rank-one part of the tangent: the derivative of the secant modulus by the
-                    # equivalent strain.
-                    scale = weight * softening[some, point] / 3
+                    force = np.einsum("cri,cr->ci", shear, strain[chunk, point])
+                    # The rank-one part of the tangent comes from the derivative of the secant
+                    # modulus by the equivalent strain.
+                    scale = weight * softening[chunk, point] / 3
                     result += scale[:, None, None] * force[:, :, None] * force[:, None, :]
                 yield result
 
         return self.pattern.assemble(matrices())
 
     def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
-        """Return scaled deviatoric strain (k, 8, 5) and equivalent strain (k, 8)."""
+        """Return R eps (k, 8, 5) and the equivalent strain e (k, 8) at the Gauss points."""
         local = self.scatter.gather(displacement, chosen)
         strain = np.einsum("cgrj,cj->cgr", elements_of(self.shear, chosen), local)
         return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
 
     def _per_cell_forces(self, stress: Array, chosen: Index | None) -> Array:
-        """Return (k, 24) from weighted scaled stresses (k, 8, 5)."""
+        """Return nodal forces (k, 24) from R eps times modulus and weight (k, 8, 5)."""
         return np.einsum("cgrj,cgr->cj", elements_of(self.shear, chosen), stress)

@@ -1,21 +1,21 @@
 """Stiffness of the calibrated cell: 28 springs that make an isotropic solid.
 
-Springs in a lattice of box cells of edges a, b, c (volume V, L² = a² + b² + c²), at unit
-shear modulus; a cell owns a quarter of each edge, half of each face diagonal and all of its
-body diagonals, so that the network's spring is the sum over the cells that own it:
+The cells are boxes with edges a, b, c, volume V and L² = a² + b² + c². At unit shear modulus,
+the springs of the whole lattice are
 
     face diagonals   k_xy = (a² + b²)/(2 a² b²) (V - 4 k_b a² b²/L²), cyclic
     edges            k_x  = V/a² (3 - a²/b² - a²/c²) + 4 k_b a²/L², cyclic
     body diagonals   k_b, free between bounds
 
-Then the energy of a uniform strain is that of an isotropic solid with lambda = mu (see
-docs/lattice.md). Taking the bulk part (5/3) V g gᵀ away leaves the deviatoric stiffness
+A cell owns a quarter of each edge, half of each face diagonal and all of its body diagonals.
+A uniform strain then stores the energy of an isotropic solid with lambda = mu
+(docs/lattice.md). The deviatoric stiffness of a cell of any shape is
 
     K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P
 
-with B̄ the strain of the cell's mean gradient and P what the mean gradient does not explain.
-On a box this is K_spr - (5/3) V g gᵀ; on a sheared cell it keeps the patch exact
-(`deviatoric_matrices`).
+B̄ gives the strain of the cell's mean displacement gradient, and I_dev its deviatoric part. P
+subtracts the linear field of this gradient from the displacement. K_spr is the matrix of the
+springs. So the patch test is exact for sheared cells too.
 """
 
 from collections.abc import Iterator
@@ -31,8 +31,8 @@ from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
 
-NOTHING = 1e-300
-"""m²: smallest divisor, which avoids a division by zero."""
+LEAST_DIVISOR = 1e-300
+"""m²: smallest divisor. It avoids a division by zero."""
 
 
 @compiled
@@ -42,19 +42,19 @@ def deviatoric_matrices(
     """Return K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P of cells (c, 24, 24), m per unit shear modulus.
 
     Between nodes i and j the first part is V (g_i·g_j I + g_j g_iᵀ - 2/3 g_i g_jᵀ). A spring
-    k along n between corners a and b adds k r_i r_j n nᵀ, r = P_b - P_a with the displacement's
-    rest P = I - x gᵀ (8, 8).
+    k along n between corners a and b adds k r_i r_j n nᵀ. Here r is the difference of the rows b
+    and a of P = I - x gᵀ (8, 8).
 
     Args:
-        corners: (c, 8, 3) m, true shapes.
-        gradients: (c, 8, 3) mean gradients g, 1/m.
-        volumes: (c,) m³.
-        springs: (28,) m, `spring_families` of the nominal box.
-        pairs: (28, 2) corners that they join.
+        corners: true corners, m, shape (c, 8, 3).
+        gradients: mean gradients g, 1/m, shape (c, 8, 3).
+        volumes: m³, shape (c,).
+        springs: `spring_families` of the nominal box, m, shape (28,).
+        pairs: corners that each spring joins, shape (28, 2).
     """
     result = np.zeros((len(corners), 24, 24))
-    rest = np.empty((8, 8))
-    pulled, force = np.empty((len(pairs), 24)), np.empty((len(pairs), 24))
+    excess = np.empty((8, 8))
+    elongation, force = np.empty((len(pairs), 24)), np.empty((len(pairs), 24))
     for cell in range(len(corners)):
         x, g, matrix = corners[cell], gradients[cell], result[cell]
         for i in range(8):
@@ -65,28 +65,28 @@ def deviatoric_matrices(
                         mixed = g[i, b] * g[j, a] - 2.0 / 3.0 * g[i, a] * g[j, b]
                         matrix[3 * i + a, 3 * j + b] = volumes[cell] * mixed
                     matrix[3 * i + a, 3 * j + a] += volumes[cell] * product
-                rest[i, j] = -(x[i, 0] * g[j, 0] + x[i, 1] * g[j, 1] + x[i, 2] * g[j, 2])
-            rest[i, i] += 1.0
+                excess[i, j] = -(x[i, 0] * g[j, 0] + x[i, 1] * g[j, 1] + x[i, 2] * g[j, 2])
+            excess[i, i] += 1.0
         for spring in range(len(pairs)):
             first, second = pairs[spring, 0], pairs[spring, 1]
             line = x[second] - x[first]
             stiffness = springs[spring] / (line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
             for i in range(8):
                 for a in range(3):
-                    pulled[spring, 3 * i + a] = (rest[second, i] - rest[first, i]) * line[a]
-                    force[spring, 3 * i + a] = stiffness * pulled[spring, 3 * i + a]
-        matrix += np.dot(pulled.T, force)
+                    elongation[spring, 3 * i + a] = (excess[second, i] - excess[first, i]) * line[a]
+                    force[spring, 3 * i + a] = stiffness * elongation[spring, 3 * i + a]
+        matrix += np.dot(elongation.T, force)
     return result
 
 
 @compiled
-def _parted(
-    x: Array, g: Array, nodes: Index, displacement: Array, u: Array, rest: Array
+def _split_displacement(
+    x: Array, g: Array, nodes: Index, displacement: Array, u: Array, excess: Array
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Split a cell's displacement into G x, G = sum u_i g_iᵀ, and a rest; return G, row by row.
+    """Return the mean gradient G = sum u_i g_iᵀ of a cell row by row; write u and u - G x.
 
     The eight corners of an axis lie side by side, so that they fill the processor's vector
-    registers. G is held in nine registers. The arguments are those of `_shear_force`.
+    registers. G is in nine registers. The arguments are those of `_shear_force`.
     """
     first = nodes[0]
     for i in range(8):
@@ -98,20 +98,20 @@ def _parted(
     yx, yy, yz = _along(u[1], g[0]), _along(u[1], g[1]), _along(u[1], g[2])
     zx, zy, zz = _along(u[2], g[0]), _along(u[2], g[1]), _along(u[2], g[2])
     for i in range(8):
-        rest[0, i] = u[0, i] - (xx * x[0, i] + xy * x[1, i] + xz * x[2, i])
+        excess[0, i] = u[0, i] - (xx * x[0, i] + xy * x[1, i] + xz * x[2, i])
     for i in range(8):
-        rest[1, i] = u[1, i] - (yx * x[0, i] + yy * x[1, i] + yz * x[2, i])
+        excess[1, i] = u[1, i] - (yx * x[0, i] + yy * x[1, i] + yz * x[2, i])
     for i in range(8):
-        rest[2, i] = u[2, i] - (zx * x[0, i] + zy * x[1, i] + zz * x[2, i])
+        excess[2, i] = u[2, i] - (zx * x[0, i] + zy * x[1, i] + zz * x[2, i])
     return xx, xy, xz, yx, yy, yz, zx, zy, zz
 
 
 @compiled
-def _along(one: Array, other: Array) -> float:
+def _along(a: Array, b: Array) -> float:
     """Return the scalar product of two vectors of eight numbers."""
     total = 0.0
     for i in range(8):
-        total += one[i] * other[i]
+        total += a[i] * b[i]
     return total
 
 
@@ -124,35 +124,35 @@ def _shear_force(
     nodes: Index,
     displacement: Array,
     u: Array,
-    rest: Array,
+    excess: Array,
     force: Array,
 ) -> float:
-    """Put K_d u of a cell into force (3, 8); return uᵀ K_d u.
+    """Write K_d u of a cell into `force`; return uᵀ K_d u.
 
-    The matrix K_d is never assembled. G = sum u_i g_iᵀ gives the rests u_i - G x_i, and these the
-    springs' forces t_i. With D = 2 V dev(sym G) - sum t_i x_iᵀ the nodes' forces are t_i + D g_i.
-    D is held in nine registers, as G is.
+    The matrix K_d is not assembled. With G = sum u_i g_iᵀ, the remainders u_i - G x_i of the
+    displacements stretch the springs, which gives the forces t_i. With
+    D = 2 V dev(sym G) - sum t_i x_iᵀ the nodal forces are t_i + D g_i. D is in nine registers.
 
     Args:
-        x: (3, 8) m, corners.
-        g: (3, 8) 1/m, mean gradients.
+        x: corners, m, shape (3, 8).
+        g: mean gradients, 1/m, shape (3, 8).
         volume: m³.
-        springs: (8, 8) m, `spring_families` of the nominal box between any two corners.
-        nodes: (8,).
-        displacement: (n, 3) m.
-        u: (3, 8) scratch, as `rest`: displacements from the cell's first node.
-        rest: (3, 8).
-        force: (3, 8) m².
+        springs: `spring_families` of the nominal box by pair of corners, m, shape (8, 8).
+        nodes: the cell's nodes, shape (8,).
+        displacement: m, shape (n, 3).
+        u: scratch (3, 8) for displacements relative to the first node, m.
+        excess: scratch (3, 8) for the remainders, m.
+        force: K_d u, m², shape (3, 8).
     """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = _parted(x, g, nodes, displacement, u, rest)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _split_displacement(x, g, nodes, displacement, u, excess)
     for i in range(8):
         fx = fy = fz = 0.0
         for j in range(8):
             line_x, line_y, line_z = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
-            pull = (rest[0, j] - rest[0, i]) * line_x + (rest[1, j] - rest[1, i]) * line_y
-            pull += (rest[2, j] - rest[2, i]) * line_z
+            pull = (excess[0, j] - excess[0, i]) * line_x + (excess[1, j] - excess[1, i]) * line_y
+            pull += (excess[2, j] - excess[2, i]) * line_z
             square = line_x * line_x + line_y * line_y + line_z * line_z
-            pull *= springs[i, j] / max(square, NOTHING)  # of a corner with itself
+            pull *= springs[i, j] / max(square, LEAST_DIVISOR)  # the square is 0 where i == j
             fx, fy, fz = fx - pull * line_x, fy - pull * line_y, fz - pull * line_z
         force[0, i], force[1, i], force[2, i] = fx, fy, fz
     mean = 2.0 / 3.0 * (xx + yy + zz)
@@ -184,20 +184,20 @@ def shear_forces(
     """Return K_d u (k, 24) and the equivalent strain (k,), e² = uᵀ K_d u / (3 V), of cells.
 
     Args:
-        corners: (c, 3, 8) m.
-        gradients: (c, 3, 8) mean gradients, 1/m.
-        volumes: (c,) m³.
-        springs: (8, 8) m.
-        nodes: (c, 8) of the cells.
-        chosen: (k,) cells.
-        displacement: (n, 3) m.
+        corners: m, shape (c, 3, 8).
+        gradients: mean gradients, 1/m, shape (c, 3, 8).
+        volumes: m³, shape (c,).
+        springs: see `_shear_force`.
+        nodes: the cells' nodes, shape (c, 8).
+        chosen: numbers of the cells, shape (k,).
+        displacement: m, shape (n, 3).
     """
     forces, strains = np.empty((len(chosen), 24)), np.empty(len(chosen))
-    u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
+    u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
     for k in range(len(chosen)):
         cell = chosen[k]
         x, g, volume = corners[cell], gradients[cell], volumes[cell]
-        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
+        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, excess, force)
         strains[k] = np.sqrt(energy / (3 * volume))
         for i in range(8):
             for a in range(3):
@@ -220,35 +220,29 @@ def softened_forces(
     displacement: Array,
     forces: Array,
 ) -> None:
-    """Put (mu - mu_s) K_d u (k, 24), N, of cells into `forces`; see `shear_forces`.
+    """Write (mu - mu_s) K_d u of the chosen cells, N, into `forces` (k, 24).
+
+    `shear_forces` has the other arguments.
 
     Args:
-        corners: (c, 3, 8) m.
-        gradients: (c, 3, 8) 1/m.
-        volumes: (c,) m³.
-        springs: (8, 8) m.
         shear_modulus: mu, Pa.
-        knots: (q,) e between which 3 mu_s e is cubic.
-        cubic: (4, q - 1) its coefficients, the highest power first.
+        knots: equivalent strains between which 3 mu_s e is cubic, shape (q,).
+        cubic: its coefficients, the highest power first, shape (4, q - 1).
         least: smallest e that is distinguished from zero.
-        nodes: (c, 8) of the cells.
-        chosen: (k,) cells.
-        displacement: (n, 3) m.
-        forces: (k, 24).
     """
-    u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
+    u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
     for k in range(len(chosen)):
         cell = chosen[k]
         x, g, volume = corners[cell], gradients[cell], volumes[cell]
-        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
+        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, excess, force)
         strain = min(max(np.sqrt(energy / (3 * volume)), least), knots[-1])
         part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
         y = strain - knots[part]
         stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
-        softened = shear_modulus - stress / (3 * strain)
+        lost_modulus = shear_modulus - stress / (3 * strain)
         for i in range(8):
             for a in range(3):
-                forces[k, 3 * i + a] = softened * force[a, i]
+                forces[k, 3 * i + a] = lost_modulus * force[a, i]
 
 
 @compiled
@@ -267,32 +261,22 @@ def cell_forces(
     residuals: Array,
     internal: Array,
 ) -> float:
-    """Add mu_s K_d u + K V g (g · u), N, of cells to the nodes' `internal` (n, 3).
+    """Return uᵀ K_T u, N·m, and compute the forces of all cells in the same pass.
 
-    Return uᵀ K_T u, N·m, K_T the tangent stiffness: V q'(e) e² + K V (g · u)² of each cell,
-    q = 3 mu_s e. Also write (mu - mu_s) K_d u of each cell, N, into `residuals` (c, 24). One pass
-    over the cells gives the true force of the solid and how much more the linear solid carries.
+    K_T is the tangent stiffness. A cell contributes V q'(e) e² + K V (g · u)², with q = 3 mu_s e.
+    `shear_forces` and `softened_forces` have the other arguments.
 
     Args:
-        corners: (c, 3, 8) m.
-        gradients: (c, 3, 8) 1/m.
-        volumes: (c,) m³.
-        springs: (8, 8) m.
-        shear_modulus: mu, Pa.
         bulk_modulus: K, Pa.
-        knots: (q,) equivalent strains between which 3 mu_s e is cubic.
-        cubic: (4, q - 1) its coefficients, the highest power first.
-        least: smallest equivalent strain that is distinguished from zero.
-        nodes: (c, 8) of the cells.
-        displacement: (n, 3) m.
-        residuals: (c, 24), written.
-        internal: (n, 3), added to.
+        residuals: (mu - mu_s) K_d u of each cell, N, shape (c, 24), written: the force that the
+            linear solid carries in excess.
+        internal: nodal forces, N, shape (n, 3). mu_s K_d u + K V g (g · u) of the cells is added.
     """
-    u, rest, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
+    u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
     tangent_work = 0.0
     for cell in range(len(nodes)):
         x, g, volume = corners[cell], gradients[cell], volumes[cell]
-        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, rest, force)
+        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, excess, force)
         strain = min(max(np.sqrt(energy / (3 * volume)), least), knots[-1])
         part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
         y = strain - knots[part]
@@ -310,36 +294,36 @@ def cell_forces(
 
 
 def spring_families(edges: Array, body_diagonal: float) -> Array:
-    """Return what one cell owns of its 28 springs, per unit shear modulus, m.
+    """Return a cell's own part (28,) of its springs' stiffness, m per unit shear modulus.
 
     Args:
-        edges: (3,) a, b, c in m.
-        body_diagonal: k_b per unit shear modulus, m.
+        edges: a, b, c, m, shape (3,).
+        body_diagonal: k_b, m per unit shear modulus.
     """
     square, volume = edges**2, np.prod(edges)
     total = square.sum()
     stiffness = np.empty(len(PAIRS))
     for spring, axes in enumerate(PAIR_AXES.astype(bool)):
         if axes.sum() == 1:
-            own, others = square[axes][0], square[~axes]
-            whole = (
-                volume / own * (3 - own / others[0] - own / others[1])
-                + 4 * body_diagonal * own / total
+            along, across = square[axes][0], square[~axes]
+            lattice_spring = (
+                volume / along * (3 - along / across[0] - along / across[1])
+                + 4 * body_diagonal * along / total
             )
-            stiffness[spring] = whole / 4
+            stiffness[spring] = lattice_spring / 4
         elif axes.sum() == 2:
             product = square[axes].prod()
-            whole = (
+            lattice_spring = (
                 square[axes].sum() / (2 * product) * (volume - 4 * body_diagonal * product / total)
             )
-            stiffness[spring] = whole / 2
+            stiffness[spring] = lattice_spring / 2
         else:
             stiffness[spring] = body_diagonal
     return stiffness
 
 
 def spring_matrix(corners: Array, stiffness: Array) -> Array:
-    """Return the stiffness (s, 24, 24) of springs k (28,) on cells (s, 8, 3): sum of k n nᵀ."""
+    """Return the stiffness (s, 24, 24) of springs (28,) in cells (s, 8, 3): the sum of k n nᵀ."""
     lines = corners[:, PAIRS[:, 1]] - corners[:, PAIRS[:, 0]]
     unit = lines / np.linalg.norm(lines, axis=2, keepdims=True)
     block = stiffness[:, None, None] * unit[..., :, None] * unit[..., None, :]
@@ -353,43 +337,43 @@ def spring_matrix(corners: Array, stiffness: Array) -> Array:
 
 
 def box_corners(edges: Array) -> Array:
-    """Return the corners (8, 3) of a box cell with these edges (3,), m."""
+    """Return the corners (8, 3) of a box cell with edges (3,), m."""
     return CORNERS * edges
 
 
 def body_diagonal_stiffness(edges: Array) -> float:
-    """Return k_b per unit shear modulus (m) that makes the cell's softest mode stiffest.
+    """Return the best stiffness k_b of the body diagonals, m per unit shear modulus.
 
-    Among k_b that leave no spring negative (if there are any) it maximises the smallest of
-    the 18 eigenvalues that are not rigid modes. At the upper bound mu V L²/(4 max pair
-    product) a face diagonal vanishes and hourglass modes appear; k_b = 0 is indefinite at
-    edge ratio 1.5.
+    It maximises the smallest of the 18 eigenvalues that are not rigid motions, among all k_b
+    without a negative spring (if there are any). At the upper bound V L²/(4 max pair product) a
+    face diagonal vanishes and hourglass modes appear. With k_b = 0 a cell of edge ratio 1.5 is
+    indefinite.
     """
     square = edges**2
     pairs = square * np.roll(square, 1)
-    # Beyond it a face diagonal's stiffness would be negative.
+    # Beyond this bound a face diagonal would be negative.
     upper = np.prod(edges) * square.sum() / (4 * pairs.max())
     candidates = np.linspace(0, upper, 201)[1:-1]
-    none = spring_families(edges, 0.0)
-    per_unit = spring_families(edges, 1.0) - none
-    # Family stiffnesses are linear in the body diagonal's, so that two evaluations give all.
-    families = none + candidates[:, None] * per_unit
-    complete = families.min(axis=1) >= 0
-    if complete.any():
-        candidates = candidates[complete]
+    at_zero = spring_families(edges, 0.0)
+    per_unit = spring_families(edges, 1.0) - at_zero
+    # All stiffnesses are linear in k_b, so two evaluations are enough.
+    families = at_zero + candidates[:, None] * per_unit
+    admissible = families.min(axis=1) >= 0
+    if admissible.any():
+        candidates = candidates[admissible]
     corners = box_corners(edges)[None]
-    matrices = spring_matrix(corners, none)
+    matrices = spring_matrix(corners, at_zero)
     matrices = matrices + candidates[:, None, None] * spring_matrix(corners, per_unit)
-    # Six eigenvalues are rigid motions; the seventh is the softest deformation, which hourglassing
-    # would make zero.
+    # The first six eigenvalues are rigid motions. The seventh is the softest deformation; it is
+    # zero if the cell hourglasses.
     return float(candidates[np.linalg.eigvalsh(matrices)[:, 6].argmax()])
 
 
 class CalibratedNetwork(Solid):
-    """Cells mu_s K_d + K V g gᵀ, with mu_s from the cell's equivalent strain.
+    """Cells with the secant stiffness mu_s K_d + K V g gᵀ (g · u: mean dilatation).
 
-    e² = uᵀ K_d u / (3 V), 3 mu_s = q(e)/e: the forces derive from an energy, so the tangent
-    is symmetric. See `Solid` for the arguments.
+    The cell's equivalent strain e² = uᵀ K_d u / (3 V) gives 3 mu_s = q(e)/e. The forces derive
+    from an energy, so the tangent is symmetric. `Solid` has the arguments.
     """
 
     def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
@@ -398,7 +382,7 @@ class CalibratedNetwork(Solid):
         self.curve = ShearCurve.of(material)
 
     def _deviatoric(self, cells: slice) -> Array:
-        """Return K_d of some cells (k, 24, 24), m per unit shear modulus."""
+        """Return K_d of a chunk of cells (k, 24, 24), m per unit shear modulus."""
         measures = self.gradients[cells], self.volume[cells]
         return deviatoric_matrices(self.corners(cells), *measures, self.springs, PAIRS)
 
@@ -406,8 +390,8 @@ class CalibratedNetwork(Solid):
     def stiffness(self) -> sparse.csr_matrix:
         """Linear stiffness (3n, 3n), N/m: mu K_d + K V g gᵀ of the cells."""
         mu = self.material.shear_modulus
-        some = chunks(len(self.cells))
-        return self.pattern.assemble(mu * self._deviatoric(c) + self.bulk(c) for c in some)
+        slices = chunks(len(self.cells))
+        return self.pattern.assemble(mu * self._deviatoric(c) + self.bulk(c) for c in slices)
 
     def linear_force(self, displacement: Array) -> Array:
         """Return K u, N, (n, 3); see `Solid`."""
@@ -428,33 +412,33 @@ class CalibratedNetwork(Solid):
         )
         forces = np.empty((len(cells), 24))
 
-        def softened(some: slice) -> None:
-            shapes, where = self._shapes, (self.cells, cells[some], displacement)
-            softened_forces(*shapes, *curve, *where, forces[some])
+        def write_forces(half: slice) -> None:
+            where = self.cells, cells[half], displacement
+            softened_forces(*self._shapes, *curve, *where, forces[half])
 
-        in_halves(softened, len(cells))
+        in_halves(write_forces, len(cells))
         return forces
 
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
-        """Return f(u) (n, 3), h of each cell (c, 24), N, and uᵀ K_T u, N·m; see `Solid`."""
+        """Return f(u) (n, 3), N, h of each cell (c, 24), N, and uᵀ K_T u, N·m; see `Solid`."""
         if self.curve.spline is None:
             return super().forces(displacement)
         shear, bulk = self.curve.shear_modulus, self.material.bulk_modulus
         knots, cubic = self.curve.spline.x, self.curve.spline.c
         residuals = np.empty((len(self.cells), 24))
 
-        def added(some: slice) -> tuple[Array, float]:
+        def forces_and_work(half: slice) -> tuple[Array, float]:
             internal = np.zeros_like(self.nodes)
             corners, gradients, volume, springs = self._shapes
             work = cell_forces(
-                corners[some], gradients[some], volume[some], springs,
+                corners[half], gradients[half], volume[half], springs,
                 shear, bulk, knots, cubic, STRESS_CURVE.least_strain,
-                self.cells[some], displacement, residuals[some], internal,
+                self.cells[half], displacement, residuals[half], internal,
             )  # fmt: skip
             return internal, work
 
-        (first, work), (second, more) = in_halves(added, len(self.cells))
-        return first + second, residuals, work + more
+        (first, first_work), (second, second_work) = in_halves(forces_and_work, len(self.cells))
+        return first + second, residuals, first_work + second_work
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
@@ -463,10 +447,10 @@ class CalibratedNetwork(Solid):
         scale = softening / (3 * self.volume)
 
         def matrices() -> Iterator[Array]:
-            for some in chunks(len(self.cells)):
-                result = secant[some, None, None] * self._deviatoric(some) + self.bulk(some)
-                outer = force[some, :, None] * force[some, None, :]
-                yield result + scale[some, None, None] * outer
+            for chunk in chunks(len(self.cells)):
+                result = secant[chunk, None, None] * self._deviatoric(chunk) + self.bulk(chunk)
+                outer = force[chunk, :, None] * force[chunk, None, :]
+                yield result + scale[chunk, None, None] * outer
 
         return self.pattern.assemble(matrices())
 
@@ -474,7 +458,8 @@ class CalibratedNetwork(Solid):
     def _shapes(self) -> tuple[Array, Array, Array, Array]:
         """Corners (c, 3, 8), mean gradients (c, 3, 8), volumes (c,) and springs (8, 8)."""
         corners, gradients = (
-            np.ascontiguousarray(one.transpose(0, 2, 1)) for one in (self.corners(), self.gradients)
+            np.ascontiguousarray(values.transpose(0, 2, 1))
+            for values in (self.corners(), self.gradients)
         )
         springs = np.zeros((8, 8))
         springs[tuple(PAIRS.T)] = self.springs

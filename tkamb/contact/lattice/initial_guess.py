@@ -1,4 +1,4 @@
-"""The initial guess of a press: candidate nodes, and the state of an earlier solution."""
+"""The initial guess of the contact solver: candidate nodes and the state of a warm start."""
 
 from dataclasses import dataclass, replace
 
@@ -13,48 +13,48 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 @dataclass(frozen=True, eq=False)
 class LatticeStart(WarmStart):
-    """The end of a solution, at which the next solution of the same problem may begin.
+    """Warm start: the state of a converged solution of the same problem.
 
     Args:
-        problem: the problem that was solved. The start is used for no other problem.
-        loads: (n, 3) N, nonlinear loads h + r of the last state; None for a linear material.
-        moved: (c, 3) m, displacement of the candidates; 0 at the other contact nodes.
-        depth: m, distance of the femoral component below the lowest contact node.
+        problem: the problem that was solved. Other problems ignore the warm start.
+        loads: nonlinear loads h + r, N, shape (n, 3); None for a linear material.
+        displacement: displacement of the contact nodes, m, shape (c, 3); 0 except at candidates.
+        depth: distance of the femoral component below the lowest contact node, m.
         region: elements outside of which h is zero, or None.
         softening: s, see `Residual`.
     """
 
     problem: ContactProblem
     loads: Array | None
-    moved: Array
+    displacement: Array
     depth: float
     region: Region | None
     softening: float = 1.0
 
 
 def lattice_start(state: LatticeState, start: Guess | None) -> LatticeStart | None:
-    """Return the start if it belongs to this prepared state, else None."""
-    own = isinstance(start, LatticeStart) and start.problem is state.problem
-    return start if own else None  # type: ignore[return-value]
+    """Return the warm start if it belongs to this prepared state, else None."""
+    matches = isinstance(start, LatticeStart) and start.problem is state.problem
+    return start if matches else None  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, eq=False)
 class InitialGuess:
-    """The state at which the iteration starts.
+    """The state at which the iteration begins.
 
     Args:
-        candidates: (m,) nodes that may come into contact, as positions among the contact nodes.
+        candidates: positions among the contact nodes of those that may be in contact, shape (m,).
         response: displacements of the candidates under forces on them.
-        active: (m,) first guess of the active set.
+        active: first guess of the active set, shape (m,).
         planes: femoral planes over the undeformed candidates.
-        loads: (n, 3) N, nonlinear loads h of an earlier solution, or None.
-        moved: (m, 3) m, displacement of the candidates in an earlier solution, or None.
-        reach: m; every node with a smaller vertical gap is a candidate.
+        loads: nonlinear loads h of an earlier solution, N, shape (n, 3), or None.
+        displacement: of the candidates in an earlier solution, m, shape (m, 3), or None.
+        reach: vertical gap below which every node is a candidate, m.
         region: elements outside of which h is zero, or None.
-        offset: (m, 3) m, displacement of the candidates without contact forces, or None. For a
-            linear material that has crept.
+        offset: creep displacement of the candidates of a linear material, m, shape (m, 3), or
+            None.
         softening: s of an earlier solution, see `Residual`.
-        region_only: whether the residual of the region alone stops the iteration.
+        region_only: whether the iteration stops by the residual of the region alone.
     """
 
     candidates: Index
@@ -62,7 +62,7 @@ class InitialGuess:
     active: Mask
     planes: TangentPlanes
     loads: Array | None = None
-    moved: Array | None = None
+    displacement: Array | None = None
     reach: float = np.inf
     region: Region | None = None
     offset: Array | None = None
@@ -72,7 +72,9 @@ class InitialGuess:
     @property
     def cold(self) -> "InitialGuess":
         """The same guess without the state of an earlier solution."""
-        return replace(self, loads=None, moved=None, region=None, softening=1.0, region_only=False)
+        return replace(
+            self, loads=None, displacement=None, region=None, softening=1.0, region_only=False
+        )
 
 
 def initial_guess(
@@ -85,15 +87,15 @@ def initial_guess(
     margin: float = LATTICE_SOLVER.candidate_margin,
     region_only: bool = False,
 ) -> InitialGuess:
-    """Return candidates, their response and a first active set.
+    """Return the candidates, their response and a first active set.
 
     Args:
         cache: compliance of the contact nodes.
-        gaps: (c,) m, vertical gaps.
-        planes: femoral planes over all contact nodes, undeformed.
-        depth: m, expected distance of the femoral component below the lowest gap.
-        at_pose: whether the femoral component stays at the pose and overlaps the candidates.
-        start: end of an earlier solution, or None.
+        gaps: vertical gaps, m, shape (c,).
+        planes: femoral planes over all undeformed contact nodes.
+        depth: expected approach beyond the smallest gap, m.
+        at_pose: whether the pose is given, not the load: the bodies then overlap.
+        start: warm start, or None.
         margin: see `LatticeSolverSettings.candidate_margin`.
         region_only: see `InitialGuess`.
     """
@@ -105,18 +107,18 @@ def initial_guess(
     if start is None:
         return guess
     return replace(
-        guess, loads=start.loads, moved=start.moved[nodes], region=start.region,
+        guess, loads=start.loads, displacement=start.displacement[nodes], region=start.region,
         region_only=region_only, softening=start.softening,
     )  # fmt: skip
 
 
 def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: float) -> float:
-    """Return a depth (m) at which an elastic foundation of modulus E would carry the load.
+    """Return the approach, m, at which an elastic foundation of modulus E carries the load.
 
     Args:
-        problem: solid; its modulus and the thickness under each node are used.
-        gaps: (c,) m, vertical gaps.
-        areas: (c,) m², area of each contact node.
+        problem: gives E and the thickness under each node.
+        gaps: vertical gaps, m, shape (c,).
+        areas: tributary areas, m², shape (c,).
         load: N.
     """
     order = np.argsort(gaps)
@@ -124,7 +126,7 @@ def guessed_depth(problem: ContactProblem, gaps: Array, areas: Array, load: floa
     thickness = np.maximum(problem.surface_points[order, 1], 1e-3)
     height, k = gaps[order], problem.solid.material.young_modulus * areas[order] / thickness
     total, moment = np.cumsum(k), np.cumsum(k * height)
-    # Force of the springs with smaller gaps when the next spring comes into contact.
+    # total * height - moment is the force of the foundation when each spring comes into contact.
     last = int(np.searchsorted(total * height - moment, load))
     last = max(min(last, len(order)) - 1, 0)
     return float((load + moment[last]) / total[last] - height[0])

@@ -1,4 +1,4 @@
-"""Contact models on a lattice of cells: the contract's prepare, evaluate and press."""
+"""Contact models on a lattice of cells, with the methods prepare, evaluate and press."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -49,31 +49,31 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
-TOUCHING = 1e-13
-"""m; bodies that overlap by less carry nothing: 1e-6 N at 1e7 N/m."""
+LEAST_OVERLAP = 1e-13
+"""m: smaller overlaps count as no contact. With 1e7 N/m their force is below 1e-6 N."""
 COARSE = 1e-3
-"""1: from this `tolerance` on the factor is stored in 16-bit integers. What their rounding leaves
-of residual force is stated at `LatticeSolverSettings.force_tolerance`."""
-REACH = 1.08
-"""Candidates must cover this many times the approach that was found."""
+"""1: from this `tolerance` on the factor is stored in 16-bit integers.
+`LatticeSolverSettings.force_tolerance` states their rounding residual."""
+COVERED_APPROACH = 1.08
+"""1: the depth covered by the candidates must be at least this factor times the approach."""
 
 
 @dataclass(frozen=True)
 class CellContact(ContactModel):
     """A solid of cells on the lattice's grid under a rigid femoral component.
 
-    Unilateral and frictionless: contact nodes may not pass the femoral surface, which they
-    meet along vertical rays, are pressed along its normal and slide on it freely. The
-    approach is an unknown of the same iteration. Small strain.
+    The contact is frictionless, at small strain. Vertical rays measure the gaps between contact
+    nodes and femoral surface. Contact forces act along the femoral normal. The approach is an
+    unknown of the same iteration.
 
     Args:
-        resolution: m, edge of the cells.
+        resolution: edge of the cells, m.
         tolerance: the three tolerances of `LatticeSolverSettings` are multiplied by
             tolerance / 1e-3. The relative error of the approach is at most half of `tolerance`.
-        pressure_rule: "tributary" (force over the node's own area) or "source" (force over
-            total area by number of nodes, Sharma 2008, section 4.5.6).
-        newton: solve by full Newton steps (slow; the reference).
-        cache: keep prepared operators on disk, see `tkamb.contact.lattice.linear.cache`.
+        pressure_rule: "tributary" (a node's force over its tributary area) or "source" (force over
+            the mean area of the nodes in contact, Sharma 2008, section 4.5.6).
+        newton: whether to use full Newton steps (slow; the reference).
+        cache: whether to store prepared operators, see `tkamb.contact.lattice.linear.cache`.
     """
 
     mobile_bearing: ClassVar[bool] = True
@@ -86,20 +86,20 @@ class CellContact(ContactModel):
 
     @property
     def settings(self) -> LatticeSolverSettings:
-        """What the solver's tolerances are at this model's tolerance."""
-        usual = LATTICE_SOLVER
+        """The solver's settings at this model's tolerance."""
+        defaults = LATTICE_SOLVER
         scale = self.tolerance / COARSE
         return replace(
-            usual,
-            force_tolerance=scale * usual.force_tolerance,
-            work_tolerance=scale * usual.work_tolerance,
-            gap_tolerance=scale * usual.gap_tolerance,
+            defaults,
+            force_tolerance=scale * defaults.force_tolerance,
+            work_tolerance=scale * defaults.work_tolerance,
+            gap_tolerance=scale * defaults.gap_tolerance,
         )
 
     direction: ClassVar[Direction] = "normal"
-    """Nodes are pressed along the femoral normal, or vertically."""
+    """Direction of the contact forces: along the femoral normal, or vertical."""
     ends_held: ClassVar[bool] = False
-    """A mobile bearing's end nodes are held, see `fixed_unknowns`."""
+    """Whether a mobile bearing's end nodes are held, see `fixed_unknowns`."""
 
     @abstractmethod
     def solid(self, lattice: Lattice, material: Material) -> Solid:
@@ -132,12 +132,11 @@ class CellContact(ContactModel):
         held: Mask,
         nodes: Index,
     ) -> ElasticOperator:
-        """Return the operator, from disk if it was made before.
+        """Return the operator, from disk if it is stored.
 
         Raises:
-            InputError: it does not fit into the memory that is left.
+            InputError: it does not fit into the available memory.
         """
-
         coarse = self.tolerance >= COARSE
 
         def make() -> ElasticOperator:
@@ -176,23 +175,24 @@ class CellContact(ContactModel):
         start: Guess | None = None,
         forces_only: bool = False,
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact at a pose, and the start of the next; see `ContactModel`.
+        """Return the contact at a pose, and a warm start for the next; see `ContactModel`.
 
         Args:
-            state: what `prepare` returned.
-            pose: (4, 4) pose_femoral_in_insert.
-            start: an earlier result, or the start that came with it.
-            forces_only: the elements that did not count at the start are not looked at, areas are
-                whole nodes', nothing is flagged. It holds near the start (`LatticeProbe`).
+            state: result of `prepare`.
+            pose: pose_femoral_in_insert, shape (4, 4).
+            start: an earlier result, or its warm start.
+            forces_only: whether only the forces are needed. Then only the region of the warm start
+                is evaluated, areas are those of whole nodes, and nothing is flagged. This is
+                accurate near the pose of the warm start (`LatticeProbe`).
         """
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return _alone(ContactResult.failed(state, pose, "the pose is not finite"))
+            return _with_start(ContactResult.failed(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
-        deepest = -float(gaps.min())
-        if deepest <= TOUCHING:
-            return _alone(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
-        return self._solved(state, pose, None, (gaps, planes), deepest, start, forces_only)
+        overlap = -float(gaps.min())
+        if overlap <= LEAST_OVERLAP:
+            return _with_start(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
+        return self._solved(state, pose, None, (gaps, planes), overlap, start, forces_only)
 
     def press_from(
         self,
@@ -201,25 +201,25 @@ class CellContact(ContactModel):
         pose: Array,
         start: Guess | None = None,
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact under a load (N), and the start of the next; see `evaluate_from`."""
+        """Return the contact under a load (N) and a warm start; see `evaluate_from`."""
         check_load(load)
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return _alone(ContactResult.failed(state, pose, "the pose is not finite"))
+            return _with_start(ContactResult.failed(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
         lowest = float(gaps.min())
         if not np.isfinite(lowest):
-            missed = "the femoral component does not lie over the insert"
-            return _alone(ContactResult.failed(state, pose, missed))
+            reason = "the femoral component does not lie over the insert"
+            return _with_start(ContactResult.failed(state, pose, reason))
         if load == 0:
             pose = state.pair.pose_at_approach(pose, 0.0)
             gaps, _ = undeformed(state.problem, pose)
-            return _alone(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
+            return _with_start(ContactResult.of(state, pose, np.zeros(len(gaps)), gaps))
         pose[1, 3] -= lowest
         gaps, planes = gaps - lowest, planes.raised(-lowest)
-        own = lattice_start(state, start)
-        if own is not None:
-            depth = own.depth
+        warm = lattice_start(state, start)
+        if warm is not None:
+            depth = warm.depth
         elif start is not None and start.approach > 0:
             depth = start.approach
         else:
@@ -227,7 +227,7 @@ class CellContact(ContactModel):
         return self._solved(state, pose, load, (gaps, planes), depth, start)
 
     def probe(self, state: LatticeState, guess: Guess | None = None) -> Probe:
-        """Return the probe with stiffness; see `ContactModel`."""
+        """Return a probe that also gives the stiffness; see `ContactModel`."""
         if self.direction == "vertical":
             return Probe(self, state, guess)
         return LatticeProbe(self, state, guess, self.tolerance)
@@ -237,43 +237,45 @@ class CellContact(ContactModel):
         state: LatticeState,
         pose: Array,
         load: float | None,
-        rest: tuple[Array, TangentPlanes],
+        gaps_and_planes: tuple[Array, TangentPlanes],
         depth: float,
-        begin: Guess | None,
+        guess_or_start: Guess | None,
         region_only: bool = False,
     ) -> tuple[ContactResult, WarmStart]:
         """Solve with growing candidate sets until they cover the approach.
 
-        `rest` is what `undeformed` says at the pose.
+        `gaps_and_planes` is the result of `undeformed` at the pose. `depth` is the expected
+        approach, m.
         """
-        (gaps, planes), settings = rest, self.settings
-        start = lattice_start(state, begin)
+        (gaps, planes), settings = gaps_and_planes, self.settings
+        start = lattice_start(state, guess_or_start)
         forces_only = region_only and start is not None and not self.newton
         for _ in range(settings.max_expansions):
             guess = initial_guess(
                 state.compliance, gaps, planes, depth, load is None, start,
                 settings.candidate_margin, forces_only,
             )  # fmt: skip
-            below = -min(float(gaps.min()), 0.0)
-            covered = load is None or len(guess.candidates) == np.isfinite(gaps).sum()
-            within = np.inf if covered else (guess.reach - below) / REACH
-            solution = self._solution(state.problem, pose, load, guess, settings, within)
+            overlap = -min(float(gaps.min()), 0.0)
+            complete = load is None or len(guess.candidates) == np.isfinite(gaps).sum()
+            covered = np.inf if complete else (guess.reach - overlap) / COVERED_APPROACH
+            solution = self._solution(state.problem, pose, load, guess, settings, covered)
             approach = solution.forces.approach
-            if approach <= within:
+            if approach <= covered:
                 rule = self.pressure_rule
                 result = result_of(state, pose, load, gaps, solution, rule, forces_only)
                 if load is not None:
-                    sunk = approach + max(-float(gaps.min()), 0.0)
-                    result = within_insert(state, result, *unseen_flags(state, result, sunk))
+                    below_first = approach + max(-float(gaps.min()), 0.0)
+                    flags = unseen_flags(state, result, below_first)
+                    result = within_insert(state, result, *flags)
                 if not solution.converged:
-                    return _alone(result)
-                return result, _start_after(state, result, solution, below + approach)
-            if solution.converged:  # the repetition with more candidates begins here
-                place = WarmStart(state.pair, pose, state.points, np.zeros(len(gaps)), gaps)
-                start = _start_after(state, place, solution, below + approach)
+                    return _with_start(result)
+                return result, _start_after(state, result, solution, overlap + approach)
+            if solution.converged:  # the solution with more candidates begins at this state
+                at_pose = WarmStart(state.pair, pose, state.points, np.zeros(len(gaps)), gaps)
+                start = _start_after(state, at_pose, solution, overlap + approach)
             depth = 1.1 * approach
         saturated = "the set of candidate nodes is saturated"
-        return _alone(ContactResult.failed(state, pose, saturated))
+        return _with_start(ContactResult.failed(state, pose, saturated))
 
     def _solution(
         self,
@@ -282,12 +284,13 @@ class CellContact(ContactModel):
         load: float | None,
         guess: InitialGuess,
         settings: LatticeSolverSettings,
-        within: float,
+        covered: float,
     ) -> Solution:
-        """Solve by the stored response; by Newton's method when that leaves forces out of balance.
+        """Solve with the stored factor, and by Newton's method if this does not converge.
 
-        A femoral surface on which nodes come to no rest stays that to Newton's method, and an
-        approach beyond `within`, m, is solved again with more candidates.
+        Newton's method is not tried if the gap is the larger residual, because nodes would
+        oscillate on the femoral surface again. It is not tried if the approach is larger than
+        `covered`, m, because the caller then adds candidates.
         """
         if self.newton:
             return solve_by_newton(problem, pose, load, guess, settings)
@@ -298,7 +301,7 @@ class CellContact(ContactModel):
             or solution.residual.gap >= solution.residual.force
         ):
             return solution
-        if solution.forces.approach > within:
+        if solution.forces.approach > covered:
             return solution
         try:
             return solve_by_newton(problem, pose, load, guess, settings, solution.field)
@@ -308,11 +311,11 @@ class CellContact(ContactModel):
 
 @dataclass(frozen=True)
 class CalibratedLattice(CellContact):
-    """The calibrated lattice: exact in the uniform-strain patch, any Poisson's ratio.
+    """The calibrated lattice. It passes the patch test, for any Poisson's ratio.
 
-    28 springs per cell weighted by the share of the cells that own them plus a cell volume
-    term; nonlinear by one secant shear modulus per cell (J2 deformation theory, elastic
-    bulk) from the material's curve, fed with small strain. See docs/lattice.md.
+    A cell has 28 springs, which it shares with its neighbours, and a volume term. The material's
+    curve gives one secant shear modulus per cell (J2 deformation theory, elastic bulk, small
+    strain). See docs/lattice.md.
     """
 
     name: ClassVar[str] = "lattice"
@@ -329,7 +332,7 @@ class CalibratedLattice(CellContact):
 
 @dataclass(frozen=True)
 class LinearLattice(CellContact):
-    """The calibrated lattice with Hooke's law: contact condensed to the surface nodes."""
+    """The calibrated lattice with Hooke's law."""
 
     name: ClassVar[str] = "lattice-linear"
     assumes: ClassVar[str] = "a spring lattice calibrated to E and nu; linear, no friction"
@@ -345,7 +348,7 @@ class LinearLattice(CellContact):
 class FiniteElements(CellContact):
     """B-bar hexahedra (mean dilatation), J2 deformation theory at eight Gauss points.
 
-    Grid, active set and pressure rules are those of the lattice; small strain.
+    Grid, contact and pressure rules are those of the lattice. Small strain.
     """
 
     name: ClassVar[str] = "fe"
@@ -357,35 +360,35 @@ class FiniteElements(CellContact):
         return BbarHexahedra(lattice.nodes, lattice.cells, lattice.spacing, material)
 
 
-def _alone(result: ContactResult) -> tuple[ContactResult, WarmStart]:
-    """Return an answer that leaves no solution behind, and the start that it gives by itself."""
+def _with_start(result: ContactResult) -> tuple[ContactResult, WarmStart]:
+    """Return a result without a lattice solution, and the warm start that it gives alone."""
     return result, WarmStart.after(result)
 
 
 def _start_after(
-    state: LatticeState, place: Guess, solution: Solution, depth: float
+    state: LatticeState, contact: Guess, solution: Solution, depth: float
 ) -> LatticeStart:
-    """Return where the next solution may begin after one that has converged.
+    """Return the warm start of a solution that has converged.
 
     Args:
         state: prepared contact.
-        place: pose, pressure and gap of the solution.
-        solution: what the solver found.
-        depth: m, how far the femoral component is below the lowest contact node.
+        contact: pose, pressure and gap of the solution.
+        solution: solution of the lattice.
+        depth: distance of the femoral component below the lowest contact node, m.
     """
-    moved = np.zeros_like(state.surface.points)
-    moved[solution.candidates] = solution.displacement
+    displacement = np.zeros_like(state.surface.points)
+    displacement[solution.candidates] = solution.displacement
     return LatticeStart(
-        state.pair, place.pose, state.points, place.pressure, place.gap,
-        state.problem, solution.loads, moved, depth, solution.region, solution.softening,
+        state.pair, contact.pose, state.points, contact.pressure, contact.gap,
+        state.problem, solution.loads, displacement, depth, solution.region, solution.softening,
     )  # fmt: skip
 
 
 def _warm_up(problem: ContactProblem, pair: ContactPair) -> None:
-    """Have built now what the first rays and the first look at the cells would build."""
+    """Build everything that the first evaluation would build: ray trees and compiled loops."""
     undeformed(problem, np.eye(4))
     pair.touch_at(np.eye(4))
     if not problem.solid.material.is_linear:
-        still = np.zeros_like(problem.solid.nodes)
-        problem.solid.nonlinear_residual(still)
-        problem.solid.least_principal_strain(still)
+        zero = np.zeros_like(problem.solid.nodes)
+        problem.solid.nonlinear_residual(zero)
+        problem.solid.least_principal_strain(zero)

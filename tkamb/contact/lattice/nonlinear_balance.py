@@ -1,20 +1,20 @@
 """Residual forces of the displaced solid, and the nonlinear loads h that make them vanish.
 
-The stiffness is that of the linear solid. Loads h replace the stress that the nonlinear material
-carries less:
+The iteration uses the linear stiffness K. The loads h correct for the stress that the softened
+material lacks:
 
     K u = f + h,    r = f - f_int(u)
 
-K is the factorised linear stiffness, f the contact forces, f_int the forces of the displaced
-solid under its nonlinear law. At equilibrium r = 0 and h = K u - f_int(u). Every pass solves
-K u = f + h and takes h + s r as the next h (modified Newton), accelerated by Anderson's method
-(Walker & Ni, SIAM J Numer Anal 49:1715, 2011, doi:10.1137/10078356X). The softening s is the ratio
-of secant and tangent stiffness along u, so that K/s approximates the tangent stiffness.
+f are the contact forces, f_int(u) the internal forces under the nonlinear law. At equilibrium r = 0
+and h = K u - f_int(u). Every pass solves K u = f + h and takes h + s r as the next h (modified
+Newton), accelerated by Anderson's method (Walker & Ni, SIAM J Numer Anal 49:1715, 2011,
+doi:10.1137/10078356X). The softening s is the ratio of secant and tangent stiffness along u, so
+that K/s approximates the tangent stiffness.
 
-An element's share of h falls with a power of its strain (4.5 for polyethylene). So passes evaluate
-the `Region` of the elements with the largest shares. The shares of the other elements and the
-residual by rounding of the factor change little from pass to pass. They are measured with the whole
-solid (`NonlinearBalance.measure`) and then held constant.
+An element's share of h grows with a power of its strain (4.5 for polyethylene). So passes evaluate
+only the `Region` of the elements with the largest shares. The shares of the other elements and the
+rounding error of the factor change little from pass to pass. They are measured with the whole solid
+(`NonlinearBalance.measure`), and are constant until the next measurement.
 """
 
 from dataclasses import dataclass, replace
@@ -30,14 +30,14 @@ from tkamb.geometry.frames import Array, Mask
 
 @dataclass(frozen=True)
 class Residual:
-    """The measured residuals of a state. They stop the iteration.
+    """The measured residuals of a state, which stop the iteration.
 
     Args:
-        force: |f - f_int(u)| over the free unknowns, relative to |f|.
-        work: |(f - f_int(u)) · u|, relative to f · u, times the softening
-            s = (f_int(u) · u) / (uᵀ K_T u): an estimate of the relative error of the approach.
-        gap: largest distance of an active node from the femoral surface, or largest overlap of
-            another node, relative to the largest displacement of an active node.
+        force: |r| over the free unknowns, relative to |f|, with r = f - f_int(u).
+        work: s |r · u|, relative to f · u, with the softening s = (f_int(u) · u) / (uᵀ K_T u): an
+            estimate of the relative error of the approach.
+        gap: largest distance of an active node from the femoral surface, or largest penetration
+            of another node, relative to the largest displacement of an active node.
     """
 
     force: float
@@ -46,38 +46,38 @@ class Residual:
 
     @classmethod
     def of(
-        cls, outside: Array, field: Array, force: Array, moved: Array, softening: float
+        cls, r: Array, field: Array, force: Array, displacement: Array, softening: float
     ) -> "Residual":
-        """Return force and work of residual nodal forces.
+        """Return the force and the work of residual nodal forces.
 
         Args:
-            outside: (n, 3) N, f - f_int(u), zero at held unknowns.
-            field: (n, 3) m, u.
-            force: (m, 3) N, contact forces.
-            moved: (m, 3) m, displacement of their nodes.
+            r: f - f_int(u), N, shape (n, 3), zero at held unknowns.
+            field: u, m, shape (n, 3).
+            force: contact forces, N, shape (m, 3).
+            displacement: displacement of the loaded nodes, m, shape (m, 3).
             softening: s.
         """
         size = max(float(np.linalg.norm(force)), 1e-300)
-        work = abs(float(np.vdot(outside, field))) / max(float(np.vdot(force, moved)), 1e-300)
-        return cls(float(np.linalg.norm(outside)) / size, softening * work)
+        work = abs(float(np.vdot(r, field))) / max(float(np.vdot(force, displacement)), 1e-300)
+        return cls(float(np.linalg.norm(r)) / size, softening * work)
 
     def within(self, settings: LatticeSolverSettings) -> bool:
-        """Return whether all are within their tolerances; NaN is not."""
-        balanced = self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
-        return balanced and self.gap <= settings.gap_tolerance
+        """Return whether all residuals are within their tolerances; NaN is not."""
+        in_balance = self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
+        return in_balance and self.gap <= settings.gap_tolerance
 
     @property
     def reported(self) -> float:
-        """The larger one of force and gap."""
+        """The larger of force and gap."""
         return max(self.force, self.gap)
 
 
 class LinearBalance:
-    """The balance of a linear material, which needs no loads h: passes repeat rays and contact.
+    """The balance of a linear material. It needs no loads h; passes repeat rays and contact.
 
     Attributes:
-        offset: (m, 3) m, displacement of the candidates without contact forces.
-        moved: (m, 3) m, total displacement of the candidates.
+        offset: displacement of the candidates without contact forces, m, shape (m, 3).
+        displacement: total displacement of the candidates, m, shape (m, 3).
     """
 
     residual, field, loads, region, softening = Residual(0.0), None, None, None, 1.0
@@ -85,10 +85,10 @@ class LinearBalance:
     def __init__(self, offset: Array) -> None:
         self.offset = offset
 
-    def displace(self, force: Array, moved: Array) -> None:
-        """Take the displacement (m, 3) of the condensed compliance."""
+    def displace(self, force: Array, displacement: Array) -> None:
+        """Set the displacement (m, 3), m, to that of the condensed compliance."""
         del force
-        self.moved = moved
+        self.displacement = displacement
 
     def measure(self) -> None:
         """Do nothing: the residual of a linear material is zero."""
@@ -105,11 +105,11 @@ class NonlinearBalance:
         settings: tolerances.
 
     Attributes:
-        moved: (m, 3) m, displacement of the candidates: by the compliance; after `measure` by the
-            factor.
-        field: (n, 3) m, displacement of the region's nodes; after `measure` of all nodes.
-        residual: force and work of the region; after `measure` of the whole solid.
-        loads: (n, 3) N, h + r; after `measure` a start of the next solution.
+        displacement: displacement of the candidates, m, shape (m, 3), from the compliance; after
+            `measure` from the factor.
+        field: displacement of the region's nodes, after `measure` of all nodes, m, shape (n, 3).
+        residual: force and work of the region, after `measure` of the whole solid.
+        loads: h + r, N, shape (n, 3); after `measure` usable as warm start.
         softening: s of the last measurement.
     """
 
@@ -123,12 +123,13 @@ class NonlinearBalance:
         self._rounding = np.zeros((len(guess.candidates), 3))
         self._differences: list[tuple[Array, Array]] = []
         self.softening, self.residual = guess.softening, Residual(np.inf, np.inf)
-        self._take(self._constant if guess.loads is None else guess.loads)
+        self._set_loads(self._constant if guess.loads is None else guess.loads)
 
-    def _take(self, h: Array) -> None:
-        """Set h (n, 3), N, on the nodes of the region; it is zero elsewhere."""
+    def _set_loads(self, h: Array) -> None:
+        """Set h (n, 3), N, on the nodes of the region, and 0 elsewhere."""
         self._h, nodes = np.zeros_like(h), self._region.nodes
         self._h[nodes] = h[nodes]
+        # L⁻¹ h in elimination order.
         self._half = self._problem.operator.start(self._h, self._region.fronts)
 
     @property
@@ -136,15 +137,16 @@ class NonlinearBalance:
         """Displacement (m, 3) of the candidates without contact forces, m."""
         return self._response.displacement(self._half) + self._rounding
 
-    def displace(self, force: Array, moved: Array) -> None:
-        """Find the region's displacement and residual under contact forces.
+    def displace(self, force: Array, displacement: Array) -> None:
+        """Compute the region's displacement and residual under contact forces.
 
         Args:
-            force: (m, 3) N, on the candidates.
-            moved: (m, 3) m, their displacement by the condensed compliance.
+            force: forces on the candidates, N, shape (m, 3).
+            displacement: candidates' displacement from the condensed compliance, m, shape (m, 3).
         """
         operator, region, solid = self._problem.operator, self._region, self._problem.solid
-        self._force, self.moved = force, moved
+        self._force, self.displacement = force, displacement
+        # First L⁻¹ (h + f), then K⁻¹ (h + f) in the unknowns of the region's fronts.
         self._x = self._half.copy()
         self._response.push(force, self._x)
         operator.factor.backward(self._x, region.fronts)
@@ -156,43 +158,45 @@ class NonlinearBalance:
         self.field[region.nodes] = operator.nodal(self._x, region.nodes)
         shares = solid.nonlinear_residual(self.field, region.elements)
         self.loads = self._constant + solid.scatter.sum(shares, region.elements)
-        outside = np.zeros_like(self._h)
-        outside[region.nodes] = (self.loads - self._h)[region.nodes]
-        self._found(outside)
+        r = np.zeros_like(self._h)
+        r[region.nodes] = (self.loads - self._h)[region.nodes]
+        self._set_residual(r)
 
     def measure(self) -> None:
-        """Measure displacement and residual of the whole solid, by the law of every element."""
+        """Measure displacement and residual of the whole solid, with the law of every element."""
         if self._measured:
             return
         solid, operator = self._problem.solid, self._problem.operator
         if not self._region.whole:
-            every = self._problem.everywhere.fronts.fronts
-            rest = np.setdiff1d(every, self._region.fronts.fronts, assume_unique=True)
-            operator.factor.backward(self._x, operator.factor.shared(rest))
+            # The other fronts still lack the backward solve.
+            fronts = self._problem.everywhere.fronts.fronts
+            others = np.setdiff1d(fronts, self._region.fronts.fronts, assume_unique=True)
+            operator.factor.backward(self._x, operator.factor.shared(others))
         self.field = operator.nodal(self._x)
         internal, self._shares, self.softening = forces_of(solid, self.field)
-        outside = -internal
-        outside[self._candidates] += self._force
-        self.loads, self._measured = self._h + outside, True
-        self._found(outside)
-        # The factor is stored with less precision than the compliance: correct the compliance's
-        # displacement by the difference.
+        r = -internal
+        r[self._candidates] += self._force
+        self.loads, self._measured = self._h + r, True
+        self._set_residual(r)
+        # The factor is less precise than the compliance. The difference of their displacements
+        # corrects the offset of the next passes.
         measured = self.field[self._candidates]
-        self._rounding, self.moved = self._rounding + measured - self.moved, measured
+        self._rounding = self._rounding + measured - self.displacement
+        self.displacement = measured
 
-    def _found(self, outside: Array) -> None:
-        """Set the residual from residual nodal forces (n, 3), N."""
-        for loads in (outside, self.loads):
+    def _set_residual(self, r: Array) -> None:
+        """Set the residual from the residual nodal forces (n, 3), N."""
+        for loads in (r, self.loads):
             loads.ravel()[self._problem.held_unknowns] = 0.0
         last, self._size = self.residual, float(np.linalg.norm(self._force))
-        new = Residual.of(outside, self.field, self._force, self.moved, self.softening)
-        # The work may vanish by chance where it changes its sign. So it is taken to fall no faster
-        # than the force.
+        new = Residual.of(r, self.field, self._force, self.displacement, self.softening)
+        # The work is small by chance where it changes its sign. So it may not fall by a larger
+        # factor than the force.
         fall = min(new.force / max(last.force, 1e-300), 1.0) if np.isfinite(last.force) else 0.0
         self.residual = replace(new, work=max(new.work, fall * last.work if fall else 0.0))
 
     def advance(self) -> None:
-        """Set the next loads h: h + s r, accelerated."""
+        """Set the next loads, h + s r accelerated."""
         if self._measured:
             self._choose_region()
         nodes = self._region.nodes
@@ -200,23 +204,23 @@ class NonlinearBalance:
         step = self.softening * (self.loads[nodes].ravel() - h)
         self._differences.append((h + step, step))
         del self._differences[: -self._settings.anderson_depth - 1]
-        following = np.zeros_like(self._h)
-        following[nodes] = accelerated(self._differences).reshape(-1, 3)
-        self._take(following)
+        next_loads = np.zeros_like(self._h)
+        next_loads[nodes] = accelerated(self._differences).reshape(-1, 3)
+        self._set_loads(next_loads)
 
     def _choose_region(self) -> None:
-        """Choose the region, and hold the loads of the other elements constant."""
-        most = self._settings.force_tolerance * self._size
-        if self._region.whole or self._beyond(self._region, self.loads - self._h) > most:
+        """Choose the region; the loads of the other elements are constant from here on."""
+        tolerance = self._settings.force_tolerance * self._size
+        if self._region.whole or self._beyond(self._region, self.loads - self._h) > tolerance:
             region = self.region
-            if self._beyond(region, self.loads) > most:
+            if self._beyond(region, self.loads) > tolerance:
                 region = self._problem.everywhere
-            if not (region.whole and self._region.whole):  # earlier iterates do not apply
+            if not (region.whole and self._region.whole):  # earlier iterates have another region
                 self._differences = []
             self._region = region
         elements = self._region.elements
-        known = self._problem.solid.scatter.sum(self._shares[elements], elements)
-        self._constant = self.loads - known
+        in_region = self._problem.solid.scatter.sum(self._shares[elements], elements)
+        self._constant = self.loads - in_region
 
     @property
     def region(self) -> Region:
@@ -226,10 +230,10 @@ class NonlinearBalance:
         settings, shares = self._settings, self._shares
         allowed = settings.region_tolerance * settings.force_tolerance * self._size
         size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
-        return Region.of(self._problem, np.flatnonzero(elements_that_count(size, allowed)))
+        return Region.of(self._problem, np.flatnonzero(largest_shares(size, allowed)))
 
     def _beyond(self, region: Region, force: Array) -> float:
-        """Return the norm of forces (n, 3) on nodes outside of a region, N."""
+        """Return the norm of forces (n, 3), N, on the nodes outside of a region."""
         outside = force.copy()
         outside[region.nodes] = 0.0
         return float(np.linalg.norm(outside))
@@ -245,10 +249,10 @@ def forces_of(solid: Solid, field: Array) -> tuple[Array, Array, float]:
 def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
     """Return the next x of a fixed-point iteration x = g(x), by Anderson's method.
 
-    The combination of the last iterates whose linearised residual is smallest.
+    It combines the iterates so that the linearised residual is smallest.
 
     Args:
-        iterates: g(x) and g(x) - x, (n,), the last one last.
+        iterates: pairs of g(x) and g(x) - x, shape (n,) each, the newest last.
     """
     value, residual = iterates[-1]
     if len(iterates) == 1:
@@ -260,15 +264,15 @@ def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
     return np.asarray(value - weights @ values)
 
 
-def elements_that_count(size: Array, allowed: float) -> Mask:
-    """Return which elements (c,) belong to the region: all but the smallest shares of h.
+def largest_shares(size: Array, allowed: float) -> Mask:
+    """Return the mask (c,) of the elements of the region: all but the smallest shares of h.
 
     Args:
-        size: (c,) N, norm of each element's share of h.
-        allowed: N, largest root of the sum of squares of the shares that are left out.
+        size: norm of each element's share of h, N, shape (c,).
+        allowed: largest root of the sum of squares of the omitted shares, N.
     """
     order = np.argsort(size)
-    counts = np.zeros(len(size), bool)
-    left_out = np.searchsorted(np.cumsum(size[order] ** 2), allowed**2, side="right")
-    counts[order[left_out:]] = True
-    return counts
+    result = np.zeros(len(size), bool)
+    omitted = np.searchsorted(np.cumsum(size[order] ** 2), allowed**2, side="right")
+    result[order[omitted:]] = True
+    return result

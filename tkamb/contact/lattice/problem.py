@@ -1,4 +1,4 @@
-"""One insert under one femoral component, discretised: what every contact solver needs."""
+"""The discretised contact problem of one insert and one femoral component."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +21,7 @@ from tkamb.geometry.surface import Surface
 Direction = Literal["normal", "vertical"]
 
 LEAST_NORMAL_Y = -0.05
-"""Largest y of a femoral normal that a vertical press can load: 87 deg from the vertical."""
+"""1: largest y of a femoral normal that can be loaded. It is 87 deg from straight down."""
 UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -29,8 +29,8 @@ UP = np.array([0.0, 1.0, 0.0])
 class SurfaceFromBelow:
     """The lowest femoral surface over any x and z of the insert.
 
-    Rays meet the triangles; from there they go on to the curved patches over them
-    (`CurvedSurface`), so that facets leave no pattern in the pressure.
+    A ray that meets a triangle is continued to the curved patch of this triangle
+    (`CurvedSurface`). So facets leave no pattern in the pressure.
 
     Args:
         surface: femoral component, femoral frame.
@@ -45,45 +45,45 @@ class SurfaceFromBelow:
         return CurvedSurface.of(self.surface)
 
     def over(self, points: Array, pose: Array) -> tuple[Array, Array]:
-        """Return the lowest femoral points (n, 3) above or below points, and their normals.
+        """Return the lowest femoral points (n, 3) on the verticals through points, and normals.
 
-        Vertical rays come from below everything. NaN where there is no femoral surface.
+        The rays begin below both bodies.
 
         Args:
-            points: (n, 3) m, insert frame; only x and z count.
-            pose: (4, 4) pose_femoral_in_insert.
+            points: m, insert frame, shape (n, 3); y is not used.
+            pose: pose_femoral_in_insert, shape (4, 4).
 
         Returns:
-            Points and outward unit normals (n, 3), insert frame. Normals are interpolated
-            between vertices, so that they are continuous across the triangles of a smooth
-            part; they point down.
+            Points, m, and outward unit normals, insert frame, shape (n, 3) each; NaN where there
+            is no femoral surface. Normals are interpolated between vertices, so that they are
+            continuous on smooth parts. They point down.
         """
-        back = inverse(pose)
+        to_femoral = inverse(pose)
         start = float(pose[1, 3]) - 2 * float(np.abs(self.surface.bounds).max()) - 1e-2
-        below = points.copy()
-        below[:, 1] = start
-        origins, up = transform(back, below), rotate(back, UP)
+        hits = points.copy()
+        hits[:, 1] = start
+        origins, up = transform(to_femoral, hits), rotate(to_femoral, UP)
         distance, face, weights = self.rays.first_in_face(origins, up)
         shift, outward = self._curved.shift(face, weights, up)
-        below[:, 1] += distance + shift
-        below[face < 0] = np.nan
+        hits[:, 1] += distance + shift
+        hits[face < 0] = np.nan
         outward = rotate(pose, outward)
-        return below, np.where(outward[:, 1:2] > 0, -outward, outward)
+        return hits, np.where(outward[:, 1:2] > 0, -outward, outward)
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """A solid, its linear operator, the nodes that can be touched and what touches them.
+    """A solid, its linear operator, its contact nodes and the femoral component.
 
     Args:
         solid: cells and material.
         operator: factor of the linear stiffness.
-        index: (n, 3) lattice index of each node.
-        held: (3n,) unknowns held by the boundary.
-        femoral: the femoral component from below.
-        direction: nodes are pressed along the femoral normal, or vertically (Sharma 2008).
-        lift: (c,) m along y, from the contact nodes to the smooth surface that their mesh
-            stands for; 0: they are taken where they are.
+        index: lattice index of each node, shape (n, 3).
+        held: mask of the unknowns held by the boundary, shape (3n,).
+        femoral: femoral component seen from below.
+        direction: direction of the contact forces: along the femoral normal, or vertical
+            (Sharma 2008).
+        lift: height of the smooth surface above the contact nodes, m, shape (c,), or 0.
     """
 
     solid: Solid
@@ -96,7 +96,7 @@ class ContactProblem:
 
     @property
     def contact_nodes(self) -> Index:
-        """Nodes (c,) that can be touched."""
+        """Nodes (c,) of the contact surface."""
         return self.operator.contact_nodes
 
     @cached_property
@@ -109,12 +109,12 @@ class ContactProblem:
 
     @cached_property
     def held_unknowns(self) -> Index:
-        """Which of the 3n unknowns are held."""
+        """Numbers of the held unknowns."""
         return np.flatnonzero(self.held)
 
     @cached_property
     def free_nodes(self) -> Mask:
-        """Which nodes (n,) can move at all."""
+        """Mask (n,) of the nodes with at least one free unknown."""
         return np.asarray(~self.held.reshape(-1, 3).all(axis=1), bool)
 
     @cached_property
@@ -125,18 +125,18 @@ class ContactProblem:
 
 @dataclass(frozen=True, eq=False)
 class TangentPlanes:
-    """The femoral surface over some contact nodes, at zero approach: one plane each.
+    """The tangent planes of the femoral surface over contact nodes, at zero approach.
 
     Args:
-        points: (m, 3) femoral points on the verticals through the nodes.
-        normals: (m, 3) femoral outward unit normals there.
+        points: femoral points on the verticals through the nodes, m, shape (m, 3).
+        normals: femoral outward unit normals at these points, shape (m, 3).
     """
 
     points: Array
     normals: Array
 
     def gap(self, positions: Array) -> Array:
-        """Return the gap (m,) of deformed nodes to the planes, m."""
+        """Return the gaps (m,), m, between displaced nodes (m, 3) and the planes."""
         return np.einsum("ij,ij->i", self.normals, positions - self.points)
 
     @property
@@ -145,18 +145,18 @@ class TangentPlanes:
         return self.normals[:, 1]
 
     def part(self, nodes: Index) -> "TangentPlanes":
-        """Return the planes over some of the nodes."""
+        """Return the planes over a subset of the nodes."""
         return TangentPlanes(self.points[nodes], self.normals[nodes])
 
     def raised(self, height: float) -> "TangentPlanes":
-        """Return the planes when the femoral component has moved along y (m)."""
+        """Return the planes of a femoral component that is raised by `height`, m."""
         return TangentPlanes(self.points + np.array([0.0, height, 0.0]), self.normals)
 
 
 def undeformed(problem: ContactProblem, pose: Array) -> tuple[Array, TangentPlanes]:
-    """Return vertical gaps (c,) and planes of all contact nodes where they are at rest.
+    """Return the vertical gaps (c,), m, and planes of all undeformed contact nodes.
 
-    The gap is inf where there is no femoral surface above.
+    The gap is inf where no femoral surface can be loaded.
     """
     points = problem.surface_points
     planes = tangent_planes(problem, points, pose, None)
@@ -167,14 +167,14 @@ def undeformed(problem: ContactProblem, pose: Array) -> tuple[Array, TangentPlan
 def tangent_planes(
     problem: ContactProblem, positions: Array, pose: Array, last: TangentPlanes | None
 ) -> TangentPlanes:
-    """Fire the vertical rays through displaced nodes again.
+    """Return the femoral planes on vertical rays through displaced nodes (m, 3).
 
-    A node that has slid from under the femoral component keeps its last plane.
+    A node that is not under the femoral component keeps its plane in `last`.
     """
     points, normals = problem.femoral.over(positions, pose)
-    lost = ~(normals[:, 1] < LEAST_NORMAL_Y)
+    missed = ~(normals[:, 1] < LEAST_NORMAL_Y)
     if last is not None:
-        points[lost], normals[lost] = last.points[lost], last.normals[lost]
+        points[missed], normals[missed] = last.points[missed], last.normals[missed]
     if problem.direction == "vertical":
         normals = np.where(np.isnan(normals), np.nan, [0.0, -1.0, 0.0])
     return TangentPlanes(points, normals)
@@ -182,13 +182,13 @@ def tangent_planes(
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Some elements (cells, springs) of a problem's solid, and what of the factor is theirs.
+    """A subset of the elements (cells or springs) of a solid.
 
     Args:
-        elements: (k,) increasing.
-        nodes: (m,) their nodes that are not held.
-        fronts: what of the factor these nodes need.
-        whole: these are all elements.
+        elements: numbers of the elements, increasing, shape (k,).
+        nodes: their nodes that are not held, shape (m,).
+        fronts: fronts of the factor that a solve for these nodes needs.
+        whole: whether the subset has all elements.
     """
 
     elements: Index
@@ -198,23 +198,23 @@ class Region:
 
     @classmethod
     def of(cls, problem: ContactProblem, elements: Index) -> "Region":
-        """Return the region of some elements of the problem's solid."""
+        """Return the region of elements of the problem's solid."""
         scatter = problem.solid.scatter
-        touched = np.zeros(scatter.nodes, bool)
-        touched[scatter.elements[elements]] = True
-        nodes = np.flatnonzero(touched & problem.free_nodes)
+        in_region = np.zeros(scatter.nodes, bool)
+        in_region[scatter.elements[elements]] = True
+        nodes = np.flatnonzero(in_region & problem.free_nodes)
         whole = len(elements) == len(scatter.elements)
         return cls(elements, nodes, problem.operator.fronts_of(nodes), whole)
 
 
 @dataclass(frozen=True, eq=False)
 class LatticeState(PreparedContact):
-    """What depends on geometry and material alone.
+    """A prepared contact: everything that depends on geometry and material alone.
 
     Args:
         lattice: the insert's grid.
         problem: solid, factorised operator and femoral component.
-        compliance: that of the contact nodes asked for last; it changes no answer.
+        compliance: cache of the compliance of recent candidates; it changes no result.
     """
 
     surface: ContactMap
@@ -224,5 +224,5 @@ class LatticeState(PreparedContact):
 
     @property
     def node_count(self) -> int:
-        """Nodes of the grid."""
+        """Number of nodes of the grid."""
         return len(self.lattice.nodes)

@@ -1,9 +1,8 @@
-"""From a solution of the lattice to the contract's result: pressures, sums, flags.
+"""From a solution of the lattice to a `ContactResult`: pressures, areas and flags.
 
-Flags name strains, edges and contacts that the lattice does not resolve. At a rounded edge that is
-narrower than the cells the pressure is that of a punch: it rises with every refinement
-(docs/lattice.md, "Convergence on real implants"). If a contact is too narrow for the cells, the
-peak is an average over an area larger than the contact.
+Flags mark large strains, and peaks that the cells do not resolve. At a rounded edge narrower than
+the cells, the peak rises with every refinement (docs/lattice.md, "Convergence on real implants").
+In a contact too narrow for the cells, the peak is an average over an area larger than the contact.
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,36 +33,37 @@ class LatticeFlagSettings:
     """When a result of the lattice gets a flag."""
 
     edge_distance_cells: float = 2.0
-    """Cells: distance from the peak at which the femoral normal is looked at. Chosen: a peak at an
-    edge lies one or two cells inside it."""
+    """Cells: distance from the peak at which the femoral normal is evaluated. Chosen because a peak
+    at an edge lies one or two cells inside it."""
     least_edge_distance: float = 2.0 * MILLIMETRE
-    """m: smallest distance from the peak at which the femoral normal is looked at. Chosen: an edge
-    of 6 mm radius counts as an edge with fine cells too."""
+    """m: smallest distance from the peak at which the femoral normal is evaluated. Chosen because
+    an edge of 6 mm radius then counts as an edge with fine cells too."""
     sharp_edge_angle: float = 20.0 * DEGREE
-    """rad: turn of the femoral normal over that distance from which a peak is flagged. Chosen: the
-    turn of a radius of 6 cells."""
+    """rad: a peak is flagged if the femoral normal turns by more over that distance. Chosen because
+    a radius of 6 cells turns by this angle."""
     strain_flag: float = -0.4
-    """1: principal strain below which a result is flagged. The material law has no barrier at
-    -1, and measured curves end before -0.4."""
+    """1: a result with a smaller principal strain is flagged. Chosen because the material law does
+    not prevent strains below -1, and measured curves end before -0.4."""
     max_unseen_height: float = 0.2e-3
-    """m: height of the femoral surface between nodes that may stay unseen. Chosen: a node of a 3 mm
-    cell misses the bottom of a ball of 15 mm radius by 0.15 mm."""
+    """m: a press is flagged if first touch lies this far above the first contact node. Chosen
+    because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm."""
     collapse_strain: float = -1.0
-    """1: principal strain at which a cell is compressed to nothing; the result is out of range. By
-    definition of the strain."""
+    """1: principal strain at which a cell has no thickness left. The result is then out of range.
+    By definition of the strain."""
 
 
 LATTICE_FLAG = LatticeFlagSettings()
 
 
 AROUND = np.array([(x, 0.0, z) for x in (-1, 0, 1) for z in (-1, 0, 1)], float)
+"""Directions along x, z and the diagonals, with the centre in the middle row, shape (9, 3)."""
 
 
 def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, ...]:
     """Return the flags of peaks that the cells do not resolve."""
     medial = medial_points(result.points, result.pose, state.pair.split)
     sides = {"medial": medial, "lateral": ~medial}
-    pressures = {side: np.where(own, result.pressure, 0.0) for side, own in sides.items()}
+    pressures = {side: np.where(points, result.pressure, 0.0) for side, points in sides.items()}
     peaks = {
         side: result.points[np.argmax(pressure)]
         for side, pressure in pressures.items()
@@ -84,52 +84,52 @@ def edge_flags(
 ) -> tuple[str, ...]:
     """Return a flag for each peak that lies at an edge of the femoral component.
 
-    There the femoral normal turns by more than `LATTICE_FLAG.sharp_edge_angle`. The normal under
-    the peak is compared with normals along x, z and both diagonals. Their distance from the peak is
-    `LATTICE_FLAG.edge_distance_cells`, and at least `LATTICE_FLAG.least_edge_distance`. Each
-    direction ends where the femoral surface ends.
+    The femoral normal at the peak is compared with eight normals around it, at a distance of
+    `LATTICE_FLAG.edge_distance_cells` or `LATTICE_FLAG.least_edge_distance`, if that is larger. A
+    turn by more than `LATTICE_FLAG.sharp_edge_angle` is an edge, and so is the end of the surface.
 
     Args:
-        femoral: the femoral component seen from below.
-        pose: (4, 4) pose_femoral_in_insert.
-        spacing: (3,) m, edges of a cell.
-        peaks: side -> (3,) m, where its pressure is highest, insert frame.
+        femoral: femoral component seen from below.
+        pose: pose_femoral_in_insert, shape (4, 4).
+        spacing: edges of a cell, m, shape (3,).
+        peaks: point of the peak pressure by side, m, insert frame, shape (3,) each.
     """
-    reach = np.maximum(LATTICE_FLAG.edge_distance_cells * spacing, LATTICE_FLAG.least_edge_distance)
-    # Eight directions at equal distance; the diagonals are shortened to it.
-    around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None] * reach
+    distance = np.maximum(
+        LATTICE_FLAG.edge_distance_cells * spacing, LATTICE_FLAG.least_edge_distance
+    )
+    # All eight directions have the same length.
+    around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None] * distance
     sites = (np.array(list(peaks.values())).reshape(-1, 1, 3) + around).reshape(-1, 3)
     normals = femoral.over(sites, pose)[1].reshape(len(peaks), len(AROUND), 3)
-    sharp = zip(peaks, map(_sharpness, normals), strict=True)
+    sharpness = zip(peaks, map(_sharpness, normals), strict=True)
     return tuple(
-        f"the {side} peak pressure lies at an edge of the femoral component, which {how} "
-        f"within {reach.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
-        for side, how in sharp
-        if how
+        f"the {side} peak pressure lies at an edge of the femoral component, which {words} "
+        f"within {distance.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
+        for side, words in sharpness
+        if words
     )
 
 
 def _sharpness(normals: NDArray[np.float64]) -> str:
-    """Return in words how sharply the surface turns around the middle point, if it does."""
+    """Return in words how the femoral surface turns or ends around a peak; "" if it is smooth."""
     if not np.isfinite(normals).all():
         return "ends"
-    # The middle row is the place of the peak itself.
+    # The middle row is the normal at the peak itself.
     cosine = normals @ normals[len(AROUND) // 2]
     turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
     return f"turns by {turn / DEGREE:.0f} deg" if turn > LATTICE_FLAG.sharp_edge_angle else ""
 
 
 def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ...], bool]:
-    """Return the flags and whether the insert is compressed to nothing."""
+    """Return the flags of large strains, and whether a cell has no thickness left."""
     if solution.field is not None:
         solid = state.problem.solid
         least = solid.least_principal_strain(solution.field)
         kind = "principal strain"
     else:
-        # A linear solver keeps no field of displacements: the mean strain of a column stands for
-        # it.
-        sunk = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]
-        least, kind = float(sunk.min(initial=0.0)), "mean strain of a column"
+        # A linear solution has only the displacement of the candidates.
+        strains = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]
+        least, kind = float(strains.min(initial=0.0)), "mean strain of a column"
     if least <= LATTICE_FLAG.collapse_strain:
         return (f"{kind} {least:.2f}: the insert is compressed to nothing",), True
     return (
@@ -140,12 +140,12 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
 
 
 def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
-    """Yield a flag where the meshes overlap much before any node is touched.
+    """Yield a flag if the meshes touch far above the first contact node.
 
     Args:
         state: prepared contact.
-        result: of a press.
-        depth: m, how far the femoral component went below the first contact node.
+        result: result of a press.
+        depth: distance of the femoral component below the first contact node, m.
     """
     unseen = result.approach - depth
     if unseen > max(
@@ -158,8 +158,8 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
         )
 
 
-def unsettled_flag(solution: Solution) -> str:
-    """Return in words how large the residual of a solution is that has not converged."""
+def unconverged_flag(solution: Solution) -> str:
+    """Return the flag of a solution that has not converged, with its residual."""
     percent = 100 * solution.residual.reported
     return (
         f"the solver has not converged: after {solution.passes} passes the residual is "
@@ -180,19 +180,19 @@ def result_of(
     rule: PressureRule,
     forces_only: bool = False,
 ) -> ContactResult:
-    """Return the contract's result.
+    """Return the result of a solution.
 
     Args:
         state: prepared contact.
-        pose: (4, 4) at approach 0 of the solution.
-        load: N, or None when the pose was given.
-        gaps: (c,) vertical gaps at that pose, m.
+        pose: pose at approach 0 of the solution, shape (4, 4).
+        load: N, or None if the pose was given.
+        gaps: vertical gaps at that pose, m, shape (c,).
         solution: solution of the lattice.
-        rule: how a nodal force becomes a pressure.
-        forces_only: the residual and the field are those of the region: nothing is flagged.
+        rule: rule for the area that a nodal force acts on.
+        forces_only: whether the solution is that of the region. Then nothing is flagged.
     """
-    # `evaluate` gets the final pose, `press` the pose of first touch, from which the solver's
-    # approach is taken off.
+    # A pose that was given is final. The pose of a press is that of first touch, and the femoral
+    # component moves down by the approach.
     depth = solution.forces.approach if load is not None else 0.0
     pose = pose.copy()
     pose[1, 3] -= depth
@@ -211,7 +211,7 @@ def result_of(
     if collapsed:
         return ContactResult.failed(state, pose, *flags)
     if not solution.converged:
-        flags = (*flags, unsettled_flag(solution))
+        flags = (*flags, unconverged_flag(solution))
     gap = _gaps(state, pose, gaps - depth, force, solution)
     surface, covered = state.surface, area
     if rule == "tributary":
@@ -226,72 +226,71 @@ def result_of(
 def _pressures(
     state: LatticeState, gaps: Array, solution: Solution, rule: PressureRule
 ) -> tuple[Array, Array, Array]:
-    """Return nodal forces (c, 3), pressures (c,) and the areas (c,) that they act on.
+    """Return nodal forces (c, 3), N, pressures (c,), Pa, and the areas (c,) that they act on, m².
 
     Args:
         state: prepared contact.
-        gaps: (c,) vertical gaps of the undeformed insert at the final pose, m.
-        solution: what the solver found.
-        rule: how a nodal force becomes a pressure.
+        gaps: vertical gaps of the undeformed insert at the final pose, m, shape (c,).
+        solution: solution of the lattice.
+        rule: rule for the areas.
     """
     force, size = np.zeros_like(state.surface.points), np.zeros(len(gaps))
     force[solution.candidates] = solution.forces.force[:, None] * solution.planes.normals
     size[solution.candidates] = solution.forces.force
     area = _areas(state, gaps, size > 0, rule)
     if rule == "source":
-        # Sharma's pressure counts the part of a nodal force along the insert's normal.
+        # Sharma's pressure uses the component of the nodal force along the insert's normal.
         size = np.maximum(-np.einsum("ij,ij->i", force, state.surface.normals), 0.0)
     return force, size / area, area
 
 
 def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
-    """Return the gaps (c,), m: of the deformed insert in and beside the contact and where the
-    undeformed bodies overlap, of the undeformed one elsewhere.
+    """Return the gaps (c,), m.
 
-    Which nodes are candidates depends on the initial guess. A node beside the contact may be
-    none, but its gap is needed to place the edge of contact.
+    They belong to the deformed insert in and beside the contact and where the undeformed bodies
+    overlap, and to the undeformed insert elsewhere. Which nodes are candidates depends on the
+    initial guess. So the gap of a node beside the contact is computed even if it is no candidate:
+    the edge of contact depends on it.
 
     Args:
         state: prepared contact.
-        pose: (4, 4) final.
-        gaps: (c,) vertical gaps of the undeformed insert there, m.
-        force: (c, 3) N.
-        solution: what the solver found.
+        pose: final pose, shape (4, 4).
+        gaps: vertical gaps of the undeformed insert at this pose, m, shape (c,).
+        force: N, shape (c, 3).
+        solution: solution of the lattice.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
-    # The edge of contact depends on the deformed gaps of the neighbours only; farther away the
-    # undeformed gap is near enough.
     close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)
-    own = solution.candidates[close[solution.candidates]]
+    candidates = solution.candidates[close[solution.candidates]]
     gap = gaps.copy()
-    gap[own] = solution.forces.gap[close[solution.candidates]]
-    close[own] = False
-    rest = np.flatnonzero(close)
-    if rest.size:
-        gap[rest] = gaps_of_others(state, pose, rest, solution)
+    gap[candidates] = solution.forces.gap[close[solution.candidates]]
+    close[candidates] = False
+    others = np.flatnonzero(close)
+    if others.size:
+        gap[others] = gaps_of_others(state, pose, others, solution)
     return gap
 
 
 def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Solution) -> Array:
-    """Return the gaps (m,), m, of deformed nodes that are no candidates; inf: nothing above."""
+    """Return the gaps (m,), m, of displaced nodes that are no candidates; inf: no surface above."""
     problem = state.problem
     if solution.field is not None:
         displacement = solution.field[problem.contact_nodes[nodes]]
     else:
         loaded = solution.forces.force != 0.0
         force = solution.forces.force[loaded, None] * solution.planes.normals[loaded]
-        displacement = state.compliance.moved(nodes, solution.candidates[loaded], force)
+        displacement = state.compliance.displacement(nodes, solution.candidates[loaded], force)
     positions = problem.surface_points[nodes] + displacement
     planes = tangent_planes(problem, positions, pose, None)
-    # A femoral normal that does not point down cannot be loaded by a vertical press.
+    # A steep femoral surface cannot be loaded by a vertical press.
     return np.where(planes.normal_y < LEAST_NORMAL_Y, planes.gap(positions), np.inf)
 
 
 def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
-    """Return the area (c,) that each node's force acts on, m².
+    """Return the area (c,), m², that each node's force acts on.
 
-    Sharma's rule: area that overlaps the undeformed insert, shared evenly by the nodes in
-    contact; the pressure is then the force along the insert's normal over it.
+    By Sharma's rule, the nodes in contact have equal shares of the area where the undeformed
+    bodies overlap.
     """
     if rule == "tributary" or not loaded.any():
         return state.surface.area
@@ -299,8 +298,8 @@ def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -
     return np.where(loaded, overlap / loaded.sum(), state.surface.area)
 
 
-def beside(triangles: Index, touched: Mask) -> Mask:
-    """Return which nodes (n,) share a triangle with one in contact and are not in contact."""
-    neighbours = np.zeros_like(touched)
-    neighbours[triangles[touched[triangles].any(axis=1)]] = True
-    return neighbours & ~touched
+def beside(triangles: Index, in_contact: Mask) -> Mask:
+    """Return the mask (n,) of nodes out of contact that share a triangle with one in contact."""
+    neighbours = np.zeros_like(in_contact)
+    neighbours[triangles[in_contact[triangles].any(axis=1)]] = True
+    return neighbours & ~in_contact

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LatticeSolverSettings:
-    """When the contact iteration stops, and what it may leave out.
+    """When the contact iteration stops, and which elements and nodes it evaluates.
 
     A contact model's option `tolerance` multiplies the first three fields by `tolerance`/1e-3.
     """
@@ -13,43 +13,42 @@ class LatticeSolverSettings:
     force_tolerance: float = 2e-3
     """1: largest residual force of the displaced solid, relative to the contact forces (Euclidean
     norms over the free unknowns). Smaller: more passes. Larger: fewer passes, nodal forces less
-    accurate. For `tolerance` of 1e-3 or more the factor is stored in 16-bit integers. Measured:
-    their rounding leaves a residual of 4e-4 (2 mm) to 1.2e-3 (1 mm) on the shipped knee, spread
-    over the whole solid, whose work is below 1e-5. Passes on the region cannot remove it; the
-    default is above it. Where it is larger (2.6e-3 at 16 kN and 1 mm), passes on the whole solid
-    remove it."""
+    accurate. Chosen above the rounding residual: if `tolerance` is 1e-3 or more, the factor is
+    stored in 16-bit integers. Their rounding leaves a residual of 4e-4 (2 mm) to 1.2e-3 (1 mm) on
+    the shipped knee, which passes on the region cannot remove. Its work is below 1e-5. A larger
+    one (2.6e-3 at 16 kN and 1 mm) is removed by passes on the whole solid."""
     work_tolerance: float = 3e-4
     """1: largest work of the residual force on the displacement, relative to the work of the
-    contact forces, times the softening: an estimate of the relative error of the approach (the
-    energy criterion of Bathe & Cimento, J Struct Div ASCE 106:1377, 1980). Smaller: more passes,
-    mostly under heavy loads. Larger: fewer passes, the approach less accurate. Measured errors of
-    the approach are half of it."""
+    contact forces, times the softening. It estimates the relative error of the approach (energy
+    criterion of Bathe & Cimento, J Struct Div ASCE 106:1377, 1980). Smaller: more passes, mostly
+    under heavy loads. Larger: fewer passes, approach less accurate. Measured: errors of the
+    approach are half of it."""
     gap_tolerance: float = 2.5e-4
-    """1: largest distance of an active node from the femoral surface (penetration of the others),
-    relative to the largest displacement of an active node. Smaller: more passes where the femoral
-    normal turns quickly. Larger: fewer passes, peaks at such places less accurate: at a rim a peak
-    is off by up to three times the gap."""
+    """1: largest distance of an active node from the femoral surface, or penetration of another
+    node, relative to the largest displacement of an active node. Smaller: more passes where the
+    femoral normal turns quickly. Larger: fewer passes, peaks less accurate there. Measured: the
+    error of a peak at a rim is up to three times the gap."""
     max_passes: int = 40
-    """Passes, and steps of the full Newton iteration, after which each stops; knees take 1 to 8
-    passes. Smaller: presses that converge slowly stop earlier, and take the slow full Newton
-    iteration or end as not converged. Larger: more of them converge; a press that cannot converge
-    takes longer. Presses that converge earlier do not change."""
+    """Largest number of passes, and of steps of the full Newton iteration. Knees take 1 to 8
+    passes. Smaller: slow presses need the full Newton iteration, or do not converge. Larger: more
+    of them converge, but a press that cannot converge takes longer. It has no effect on presses
+    that converge earlier."""
     anderson_depth: int = 6
-    """Differences that Anderson's method keeps. Smaller: more passes of a softened contact. Larger:
-    fewer passes, more memory."""
+    """Number of differences that Anderson's method uses. Smaller: more passes of a softened
+    contact. Larger: fewer passes, more memory."""
     region_tolerance: float = 0.05
     """1: residual force that elements outside of the region may add, relative to `force_tolerance`.
-    Smaller: a larger region, passes that take longer. Larger: cheaper passes, more measurements of
-    the whole solid."""
+    Smaller: larger region, slower passes. Larger: faster passes, more measurements of the whole
+    solid."""
     candidate_margin: float = 0.25
-    """1: candidates are the nodes that the femoral component reaches at the expected approach plus
-    this share of it. Smaller: more presses are repeated because too few nodes were candidates.
-    Larger: larger condensed systems, fewer repetitions."""
+    """1: the femoral component meets the candidates within the expected approach plus this share of
+    it. Smaller: more presses are repeated because they had too few candidates. Larger: larger
+    condensed systems, fewer repetitions."""
     max_expansions: int = 8
-    """Largest number of sets of candidates that are tried. A press whose approach reaches nodes
-    that are no candidates is repeated with more of them. Smaller: a press whose expected approach
-    was far too small fails (out of range). Larger: it is repeated more often first. Presses that
-    need fewer sets do not change."""
+    """Largest number of candidate sets. A press is repeated with more candidates if its approach
+    goes beyond them. Smaller: a press fails (out of range) if its expected approach was far too
+    small. Larger: it is repeated more often before it fails. It has no effect on presses that need
+    fewer sets."""
 
 
 LATTICE_SOLVER = LatticeSolverSettings()

@@ -1,27 +1,27 @@
-"""The lattice of Sharma (2008) and its own loops, kept for comparison (`lattice-source`).
+"""The lattice of Sharma (2008) and its own loops, for comparison (`lattice-source`).
 
-Sharma (2008), section 4.5.5. Nodes in contact get the vertical displacement that brings them
-onto the femoral component, and slide freely in x and z. All other nodes must carry no force.
+The loops follow Sharma (2008), section 4.5.5. Nodes in contact get the vertical displacement that
+brings them onto the femoral component, and slide freely in x and z. All other nodes have no load.
 
-Linear: a unit dummy displacement of the nodes in contact gives the slope of the reaction, so
-that one correction of D reaches the load while the set stays. Nonlinear: at fixed D the free
-unknowns are iterated to zero force with the tangent springs, then D_new = D
-(F_load/F_reaction)^(1/m). Sharma (2008) has m = 1. That oscillates without end where the reaction
-grows with the square of D or faster, as it does while nodes come into contact. From the second D
-on, m is therefore the exponent between the last two.
-Sharma (2008) leaves open what happens to nodes that would be pulled. Here they are released, and
-nodes that the femoral component would penetrate are added.
+Linear: a unit displacement of the nodes in contact gives the slope of the reaction F. One
+correction of the approach D then gives the load, if the contact set does not change.
+Nonlinear: at fixed D, Newton steps with the tangent springs bring the free nodes to equilibrium.
+Then D_new = D (load/F)^(1/m). Sharma (2008) has m = 1. This oscillates without end if F grows with
+the square of D or faster, as it does while nodes come into contact. So m is the exponent of this
+growth between the last two D.
+Sharma (2008) does not define what happens to nodes in tension. tkamb releases them, and adds nodes
+that the femoral component penetrates.
 
-No step factorises a matrix. Which nodes are in contact changes from loop to loop, and so does the
-matrix of the free unknowns. With K = L Lᵀ, the factor of the undeformed insert, and Z = L⁻¹ E, the
-response of the held unknowns (E picks them) that `prepare` stores,
+No step factorises a matrix, although the free unknowns change with the contact set. `prepare`
+stores the factor of the undeformed insert, K = L Lᵀ, and the response of the held unknowns,
+Z = L⁻¹ E (the columns of E are their unit forces). With these,
 
     P = L⁻ᵀ (1 − Z (ZᵀZ)⁻¹ Zᵀ) L⁻¹
 
-is the inverse of K on the free unknowns. A prescribed displacement d of the held unknowns moves
-the lattice by L⁻ᵀ Z (ZᵀZ)⁻¹ d. The springs' tangent differs from K in the few springs that have
-softened. The conjugate gradient method, preconditioned by P, solves with it in a few iterations
-(Saad 2003, section 9.2). Rounding of the stored factor changes only the number of iterations.
+is the inverse of K on the free unknowns. A prescribed displacement d of the held unknowns displaces
+the lattice by L⁻ᵀ Z (ZᵀZ)⁻¹ d. The tangent stiffness differs from K only in the few springs that
+have softened. The conjugate gradient method, preconditioned by P, therefore solves with it in a few
+iterations (Saad 2003, section 9.2). The rounding of the stored factor changes only their number.
 """
 
 from dataclasses import dataclass, replace
@@ -48,7 +48,7 @@ from tkamb.contact.materials import LinearElastic, Material
 from tkamb.geometry.frames import Array, Index, Mask
 
 VERTICAL = 1
-"""Component of a node's displacement that the femoral component prescribes."""
+"""Component y of a node's displacement, which the femoral component prescribes."""
 
 
 @dataclass(frozen=True)
@@ -56,23 +56,23 @@ class ConjugateGradientSettings:
     """When the linear system of a tangent step of Sharma's loops counts as solved."""
 
     tolerance: float = 0.02
-    """1: residual relative to the right-hand side. Smaller: more iterations for each tangent step.
-    Larger: more tangent steps. A tangent step need not be exact, because the next one corrects its
+    """1: largest residual relative to the right-hand side. Smaller: more iterations for each
+    tangent step. Larger: more tangent steps. Chosen because the next tangent step corrects the
     error."""
     max_iterations: int = 60
-    """Largest number of iterations for a tangent step; the solution so far is then used. Smaller:
-    more tangent steps. Larger: a step may take longer."""
+    """Largest number of iterations for a tangent step; then the last iterate is used. Smaller: more
+    tangent steps. Larger: a step may take longer."""
 
 
 CONJUGATE_GRADIENT = ConjugateGradientSettings()
 
 
 class CandidateResponse:
-    """Response to vertical forces on candidate nodes: the part of `prepare` that the loops use.
+    """Stored response to vertical forces on the candidate nodes.
 
     Args:
         problem: solid and factor.
-        candidates: (m,) positions among the contact nodes.
+        candidates: positions of the candidates among the contact nodes, shape (m,).
     """
 
     def __init__(self, problem: ContactProblem, candidates: Index) -> None:
@@ -83,17 +83,17 @@ class CandidateResponse:
 
     @cached_property
     def compliance(self) -> Array:
-        """Vertical displacement of each candidate (m, m), m/N, by a force on each."""
+        """Vertical displacements under vertical unit forces on the candidates (m, m), m/N."""
         return np.asarray(self.half.compliance(), float)
 
 
 class HeldNodes:
-    """The free unknowns of the lattice while y of the active candidates is prescribed.
+    """The lattice while the vertical displacement of the active candidates is prescribed.
 
     Args:
-        response: of the candidates.
-        active: (m,) which of them are held.
-        settings: of the linear solutions.
+        response: response of the candidates.
+        active: mask of the active candidates, shape (m,).
+        settings: settings of the linear solver.
     """
 
     def __init__(
@@ -111,20 +111,18 @@ class HeldNodes:
 
     @cached_property
     def _factor(self) -> tuple[Array, bool]:
-        """Cholesky factor of ZᵀZ, the compliance of the held unknowns."""
-        # Compliance of the active nodes; symmetric and positive definite.
+        """Cholesky factor of ZᵀZ, the compliance of the active nodes along y."""
         return cho_factor(self._response.compliance[np.ix_(self._chosen, self._chosen)])
 
     @property
     def slope(self) -> float:
-        """Sum of forces (N) that move the active nodes down together, per metre (linear)."""
-        # Forces that move all active nodes by one: their sum is the stiffness of the contact.
+        """Stiffness of the contact, N/m: sum of the forces per common displacement (linear)."""
         return float(cho_solve(self._factor, np.ones(len(self._chosen))).sum())
 
     def spread(self, prescribed: Array) -> Array:
-        """Return the displacement (n, 3), m, that given y (a,), m, of the active nodes cause.
+        """Return the displacement (n, 3), m, of the linear lattice for prescribed y (a,), m.
 
-        It is that of the undeformed lattice; the active nodes have the given y exactly.
+        The active nodes have the prescribed y without rounding error.
         """
         count = len(self._response.problem.solid.nodes)
         if not len(prescribed):
@@ -137,11 +135,11 @@ class HeldNodes:
         return field
 
     def solve(self, tangent: Tangent, force: Array) -> Array:
-        """Return the displacement (n, 3), m, of the free unknowns under a force (n, 3), N.
+        """Return the displacement (n, 3), m, of the free unknowns under a force.
 
         Args:
-            tangent: of the springs as they are.
-            force: forces on held unknowns have no effect.
+            tangent: tangent stiffness of the springs.
+            force: N, shape (n, 3); forces on held unknowns have no effect.
         """
         solid, settings = self._response.problem.solid, self._settings
         assert isinstance(solid, SourceNetwork)
@@ -154,8 +152,7 @@ class HeldNodes:
             return self._free(self._solve_linear(x.reshape(shape)))
 
         size = (force.size, force.size)
-        # The elastic factor is the preconditioner: near to the tangent, so that few iterations are
-        # needed.
+        # P is a good preconditioner, because the tangent stiffness differs little from K.
         solution, _ = cg(
             LinearOperator(size, matvec=stiffness, dtype=float),
             self._free(force),
@@ -170,49 +167,49 @@ class HeldNodes:
         return np.where(self.held, 0.0, values.ravel())
 
     def _solve_linear(self, force: Array) -> Array:
-        """Return P f (n, 3) of a force (n, 3)."""
+        """Return P f (n, 3), m, of a force f (n, 3), N."""
         y = self._operator.start(force)
         if len(self._chosen):
             projection = self._response.half.project(y)[self._chosen]
-            # Reactions of the active nodes that bring their vertical displacement back to zero.
+            # Reactions make the vertical displacement of the active nodes zero.
             self._push(-cho_solve(self._factor, projection), y)
         self._operator.factor.backward(y)
         return self._operator.nodal(y)
 
     def _push(self, force: Array, y: Array) -> None:
-        """Add Z f to y, for vertical forces (a,) on the active nodes."""
-        everywhere = np.zeros(len(self._active))
-        everywhere[self._chosen] = force
-        self._response.half.apply(everywhere, y)
+        """Add Z f to y, for vertical forces f (a,), N, on the active nodes."""
+        candidate_force = np.zeros(len(self._active))
+        candidate_force[self._chosen] = force
+        self._response.half.apply(candidate_force, y)
 
 
 @dataclass(frozen=True)
 class LoopSettings:
     """How Sharma's loops begin and end (`lattice-source` with the option loops = "source").
 
-    The tolerances that they share with the other solvers are in `LatticeSolverSettings`.
+    D is the approach. `LatticeSolverSettings` has the tolerances that all solvers share.
     """
 
     max_loops: int = 60
-    """Largest number of changes of the contact set or of D; then the press has not converged.
-    Smaller: more presses end so. Larger: a press that cannot converge takes longer."""
+    """Largest number of changes of the contact set or of D. Smaller: more presses do not converge.
+    Larger: a press that cannot converge takes longer."""
     max_steps: int = 30
-    """Largest number of tangent steps at one D; the next loop goes on from there. Smaller: loops
-    are cheaper, but there may be more of them. Larger: the residual at one D is brought further
-    down."""
+    """Largest number of tangent steps at one D. Smaller: faster loops, but perhaps more of them.
+    Larger: smaller residual at one D."""
     first_depth: float = 0.8
-    """1: first D, as a share of the depth that the candidates cover. Candidates reach a quarter
-    deeper than the depth that is expected: 1 / 1.25."""
+    """1: first D, relative to the depth that the candidates cover. Chosen because the candidates
+    cover 1.25 times the expected approach, and 1 / 1.25 = 0.8."""
     load: float = 0.1
-    """1: largest relative error of the load, as a share of the solver's `force_tolerance`. Smaller:
-    more loops. Larger: fewer; an error of the whole tolerance changes the forces by as much."""
+    """1: largest relative error of the load, relative to the solver's `force_tolerance`. Smaller:
+    more loops. Larger: fewer loops, but the forces have the same relative error as the load."""
     balance: float = 0.01
     """1: the tangent steps at one D end when the residual of the free nodes is below this share of
     the relative error of the load (or of the solver's `force_tolerance`, if that is larger).
-    Smaller: more tangent steps in each loop. Larger: fewer, but D is corrected by a less accurate
-    reaction."""
+    Smaller: more tangent steps in each loop. Larger: fewer, but the reaction that corrects D is
+    less accurate."""
     smallest_step: float = 0.05
-    """1: a tangent step that raises the residual is halved, down to about this share."""
+    """1: smallest share of a tangent step. A step that raises the residual is halved until about
+    this share. Smaller: more halvings. Larger: more steps that raise the residual."""
 
 
 LOOP = LoopSettings()
@@ -220,16 +217,16 @@ LOOP = LoopSettings()
 
 @dataclass(frozen=True)
 class SourceLattice(CellContact):
-    """26-neighbour springs of one stiffness k = E·C; see `tkamb.contact.lattice.source`.
+    """Springs of equal stiffness k = E·C between neighbours; see `source_springs`.
 
     Contact is vertical as in Sharma (2008): nodes are pressed along y and slide freely in x and
-    z, so that no horizontal force arises. Kept for comparison: with free sides it is too
-    stiff (12 % on a cube of 12 cells), and its Poisson's ratio is 0.35 whatever the material.
+    z, so that no horizontal force arises. The model is for comparison: with free sides it is too
+    stiff (12 % on a cube of 12 cells), and its Poisson's ratio is 0.35 for every material.
 
     Args:
-        law: "nonlinear" (the material's curve on every spring) or "linear".
-        loops: "stored" (one iteration on the stored response) or "source" (Sharma's own
-            displacement-driven loops; the same answer, slower).
+        law: "nonlinear" (the material's curve for every spring) or "linear".
+        loops: "stored" (the solver of the other lattice models) or "source" (Sharma's own
+            displacement-driven loops; the same result, slower).
         pressure_rule: "source" by default.
     """
 
@@ -261,16 +258,23 @@ class SourceLattice(CellContact):
         load: float | None,
         guess: InitialGuess,
         settings: LatticeSolverSettings,
-        within: float,
+        covered: float,
     ) -> Solution:
         if self.loops == "source":
             return solve_by_loops(problem, pose, load, guess, settings)
-        return super()._solution(problem, pose, load, guess, settings, within)
+        return super()._solution(problem, pose, load, guess, settings, covered)
 
 
 @dataclass(frozen=True, eq=False)
 class _Pressed:
-    """Vertical forces (m,) on all candidates and displacements (n, 3) at one D."""
+    """Equilibrium at one D.
+
+    Args:
+        force: vertical forces on the candidates, N, shape (m,).
+        field: displacement of all nodes, m, shape (n, 3).
+        slope: change of the reaction with D, N/m; NaN for a nonlinear material.
+        residual: residual of the free nodes, relative to the reaction (sums of absolute values).
+    """
 
     force: Array
     field: Array
@@ -286,53 +290,53 @@ def solve_by_loops(
     solver: LatticeSolverSettings,
     settings: LoopSettings = LOOP,
 ) -> Solution:
-    """Return the contact at a pose under a load (N), or at approach 0 when load is None.
+    """Return the result of `solver.solve` by Sharma's loops.
 
-    `guess` gives candidates and how deep they reach; for the others see `solver.solve`. The
-    problem's `direction` is "vertical".
+    `solver.solve` has the arguments. The problem's `direction` is "vertical". Of the guess, only
+    the candidates, their planes and their reach are used.
     """
     nodes = problem.contact_nodes[guess.candidates]
     points = problem.surface_points[guess.candidates]
     response = CandidateResponse(problem, guess.candidates)
     sliding = SlidingNodes(problem, points, np.zeros_like(points), pose, guess.planes)
     depth = 0.0 if load is None else settings.first_depth * float(guess.reach)
-    field, loops, missed = np.zeros_like(problem.solid.nodes), 0, 1.0
+    field, loops, load_error = np.zeros_like(problem.solid.nodes), 0, 1.0
     active, history = sliding.planes.gap(points) < depth, []
     while True:
         loops += 1
         planes = sliding.planes
-        target = settings.balance * max(solver.force_tolerance, missed)
+        target = settings.balance * max(solver.force_tolerance, load_error)
         pressed = _press(response, points, planes, active, depth, field, target, settings)
         field, displacement = pressed.field, pressed.field[nodes]
         reaction = float(pressed.force.sum())
-        missed = 0.0 if load is None else abs(reaction - load) / load
-        changed = _next_active(points + displacement, planes, active, pressed.force, depth)
+        load_error = 0.0 if load is None else abs(reaction - load) / load
+        next_active = _next_active(points + displacement, planes, active, pressed.force, depth)
         opening = np.where(active, 0.0, planes.gap(points + displacement) - depth)
         force = np.where(active, np.maximum(pressed.force, 0), 0.0)
         forces = ContactForces(force, opening, depth, active, loops, True)
         last = loops == settings.max_loops
-        settled = sliding.follow(displacement, forces) <= solver.gap_tolerance
-        still = bool((changed == active).all())
-        load_reached = missed <= settings.load * solver.force_tolerance
-        converged = (
-            still and settled and load_reached and pressed.residual <= solver.force_tolerance
-        )
+        gap_closed = sliding.follow(displacement, forces) <= solver.gap_tolerance
+        same_set = bool((next_active == active).all())
+        load_reached = load_error <= settings.load * solver.force_tolerance
+        in_balance = pressed.residual <= solver.force_tolerance
+        converged = same_set and gap_closed and load_reached and in_balance
         if converged or last:
-            return _solution(guess, forces, planes, pressed, nodes, loops, missed, converged)
-        if load is not None and still:
+            return _solution(guess, forces, planes, pressed, nodes, loops, load_error, converged)
+        if load is not None and same_set:
             history.append((depth, reaction))
             depth = _next_depth(problem, history, load, pressed.slope)
-            changed = changed | (sliding.planes.gap(points + displacement) < depth) & ~active
-        if not load_reached or not (changed == active).all():
-            # Another set or depth moves the nodes again; that is no oscillation.
+            penetrated = sliding.planes.gap(points + displacement) < depth
+            next_active = next_active | penetrated & ~active
+        if not load_reached or not (next_active == active).all():
+            # A new set or depth moves the nodes, which must not count as oscillation.
             sliding = SlidingNodes(problem, points, displacement, pose, planes)
-        active = changed
+        active = next_active
 
 
 def _next_depth(
     problem: ContactProblem, history: list[tuple[float, float]], load: float, slope: float
 ) -> float:
-    """Return D by the dummy displacement's slope (linear) or by the secant (nonlinear)."""
+    """Return D from the stiffness of the contact (linear) or the growth exponent m (nonlinear)."""
     depth, reaction = history[-1]
     if problem.solid.material.is_linear:
         return depth + (load - reaction) / slope
@@ -346,7 +350,7 @@ def _next_depth(
 def _next_active(
     positions: Array, planes: TangentPlanes, active: Mask, force: Array, depth: float
 ) -> Mask:
-    """Return the set without the nodes that are pulled, plus those that would be penetrated."""
+    """Return the active set without nodes in tension and with the penetrated nodes."""
     return (active & (force >= 0)) | (~active & (planes.gap(positions) < depth))
 
 
@@ -360,11 +364,10 @@ def _press(
     target: float,
     settings: LoopSettings,
 ) -> _Pressed:
-    """Prescribe the active nodes' vertical displacement and bring the other nodes to zero force.
+    """Return the equilibrium for the prescribed vertical displacement of the active nodes.
 
-    The first step spreads the change with the undeformed stiffness, as in Sharma (2008); then
-    tangent steps, halved while they would raise the unbalanced force, until that is below
-    `target` times the contact force.
+    The first step is linear, as in Sharma (2008). Tangent steps follow, until the residual is below
+    `target` times the contact force. A step that raises the residual is halved.
     """
     solid = response.problem.solid
     assert isinstance(solid, SourceNetwork)
@@ -384,11 +387,10 @@ def _press(
                 break
             share /= 2
         u = u + share * step
-    everywhere = np.zeros(len(active))
-    everywhere[active] = force
-    return _Pressed(
-        everywhere, u, active_nodes.slope if solid.material.is_linear else np.nan, residual
-    )
+    candidate_force = np.zeros(len(active))
+    candidate_force[active] = force
+    slope = active_nodes.slope if solid.material.is_linear else np.nan
+    return _Pressed(candidate_force, u, slope, residual)
 
 
 def _balance(solid: SourceNetwork, u: Array, active_nodes: HeldNodes) -> tuple[Array, float, Array]:
@@ -409,13 +411,11 @@ def _solution(
     pressed: _Pressed,
     nodes: Index,
     loops: int,
-    missed: float,
+    load_error: float,
     converged: bool,
 ) -> Solution:
-    ended = ContactForces(
-        forces.force, forces.gap, forces.approach, forces.active, forces.sets, converged
-    )
-    residual = Residual(max(missed, pressed.residual))
+    forces = replace(forces, converged=converged)
+    residual = Residual(max(load_error, pressed.residual))
     return Solution(
-        guess.candidates, ended, planes, pressed.field[nodes], pressed.field, None, loops, residual
+        guess.candidates, forces, planes, pressed.field[nodes], pressed.field, None, loops, residual
     )

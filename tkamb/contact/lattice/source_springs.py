@@ -1,16 +1,16 @@
 """Sharma's lattice: one stiffness k = E·C for every spring.
 
-Every node is joined to its 26 neighbours. C (m) makes the compliance of a uniformly strained
-cell in the superior-inferior direction 1/E: 13 springs belong to the volume of one cell, and
+Every node is joined to its 26 neighbours. C, m, is calibrated so that a uniformly strained cell has
+Young's modulus E in the superior-inferior direction. 13 springs belong to the volume of a cell, so
 
     C_ijkl = (k/V) sum over 13 springs of L² n_i n_j n_k n_l,   k = E / (E of unit k)
 
-(Sharma's sum runs over 26 springs per cell and counts each twice). On a cube of edge a
-this is k = E a/2.7, and Poisson's ratio is 0.35 whatever the material's. Springs on the surface
-have the same k though fewer cells own them: a patch with free sides is too stiff.
+(Sharma's sum has 26 springs per cell and counts each twice). On a cube of edge a, k = E a/2.7.
+Poisson's ratio is 0.35 for every material. Springs on the surface have the same k although fewer
+cells share them, so that a part with free sides is too stiff.
 
-Nonlinear: f = sigma(eps) C L0 along the spring as it lies now, eps from its true length.
-Reference: Sharma, PhD dissertation, University of Tennessee (2008), sections 4.5.1 to 4.5.3.
+Nonlinear: the force is f = sigma(eps) C L0 along the deformed spring, with eps from its length.
+Source: Sharma, PhD dissertation, University of Tennessee (2008), sections 4.5.1 to 4.5.3.
 """
 
 from dataclasses import dataclass
@@ -35,20 +35,19 @@ def source_factor(spacing: Array) -> float:
     length = np.linalg.norm(lines, axis=1)
     n = lines / length[:, None]
     strain = np.column_stack([n**2, n[:, 0] * n[:, 1], n[:, 1] * n[:, 2], n[:, 2] * n[:, 0]])
-    # Stiffness of a cell of unit springs under uniform strain: sum of l² (n n) (n n) over the
-    # volume.
+    # Elasticity matrix of a cell with springs of k = 1.
     unit = np.einsum("s,si,sj->ij", length**2, strain, strain) / np.prod(spacing)
-    # Scaled so that a free bar along y has the material's Young's modulus (Sharma 2008).
+    # With k = E C, a free bar along y has the material's Young's modulus.
     return float(np.linalg.inv(unit)[VERTICAL, VERTICAL])
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """Tangent of all springs as they lie.
+    """Tangent stiffness of all deformed springs.
 
     Args:
-        stiffness: (s,) N/m along the spring.
-        direction: (s, 3) unit.
+        stiffness: stiffness along the spring, N/m, shape (s,).
+        direction: unit vector along the spring, shape (s, 3).
     """
 
     stiffness: Array
@@ -56,14 +55,14 @@ class Tangent:
 
 
 class SourceNetwork(Solid):
-    """Springs of one stiffness, linear or after the material's curve; see `Solid`.
+    """Springs of equal stiffness, linear or with the material's curve; see `Solid`.
 
     Args:
-        nodes: (n, 3) m.
-        cells: (c, 8); they only give strains for the flags.
-        spacing: (3,) m.
+        nodes: m, shape (n, 3).
+        cells: nodes of the cells, shape (c, 8), for the strains of the flags only.
+        spacing: edges of a cell, m, shape (3,).
         material: E and the stress-strain curve; its Poisson's ratio has no effect.
-        springs: (s, 2) nodes, each spring once.
+        springs: end nodes of the springs, shape (s, 2).
     """
 
     def __init__(
@@ -93,30 +92,29 @@ class SourceNetwork(Solid):
         return self.tangent_force(Tangent(k, self._straight), displacement)
 
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
-        """Return linear forces minus those of the springs as they lie, N, (k, 6)."""
+        """Return linear forces minus those of the deformed springs, N, (k, 6)."""
         springs = slice(None) if chosen is None else chosen
         strain, direction = self._state(displacement, springs)
         a, b = self.springs[springs].T
-        straight = self.lines[springs] / self.lengths[springs, None]
-        longer = np.einsum("sd,sd->s", straight, displacement[b] - displacement[a])
-        linear = self.material.young_modulus * longer[:, None] * straight
-        # Springs turn with the displacement, so that force and direction are those of the deformed
-        # network.
-        now = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
-        softened = self.factor * (linear - now)
-        return np.hstack([-softened, softened])
+        undeformed = self.lines[springs] / self.lengths[springs, None]
+        elongation = np.einsum("sd,sd->s", undeformed, displacement[b] - displacement[a])
+        linear = self.material.young_modulus * elongation[:, None] * undeformed
+        # The actual force acts along the deformed spring.
+        actual = (self.material.stress(strain) * self.lengths[springs])[:, None] * direction
+        difference = self.factor * (linear - actual)
+        return np.hstack([-difference, difference])
 
     def internal_force(self, displacement: Array) -> Array:
-        """Return the forces f = sigma C L0 of the springs as they lie, N, (n, 3)."""
+        """Return the nodal forces f = sigma C L0 of the deformed springs, N, (n, 3)."""
         if self.material.is_linear:
             return self.linear_force(displacement)
         strain, direction = self._state(displacement)
         return self._pulls(self.material.stress(strain) * (self.factor * self.lengths), direction)
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
-        """Return the springs' (d sigma/d eps) C n nᵀ, assembled as in Sharma (2008) (3n, 3n).
+        """Return the sum of (d sigma/d eps) C n nᵀ of the springs, N/m, (3n, 3n).
 
-        The turning of the loaded springs is left out: the forces are exact, the step is not.
+        As in Sharma (2008), it neglects that loaded springs turn. It is therefore not exact.
         """
         if self.material.is_linear:
             return self.stiffness
@@ -124,7 +122,7 @@ class SourceNetwork(Solid):
         return self._assembled(tangent.stiffness, tangent.direction)
 
     def spring_tangent(self, displacement: Array) -> Tangent:
-        """Return the tangent spring by spring; nothing is assembled."""
+        """Return the tangent stiffness of each spring."""
         if self.material.is_linear:
             k = np.full(len(self.springs), self.material.young_modulus * self.factor)
             return Tangent(k, self._straight)
@@ -132,13 +130,13 @@ class SourceNetwork(Solid):
         return Tangent(self.material.tangent(strain) * self.factor, direction)
 
     def tangent_force(self, tangent: Tangent, displacement: Array) -> Array:
-        """Return what a small displacement (n, 3) adds to the forces, N, (n, 3)."""
+        """Return the change (n, 3), N, of nodal forces under a small displacement (n, 3), m."""
         total = np.zeros((len(self.nodes), 3))
         _add_tangent_forces(self.springs, tangent.direction, tangent.stiffness, displacement, total)
         return total
 
     def _pulls(self, pull: Array, direction: Array) -> Array:
-        """Return nodal forces (n, 3) of springs that pull their ends together by pull (s,), N."""
+        """Return the nodal forces (n, 3), N, of springs with tensions `pull` (s,), N."""
         total = np.zeros((len(self.nodes), 3))
         _add_pulls(self.springs, direction, pull, total)
         return total
@@ -154,14 +152,14 @@ class SourceNetwork(Solid):
 
     def _assembled(self, stiffness: Array, direction: Array) -> sparse.csr_matrix:
         block = stiffness[:, None, None] * direction[:, :, None] * direction[:, None, :]
-        # Stiffness along the spring only: how the force turns with it is left out.
+        # The stiffness is along the spring only; the turning of its force is neglected.
         matrices = np.block([[block, -block], [-block, block]])
         return self._spring_pattern.assemble([matrices])
 
     def _state(
         self, displacement: Array, springs: Index | slice = slice(None)
     ) -> tuple[Array, Array]:
-        """Return strain (k,) and unit direction (k, 3) of springs as they lie."""
+        """Return the strain (k,) and unit direction (k, 3) of deformed springs."""
         a, b = self.springs[springs].T
         lines = self.lines[springs] + displacement[b] - displacement[a]
         length = np.linalg.norm(lines, axis=1)
@@ -172,29 +170,29 @@ class SourceNetwork(Solid):
 def _add_tangent_forces(
     springs: Index, direction: Array, stiffness: Array, displacement: Array, total: Array
 ) -> None:
-    """Add the forces k n (n · (u_b − u_a)) of springs (s, 2) to the nodes' (n, 3).
+    """Add the forces k n (n · (u_b − u_a)) of springs to nodal forces.
 
     Args:
-        springs: (s, 2) nodes a and b.
-        direction: (s, 3) n, unit, from a to b.
-        stiffness: (s,) k, N/m.
-        displacement: (n, 3) u, m.
-        total: (n, 3) N, sum of forces that hold the displacement; added to.
+        springs: end nodes a and b, shape (s, 2).
+        direction: n, unit vector from a to b, shape (s, 3).
+        stiffness: k, N/m, shape (s,).
+        displacement: u, m, shape (n, 3).
+        total: nodal forces, N, shape (n, 3), changed in place.
     """
     for s in range(len(springs)):
         a, b = springs[s]
-        longer = 0.0
+        force = 0.0
         for axis in range(3):
-            longer += direction[s, axis] * (displacement[b, axis] - displacement[a, axis])
-        longer *= stiffness[s]
+            force += direction[s, axis] * (displacement[b, axis] - displacement[a, axis])
+        force *= stiffness[s]
         for axis in range(3):
-            total[a, axis] -= longer * direction[s, axis]
-            total[b, axis] += longer * direction[s, axis]
+            total[a, axis] -= force * direction[s, axis]
+            total[b, axis] += force * direction[s, axis]
 
 
 @compiled
 def _add_pulls(springs: Index, direction: Array, pull: Array, total: Array) -> None:
-    """Add the forces of springs (s, 2) that pull by pull (s,), N, to the nodes' (n, 3)."""
+    """Add the forces of springs (s, 2) with tensions `pull` (s,), N, to nodal forces (n, 3)."""
     for s in range(len(springs)):
         a, b = springs[s]
         for axis in range(3):

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tkamb.contact.lattice.initial_guess import InitialGuess, guessed_depth, initial_guess
-from tkamb.contact.lattice.model import REACH, TOUCHING, LinearLattice
+from tkamb.contact.lattice.model import COVERED_APPROACH, LEAST_OVERLAP, LinearLattice
 from tkamb.contact.lattice.problem import TangentPlanes, undeformed
 from tkamb.contact.lattice.solver import Solution, solve
 from tkamb.contact.pair import ContactPair
@@ -185,7 +185,7 @@ class ViscoelasticLattice:
         lowest, force = float(gaps.min()), np.zeros_like(offset)
         if not np.isfinite(lowest):
             raise InputError("the femoral component does not lie over the insert", "viscoelastic")
-        if load == 0 or (load is None and lowest >= -TOUCHING):
+        if load == 0 or (load is None and lowest >= -LEAST_OVERLAP):
             return pose, force
         if load is not None:
             pose[1, 3] -= lowest
@@ -216,7 +216,7 @@ class ViscoelasticLattice:
             if not result.converged:
                 break
             covered = load is None or len(guess.candidates) == np.isfinite(gaps).sum()
-            if covered or result.forces.approach * REACH <= guess.reach:
+            if covered or result.forces.approach * COVERED_APPROACH <= guess.reach:
                 return result
             depth = 1.1 * result.forces.approach
         raise ComputationError("the contact does not converge", "viscoelastic")

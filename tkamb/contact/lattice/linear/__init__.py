@@ -1,1 +1,1 @@
-"""The linear operator: factorisation, response of the contact nodes, the cache on disk."""
+"""The linear operator: factorisation, compliance of the contact nodes, cache on disk."""

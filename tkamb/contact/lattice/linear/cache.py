@@ -1,21 +1,24 @@
-"""Prepared operators on disk, found by a hash of everything that they depend on.
+"""Cache of prepared operators on disk.
 
-The key is the SHA-256 of everything that the operator depends on: nodes, cells, held unknowns,
-contact nodes, elastic constants, kind of solid, and the code that makes it. A file is
+The key of a file is the SHA-256 of everything that its operator depends on: nodes, cells, held
+unknowns, contact nodes, elastic constants, kind of solid, and tkamb's own code. A file is
 
     magic (16 bytes) | two sums (16) | length of the header (8) | header (JSON) | arrays
 
-The two sums are over all 64-bit words that follow: of the words, and of each word times its
-position, modulo 2^64. They detect any changed bit, and words that changed places, in an eighth of
-the time of CRC-32. A file is written beside its place and moved there in one step, so that another
-process sees a whole file or none. A file is used only if it is a regular one of the user's own that
-nobody else may write, its size is what its header says, its sums and key are right, and its
-operator inverts the stiffness that is assembled anew (`operator_error`). Otherwise the operator is
-made again, with one notice. The files used longest ago are removed when the folder exceeds its
-limit, and with them files that a killed process left half written.
+The first sum adds all 64-bit words that follow, modulo 2^64. The second adds each word times its
+position. Together they detect changed bits and exchanged words in an eighth of the time of CRC-32.
+A file is written under a temporary name and then renamed, so that other processes never read half
+a file.
 
-The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Operators that
-can be made in about a second are not kept.
+A file is used only if
+- it is a regular file of this user, and nobody else may write it;
+- size, sums and key are right;
+- its operator inverts the stiffness of the solid (`operator_error`).
+Otherwise the operator is computed again, with one notice. When the folder exceeds its limit, the
+least recently used files are removed, and half-written files of killed processes too.
+
+The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Small operators,
+which take about a second, are not stored.
 """
 
 import fcntl
@@ -60,21 +63,21 @@ class FactorCacheSettings:
     """The folder of factorised lattices on disk."""
 
     longest_header: int = 1_000_000
-    """Bytes: a file whose header claims more is not one of ours. Chosen: a real header has some
+    """Bytes: a file with a longer header is rejected. Chosen because a real header has some
     hundreds."""
     least_unknowns: int = 20_000
-    """Unknowns: smaller operators are not stored. Chosen: factorising them is faster than
+    """Unknowns: smaller operators are not stored. Chosen because factorising them is faster than
     reading."""
     size_limit: float = 6e9
-    """Bytes that the folder may hold; the files used longest ago are removed first. Chosen: a small
-    part of a usual disk."""
+    """Bytes: largest size of the folder. The least recently used files are removed first. Chosen
+    because it is a small part of a usual disk."""
     largest_error: float = 2e-3
-    """1: largest relative error of an operator that is read (`operator_error`). Chosen: storage in
-    16 bits leaves 5e-4 (random displacement) for every Poisson's ratio and bearing; four times that
-    is a damaged file."""
+    """1: largest relative error of a stored operator (`operator_error`). Chosen because rounding to
+    16 bits causes 5e-4 for every Poisson's ratio and bearing; four times as much means a damaged
+    file."""
     orphan_seconds: float = 60.0
-    """s: age from which a half-written file that nobody has locked is removed. Chosen: writing a
-    file takes less."""
+    """s: age from which an unlocked, half-written file is removed. Chosen because writing a file
+    takes less."""
 
 
 FACTOR_CACHE = FactorCacheSettings()
@@ -85,9 +88,9 @@ _log = logging.getLogger("tkamb")
 
 def cache_folder() -> Path:
     """Return the folder of prepared operators."""
-    own = os.environ.get("TKAMB_CACHE_DIR")
-    if own:
-        return Path(own)
+    folder = os.environ.get("TKAMB_CACHE_DIR")
+    if folder:
+        return Path(folder)
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "tkamb"
 
@@ -95,11 +98,11 @@ def cache_folder() -> Path:
 def operator_key(
     solid: Solid, fixed: NDArray[Any], contact_nodes: NDArray[Any], coarse: bool = True
 ) -> str:
-    """Return the hash of an operator: of everything that it depends on, and of the code."""
+    """Return the hash of everything that an operator depends on, the code included."""
     material = solid.material
-    made_by = code_identity("contact/lattice")
+    code = code_identity("contact/lattice")
     kind = (type(solid).__name__, "16 bits" if coarse else "single")
-    words = (made_by, *kind, material.young_modulus, material.poisson_ratio)
+    words = (code, *kind, material.young_modulus, material.poisson_ratio)
     digest = hashlib.sha256(repr(words).encode())
     for array in (solid.nodes, solid.spacing, solid.cells, fixed, contact_nodes):
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -114,17 +117,17 @@ def cached_operator(
     coarse: bool = True,
     limit: float = FACTOR_CACHE.size_limit,
 ) -> ElasticOperator:
-    """Return a solid's operator, from disk or newly made and kept.
+    """Return a solid's operator, from disk or newly computed and stored.
 
-    A folder that cannot be written to only costs the time to make the operator again.
+    If the folder cannot be written, the operator is computed each time.
 
     Args:
         solid: cells and material.
-        fixed: (3n,) unknowns held by the boundary.
-        contact_nodes: (c,) nodes that can be touched.
-        make: makes the operator.
-        coarse: whether that has a factor of 16-bit integers.
-        limit: bytes that the folder may hold; a larger operator is not kept.
+        fixed: mask of the held unknowns, shape (3n,).
+        contact_nodes: nodes of the contact surface, shape (c,).
+        make: function that computes the operator.
+        coarse: whether its factor is stored in 16-bit integers.
+        limit: largest size of the folder, bytes; a larger operator is not stored.
     """
     if int((~fixed).sum()) < FACTOR_CACHE.least_unknowns:
         return make()
@@ -136,19 +139,19 @@ def cached_operator(
             check_operator(*stored, solid, fixed, contact_nodes)
             return stored[0]
     except DamagedOperator as damage:
-        _log.warning("%s: %s; the operator is made again", path, damage)
+        _log.warning("%s: %s; the operator is computed again", path, damage)
     fresh = make()
     if sum(part.nbytes for part in _parts(fresh)) <= limit:
         try:
             write_operator(path, key, fresh)
             prune(path.parent, limit)
         except OSError as error:
-            _log.warning("%s: not kept (%s)", path, error.strerror or error)
+            _log.warning("%s: the operator is not stored (%s)", path, error.strerror or error)
     return fresh
 
 
 class DamagedOperator(Exception):
-    """The file exists, but does not hold the operator that was asked for."""
+    """The file exists, but does not contain the requested operator."""
 
 
 def check_operator(
@@ -158,27 +161,34 @@ def check_operator(
     fixed: Mask,
     contact_nodes: Index,
 ) -> None:
-    """Check an operator that was read against the solid that it should belong to.
+    """Check that a stored operator belongs to the solid.
 
-    The memory of its file is released as soon as it has been checked: a motion reads only a
-    small part of the response. Pages that are read again come from the system's file cache.
+    The mapped memory is released after the check, because a motion reads only a small part of the
+    response. The system's file cache has the pages that are read again.
+
+    Args:
+        operator: the stored operator.
+        mapped: its file in memory.
+        solid: cells and material.
+        fixed: mask of the held unknowns, shape (3n,).
+        contact_nodes: nodes of the contact surface, shape (c,).
 
     Raises:
-        DamagedOperator: it is of other unknowns, or does not invert the solid's stiffness.
+        DamagedOperator: it has other unknowns, or does not invert the solid's stiffness.
     """
-    same = np.array_equal(operator.free, ~fixed)
-    if not same or not np.array_equal(operator.contact_nodes, contact_nodes):
-        raise DamagedOperator("is of another boundary")
+    same_unknowns = np.array_equal(operator.free, ~fixed)
+    if not same_unknowns or not np.array_equal(operator.contact_nodes, contact_nodes):
+        raise DamagedOperator("has other held unknowns or contact nodes")
     try:
         error = operator_error(operator, solid, lambda: mapped.madvise(mmap.MADV_DONTNEED))
-    except (ValueError, IndexError) as broken:  # indices that lead nowhere
+    except (ValueError, IndexError) as broken:  # indices out of range
         raise DamagedOperator(f"is not an operator ({broken})") from None
     if not error <= FACTOR_CACHE.largest_error:
-        raise DamagedOperator(f"is off the assembled stiffness by {100 * error:.2g} %")
+        raise DamagedOperator(f"differs from the solid's stiffness by {100 * error:.2g} %")
 
 
 def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
-    """Write beside the path, then move there in one step."""
+    """Write a file under a temporary name, then rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = _parts(operator)
     header = json.dumps(
@@ -192,9 +202,10 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
     parts = [_words(len(header).to_bytes(8, "little") + header)]
     for array in arrays:
         content = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-        whole = len(content) // BOUNDARY * BOUNDARY
-        rest = content[whole:].tobytes()
-        parts += [content[:whole].view(np.uint64), _words(rest + bytes(_padding(len(rest))))]
+        end = len(content) // BOUNDARY * BOUNDARY
+        remainder = content[end:].tobytes()
+        padded = remainder + bytes(_padding(len(remainder)))
+        parts += [content[:end].view(np.uint64), _words(padded)]
     sums, count = np.zeros(2, np.uint64), 0
     for words in parts:
         _add_sums(words, count, sums)
@@ -202,7 +213,7 @@ def write_operator(path: Path, key: str, operator: ElasticOperator) -> None:
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".tkamb-", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)  # says that somebody is at it, until he closes or dies
+            fcntl.flock(file, fcntl.LOCK_EX)  # keeps other processes from removing it as an orphan
             file.write(MAGIC + sums.tobytes())
             for words in parts:
                 file.write(words.data)
@@ -233,10 +244,10 @@ def _parts(operator: ElasticOperator) -> list[NDArray[Any]]:
 def read_operator(
     path: Path, key: str, limit: float = FACTOR_CACHE.size_limit
 ) -> tuple[ElasticOperator, mmap.mmap] | None:
-    """Return the operator in a file, and the file in memory; None if there is no file.
+    """Return the operator in a file, and the mapped file; None if there is no file.
 
     Raises:
-        DamagedOperator: the file is not one that this user wrote whole, or of another key.
+        DamagedOperator: the file is incomplete, not this user's, or has another key.
     """
     try:
         descriptor = open_regular(path, 1.5 * limit, follow=False)
@@ -253,36 +264,36 @@ def read_operator(
             operator = _operator_of(arrays)
         except (OSError, ValueError, KeyError, TypeError, IndexError, MemoryError) as error:
             raise DamagedOperator(f"is damaged ({error})") from None
-        # Records when it was last used. Another process may have removed it, or writing is
-        # forbidden.
+        # Record the time of use for `prune`. This fails if another process has removed the file, or
+        # if writing is forbidden.
         with suppress(OSError):
             os.utime(file.fileno())
     return operator, mapped
 
 
 def _arrays(file: BinaryIO, size: int, key: str) -> tuple[mmap.mmap, list[NDArray[Any]]]:
-    """Return a file of that size, mapped, and its arrays, after key and sums were checked."""
+    """Map a file of `size` bytes and return its arrays, after checking key and sums."""
     start = file.read(PREFIX)
     length = int.from_bytes(start[-8:], "little")
     if len(start) < PREFIX or start[: len(MAGIC)] != MAGIC or length > FACTOR_CACHE.longest_header:
-        raise ValueError("no such header")
+        raise ValueError("it has no valid header")
     text = file.read(length)
     header = json.loads(text)
     if header["key"] != key or header["code"] != code_identity("contact/lattice"):
-        raise ValueError("another key or code")
+        raise ValueError("it has another key or code")
     shapes = [(np.dtype(kind), tuple(map(int, shape))) for kind, shape in header["arrays"]]
     sizes = [kind.itemsize * int(np.prod(shape, dtype=object)) for kind, shape in shapes]
     firsts = np.cumsum([len(start) + length, *(n + _padding(n) for n in sizes)]).tolist()
     if any(n < 0 for n in sizes) or firsts[-1] != size:
-        raise ValueError("another size than its header says")
-    # Mapped, not read: nothing is copied, and processes share it. A file is never written in
-    # place; what is written to a mapped array stays this process's own.
+        raise ValueError("its size differs from its header")
+    # A mapped file is not copied, and processes share it. Changes of a mapped array stay in this
+    # process.
     mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     content, sums = memoryview(mapped), np.zeros(2, np.uint64)
     _add_sums(_words(content[len(MAGIC) + SUMS :]), 0, sums)
     mapped.madvise(mmap.MADV_DONTNEED)
     if sums.tobytes() != start[len(MAGIC) : -8]:
-        raise ValueError("other sums")
+        raise ValueError("its sums differ")
     return mapped, [
         np.frombuffer(content[first : first + n], kind).reshape(shape)
         for (kind, shape), first, n in zip(shapes, firsts, sizes, strict=False)
@@ -296,16 +307,19 @@ def _words(content: bytes | memoryview) -> NDArray[np.uint64]:
 
 @compiled
 def _add_sums(words: NDArray[np.uint64], first: int, sums: NDArray[np.uint64]) -> None:
-    """Add 64-bit words to one sum, and times their position to another; `first` is the first's."""
-    plain, weighted, number = sums[0], sums[1], np.uint64(first)
+    """Add 64-bit words to `sums[0]`, and words times positions to `sums[1]`.
+
+    `first` is the position of the first word.
+    """
+    plain, weighted, offset = sums[0], sums[1], np.uint64(first)
     for i in range(len(words)):
         plain += words[i]
-        weighted += words[i] * (np.uint64(i) + number)
+        weighted += words[i] * (np.uint64(i) + offset)
     sums[0], sums[1] = plain, weighted
 
 
 def _padding(length: int) -> int:
-    """Return how many bytes are missing to the next boundary, at which an array may begin."""
+    """Return the number of bytes from `length` to the next boundary."""
     return -length % BOUNDARY
 
 
@@ -314,41 +328,41 @@ def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
 
     Compiled code does not check bounds, so every index is checked here.
     """
-    free, contact_nodes, *of_factor, rank, blocks, columns = arrays
-    factor = CholeskyFactor(*of_factor)
+    free, contact_nodes, *factor_arrays, rank, blocks, columns = arrays
+    factor = CholeskyFactor(*factor_arrays)
     unknowns, fronts = len(factor.order), len(factor.parents)
     _check(factor.order, 0, unknowns)
     _check(factor.boundary, 0, unknowns)
     _check(factor.parents, -1, fronts)
     for edges, count in (factor.starts, unknowns), (factor.edges, len(factor.boundary)):
         if len(edges) != fronts + 1 or edges[0] != 0 or edges[-1] != count:
-            raise ValueError("fronts that do not follow each other")
+            raise ValueError("the fronts are not contiguous")
         _check(np.diff(edges), 0, count + 1)
     if (
         len(factor.scale) != unknowns + len(factor.boundary)
         or len(factor.values) != factor.firsts[-1]
     ):
-        raise ValueError("rows of another number or length")
+        raise ValueError("the rows of the factor have another number or length")
     if factor.parents.size and not (factor.parents > np.arange(fronts))[factor.parents >= 0].all():
-        raise ValueError("a front that is not below its parent")
+        raise ValueError("a front is not below its parent")
     half = HalfResponse.of(rank, blocks, columns)
     for edges, count in (blocks[:, :2], unknowns), (blocks[:, 2:], half.columns):
         _check(edges, 0, count + 1)
         _check(np.diff(edges), 0, count + 1)
     _check(rank, -1, half.columns)
     if len(columns) != (np.diff(blocks[:, :2]) * np.diff(blocks[:, 2:])).sum():
-        raise ValueError("columns of another number or length")
+        raise ValueError("the columns of the response have another number or length")
     return ElasticOperator(free, factor, contact_nodes, half)
 
 
 def _check(indices: Index, least: int, end: int) -> None:
     """Raise ValueError unless all indices lie in [least, end)."""
     if len(indices) and not (indices.min() >= least and indices.max() < end):
-        raise ValueError("an index that leads nowhere")
+        raise ValueError("an index is out of range")
 
 
 def prune(folder: Path, limit: float) -> None:
-    """Delete orphans, then the least recently used operators beyond the folder's limit."""
+    """Delete half-written files, then the least recently used operators above the limit, bytes."""
     entries = []
     for path in folder.glob("*.operator"):
         try:
@@ -365,9 +379,10 @@ def prune(folder: Path, limit: float) -> None:
 
 
 def _remove_orphans(folder: Path) -> int:
-    """Remove files that killed processes left half written; return the bytes of the others."""
-    stays = removed = freed = 0
-    for path in [*folder.glob(".tkamb-*.part"), *folder.glob("tmp*.part")]:  # the latter: 0.1.0
+    """Remove half-written files of killed processes; return the bytes of those still written."""
+    remaining = removed = freed = 0
+    # Release 0.1.0 wrote tmp*.part.
+    for path in [*folder.glob(".tkamb-*.part"), *folder.glob("tmp*.part")]:
         try:
             with os.fdopen(open_regular(path, float("inf"), follow=False), "rb") as file:
                 status = os.fstat(file.fileno())
@@ -377,9 +392,9 @@ def _remove_orphans(folder: Path) -> int:
                 path.unlink(missing_ok=True)
             removed, freed = removed + 1, freed + status.st_size
         except BlockingIOError:
-            stays += status.st_size
+            remaining += status.st_size
         except InputError:
             continue
     if removed:
         _log.warning("%s: %d unfinished file(s) removed, %.0f MB", folder, removed, freed / 1e6)
-    return stays
+    return remaining

@@ -1,11 +1,10 @@
 """The compliance of the contact nodes: displacements under unit forces on them.
 
-With K = L Lᵀ and Z = L⁻¹ E (E picks the contact nodes' unknowns) the compliance between them
-is Eᵀ K⁻¹ E = Zᵀ Z, so that the backward half of the solves is not needed. A column of Z is zero
-except on the path from its node to the root of the elimination tree, and the columns of one
-subtree follow each other. So Z is stored as one dense block per front (node of this tree), column
-by column. A product with few nodes then reads only their columns. `ComplianceCache` stores the
-compliance of the nodes that were candidates lately.
+K = L Lᵀ is the stiffness, and the columns of E are unit forces on the contact nodes' unknowns.
+With Z = L⁻¹ E the compliance is Eᵀ K⁻¹ E = Zᵀ Z, so that no backward solve is needed. A column of
+Z is zero except on the path from its node to the root of the elimination tree. So Z is stored as
+one dense block per front (node of this tree), column by column. A product for few nodes reads only
+their columns. `ComplianceCache` stores the compliance of recent candidates.
 """
 
 from dataclasses import dataclass, field
@@ -34,11 +33,11 @@ class ResponseSettings:
     """Products of the factor with columns of forces."""
 
     gathered_columns: int = 512
-    """Columns that are copied for BLAS at a time. Chosen: 3 MB, about the size of a processor's
+    """Columns that are copied for BLAS at a time. Chosen because their 3 MB fit into a processor's
     cache."""
     few_columns: int = 12
-    """Largest number of columns whose products are computed without a copy for BLAS. Chosen: for so
-    few columns the copy costs more time than BLAS saves."""
+    """Largest number of columns that are multiplied without BLAS. Chosen because the copy for BLAS
+    costs more time than it saves for so few columns."""
 
 
 RESPONSE = ResponseSettings()
@@ -49,12 +48,12 @@ class HalfResponse:
     """Z = L⁻¹ E of q unknowns.
 
     Args:
-        rank: (q,) column of Z that belongs to each unknown of the caller; -1: the unknown is held.
-        blocks: (b, 4) blocks of Z that are not zero: first row, end of the rows, first column, end
+        rank: column of Z of each of the caller's unknowns, shape (q,); -1 if it is held.
+        blocks: nonzero blocks of Z, shape (b, 4): first row, end of the rows, first column, end
             of the columns. An end is one past the last. Rows are in elimination order, and no two
             blocks share a row.
-        values: (v,) float64 or float32, the columns of the blocks, one after the other.
-        places: (w,) position in `values` at which each column of each block begins, block by block.
+        values: the columns of the blocks, one after the other, float64 or float32, shape (v,).
+        places: position in `values` of each column of each block, shape (w,).
     """
 
     rank: Index
@@ -64,7 +63,7 @@ class HalfResponse:
 
     @classmethod
     def of(cls, rank: Index, blocks: Index, values: NDArray[Any]) -> "HalfResponse":
-        """Return the response whose columns lie one after the other, block after block."""
+        """Return the response from `values` without gaps, block after block."""
         lengths = np.repeat(blocks[:, 1] - blocks[:, 0], blocks[:, 3] - blocks[:, 2])
         return cls(rank, blocks, values, np.cumsum(lengths) - lengths)
 
@@ -79,35 +78,35 @@ class HalfResponse:
         both(lambda: add(0, self._middle), lambda: add(self._middle, len(self.blocks)))
 
     def project(self, y: Array) -> Array:
-        """Return Zᵀ y (q,): displacement of the unknowns under the load whose L⁻¹ f is y."""
+        """Return Zᵀ y (q,). With y = L⁻¹ f it is the unknowns' displacement under a load f."""
         ordered = np.zeros(self.columns)
 
-        def add(some: slice) -> None:
-            _add_products(*self._parts, y, ordered, some.start, some.stop)
+        def add(half: slice) -> None:
+            _add_products(*self._parts, y, ordered, half.start, half.stop)
 
         in_halves(add, self.columns)
         return np.where(self.rank >= 0, ordered[np.maximum(self.rank, 0)], 0.0)
 
     def among(self, unknowns: Index) -> "HalfResponse":
-        """Return the response of a subset (u,) of the unknowns. Both share the same `values`."""
+        """Return the response of a subset (u,) of the unknowns; `values` is not copied."""
         ranks = self.rank[unknowns]
-        live = np.flatnonzero(ranks >= 0)
-        order = live[np.argsort(ranks[live])]
+        free = np.flatnonzero(ranks >= 0)
+        order = free[np.argsort(ranks[free])]
         rank = np.full(len(unknowns), -1)
         rank[order] = np.arange(len(order))
         blocks, places = _of_columns(*self._parts[:3], ranks[order])
         return HalfResponse(rank, blocks, self.values, places)
 
-    def compliance(self, some: Index | None = None) -> Array:
-        """Return displacements (s, q), m/N, of some unknowns under unit forces on all q unknowns.
+    def compliance(self, subset: Index | None = None) -> Array:
+        """Return the displacements (s, q), m/N, of a subset under unit forces on all q unknowns.
 
         Args:
-            some: (s,) the unknowns whose displacements are returned; None: all.
+            subset: unknowns whose displacements are returned, shape (s,); all by default.
         """
-        rank = self.rank if some is None else self.rank[some]
-        rows, live = np.unique(rank[rank >= 0]), self.rank >= 0
-        # The compliance Zᵀ Z is the sum of the products of the blocks. `few` and `others` hold
-        # columns of Z as their rows.
+        rank = self.rank if subset is None else self.rank[subset]
+        rows, free = np.unique(rank[rank >= 0]), self.rank >= 0
+        # Zᵀ Z is the sum of the products of the blocks. The rows of `few` and `others` are columns
+        # of Z.
         inner = np.zeros((len(rows), self.columns))
         firsts, lasts = np.searchsorted(rows, self.blocks[:, 2:]).T
         for block in np.flatnonzero(lasts > firsts):
@@ -127,7 +126,7 @@ class HalfResponse:
                 )
         result = np.zeros((len(rank), len(self.rank)))
         index = np.searchsorted(rows, rank[rank >= 0])
-        result[np.ix_(rank >= 0, live)] = inner[np.ix_(index, self.rank[live])]
+        result[np.ix_(rank >= 0, free)] = inner[np.ix_(index, self.rank[free])]
         return result
 
     @property
@@ -146,13 +145,13 @@ class HalfResponse:
 
     @cached_property
     def _edges(self) -> Index:
-        """(b + 1,) index in `places` at which each block begins, then the number of places."""
+        """Index in `places` at which each block begins, then the number of places (b + 1,)."""
         return np.cumsum(np.concatenate([[0], self.blocks[:, 3] - self.blocks[:, 2]]))
 
     @cached_property
     def _middle(self) -> int:
-        """Number of blocks that hold half of the entries."""
-        # Blocks are halved by their work, which is rows times columns, for two threads.
+        """Number of leading blocks that hold half of the entries."""
+        # Two threads get about the same work, which is rows times columns.
         sizes = (self.blocks[:, 1] - self.blocks[:, 0]) * (self.blocks[:, 3] - self.blocks[:, 2])
         return int(np.searchsorted(np.cumsum(sizes), sizes.sum() / 2))
 
@@ -168,7 +167,7 @@ def _add_columns(
     begin: int,
     end: int,
 ) -> None:
-    """Add the columns of blocks [begin, end) times factors to y, in the precision of `values`."""
+    """Add factors times columns of the blocks [begin, end) to y, in the precision of `values`."""
     for block in range(begin, end):
         start, stop, first = blocks[block, 0], blocks[block, 1], blocks[block, 2]
         total = np.zeros(stop - start, values.dtype)
@@ -194,41 +193,41 @@ def _add_products(
     begin: int,
     end: int,
 ) -> None:
-    """Add the products of columns [begin, end) with y to `products`, in precision of `values`."""
+    """Add the products of columns [begin, end) with y to `products`, in the type of `values`."""
     for block in range(len(blocks)):
         first = blocks[block, 2]
-        some, last = max(first, begin), min(blocks[block, 3], end)
-        if some < last:
-            own = y[blocks[block, 0] : blocks[block, 1]].astype(values.dtype)
-            for column in range(some, last):
-                place = places[edges[block] + column - first]
-                part, total = values[place : place + len(own)], values.dtype.type(0)
-                for i in range(len(own)):
-                    total += part[i] * own[i]
-                products[column] += total
+        lower, upper = max(first, begin), min(blocks[block, 3], end)
+        if lower < upper:
+            part = y[blocks[block, 0] : blocks[block, 1]].astype(values.dtype)
+            for number in range(lower, upper):
+                place = places[edges[block] + number - first]
+                column, total = values[place : place + len(part)], values.dtype.type(0)
+                for i in range(len(part)):
+                    total += column[i] * part[i]
+                products[number] += total
 
 
 @compiled
 def _of_columns(blocks: Index, edges: Index, places: Index, columns: Index) -> tuple[Index, Index]:
-    """Return blocks and places of a subset of the columns; blocks count columns of the subset.
+    """Return the `blocks` and `places` of a response with a subset of the columns.
 
     Args:
-        blocks: (b, 4), see `HalfResponse`.
-        edges: (b + 1,) index in `places` at which each block begins.
-        places: (w,), see `HalfResponse`.
-        columns: (u,) the subset, increasing.
+        blocks: see `HalfResponse`.
+        edges: index in `places` at which each block begins, shape (b + 1,).
+        places: see `HalfResponse`.
+        columns: numbers of the columns of the subset, increasing, shape (u,).
     """
     firsts, lasts = np.searchsorted(columns, blocks[:, 2]), np.searchsorted(columns, blocks[:, 3])
     nonempty = np.flatnonzero(lasts > firsts)
-    some, at = blocks[nonempty], 0
-    chosen = np.empty((lasts - firsts).sum(), np.int64)
+    subset_blocks, at = blocks[nonempty], 0
+    subset_places = np.empty((lasts - firsts).sum(), np.int64)
     for number, block in enumerate(nonempty):
         first, last = firsts[block], lasts[block]
         for k in range(first, last):
-            chosen[at] = places[edges[block] + columns[k] - blocks[block, 2]]
+            subset_places[at] = places[edges[block] + columns[k] - blocks[block, 2]]
             at += 1
-        some[number, 2], some[number, 3] = first, last
-    return some, chosen
+        subset_blocks[number, 2], subset_blocks[number, 3] = first, last
+    return subset_blocks, subset_places
 
 
 @compiled
@@ -242,21 +241,21 @@ def _gathered(values: Array, places: Index, length: int) -> Array:
 
 @compiled
 def _products(values: Array, places: Index, few: Array) -> Array:
-    """Return the products (f, k) of a few columns (f, n) with those that begin at places (k,)."""
+    """Return the products (f, k) of columns `few` (f, n) with the columns at places (k,)."""
     result = np.empty((len(few), len(places)), values.dtype)
     for k in range(len(places)):
         column = values[places[k] : places[k] + few.shape[1]]
         for f in range(len(few)):
-            own, total = few[f], values.dtype.type(0)
-            for i in range(len(own)):
-                total += column[i] * own[i]
+            other, total = few[f], values.dtype.type(0)
+            for i in range(len(other)):
+                total += column[i] * other[i]
             result[f, k] = total
     return result
 
 
 @compiled
-def _take_away(target: Array, columns: Index, values: Array) -> None:
-    """Subtract values (n, k) from some columns (k,) of the target."""
+def _subtract_columns(target: Array, columns: Index, values: Array) -> None:
+    """Subtract values (n, k) from columns (k,) of the target."""
     for i in range(len(values)):
         for j in range(len(columns)):
             target[i, columns[j]] -= values[i, j]
@@ -268,23 +267,23 @@ def unknowns_of(nodes: Index) -> Index:
 
 
 class HalfSolves:
-    """L⁻¹ of unit forces on some unknowns, computed front by front, together with the factor.
+    """Computes Z = L⁻¹ E for some unknowns front by front, while the factor is computed.
 
-    Only fronts on the paths to the root take time and memory. It is computed in `precision`: in
-    single precision compliances are right to 1e-6 of the largest.
+    Only fronts on the paths to the root take time and memory. In single precision the error of
+    compliances is 1e-6 of the largest.
 
     Args:
-        starts: (f + 1,) first unknown of each front in elimination order, then their total number.
-        parents: front above each, -1 at a root.
-        unknowns: (q,) in elimination order, -1 = held.
-        precision: of the numbers that are computed and kept.
+        starts: first unknown of each front in elimination order, then the number of unknowns.
+        parents: front above each front; -1 at a root.
+        unknowns: positions in elimination order, shape (q,); -1 if held.
+        precision: type of the numbers.
     """
 
     def __init__(
         self, starts: Index, parents: list[int], unknowns: Index, precision: Precision
     ) -> None:
-        live = np.flatnonzero(unknowns >= 0)
-        order = live[np.argsort(unknowns[live])]
+        free = np.flatnonzero(unknowns >= 0)
+        order = free[np.argsort(unknowns[free])]
         self._rows, self._rank = unknowns[order], np.full(len(unknowns), -1)
         self._rank[order] = np.arange(len(order))
         self._starts, self._parents, self._precision = starts, parents, precision
@@ -298,26 +297,26 @@ class HalfSolves:
         first, last = self._spans[member]
         if last == first:
             return
-        right = self._of(member)
+        right_side = self._right_side(member)
         del self._waiting[member]
         a, b = np.searchsorted(self._rows, [front.start, front.stop])
-        # Unit forces at the contact unknowns that this front eliminates.
-        right[np.arange(a, b) - first, self._rows[a:b] - front.start] += 1.0
+        # Unit forces on the contact unknowns that this front eliminates.
+        right_side[np.arange(a, b) - first, self._rows[a:b] - front.start] += 1.0
         count = front.stop - front.start
         if len(front.boundary):
-            self._pass_up(member, front.boundary, right @ front.block[count:].T)
-        # BLAS reads column by column, so it sees the transposes of arrays that are kept row by row.
-        times = get_blas_funcs("trmm", dtype=self._precision)
-        own = times(1.0, front.block[:count].T, right.T, trans_a=1, overwrite_b=1).T
+            self._pass_up(member, front.boundary, right_side @ front.block[count:].T)
+        # BLAS expects column-major arrays: it gets the transposes of row-major ones.
+        multiply = get_blas_funcs("trmm", dtype=self._precision)
+        columns = multiply(1.0, front.block[:count].T, right_side.T, trans_a=1, overwrite_b=1).T
         self._blocks.append((front.start, front.stop, first, last))
-        self._columns.append(own)
+        self._columns.append(columns)
 
     def response(self) -> HalfResponse:
-        """Return the response of all fronts; the columns stored here are released."""
+        """Return the response, and release the columns that this object stores."""
         blocks = np.array(self._blocks, np.int64).reshape(-1, 4)
         return HalfResponse.of(self._rank, blocks, joined(self._columns, self._precision))
 
-    def _of(self, member: int) -> NDArray[Any]:
+    def _right_side(self, member: int) -> NDArray[Any]:
         """Return a front's current right-hand side (columns of its span, unknowns of the front)."""
         if member not in self._waiting:
             first, last = self._spans[member]
@@ -326,7 +325,7 @@ class HalfSolves:
         return self._waiting[member]
 
     def _column_spans(self) -> list[tuple[int, int]]:
-        """Return for each front the columns [first, last) whose path to the root meets it."""
+        """Return for each front the columns [first, last) that are not zero in it."""
         edges = np.searchsorted(self._rows, self._starts).tolist()
         spans = list(pairwise(edges))
         for member, parent in enumerate(self._parents):
@@ -346,7 +345,8 @@ class HalfSolves:
             if end > at:
                 start = self._spans[above][0]
                 local = boundary[at:end] - self._starts[above]
-                _take_away(self._of(above)[first - start : last - start], local, passed[:, at:end])
+                target = self._right_side(above)[first - start : last - start]
+                _subtract_columns(target, local, passed[:, at:end])
             above, at = self._parents[above], end
 
 
@@ -355,9 +355,10 @@ class ComplianceSettings:
     """The stored compliance of candidate nodes."""
 
     max_nodes: int = 1500
-    """Nodes of the stored compliance. Chosen: its matrix then takes 80 MB."""
+    """Largest number of nodes of the stored compliance. Chosen because the matrix then takes 80
+    MB."""
     spare_nodes: int = 100
-    """Nodes that may be added before the arrays have to grow. Chosen: it trades memory against
+    """Number of nodes that may be added before the arrays have to grow. Larger: more memory, fewer
     copies."""
 
 
@@ -370,9 +371,9 @@ class ContactResponse:
 
     Args:
         whole: response of a set of nodes that contains the candidates.
-        candidates: (m,) positions of the candidates in this set.
-        compliance: (3, m, 3, m) m/N, of the candidates: component and node moved, component
-            and node pushed.
+        candidates: positions of the candidates in this set, shape (m,).
+        compliance: m/N, shape (3, m, 3, m): component and node of the displacement, then
+            component and node of the force.
     """
 
     whole: HalfResponse
@@ -386,7 +387,7 @@ class ContactResponse:
 
     @cached_property
     def _half(self) -> HalfResponse:
-        """The response of the candidates alone; a linear material never asks for it."""
+        """The response of the candidates alone; a linear material does not need it."""
         return self.whole.among(unknowns_of(self.candidates))
 
     def push(self, force: Array, y: Array) -> None:
@@ -394,23 +395,26 @@ class ContactResponse:
         self._half.apply(force.ravel(), y)
 
     def displacement(self, y: Array) -> Array:
-        """Return the candidates' displacement (m, 3), m, under the load whose L⁻¹ f is y."""
+        """Return the candidates' displacement (m, 3), m, under a load f, from y = L⁻¹ f."""
         return self._half.project(y).reshape(-1, 3)
 
     def along(self, normals: Array) -> tuple[Array, Array]:
-        """Return the compliance along normals (m, 3), and the displacement vectors.
+        """Return displacements under unit forces along the normals (m, 3).
 
         Returns:
-            (m, m) m/N, displacements along the normals under unit forces along the normals, and
-            (3, m, m) m/N, the displacement vectors under the same forces, for `moved`.
+            Displacements along the normals (m, m), m/N, and displacement vectors (3, m, m), m/N.
         """
         n = np.ascontiguousarray(normals.T, dtype=self.compliance.dtype)
-        pushed = np.einsum("aibj,bj->aij", self.compliance, n)
-        return np.einsum("aij,ai->ij", pushed, n).astype(np.float64), pushed
+        vectors = np.einsum("aibj,bj->aij", self.compliance, n)
+        return np.einsum("aij,ai->ij", vectors, n).astype(np.float64), vectors
 
-    def moved(self, pushed: Array, force: Array) -> Array:
-        """Return the candidates' displacement (m, 3), m, under forces (m,), N, along normals."""
-        return np.einsum("aij,j->ia", pushed, force.astype(pushed.dtype))
+
+def displacement_under(vectors: Array, force: Array) -> Array:
+    """Return the displacement (m, 3), m, under forces (m,), N, along normals.
+
+    `vectors` (3, m, m), m/N, are the displacement vectors of `ContactResponse.along`.
+    """
+    return np.einsum("aij,j->ia", vectors, force.astype(vectors.dtype))
 
 
 def by_component(matrix: Array) -> Array:
@@ -421,14 +425,14 @@ def by_component(matrix: Array) -> Array:
 
 @dataclass
 class ComplianceCache:
-    """The compliance among the nodes that were requested so far.
+    """The compliance of the contact nodes that were requested so far.
 
-    Apart from rounding, a result does not depend on which nodes are stored.
+    Apart from rounding, results do not depend on which nodes are stored.
 
     Args:
         whole: response of all contact nodes.
-        nodes: (p,) stored contact nodes, in the order in which they were added.
-        stored: (3, s, 3, s) m/N, s >= p: component and node moved, component and node pushed.
+        nodes: stored contact nodes in the order in which they were added, shape (p,).
+        stored: compliance, m/N, shape (3, s, 3, s) with s >= p, see `ContactResponse`.
     """
 
     whole: HalfResponse
@@ -437,58 +441,58 @@ class ComplianceCache:
     _lock: Lock = field(default_factory=Lock)
 
     def among(self, needed: Index) -> ContactResponse:
-        """Return the response of some contact nodes, given by increasing positions (m,)."""
+        """Return the response of contact nodes at increasing positions (m,)."""
         with self._lock:
-            at = self._at(needed)
-            compliance = _taken(_taken(self.stored, at, 1), at, 3)
+            places = self._places(needed)
+            compliance = _entries(_entries(self.stored, places, 1), places, 3)
         return ContactResponse(self.whole, needed, compliance)
 
-    def moved(self, nodes: Index, pushed: Index, force: Array) -> Array:
+    def displacement(self, nodes: Index, loaded: Index, force: Array) -> Array:
         """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
 
         Args:
-            nodes: (m,) increasing.
-            pushed: (k,) increasing.
-            force: (k, 3) N.
+            nodes: positions of the displaced nodes, increasing, shape (m,).
+            loaded: positions of the loaded nodes, increasing, shape (k,).
+            force: N, shape (k, 3).
         """
         with self._lock:
-            both = self._at(np.concatenate([nodes, pushed]))
-            columns, rows = both[: len(nodes)], both[len(nodes) :]
-            compliance = _taken(_taken(self.stored, columns, 1), rows, 3)
+            places = self._places(np.concatenate([nodes, loaded]))
+            displaced, pushed = places[: len(nodes)], places[len(nodes) :]
+            compliance = _entries(_entries(self.stored, displaced, 1), pushed, 3)
         return np.einsum("aibj,jb->ia", compliance, force)
 
-    def _at(self, needed: Index) -> Index:
+    def _places(self, needed: Index) -> Index:
         """Return the positions of nodes (m,) in `stored`. Missing nodes are computed and added."""
         place = np.full(len(self.whole.rank) // 3, -1)
         place[self.nodes] = np.arange(len(self.nodes))
         if (place[needed] < 0).any():
-            wanted = np.unique(needed)
-            if len(self.nodes) + np.count_nonzero(place[wanted] < 0) > COMPLIANCE.max_nodes:
+            requested = np.unique(needed)
+            if len(self.nodes) + np.count_nonzero(place[requested] < 0) > COMPLIANCE.max_nodes:
                 self.nodes, place[:] = self.nodes[:0], -1
-            self._take(wanted[place[wanted] < 0])
+            self._store(requested[place[requested] < 0])
             place[self.nodes] = np.arange(len(self.nodes))
         return place[needed]
 
-    def _take(self, nodes: Index) -> None:
-        """Compute the compliance of nodes that are not stored yet, and add it."""
-        had, new = len(self.nodes), len(nodes)
-        count = had + new
+    def _store(self, nodes: Index) -> None:
+        """Compute the compliance of nodes that are not stored yet, and store it."""
+        old, new = len(self.nodes), len(nodes)
+        count = old + new
         if count > self.stored.shape[1]:
             larger: Array = np.empty(
                 (3, count + COMPLIANCE.spare_nodes, 3, count + COMPLIANCE.spare_nodes), SINGLE
             )
-            larger[:, :had, :, :had] = self.stored[:, :had, :, :had]
+            larger[:, :old, :, :old] = self.stored[:, :old, :, :old]
             self.stored = larger
         self.nodes = np.concatenate([self.nodes, nodes])
         half = self.whole.among(unknowns_of(self.nodes))
-        rows = half.compliance(unknowns_of(np.arange(had, count))).reshape(new, 3, count, 3)
-        self.stored[:, had:count, :, :count] = rows.transpose(1, 0, 3, 2)
-        self.stored[:, :count, :, had:count] = rows.transpose(3, 2, 1, 0)
+        rows = half.compliance(unknowns_of(np.arange(old, count))).reshape(new, 3, count, 3)
+        self.stored[:, old:count, :, :count] = rows.transpose(1, 0, 3, 2)
+        self.stored[:, :count, :, old:count] = rows.transpose(3, 2, 1, 0)
 
 
-def _taken(values: Array, index: Index, axis: int) -> Array:
-    """Return some entries along an axis.
+def _entries(values: Array, index: Index, axis: int) -> Array:
+    """Return the entries at positions `index` along an axis.
 
-    All indices are in range, and the mode "clip" lets numpy omit a buffer.
+    All positions are in range. The mode "clip" lets numpy omit a buffer.
     """
     return np.take(values, index, axis=axis, mode="clip")

@@ -1,18 +1,17 @@
 """Nested dissection of a lattice, and multifrontal Cholesky factorisation on its tree.
 
-A plane of lattice nodes separates the nodes on its two sides, since only neighbours are
-joined: such planes are eliminated last. The insert is wide and thin, so planes across x and z
-leave small separators (George, SIAM J Numer Anal 10:345, 1973, doi:10.1137/0710032).
+Only neighbouring nodes are joined, so a plane of nodes separates the nodes on its two sides. Such
+planes (separators) are eliminated last. The insert is wide and thin, so that planes across x and z
+are small separators (George, SIAM J Numer Anal 10:345, 1973, doi:10.1137/0710032).
 
-Each tree member gathers its rows and its children's updates into a dense front, eliminates
-its own unknowns and hands the rest up (Duff & Reid, ACM TOMS 9:302, 1983,
-doi:10.1145/356044.356047). The factor keeps, per member, W = [L11⁻¹; L21 L11⁻¹], so that
-either half of a solve is one product per member. Forces on few members need only the members
-above them, and so do displacements of few.
+Each tree member adds its rows and its children's updates to a dense front, eliminates its own
+unknowns and passes the update of the other unknowns to its parent (Duff & Reid, ACM TOMS 9:302,
+1983, doi:10.1145/356044.356047). The factor stores W = [L11⁻¹; L21 L11⁻¹] of each front, so that a
+forward or backward solve is one product per front. Forces on few nodes, and displacements of few
+nodes, need only their fronts and the fronts above.
 
-The products of a solve read every W once, without the zeros of L11⁻¹. Their time is that of reading
-memory. A compiled loop over one row after the other reads at two thirds of the memory's speed,
-twice as fast as over four rows at a time, and faster than `einsum` and BLAS.
+A solve takes as long as reading every W once, without the zeros of L11⁻¹. Compiled loops over
+single rows read at two thirds of the memory's speed, faster than `einsum` and BLAS.
 """
 
 from collections.abc import Iterator
@@ -32,7 +31,7 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import both
 
 CUTS = 16
-"""Number of ways to divide fronts between two threads that are tried; the best is taken."""
+"""Number of divisions of the fronts between two threads that are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +40,7 @@ class Dissection:
 
     Args:
         own: nodes that each tree member eliminates.
-        parent: index of the parent of each member, -1 for a root.
+        parent: index of each member's parent; -1 for a root.
     """
 
     own: list[Index]
@@ -49,18 +48,18 @@ class Dissection:
 
 
 def dissect(index: Index, joined: sparse.csr_matrix, leaf: int = 48) -> Dissection:
-    """Return the dissection of the nodes with lattice index (n, 3).
+    """Return the nested dissection of a lattice's nodes.
 
     Args:
-        index: lattice position of each node.
-        joined: (n, n) pattern: which nodes are joined.
-        leaf: parts of at most this number of nodes are not cut further.
+        index: lattice index (i, j, k) of each node, shape (n, 3).
+        joined: pattern of the joined nodes, shape (n, n).
+        leaf: largest number of nodes of a part that is not cut.
     """
     own: list[Index] = []
     parent: list[int] = []
 
     def cut(part: Index) -> int:
-        """Append the members of a part; return the position of its topmost one."""
+        """Append the members of a part; return the position of its topmost member."""
         halves = None if len(part) <= leaf else _halves(index, joined, part)
         if halves is None:
             own.append(_along_columns(index, part))
@@ -82,7 +81,7 @@ def dissect(index: Index, joined: sparse.csr_matrix, leaf: int = 48) -> Dissecti
 def _halves(
     index: Index, joined: sparse.csr_matrix, part: Index
 ) -> tuple[Index, Index, Index] | None:
-    """Return (low, high, separator), or None if no plane leaves two sides."""
+    """Return the nodes (low, high, separator), or None if no plane separates the part."""
     position = index[part]
     for axis in np.argsort(-np.ptp(position, axis=0), kind="stable"):
         plane = int(np.median(position[:, axis]))
@@ -96,7 +95,7 @@ def _halves(
         low[np.flatnonzero(low)[np.unique(across.nonzero()[0])]] = False
         if not low.any():
             return None
-    if (low | high).all():  # two pieces apart: a member without unknowns of its own is none
+    if (low | high).all():  # the pieces are apart, but a separator needs at least one node
         lower = np.flatnonzero(low)
         low[lower[position[lower, axis].argmax()]] = False
         if not low.any():
@@ -105,20 +104,20 @@ def _halves(
 
 
 def _along_columns(index: Index, part: Index) -> Index:
-    """Return the part sorted so that a stretch of columns is a stretch of the list."""
+    """Return the part sorted column by column."""
     i, j, k = index[part].T
     return part[np.lexsort((j, k, i)) if np.ptp(i) >= np.ptp(k) else np.lexsort((j, i, k))]
 
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """One member of the factor, as it is made.
+    """The front of one tree member after its elimination.
 
     Args:
         start: first own unknown in elimination order.
         stop: one past the last own unknown.
-        boundary: (m,) later unknowns that it touches, increasing.
-        block: (k + m, k) W = [L11⁻¹; L21 L11⁻¹].
+        boundary: later unknowns that the front is coupled with, increasing, shape (m,).
+        block: W = [L11⁻¹; L21 L11⁻¹], shape (k + m, k).
     """
 
     start: int
@@ -127,11 +126,14 @@ class Front:
     block: NDArray[Any]
 
     def rows(self, coarse: bool) -> tuple[NDArray[Any], Array]:
-        """Return W row by row without the zeros of L11⁻¹, rows over their scales, and the scales.
+        """Return the rows of W, divided by their scales and without the zeros of L11⁻¹.
 
         Args:
-            coarse: in 16-bit integers, entries to 1.5e-5 of the largest in their row; else as
-                they are, and the scales are 1.
+            coarse: whether rows are rounded to 16-bit integers. The error of an entry is then
+                1.5e-5 of the largest entry of its row. If not, the scales are 1.
+
+        Returns:
+            The rows, one after the other, and their scales.
         """
         block, scale = self.block, np.ones(len(self.block), self.block.dtype)
         if coarse:
@@ -140,20 +142,20 @@ class Front:
             block = np.rint(block / scale[:, None]).astype(np.int16)
             scale = scale.astype(np.float32)
         count = self.stop - self.start
-        own = block[:count][np.tri(count, dtype=bool)]
-        return np.concatenate([own, block[count:].ravel()]), scale
+        triangle = block[:count][np.tri(count, dtype=bool)]
+        return np.concatenate([triangle, block[count:].ravel()]), scale
 
 
 @dataclass(frozen=True, eq=False)
 class Shares:
-    """Fronts of a factor, divided so that two threads may go through them.
+    """Fronts of a factor, divided between two threads.
 
-    No front of one of the first two is above one of the other.
+    No front of one thread lies above a front of the other.
 
     Args:
-        first: increasing.
-        second: increasing.
-        above: increasing; none is below one of the first two.
+        first: fronts of the first thread, increasing.
+        second: fronts of the second thread, increasing.
+        above: fronts above both, increasing, for one thread.
     """
 
     first: Index
@@ -162,7 +164,7 @@ class Shares:
 
     @property
     def fronts(self) -> Index:
-        """All of them, increasing."""
+        """All fronts, increasing."""
         return np.sort(np.concatenate([self.first, self.second, self.above]))
 
 
@@ -170,18 +172,19 @@ class Shares:
 class CholeskyFactor:
     """P A Pᵀ = L Lᵀ of a symmetric positive definite matrix.
 
-    Of a front's unknowns and boundary together, f + m, each has a row of W. All fronts' rows
-    follow each other; the first `edges[i] + starts[i]` of them are those of the fronts before i.
+    W of a front has a row for each of its unknowns and each unknown of its boundary. The rows of
+    front i begin at row `starts[i] + edges[i]` of all rows.
 
     Args:
-        order: (n,) unknowns in elimination order.
-        starts: (f + 1,) first unknown of each front in elimination order, children before
-            parents, and how many there are.
-        parents: (f,) front above each, -1 at a root.
-        edges: (f + 1,) first place of each front's boundary in `boundary`, and its length.
-        boundary: (b,) later unknowns that the fronts touch, increasing within a front.
-        values: the rows of W, without the zeros of L11⁻¹, each over its scale.
-        scale: (n + b,) of the rows; its type is that of all products with them.
+        order: unknowns in elimination order, shape (n,).
+        starts: first unknown of each front in elimination order, children before parents, then
+            the number of unknowns, shape (f + 1,).
+        parents: front above each front, shape (f,); -1 at a root.
+        edges: position in `boundary` of each front's boundary, then its length, shape (f + 1,).
+        boundary: later unknowns that the fronts are coupled with, increasing within a front,
+            shape (b,).
+        values: rows of W without the zeros of L11⁻¹, each divided by its scale.
+        scale: scales of the rows, shape (n + b,). Products have the type of this array.
     """
 
     order: Index
@@ -201,14 +204,14 @@ class CholeskyFactor:
         boundaries: list[Index],
         rows: list[tuple[NDArray[Any], Array]],
     ) -> "CholeskyFactor":
-        """Return the factor of fronts' boundaries and `Front.rows`; the lists are emptied."""
+        """Return the factor made of the fronts' boundaries and `Front.rows`; empty the lists."""
         values, scales = map(list, zip(*rows, strict=True)) if rows else ([], [])
         rows.clear()
         edges = np.cumsum([0, *map(len, boundaries)])
         boundary = joined(boundaries, np.dtype(np.int64))
-        number = values[0].dtype if values else np.dtype(float)
-        scale = joined(scales, scales[0].dtype if scales else number)
-        parts = edges, boundary, joined(values, number), scale
+        dtype = values[0].dtype if values else np.dtype(float)
+        scale = joined(scales, scales[0].dtype if scales else dtype)
+        parts = edges, boundary, joined(values, dtype), scale
         return cls(order, starts, np.array(parents, np.int64), *parts)
 
     @property
@@ -218,9 +221,9 @@ class CholeskyFactor:
 
     @cached_property
     def firsts(self) -> Index:
-        """Where the rows of each front begin in `values`, and its length at the end (f + 1,)."""
-        own, touched = np.diff(self.starts), np.diff(self.edges)
-        return np.cumsum(np.concatenate([[0], own * (own + 1) // 2 + own * touched]))
+        """Position in `values` of each front's rows, then the length of `values` (f + 1,)."""
+        own, boundary = np.diff(self.starts), np.diff(self.edges)
+        return np.cumsum(np.concatenate([[0], own * (own + 1) // 2 + own * boundary]))
 
     @cached_property
     def everything(self) -> Shares:
@@ -232,9 +235,9 @@ class CholeskyFactor:
         share = _divided(fronts, self.parents, np.diff(self.firsts))
         return Shares(*(fronts[share == number] for number in range(3)))
 
-    def solve(self, right: Array) -> Array:
-        """Return x (n,) of A x = right."""
-        x = right[self.order].astype(np.float64)
+    def solve(self, right_side: Array) -> Array:
+        """Return the solution x (n,) of A x = right_side."""
+        x = right_side[self.order].astype(np.float64)
         self.forward(x)
         self.backward(x)
         result = np.empty_like(x)
@@ -242,36 +245,37 @@ class CholeskyFactor:
         return result
 
     def forward(self, x: Array, fronts: Shares | None = None) -> None:
-        """Turn x (n,) into L⁻¹ x in place, in elimination order.
+        """Replace x (n,), in elimination order, by L⁻¹ x.
 
         Args:
-            x: zero except on the fronts.
-            fronts: with everything above each of them; all by default.
+            x: vector that is zero except in the unknowns of the fronts.
+            fronts: fronts of the solve, with all fronts above them; by default all.
         """
-        some = self.everything if fronts is None else fronts
-        # Both threads change unknowns above: each in a vector of its own, added in a fixed order.
+        shares = self.everything if fronts is None else fronts
+        # Both threads change unknowns above their fronts. So each has its own vector, and the
+        # vectors are added in a fixed order.
         other = np.zeros_like(x)
-        _copy(some.second, self.starts, x, other)
+        _copy(shares.second, self.starts, x, other)
         both(
-            lambda: _forward(some.first, *self._parts, x),
-            lambda: _forward(some.second, *self._parts, other),
+            lambda: _forward(shares.first, *self._parts, x),
+            lambda: _forward(shares.second, *self._parts, other),
         )
-        _copy(some.second, self.starts, other, x)
-        _add(some.above, self.starts, other, x)
-        _forward(some.above, *self._parts, x)
+        _copy(shares.second, self.starts, other, x)
+        _add(shares.above, self.starts, other, x)
+        _forward(shares.above, *self._parts, x)
 
     def backward(self, x: Array, fronts: Shares | None = None) -> None:
-        """Turn x (n,) into L⁻ᵀ x in place, in elimination order.
+        """Replace x (n,), in elimination order, by L⁻ᵀ x.
 
         Args:
-            x: L⁻ᵀ x already on what lies above the fronts and is none of them.
-            fronts: all by default.
+            x: vector that has the result already in the fronts above those of the solve.
+            fronts: fronts of the solve; by default all.
         """
-        some = self.everything if fronts is None else fronts
-        _backward(some.above, *self._parts, x)
+        shares = self.everything if fronts is None else fronts
+        _backward(shares.above, *self._parts, x)
         both(
-            lambda: _backward(some.first, *self._parts, x),
-            lambda: _backward(some.second, *self._parts, x),
+            lambda: _backward(shares.first, *self._parts, x),
+            lambda: _backward(shares.second, *self._parts, x),
         )
 
     @cached_property
@@ -279,15 +283,15 @@ class CholeskyFactor:
         return self.starts, self.edges, self.boundary, self.firsts, self.values, self.scale
 
 
-def joined(parts: list[NDArray[Any]], number: DTypeLike) -> NDArray[Any]:
-    """Return the parts joined into one array; each is freed when it has been copied."""
-    whole = np.empty(sum(part.size for part in parts), number)
-    at = len(whole)
+def joined(parts: list[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any]:
+    """Return the parts joined into one array; each part is freed after its copy."""
+    result = np.empty(sum(part.size for part in parts), dtype)
+    at = len(result)
     while parts:
         part = parts.pop()
         at -= part.size
-        whole[at : at + part.size] = part.ravel()
-    return whole
+        result[at : at + part.size] = part.ravel()
+    return result
 
 
 @compiled
@@ -301,23 +305,26 @@ def _forward(
     scale: Array,
     x: Array,
 ) -> None:
-    """Take steps of L⁻¹ x: own unknowns times L11⁻¹, what lies above less the rest of W."""
-    number = scale.dtype.type
+    """Apply the fronts' steps of L⁻¹ x.
+
+    A step subtracts L21 L11⁻¹ x₁ from the boundary, and replaces its own unknowns x₁ by L11⁻¹ x₁.
+    """
+    dtype = scale.dtype.type
     for front in fronts:
         start, stop = starts[front], starts[front + 1]
         count, at, scales = stop - start, firsts[front], scale[start + edges[front] :]
         own = x[start:stop].astype(scale.dtype)
         for i in range(count):
-            row, total = values[at : at + i + 1], number(0)
+            row, total = values[at : at + i + 1], dtype(0)
             for j in range(i + 1):
-                total += number(row[j]) * own[j]
+                total += dtype(row[j]) * own[j]
             x[start + i] = scales[i] * total
             at += i + 1
         later = boundary[edges[front] : edges[front + 1]]
         for i in range(len(later)):
-            row, total = values[at : at + count], number(0)
+            row, total = values[at : at + count], dtype(0)
             for j in range(count):
-                total += number(row[j]) * own[j]
+                total += dtype(row[j]) * own[j]
             x[later[i]] -= scales[count + i] * total
             at += count
 
@@ -333,22 +340,25 @@ def _backward(
     scale: Array,
     x: Array,
 ) -> None:
-    """Take steps of L⁻ᵀ x: Wᵀ times own unknowns and minus those above, the last front first."""
-    number = scale.dtype.type
+    """Apply the fronts' steps of L⁻ᵀ x, the last front first.
+
+    A step replaces its own unknowns x₁ by Wᵀ [x₁; -x₂], with the unknowns x₂ of the boundary.
+    """
+    dtype = scale.dtype.type
     for front in fronts[::-1]:
         start, stop = starts[front], starts[front + 1]
         count, at, scales = stop - start, firsts[front], scale[start + edges[front] :]
         total = np.zeros(count, scale.dtype)
         for i in range(count):
-            row, right = values[at : at + i + 1], number(scales[i] * x[start + i])
+            row, factor = values[at : at + i + 1], dtype(scales[i] * x[start + i])
             for j in range(i + 1):
-                total[j] += right * number(row[j])
+                total[j] += factor * dtype(row[j])
             at += i + 1
         later = boundary[edges[front] : edges[front + 1]]
         for i in range(len(later)):
-            row, right = values[at : at + count], number(-scales[count + i] * x[later[i]])
+            row, factor = values[at : at + count], dtype(-scales[count + i] * x[later[i]])
             for j in range(count):
-                total[j] += right * number(row[j])
+                total[j] += factor * dtype(row[j])
             at += count
         for j in range(count):
             x[start + j] = total[j]
@@ -356,7 +366,7 @@ def _backward(
 
 @compiled
 def _copy(fronts: Index, starts: Index, source: Array, target: Array) -> None:
-    """Copy the unknowns of some fronts from one vector to another."""
+    """Copy the unknowns of fronts from one vector to another."""
     for front in fronts:
         for i in range(starts[front], starts[front + 1]):
             target[i] = source[i]
@@ -364,7 +374,7 @@ def _copy(fronts: Index, starts: Index, source: Array, target: Array) -> None:
 
 @compiled
 def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
-    """Add the unknowns of some fronts in one vector to another."""
+    """Add the unknowns of fronts in one vector to another."""
     for front in fronts:
         for i in range(starts[front], starts[front + 1]):
             target[i] += source[i]
@@ -372,10 +382,11 @@ def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
 
 @compiled
 def _divided(fronts: Index, parents: Index, sizes: Index) -> Index:
-    """Return the thread of each of some fronts (k,), increasing: 0, 1, or 2 for above both.
+    """Return the thread (k,) of each front: 0, 1, or 2 for the fronts above both.
 
-    The subtree with the most work is cut below its top, repeatedly, and each time the subtrees go
-    to the thread with less work, the largest first; the division that ends soonest is kept.
+    Each trial assigns the subtrees, the largest first, to the thread with less work. Then the
+    largest subtree loses its top, which becomes a front above both. The fastest division is
+    returned. `fronts` is increasing, `sizes` is the work of every front.
     """
     count = len(fronts)
     place = np.full(len(parents), -1)
@@ -384,39 +395,39 @@ def _divided(fronts: Index, parents: Index, sizes: Index) -> Index:
     weight = np.empty(count, np.int64)
     for i in range(count):
         parent = parents[fronts[i]]
-        while parent >= 0 and place[parent] < 0:  # of those left out, what is above
+        while parent >= 0 and place[parent] < 0:  # skip fronts that are not in the list
             parent = parents[parent]
         above[i] = place[parent] if parent >= 0 else -1
         weight[i] = sizes[fronts[i]]
     for i in range(count):  # children before parents
         if above[i] >= 0:
             weight[above[i]] += weight[i]
-    open_, cut = above < 0, np.zeros(count, np.bool_)
-    whose = np.full(count, 2)
-    best, on_top = np.inf, 0
+    is_top, cut = above < 0, np.zeros(count, np.bool_)
+    thread = np.full(count, 2)
+    best, above_work = np.inf, 0
     for _ in range(CUTS):
-        tops = np.flatnonzero(open_)
+        tops = np.flatnonzero(is_top)
         tops = tops[np.argsort(-weight[tops])]
         loads, owner = np.zeros(2, np.int64), np.empty(len(tops), np.int64)
         for k in range(len(tops)):
             owner[k] = 0 if loads[0] <= loads[1] else 1
             loads[owner[k]] += weight[tops[k]]
-        if on_top + loads.max() < best:
-            best = on_top + loads.max()
-            whose[:] = 2
-            whose[tops] = owner
+        if above_work + loads.max() < best:
+            best = above_work + loads.max()
+            thread[:] = 2
+            thread[tops] = owner
             for i in range(count - 1, -1, -1):
-                if not open_[i] and not cut[i]:
-                    whose[i] = whose[above[i]]
+                if not is_top[i] and not cut[i]:
+                    thread[i] = thread[above[i]]
         if len(tops) == 0:
             break
         heaviest = tops[0]
-        open_[heaviest], cut[heaviest] = False, True
-        on_top += sizes[fronts[heaviest]]
+        is_top[heaviest], cut[heaviest] = False, True
+        above_work += sizes[fronts[heaviest]]
         for i in range(count):
             if above[i] == heaviest:
-                open_[i] = True
-    return whose
+                is_top[i] = True
+    return thread
 
 
 def fronts_of(
@@ -429,11 +440,11 @@ def fronts_of(
     """Yield the fronts of the Cholesky factor, children before parents.
 
     Args:
-        matrix: (n, n) symmetric, positive definite on the unknowns that have a rank.
-        rank: (n,) place of each unknown in elimination order, -1 for one left out.
-        starts: (f + 1,) first place of each tree member, and how many there are.
-        parent: index of the parent of each member, -1 for a root.
-        precision: in which the fronts are yielded; they are computed in float64.
+        matrix: symmetric, positive definite on the unknowns that have a rank, shape (n, n).
+        rank: place of each unknown in elimination order, shape (n,); -1 if it is excluded.
+        starts: first place of each tree member, then the number of places, shape (f + 1,).
+        parent: index of each member's parent; -1 for a root.
+        precision: type of the yielded fronts, which are computed in float64.
 
     Raises:
         ComputationError: the matrix is not positive definite.
@@ -451,14 +462,10 @@ def fronts_of(
 
 
 def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:
-    """Return the lower half of a symmetric matrix in elimination order, by columns.
+    """Return the lower half of a symmetric matrix (n, n) in elimination order, by columns.
 
-    The rows of a column are in no order.
-
-    Args:
-        matrix: (n, n).
-        rank: (n,) place of each unknown, -1 for one left out.
-        count: how many have one.
+    The rows of a column are not sorted. `rank` is that of `fronts_of`, and `count` the number of
+    unknowns with a rank.
     """
     edges = np.zeros(count + 1, np.int64)
     _count_lower(matrix.indptr, matrix.indices, rank, edges)
@@ -470,7 +477,7 @@ def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse
 
 @compiled
 def _count_lower(indptr: Index, indices: Index, rank: Index, counts: Index) -> None:
-    """Put the number of entries of each column j into counts[j + 1]: a row read as a column."""
+    """Write the number of entries of each column j into counts[j + 1]."""
     for i in range(len(rank)):
         for at in range(indptr[i], indptr[i + 1]):
             if 0 <= rank[i] <= rank[indices[at]]:
@@ -487,14 +494,17 @@ def _fill_lower(
     rows: Index,
     values: Array,
 ) -> None:
-    """Put rows and values at the place of their column in `edges`."""
+    """Write the rows and values of each column, from its position in `edges` on.
+
+    The matrix is symmetric, so that its row i is its column i.
+    """
     for i in range(len(rank)):
         if rank[i] >= 0:
-            free = edges[rank[i]]
+            target = edges[rank[i]]
             for at in range(indptr[i], indptr[i + 1]):
                 if rank[indices[at]] >= rank[i]:
-                    rows[free], values[free] = rank[indices[at]], data[at]
-                    free += 1
+                    rows[target], values[target] = rank[indices[at]], data[at]
+                    target += 1
 
 
 def _eliminate(
@@ -505,7 +515,7 @@ def _eliminate(
     row: Index,
     precision: type[np.floating],
 ) -> tuple[Index, NDArray[Any], Array]:
-    """Return a member's boundary, its W, and the update for its parent."""
+    """Return the boundary and W of a tree member, and the update for its parent."""
     k = stop - start
     first, last = matrix.indptr[start], matrix.indptr[stop]
     rows, values = matrix.indices[first:last], matrix.data[first:last]
@@ -515,37 +525,37 @@ def _eliminate(
         np.concatenate([rows[below], *(b[np.searchsorted(b, stop) :] for b, _ in children)])
     ).astype(np.int64)
     m = len(boundary)
-    own, mixed, rest = (np.zeros(size, order="F") for size in ((k, k), (m, k), (m, m)))
+    own, mixed, update = (np.zeros(size, order="F") for size in ((k, k), (m, k), (m, m)))
     inside = ~below
     own[rows[inside] - start, columns[inside]] = values[inside]
     row[boundary] = np.arange(m)
     mixed[row[rows[below]], columns[below]] = values[below]
-    while children:  # each is freed when it has been added
-        indices, update = children.pop()
+    while children:  # each child's update is freed after it has been added
+        indices, part = children.pop()
         split = int(np.searchsorted(indices, stop))
         own_rows, parent_rows = indices[:split] - start, row[indices[split:]]
-        _extend_add(own, own_rows, own_rows, update[:split, :split], True)
-        _extend_add(mixed, parent_rows, own_rows, update[split:, :split], False)
-        _extend_add(rest, parent_rows, parent_rows, update[split:, split:], True)
+        _extend_add(own, own_rows, own_rows, part[:split, :split], True)
+        _extend_add(mixed, parent_rows, own_rows, part[split:, :split], False)
+        _extend_add(update, parent_rows, parent_rows, part[split:, split:], True)
     lower, info = lapack.dpotrf(own, lower=1, clean=1, overwrite_a=1)
     if info:
         raise ComputationError("the stiffness matrix is not positive definite")
     inverse, _ = lapack.dtrtri(lower, lower=1, overwrite_c=1)
     if m:
         mixed = blas.dtrmm(1.0, inverse, mixed, side=1, lower=1, trans_a=1, overwrite_b=1)
-        rest = blas.dsyrk(-1.0, mixed, 1.0, rest, lower=1, overwrite_c=1)
+        update = blas.dsyrk(-1.0, mixed, 1.0, update, lower=1, overwrite_c=1)
     block = np.empty((k + m, k), precision)
     block[:k], block[k:] = inverse, mixed
-    if m:  # in the precision in which W is kept: it is used for nothing else of the factor
-        times = get_blas_funcs("trmm", dtype=precision)
-        # BLAS reads column by column, so it sees the transpose of an array that is kept row by row.
-        times(1.0, block[:k].T, block[k:].T, overwrite_b=1)
-    return boundary, block, rest
+    if m:  # the stored precision is enough, because the factorisation does not use W
+        multiply = get_blas_funcs("trmm", dtype=precision)
+        # BLAS expects column-major arrays: it gets the transposes of row-major ones.
+        multiply(1.0, block[:k].T, block[k:].T, overwrite_b=1)
+    return boundary, block, update
 
 
 @compiled
 def _extend_add(target: Array, rows: Index, columns: Index, update: Array, lower: bool) -> None:
-    """Add update to target[rows, columns]; of a square one only what is below the diagonal."""
+    """Add `update` to target[rows, columns]; if `lower`, skip entries above the diagonal."""
     for j in range(len(columns)):
         for i in range(j if lower else 0, len(rows)):
             target[rows[i], columns[j]] += update[i, j]

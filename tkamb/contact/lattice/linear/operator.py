@@ -1,8 +1,8 @@
 """The linear operator of one insert: factor, boundary conditions, response of contact nodes.
 
-The memory that the factorisation will need is computed before it begins. The sizes of the fronts
-follow from the dissection and the pattern alone (symbolic factorisation, on nodes instead of
-unknowns). They are compared with the available memory of the machine.
+The memory for the factorisation is estimated before it begins, and compared with the available
+memory. The estimate is a symbolic factorisation on nodes instead of unknowns: the sizes of the
+fronts follow from the dissection and the pattern alone.
 """
 
 from collections.abc import Callable
@@ -35,67 +35,67 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class MemoryNeedSettings:
-    """The estimate of a lattice's memory before it is made."""
+    """The estimate of the memory that a lattice needs."""
 
     unknowns_per_node: int = 3
-    """Unknowns of a node. By definition: each boundary is counted as if all of its displacements
-    were free."""
+    """Unknowns of a node. By definition; held unknowns are counted too."""
     cell_bytes: int = 20_000
-    """Bytes of a cell while its stiffness is put into the global matrix. Measured: 9 to 22 kB."""
+    """Bytes for a cell during the assembly of the stiffness. Measured: 9 to 22 kB."""
     entry_bytes: int = 36
-    """Bytes of an entry of the global matrix: 20 for itself and its lower half in elimination
-    order; the rest stands for the arrays of the compliance at that time. Measured: without
-    it the estimate is 12 % low."""
+    """Bytes for an entry of the stiffness matrix: 20 for the entry and its copy in elimination
+    order, 16 for the arrays of the compliance. Measured: without these 16 the estimate is 12 %
+    low."""
     safety_factor: float = 1.1
-    """1: factor for what the estimate leaves out. Chosen: a proposal that fits is better than one
-    that nearly fits."""
+    """1: factor on the estimate. Chosen because the proposed cell size must fit."""
     memory_exponent: float = 3.0
-    """1: memory falls at least with this power of the cell size. Measured: 3.7."""
+    """1: the memory is proportional to at least this power of 1 / cell size. Measured: 3.7."""
     cell_size_step: float = 0.05e-3
-    """m: proposed cell sizes are multiples of it. Chosen: proposals are round numbers."""
+    """m: proposed cell sizes are multiples of it. Chosen because it gives round numbers."""
     largest_cell_size: float = 5e-3
-    """m: larger cells are not proposed. Chosen: a condyle's contact would be two cells wide."""
+    """m: largest cell size that is proposed. Chosen because a condyle's contact would be two cells
+    wide."""
 
 
 MEMORY_NEED = MemoryNeedSettings()
 
 
 class TooLittleMemoryError(ComputationError):
-    """What is to be computed does not fit into the available memory.
+    """The computation does not fit into the available memory.
 
     Args:
-        need: bytes that the next step needs.
-        available: bytes that are available.
-        likely: bytes that the whole computation is expected to need; 0: as many as `need`.
+        need: memory for the next step, bytes.
+        available: available memory, bytes.
+        likely: expected memory for the whole computation, bytes; 0: as much as `need`.
     """
 
     def __init__(self, need: float, available: float, likely: float) -> None:
-        self.left, self.likely = available, max(need, likely)
+        self.available, self.likely = available, max(need, likely)
         what = (
             f"{need / 1e9:.2g} GB of memory are needed, {max(available, 0) / 1e9:.2g} GB are left"
         )
         super().__init__(what, "lattice", "take a coarser resolution")
 
     def advice(self, size: float) -> str:
-        """Return the advice: the cell size that fits instead of a size (m) that does not."""
-        fits = size * (self.likely / max(self.left, 1.0)) ** (1.0 / MEMORY_NEED.memory_exponent)
-        if fits > MEMORY_NEED.largest_cell_size:
+        """Return the advice in words: a cell size that fits, when `size` (m) does not."""
+        ratio = self.likely / max(self.available, 1.0)
+        least_size = size * ratio ** (1.0 / MEMORY_NEED.memory_exponent)
+        if least_size > MEMORY_NEED.largest_cell_size:
             return "free some memory"
         step = MEMORY_NEED.cell_size_step
-        # Rounded up, so that the proposed size fits; 1e-9 keeps a size that is a multiple already.
-        proposal = np.ceil(fits / step * (1.0 - 1e-9)) * step
+        # Rounded up, so that the proposed size fits; with 1e-9, a multiple of the step stays.
+        proposal = np.ceil(least_size / step * (1.0 - 1e-9)) * step
         return f"take {proposal / MILLIMETRE:g} mm or coarser"
 
 
 def check_memory(need: float, likely: float = 0.0) -> None:
-    """Raise unless a number of bytes is left.
+    """Raise an error if the available memory is too small.
 
     Args:
-        need: bytes.
-        likely: bytes that the whole computation is expected to need, for the advice.
+        need: memory for the next step, bytes.
+        likely: expected memory for the whole computation, bytes; for the advice.
 
     Raises:
-        TooLittleMemoryError: they are not left.
+        TooLittleMemoryError: the available memory is too small.
     """
     available = available_memory()
     if MEMORY_NEED.safety_factor * need > available:
@@ -105,10 +105,10 @@ def check_memory(need: float, likely: float = 0.0) -> None:
 
 
 def check_assembly_memory(cells: int) -> None:
-    """Raise unless the stiffness of a number of cells can be assembled.
+    """Raise an error if the memory is too small to assemble the stiffness of the cells.
 
     Raises:
-        TooLittleMemoryError: the memory is not left.
+        TooLittleMemoryError: the available memory is too small.
     """
     need = MEMORY_NEED.cell_bytes * cells
     # The factor grows as cells^1.25; from about 3,000 cells it needs more memory than the assembly
@@ -119,13 +119,13 @@ def check_assembly_memory(cells: int) -> None:
 def factor_memory(
     tree: Dissection, joined: sparse.csr_matrix, touched: Mask, itemsize: int
 ) -> float:
-    """Return the bytes that factor and half response take at their peak.
+    """Return the peak memory of the factor and the half response, bytes.
 
     Args:
         tree: dissection of n nodes.
-        joined: (n, n) pattern: which nodes are joined.
-        touched: (n,) nodes whose response is wanted.
-        itemsize: bytes of a number that is kept; the factor is computed with 8.
+        joined: pattern of the joined nodes, shape (n, n).
+        touched: mask of the contact nodes, shape (n,).
+        itemsize: bytes of a stored number; the factor is computed with 8.
     """
     rank = np.empty(joined.shape[0], np.int64)
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
@@ -142,8 +142,8 @@ def factor_memory(
             MEMORY_NEED.unknowns_per_node * len(own),
             MEMORY_NEED.unknowns_per_node * len(boundary),
         )
-        # W in 8 bytes and as it is kept, the update (m, m), and updates that no parent has added
-        # yet.
+        # In memory are W in 8 bytes and as stored, the update (m, m), and the updates that wait
+        # for their parents.
         block = float(k + m) * k
         stored += block
         peak = max(peak, itemsize * stored + 8.0 * (live + block + float(m) * m))
@@ -166,11 +166,11 @@ class OperatorSettings:
     """The linear operator of a lattice."""
 
     test_vector_seed: int = 20_240_501
-    """Seed of the random vectors by which the operator's error is measured. Fixed, so that a
-    run repeats."""
+    """Seed of the random vectors that measure the operator's error. It is fixed, so that runs are
+    reproducible."""
     max_fronts_ahead: int = 128
-    """Fronts by which the factorisation may be ahead of the compliance. Chosen: they stay whole in
-    memory for so long."""
+    """Fronts that may wait in memory for the computation of their compliance. Larger: more memory.
+    Smaller: the factorisation waits more often."""
 
 
 OPERATOR = OperatorSettings()
@@ -178,12 +178,12 @@ OPERATOR = OperatorSettings()
 
 @dataclass(frozen=True, eq=False)
 class ElasticOperator:
-    """K = L Lᵀ on the free unknowns, and L⁻¹ of unit forces at the contact nodes.
+    """K = L Lᵀ on the free unknowns, and L⁻¹ E of unit forces E on the contact nodes.
 
     Args:
-        free: (3n,) which unknowns are free.
-        factor: of the free part of the stiffness matrix.
-        contact_nodes: (c,) nodes that the femoral component may touch.
+        free: mask of the free unknowns, shape (3n,).
+        factor: factor of the free part of the stiffness matrix.
+        contact_nodes: nodes of the contact surface, shape (c,).
         half: L⁻¹ E of their 3c unit forces.
     """
 
@@ -202,23 +202,23 @@ class ElasticOperator:
         """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
 
         Args:
-            force: N; zero except on the nodes of the fronts.
-            fronts: from `fronts_of`; all by default.
+            force: nodal forces, N; zero except on the nodes of the fronts.
+            fronts: result of `fronts_of`; by default all fronts.
         """
         y = force.ravel()[self._unknown]
         self.factor.forward(y, fronts)
         return y
 
     def nodal(self, x: Array, nodes: Index | None = None) -> Array:
-        """Return values (m, 3) of nodes, by default of all, from a vector in elimination order.
+        """Return the values (m, 3) at nodes, by default all, of a vector in elimination order.
 
-        Held unknowns have 0.
+        Held unknowns have the value 0.
         """
         return _at_places(x, self._place if nodes is None else self._place[nodes])
 
     @cached_property
     def _unknown(self) -> Index:
-        """Unknown, of the 3n, at each place of the elimination order."""
+        """Number of the unknown at each place of the elimination order."""
         return np.flatnonzero(self.free)[self.factor.order]
 
     @cached_property
@@ -230,12 +230,12 @@ class ElasticOperator:
 
     def fronts_of(self, nodes: Index) -> Shares:
         """Return the fronts of the factor that eliminate the nodes, and all above them."""
-        own = np.unique(self._front_of_node[nodes])
-        return self.factor.shared(np.flatnonzero(self._above[own[own >= 0]].any(axis=0)))
+        fronts = np.unique(self._front_of_node[nodes])
+        return self.factor.shared(np.flatnonzero(self._above[fronts[fronts >= 0]].any(axis=0)))
 
     @cached_property
     def _above(self) -> Mask:
-        """Which fronts are each front or lie above it (f, f)."""
+        """Mask (f, f): row i marks front i and all fronts above it."""
         parents = self.factor.parents
         above = np.eye(len(parents), dtype=bool)
         for member in reversed(range(len(parents))):  # the parent's row is complete
@@ -245,17 +245,16 @@ class ElasticOperator:
 
     @cached_property
     def _front_of_node(self) -> Index:
-        """Front (n,) that eliminates each node; -1 for a node that is held."""
-        own = np.diff(self.factor.starts)
-        member = np.repeat(np.arange(len(own)), own)
+        """Front (n,) that eliminates each node; -1 for a held node."""
+        sizes = np.diff(self.factor.starts)
         result = np.full(len(self.free) // 3, -1)
-        result[self._unknown // 3] = member
+        result[self._unknown // 3] = np.repeat(np.arange(len(sizes)), sizes)
         return result
 
 
 @compiled
 def _at_places(x: Array, places: Index) -> Array:
-    """Return x (n,) at places (m, 3), 0 at those below 0."""
+    """Return x (n,) at places (m, 3), and 0 where a place is negative."""
     result = np.zeros(places.shape)
     for i in range(len(places)):
         for axis in range(3):
@@ -271,20 +270,20 @@ def fixed_unknowns(
     piece: Index | None = None,
     ends_held: bool = False,
 ) -> Mask:
-    """Return which of the 3n unknowns are held.
+    """Return the mask (3n,) of the held unknowns.
 
-    Fixed bearing: all of the bottom nodes' unknowns. Mobile bearing: their y, and what takes away
-    the rigid modes and hinders no strain: x of the two end nodes along z (those nearest to
-    x = 0), and z of the node nearest to the middle between them. Each of several pieces slides
-    by itself.
+    A fixed bearing holds all unknowns of the bottom nodes. A mobile bearing holds their y. It also
+    holds x of the two end nodes along z (those nearest to x = 0) and z of the node nearest to the
+    middle. This prevents rigid motion and allows every strain. Each separate piece of the insert
+    is held in the same way.
 
     Args:
-        nodes: (n, 3) m.
-        bottom: (b,) nodes in the flat bottom.
+        nodes: m, shape (n, 3).
+        bottom: nodes in the flat bottom, shape (b,).
         bearing: "fixed" or "mobile".
-        piece: (n,) of each node; None: all belong together.
-        ends_held: hold x and z of both end nodes, as Sharma (2008), section 4.5.4. The insert
-            then cannot grow wider between them, and a uniform pressure is uneven by up to 10 %.
+        piece: number of each node's piece, shape (n,); None: there is one piece.
+        ends_held: whether x and z of both end nodes are held, as in Sharma (2008), section 4.5.4.
+            Then the insert cannot widen, and a uniform pressure is uneven by up to 10 %.
     """
     fixed = np.zeros((len(nodes), 3), bool)
     if bearing == "fixed":
@@ -294,19 +293,19 @@ def fixed_unknowns(
     pieces = [bottom]
     if piece is not None:
         pieces = [bottom[piece[bottom] == each] for each in np.unique(piece[bottom])]
-    for own in pieces:
-        z = nodes[own, 2]
+    for subset in pieces:
+        z = nodes[subset, 2]
         for end in (z.min(), z.max()):
-            fixed[_nearest(nodes, own, end), [0, 2] if ends_held else 0] = True
+            fixed[_nearest(nodes, subset, end), [0, 2] if ends_held else 0] = True
         if not ends_held:
-            fixed[_nearest(nodes, own, (z.min() + z.max()) / 2.0), 2] = True
+            fixed[_nearest(nodes, subset, (z.min() + z.max()) / 2.0), 2] = True
     return fixed.ravel()
 
 
-def _nearest(nodes: Array, some: Index, z: float) -> int:
-    """Return the node nearest to a place along z; of those as near the one nearest to x = 0."""
-    away = np.abs(nodes[some, 2] - z)
-    tied = some[away <= away.min() + 1e-9 + 1e-6 * np.ptp(nodes[some, 2])]
+def _nearest(nodes: Array, subset: Index, z: float) -> int:
+    """Return the node of a subset that is nearest to z; among equals the nearest to x = 0."""
+    distance = np.abs(nodes[subset, 2] - z)
+    tied = subset[distance <= distance.min() + 1e-9 + 1e-6 * np.ptp(nodes[subset, 2])]
     return int(tied[np.argmin(np.abs(nodes[tied, 0]))])
 
 
@@ -318,37 +317,37 @@ def prepare_operator(
     precision: type[np.floating] = np.float64,
     coarse: bool = False,
 ) -> ElasticOperator:
-    """Factorise a stiffness matrix (3n, 3n) and compute the contact nodes' half response.
+    """Factorise a stiffness matrix and compute the contact nodes' half response.
 
     Args:
-        stiffness: symmetric, positive definite on the free unknowns.
-        index: (n, 3) lattice index of each node.
-        fixed: (3n,) unknowns that are zero.
-        contact_nodes: (c,).
-        precision: in which the numbers are kept and the response is computed; the factor is
-            computed in float64.
-        coarse: keep the factor, not the response, in 16-bit integers: half the memory of single
-            precision, and half to read in every solve.
+        stiffness: symmetric, positive definite on the free unknowns, shape (3n, 3n).
+        index: lattice index of each node, shape (n, 3).
+        fixed: mask of the held unknowns, shape (3n,).
+        contact_nodes: nodes of the contact surface, shape (c,).
+        precision: type of the stored numbers and of the response. The factor is computed in
+            float64.
+        coarse: whether the factor is stored in 16-bit integers, in half the memory of single
+            precision. The response is not.
 
     Raises:
-        TooLittleMemoryError: they do not fit into the memory that is left.
+        TooLittleMemoryError: factor and response do not fit into the available memory.
         ComputationError: the matrix is not positive definite.
     """
     free = ~fixed
     number = np.cumsum(free) - 1
-    some = np.flatnonzero(free.reshape(-1, 3).any(axis=1))
+    free_nodes = np.flatnonzero(free.reshape(-1, 3).any(axis=1))
     joined = stiffness.tobsr((3, 3))
     joined = sparse.csr_matrix(
         (np.ones(len(joined.indices), np.int8), joined.indices, joined.indptr),
         (len(index), len(index)),
     )
-    joined = joined[some][:, some]
-    tree = dissect(index[some], joined)
-    touched = np.isin(some, contact_nodes)
+    joined = joined[free_nodes][:, free_nodes]
+    tree = dissect(index[free_nodes], joined)
+    touched = np.isin(free_nodes, contact_nodes)
     check_memory(factor_memory(tree, joined, touched, np.dtype(precision).itemsize))
     unknowns = []
     for own in tree.own:
-        unknown = (3 * some[own][:, None] + np.arange(3)).ravel()
+        unknown = (3 * free_nodes[own][:, None] + np.arange(3)).ravel()
         unknowns.append(number[unknown[free[unknown]]])
     order = np.concatenate(unknowns)
     rank = np.full(len(free), -1)
@@ -357,22 +356,22 @@ def prepare_operator(
     starts = np.cumsum([0, *map(len, unknowns)])
     half = HalfSolves(starts, tree.parent, unknown, precision)
     fronts = fronts_of(stiffness, rank, starts, tree.parent, precision)
-    del stiffness, joined  # as large as half of the factor, and not needed any more
+    del stiffness, joined  # they are as large as half of the factor
 
-    def taken(member: int, front: Front) -> tuple[NDArray[Any], Array]:
+    def add_to_response(member: int, front: Front) -> tuple[NDArray[Any], Array]:
         half.add(member, front)
         return front.rows(coarse)
 
-    # The response follows the factor in its own thread: BLAS lets both threads run.
-    with ThreadPoolExecutor(1) as other:
+    # A second thread computes the response, because BLAS releases the interpreter lock.
+    with ThreadPoolExecutor(1) as thread:
         waiting: list[Future[tuple[NDArray[Any], Array]]] = []
         boundaries = []
         for member, front in enumerate(fronts):
             boundaries.append(front.boundary)
-            waiting.append(other.submit(taken, member, front))
+            waiting.append(thread.submit(add_to_response, member, front))
             if member >= OPERATOR.max_fronts_ahead:
                 waiting[member - OPERATOR.max_fronts_ahead].result()
-    rows = [one.result() for one in waiting]
+    rows = [future.result() for future in waiting]
     del waiting
     factor = CholeskyFactor.of(order, starts, tree.parent, boundaries, rows)
     return ElasticOperator(free, factor, contact_nodes, half.response())
@@ -381,53 +380,52 @@ def prepare_operator(
 def operator_error(
     operator: ElasticOperator, solid: Solid, response_read: Callable[[], None] | None = None
 ) -> float:
-    """Return how far an operator is from its solid's stiffness K, relative.
+    """Return the relative error of an operator, against the stiffness K of its solid.
 
-    The largest of
+    K is applied cell by cell. The error is the largest of
 
-        |K ũ - f| / |f|            f = K u of a random u, ũ = L⁻ᵀ L⁻¹ f
-        |fᵀũ - ũᵀK ũ| / fᵀũ        f pressing on every contact node
+        |K ũ - f| / |f|                f = K u of a random u, ũ = L⁻ᵀ L⁻¹ f
+        |fᵀũ - ũᵀK ũ| / fᵀũ            f: unit forces down on every contact node
         |Z g - L⁻¹ E g| / |L⁻¹ E g|    g random on the contact nodes
 
-    with K summed from the cells. A random u is as rough as the grid, so that f is as large as
-    K and u allow, and the relative rounding error does not depend on the condition of K (float32
-    1e-6, 16-bit integers 5e-4). The second measures the soft, smooth displacements, and the third
-    compares the stored response with the factor.
-    Random numbers reach every entry of factor and response.
+    The first tests rough displacements. Its rounding error does not depend on the condition of K
+    (float32: 1e-6, 16-bit integers: 5e-4). The second tests smooth displacements. The third
+    compares the stored response with the factor. The random vectors involve every stored number.
 
     Args:
-        operator: the operator to check.
-        solid: the solid whose operator it should be.
-        response_read: called when all of the response has been read, and nothing of the factor.
+        operator: operator to check.
+        solid: solid that the operator should belong to.
+        response_read: called after the last use of the response, before the factor is read.
     """
-    chance = np.random.default_rng(OPERATOR.test_vector_seed)
+    generator = np.random.default_rng(OPERATOR.test_vector_seed)
     nodes, shape = operator.contact_nodes, solid.nodes.shape
     pressed, touched = np.zeros(shape), np.zeros(shape)
     pressed[nodes, 1] = -1.0
-    touched[nodes] = chance.normal(size=(len(nodes), 3))
+    touched[nodes] = generator.normal(size=(len(nodes), 3))
     stored = np.zeros(len(operator.factor.order))
     operator.half.apply(touched[nodes].ravel(), stored)
     if response_read is not None:
         response_read()
-    displacement = np.where(operator.free.reshape(-1, 3), chance.normal(size=shape), 0.0)
-    force = _carried(operator, solid, displacement)
-    missing = _carried(operator, solid, operator.solve(force)) - force
-    sunk = operator.solve(pressed)
-    work, energy = (float((f * sunk).sum()) for f in (pressed, _carried(operator, solid, sunk)))
-    directly = operator.start(touched)
+    displacement = np.where(operator.free.reshape(-1, 3), generator.normal(size=shape), 0.0)
+    force = _free_force(operator, solid, displacement)
+    difference = _free_force(operator, solid, operator.solve(force)) - force
+    smooth = operator.solve(pressed)
+    inner = _free_force(operator, solid, smooth)
+    work, energy = (float((f * smooth).sum()) for f in (pressed, inner))
+    from_factor = operator.start(touched)
     return max(
-        _ratio(np.linalg.norm(missing), np.linalg.norm(force)),
+        _ratio(np.linalg.norm(difference), np.linalg.norm(force)),
         _ratio(work - energy, work),
-        _ratio(np.linalg.norm(stored - directly), np.linalg.norm(directly)),
+        _ratio(np.linalg.norm(stored - from_factor), np.linalg.norm(from_factor)),
     )
 
 
-def _carried(operator: ElasticOperator, solid: Solid, displacement: Array) -> Array:
-    """Return K u, N, (n, 3), on the free unknowns; 0 where held."""
+def _free_force(operator: ElasticOperator, solid: Solid, displacement: Array) -> Array:
+    """Return K u, N, (n, 3), with 0 at the held unknowns."""
     return np.where(operator.free.reshape(-1, 3), solid.linear_force(displacement), 0.0)
 
 
 def _ratio(part: float | np.floating, whole: float | np.floating) -> float:
-    """Return |part / whole|; inf where that is no number, so that it passes no comparison."""
+    """Return |part / whole|, or inf where it is not finite, so that it fails every test."""
     value = abs(float(part)) / max(abs(float(whole)), 1e-300)
     return value if np.isfinite(value) else float("inf")

@@ -1,1 +1,1 @@
-"""From an insert to cells: the grid, its columns and walls, and the surface that is touched."""
+"""From an insert to cells: grid, columns, walls and contact surface."""

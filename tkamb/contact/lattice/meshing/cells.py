@@ -1,6 +1,6 @@
-"""Cells of eight nodes: corners, springs to the 26 neighbours, quality, shape functions.
+"""Cells of eight nodes: corners, springs, quality and shape functions.
 
-Corners are in VTK hexahedron order with the cell's own axes along x, y and z.
+Corners are in VTK hexahedron order. The cell's axes i, j, k are along x, y, z.
 """
 
 from dataclasses import dataclass
@@ -31,13 +31,16 @@ NEIGHBOURS = np.array(
         for o in CORNERS
     ]
 )
-"""The corner (8, 3) at the other end of the edge along x, y and z of each corner."""
+"""Number of the corner at the other end of each corner's edge along x, y and z, shape (8, 3)."""
 
 PAIRS = np.array([(a, b) for a in range(8) for b in range(a + 1, 8)])
 """The 28 pairs of a cell's corners that are joined by springs."""
 
 PAIR_AXES = np.abs(np.diff(CORNERS[PAIRS], axis=1))[:, 0]
-"""Axes along which the ends of each pair differ (28, 3), 0 or 1: 1 edge, 2 face, 3 body."""
+"""Axes along which the corners of each pair differ, 0 or 1, shape (28, 3).
+
+The sum of a row is 1 for an edge, 2 for a face diagonal and 3 for a body diagonal.
+"""
 
 _GAUSS = 0.5 + (CORNERS - 0.5) / np.sqrt(3.0)
 
@@ -61,7 +64,7 @@ DIRECTIONS = np.array(
 """The 13 directions of springs: edges x, y, z; face diagonals xy, yz, xz; body diagonals."""
 
 FAMILY_SHARE = np.array([0.25] * 3 + [0.5] * 6 + [1.0] * 4)
-"""Share of one cell in a spring of each direction: four cells meet in an edge, two in a face."""
+"""Share of one cell in a spring of each direction: four cells share an edge, two a face."""
 
 FACES = np.array(
     [[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]]
@@ -83,13 +86,13 @@ EDGES = np.array(
 
 @dataclass(frozen=True, eq=False)
 class Springs:
-    """Every spring once, and where each cell finds its 28.
+    """The springs of a lattice, each once.
 
     Args:
-        ends: (s, 2) nodes.
-        family: (s,) row of DIRECTIONS.
-        owners: (s,) number of cells that own it.
-        of_cell: (c, 28) spring of each of the cell's PAIRS.
+        ends: end nodes, shape (s, 2).
+        family: row of DIRECTIONS, shape (s,).
+        owners: number of cells that share the spring, shape (s,).
+        of_cell: springs of each cell, in the order of PAIRS, shape (c, 28).
     """
 
     ends: Index
@@ -99,10 +102,9 @@ class Springs:
 
 
 def join_springs(cells: Index, node_count: int) -> Springs:
-    """Return the springs of cells (c, 8), each once; no sorting, the grid gives the keys."""
+    """Return the springs of cells (c, 8), each once."""
     offset = CORNERS[PAIRS[:, 1]] - CORNERS[PAIRS[:, 0]]
-    # A spring between two nodes is shared by all cells that hold both; it has one direction out of
-    # thirteen.
+    # Cells that have both end nodes share a spring. Its first node and its direction identify it.
     forward = (offset[:, None, :] == DIRECTIONS).all(axis=2)
     backward = (-offset[:, None, :] == DIRECTIONS).all(axis=2)
     family = (forward | backward).argmax(axis=1)
@@ -121,7 +123,7 @@ def join_springs(cells: Index, node_count: int) -> Springs:
 
 @compiled
 def scaled_jacobians(points: Array) -> Array:
-    """Return the least scaled Jacobian (c,) of cells (c, 8, 3): 1 for a box, <= 0 inverted."""
+    """Return the least scaled Jacobian (c,) of cells (c, 8, 3): 1 for a box, <= 0 if inverted."""
     result, edges, lengths = np.full(len(points), np.inf), np.empty((3, 3)), np.empty(3)
     for cell in range(len(points)):
         for corner in range(8):
@@ -135,7 +137,7 @@ def scaled_jacobians(points: Array) -> Array:
             for d in range(3):
                 e, f = (d + 1) % 3, (d + 2) % 3
                 volume += edges[2, d] * (edges[0, e] * edges[1, f] - edges[0, f] * edges[1, e])
-            # Volume of three unit edges: 1 at a right-angled corner, 0 at a flat one.
+            # This is the volume spanned by unit edges: 1 at a right-angled corner, 0 at a flat one.
             result[cell] = min(result[cell], volume / length if length > 0 else 0.0)
     return result
 
@@ -152,8 +154,8 @@ def cell_volumes(points: Array) -> Array:
 
 
 def shape_gradients(at: Array) -> Array:
-    """Return reference gradients (8, 3) of the trilinear shape functions at a point of [0, 1]³."""
-    # Trilinear shape functions: products of x or 1 - x along the three axes.
+    """Return the gradients (8, 3) of the trilinear shape functions at a point of [0, 1]³."""
+    # A shape function is the product of x or 1 - x for each axis.
     factor = np.where(CORNERS == 1, at, 1 - at)
     sign = np.where(CORNERS == 1, 1.0, -1.0)
     return np.stack(
@@ -162,7 +164,7 @@ def shape_gradients(at: Array) -> Array:
 
 
 REFERENCE_GRADIENTS = np.stack([shape_gradients(at) for at in _GAUSS])
-"""(8 points, 8 nodes, 3) of the shape functions at the 2 x 2 x 2 Gauss points of [0, 1]³."""
+"""Gradients at the 2 x 2 x 2 Gauss points of [0, 1]³, shape (8 points, 8 nodes, 3)."""
 
 
 def _jacobians(corners: Array) -> Array:
@@ -174,14 +176,14 @@ def gauss_gradients(corners: Array) -> tuple[Array, Array]:
     """Return shape-function gradients and weights at the 2×2×2 Gauss points.
 
     Args:
-        corners: (s, 8, 3) m.
+        corners: m, shape (s, 8, 3).
 
     Returns:
-        Gradients (s, 8 points, 8 nodes, 3), 1/m, and weights (s, 8), m³, whose sum is the
-        cell's volume. A weight that is not positive marks an inverted cell.
+        Gradients (s, 8 points, 8 nodes, 3), 1/m, and weights (s, 8), m³. The weights add up to
+        the cell's volume. A cell with a weight <= 0 is inverted.
     """
     jacobian = _jacobians(corners)
-    # Eight Gauss points of equal weight in a unit cube.
+    # The eight Gauss points of the unit cube have equal weights.
     weights = np.linalg.det(jacobian) / 8
     gradients = np.einsum("sgxd,gnd->sgnx", np.linalg.inv(jacobian), REFERENCE_GRADIENTS)
     return gradients, weights
@@ -189,12 +191,11 @@ def gauss_gradients(corners: Array) -> tuple[Array, Array]:
 
 @compiled
 def mean_gradient(corners: Array) -> tuple[Array, Array]:
-    """Return the volume-averaged gradients (s, 8, 3), 1/m, and the volume (s,), m³.
+    """Return the volume-averaged gradients g_i (s, 8, 3), 1/m, and the volume (s,), m³.
 
-    They reproduce a linear field exactly: sum_i x_i g_i = identity
-    (Flanagan & Belytschko, Int J Numer Meth Eng 17:679, 1981). At a Gauss point with the
-    Jacobian J the gradients times the weight are the cofactors of J by the reference gradients,
-    so that an inverted cell needs no inverse.
+    A linear field has its exact gradient: sum_i x_i g_i = identity (Flanagan & Belytschko,
+    Int J Numer Meth Eng 17:679, 1981). The cofactors of the Jacobian replace its inverse, so that
+    inverted cells are no exception.
     """
     gradients, volume = np.zeros((len(corners), 8, 3)), np.zeros(len(corners))
     j, cofactor = np.empty((3, 3)), np.empty((3, 3))

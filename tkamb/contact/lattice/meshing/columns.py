@@ -1,18 +1,18 @@
-"""Which nodes of every vertical grid line belong to the insert, by rules 7 to 9 of Sharma (2008).
+"""The insert's nodes on every vertical grid line, by rules 7 to 9 of Sharma (2008).
 
-A line along y runs inside the part over a set of intervals. The node nearest to an interval's end
-is moved onto the surface (half-cell rule). Intervals thinner than a cell follow rules 8 and 9.
+A line along y is inside the part (the insert) over some intervals. The node nearest to an
+interval's end is moved onto the surface (half-cell rule). Rules 8 and 9 are for intervals thinner
+than a cell.
 
-On a grid of level layers a dish is a staircase: wherever the number of cells in a column
-changes, a wedge under the surface belongs to no cell (3.4 to 4 % of the volume of real inserts at
-1 mm with the half-cell rule alone). So the layers between the flat bottom and one reference layer
-are stretched, column by column, to the top surface, as far as the edge ratio permits:
+With level layers a dish would be a staircase. Wherever the number of cells in a column changes, a
+wedge under the surface would belong to no cell (3.4 to 4 % of the volume of real inserts at 1 mm).
+So the layers between the flat bottom and one reference layer are stretched to the top surface,
+column by column, as far as the edge ratio permits:
 
     y_j(x, z) = j H(x, z) / J          0 <= j <= J
 
-Above the reference layer (a post, an eminence) and below the bottom (a peg) the spacing is the
-grid's own. H is the height of the top where that is smooth. Under a post or an eminence H is
-continued smoothly.
+H is the height of the top where this is smooth, continued smoothly under a post or an eminence.
+Above the reference layer and below the bottom (a peg) the layers have the spacing of the grid.
 """
 
 from dataclasses import dataclass
@@ -33,14 +33,14 @@ class LayerSettings:
     """The layers of cells below the articular surface."""
 
     max_edge_ratio: float = 1.4
-    """1: longest over shortest edge of a cell before its nodes are moved onto the surface. Chosen:
-    flatter hexahedra are too stiff in bending."""
+    """1: longest over shortest edge of a cell before its nodes are moved onto the surface. Chosen
+    because flatter hexahedra are too stiff in bending."""
     max_slope: float = 1.0
-    """1: steepest slope, rise over run, that the layers follow (45 deg). Chosen: steeper layers
-    would shear the cells."""
+    """1: steepest slope, rise over run, that the layers follow (45 deg). Chosen because steeper
+    layers would shear the cells."""
     max_low_share: float = 0.01
-    """1: largest share of the columns that may be too low for the layers. Chosen: a few columns at
-    the rim."""
+    """1: largest share of columns that are too low for the layers. Chosen because a few columns at
+    the rim may be too low."""
 
 
 LAYER = LayerSettings()
@@ -51,11 +51,11 @@ class Levels:
     """Heights of the node layers over the columns of the grid.
 
     Args:
-        reference: (nx, nz) m, height H of the reference layer.
-        layers: J, cells between the bottom and the reference layer.
-        below: layers under the bottom.
-        spacing: m, of the layers above the reference layer and below the bottom.
-        count: number of layers of nodes.
+        reference: height H of the reference layer, m, shape (nx, nz).
+        layers: J, number of cells between the bottom and the reference layer.
+        below: number of layers under the bottom.
+        spacing: spacing of the layers above the reference layer and below the bottom, m.
+        count: number of node layers.
     """
 
     reference: Array
@@ -65,7 +65,7 @@ class Levels:
     count: int
 
     def position(self, height: Array, i: Index, k: Index) -> Array:
-        """Return heights (m,) of columns (i, k) as layer numbers, with fractions in between."""
+        """Return heights (m,), m, in columns (i, k) as layer numbers, which may be fractions."""
         reference = self.reference[i, k]
         within = np.clip(height, 0.0, reference) * self.layers / reference
         outside = np.minimum(height, 0.0) + np.maximum(height - reference, 0.0)
@@ -80,12 +80,12 @@ class Levels:
 
 
 def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
-    """Return the layers for columns whose highest point is `top`.
+    """Return the layers that follow the top surface.
 
     Args:
-        top: (nx, nz) m, NaN where the column misses the part.
-        lowest: m, lowest point of the part; the flat bottom is y = 0.
-        spacing: (3,) m, of the grid.
+        top: height of the top surface, m, shape (nx, nz); NaN where the column misses the part.
+        lowest: y of the part's lowest point, m; the flat bottom is y = 0.
+        spacing: spacing of the grid, m, shape (3,).
     """
     across = spacing[[0, 2]]
     thinnest, thickest = across.max() / LAYER.max_edge_ratio, across.min() * LAYER.max_edge_ratio
@@ -99,11 +99,11 @@ def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
 
 
 def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: float) -> int:
-    """Return the number of layers that can follow the largest part of the top.
+    """Return the number of layers that can follow the largest part of the top surface.
 
-    Where the top is more than half a layer too low for them, the layers end in a step. The edge of
-    a step has a cell on one side only, and so half the support. A number of layers that puts such
-    steps into the dishes is excluded. Steps higher up are allowed: no condyle rests on them.
+    The layers end in a step where the top is more than half a layer too low for them. The edge of
+    a step has cells on one side only, and is therefore too soft. Numbers of layers with such steps
+    in the dishes are excluded. Steps on higher parts are allowed, because no condyle meets them.
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
@@ -114,7 +114,10 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
 
 
 def _smooth_part(height: Array, across: Array) -> Array:
-    """Return the heights of the largest patch of columns joined by slopes <= 1, else NaN."""
+    """Return the heights of the largest smooth patch of columns, and NaN elsewhere.
+
+    Slopes between neighbours of a patch are at most `LAYER.max_slope`.
+    """
     number = np.arange(height.size).reshape(height.shape)
     links = []
     for axis in range(2):
@@ -145,7 +148,7 @@ def _slope_limited(height: Array, across: Array) -> Array:
 
 
 def _filled(height: Array) -> Array:
-    """Return the heights with NaN replaced by the harmonic continuation of the others."""
+    """Return the heights, with NaN replaced by a harmonic continuation."""
     unknown = np.isnan(height)
     if not unknown.any():
         return height
@@ -181,20 +184,20 @@ class ColumnSettings:
     """Tolerances with which nodes are placed on the surface."""
 
     tie: float = 1e-6
-    """Cells: a distance this near half a cell counts as half a cell. Chosen: rounding does not
-    decide."""
+    """Cells: distances this near to half a cell count as half a cell. Chosen above rounding
+    errors."""
     side_tolerance: float = 0.02
-    """Cells: vertices this near the bounding box lie on its side. Chosen: the difference is noise
-    of the mesh."""
+    """Cells: vertices this near to the bounding box lie on its side. Chosen above the noise of
+    meshes."""
     wall_normal_y: float = 0.05
-    """1: a triangle whose normal has a smaller superior component (87 deg) belongs to a wall.
-    Chosen: no surface that carries is as steep."""
+    """1: a triangle with a smaller y of its normal (87 deg) belongs to a wall. Chosen because no
+    articular surface is as steep."""
     wall_inset: float = 0.02
-    """Cells: distance from a wall at which a ray along y is fired again after a miss. Chosen: a ray
-    exactly on a rough wall may miss the part."""
+    """Cells: distance inside a wall at which a missed vertical ray is repeated. Chosen because a
+    ray exactly on a rough wall may miss the part."""
     max_height_change: float = 0.75
-    """Cells: largest change of a surface's height where a node moves sideways; beyond it, a ray has
-    hit another surface. Chosen: a slope that a column of cells can follow changes by less."""
+    """Cells: largest change of a surface's height when a node moves sideways. If it is larger, the
+    ray has hit another surface. Chosen because slopes that cells can follow change by less."""
 
 
 COLUMN = ColumnSettings()
@@ -202,20 +205,20 @@ COLUMN = ColumnSettings()
 
 @dataclass(eq=False)
 class NodeField:
-    """Every node of the structured grid while nodes are placed; arrays are (nx, ny, nz).
+    """All nodes of the structured grid, during meshing; arrays have the shape (nx, ny, nz).
 
     Args:
-        lines: x and z coordinates (m) of the grid lines along y.
-        spacing: (3,) m.
-        points: (nx, ny, nz, 3) m.
-        member: belongs to the part.
-        lower_end: lower end of an interval of its line.
-        upper_end: upper end of an interval of its line.
-        top: upper end of the highest interval of its line.
-        interval: number of the interval that holds the node, -1 where none does.
-        mended: lines mended from their neighbours.
-        closed_gaps: gaps too narrow for the grid, filled.
-        thin: intervals thinner than half a cell, held by one node.
+        lines: x and z coordinates of the grid lines along y, m.
+        spacing: spacing of the grid, m, shape (3,).
+        points: positions of the nodes, m, shape (nx, ny, nz, 3).
+        member: mask of the nodes that belong to the part.
+        lower_end: mask of the lower ends of intervals.
+        upper_end: mask of the upper ends of intervals.
+        top: mask of the upper ends of the highest intervals.
+        interval: number of each node's interval; -1 if there is none.
+        mended: number of lines with crossings corrected from their neighbours.
+        closed_gaps: number of filled gaps, narrower than a cell.
+        thin: number of intervals thinner than half a cell, with one node.
     """
 
     lines: tuple[Array, Array]
@@ -231,15 +234,15 @@ class NodeField:
     thin: int
 
     def has_top(self, nodes: tuple[Index, ...]) -> Mask:
-        """Say whether the columns of nodes (i, j, k) have a top already."""
+        """Return whether the columns of nodes (i, j, k) have a top node already."""
         return np.logical_or.reduce(self.top, axis=1)[nodes[0], nodes[2]]
 
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """First and last node of intervals, in layers.
+    """The layers of the first and last nodes of intervals.
 
-    `single` marks an interval of one node; where `held` is true too, that node is not moved.
+    `single` marks intervals of one node. `held` marks those of them whose node is not moved.
     """
 
     first: Index
@@ -248,12 +251,12 @@ class Ends:
     held: Mask
 
 
-def settle_columns(surface: Surface, spacing: Array) -> NodeField:
-    """Return the grid over the surface's bounding box with the nodes of its columns placed along y.
+def place_columns(surface: Surface, spacing: Array) -> NodeField:
+    """Return the grid over the surface's bounding box, with nodes placed along y.
 
     Args:
-        surface: closed insert in the insert frame.
-        spacing: (3,) m.
+        surface: closed insert, insert frame.
+        spacing: spacing of the grid, m, shape (3,).
     """
     x, z = (_grid_line(surface, axis, spacing[axis]) for axis in (0, 2))
     intervals = inside_intervals(surface, 1, z, x)
@@ -270,10 +273,10 @@ def settle_columns(surface: Surface, spacing: Array) -> NodeField:
 
 
 def interval_ends(low: Array, high: Array, count: int) -> Ends:
-    """Return the nodes that hold intervals [low, high] of a line, in layers.
+    """Return the end nodes of intervals [low, high] of a line.
 
-    T = high - low is the thickness and n the number of nodes strictly inside. In general, the node
-    nearest to each end is moved to that end. The exceptions are:
+    All heights are in layers. T = high - low is the thickness, and n the number of nodes strictly
+    inside. In general, the node nearest to each end is moved to that end. The exceptions are:
 
         n = 0, T <= 1/2   one node, moved to the mean height
         n = 1, T <= 1/2   one node, not moved
@@ -281,8 +284,8 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
                           the next node outside is moved to the other end
 
     Args:
-        low: (m,) lower ends.
-        high: (m,) upper ends.
+        low: lower ends (m,).
+        high: upper ends (m,).
         count: number of nodes of a line.
     """
     first = np.floor(low + 0.5 + COLUMN.tie).astype(np.int64)
@@ -302,9 +305,9 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
 
 
 def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
-    """Return equally spaced coordinates over the part.
+    """Return equally spaced coordinates over the part, m.
 
-    The first and the last are moved to the innermost vertices of the part's sides.
+    The first and the last one are moved to the innermost vertices of the part's sides.
     """
     lower, upper = surface.bounds[:, axis]
     line = np.linspace(lower, upper, round((upper - lower) / spacing) + 1)
@@ -337,7 +340,7 @@ def _empty_field(lines: tuple[Array, Array], spacing: Array, heights: Array) -> 
 def _without_narrow_gaps(
     intervals: Intervals, low: Array, high: Array
 ) -> tuple[Intervals, Array, Array, int]:
-    """Join neighbouring intervals of a line whose facing ends fall on the same node."""
+    """Join neighbouring intervals of a line if their facing ends have the same node."""
     same = (np.diff(intervals.first) == 0) & (np.diff(intervals.second) == 0)
     joined = same & (np.floor(low[1:] + 0.5 + COLUMN.tie) <= np.ceil(high[:-1] - 0.5 - COLUMN.tie))
     begins = np.flatnonzero(np.append(True, ~joined))
@@ -353,14 +356,14 @@ def _without_narrow_gaps(
 
 
 def _admit(field: NodeField, intervals: Intervals, ends: Ends) -> None:
-    """Make the nodes of every interval members and move its ends onto the surface."""
+    """Mark the nodes of every interval as members, and move its end nodes onto the surface."""
     i, k = intervals.second, intervals.first
     count = ends.last - ends.first + 1
     owner = np.repeat(np.arange(len(count)), count)
     rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    run = i[owner], ends.first[owner] + rank, k[owner]
-    field.member[run] = True
-    field.interval[run] = owner
+    nodes = i[owner], ends.first[owner] + rank, k[owner]
+    field.member[nodes] = True
+    field.interval[nodes] = owner
     mean = 0.5 * (intervals.lower + intervals.upper)
     free = ~ends.held
     lower = np.where(ends.single, mean, intervals.lower)
@@ -378,17 +381,17 @@ def _admit(field: NodeField, intervals: Intervals, ends: Ends) -> None:
 def refired_inwards(
     field: NodeField, nodes: Nodes, target: Array, inward: Array, rays: RayCaster
 ) -> Array:
-    """Return the heights (n,) of nodes that are moved onto walls.
+    """Return the heights (n,), m, of nodes that are moved onto walls.
 
-    The mesh's noise makes a wall rough, so that a vertical ray on it may miss the part. Such a ray
-    is fired again, `wall_inset` inside the wall, and the target (n, 3) is moved there.
+    Walls of a mesh are rough, so that a vertical ray on a wall may miss the part. The ray is then
+    repeated inside by `wall_inset`, and the target moved there.
 
     Args:
-        field: nodes.
-        nodes: which of them.
-        target: (n, 3) m, new positions of the nodes, changed in place; y is not used.
-        inward: (n, 2) directions along x and z into the part, of any length but 0.
-        rays: of the part.
+        field: all nodes of the grid.
+        nodes: indices (i, j, k) of the moved nodes.
+        target: new positions of the nodes, m, shape (n, 3), changed in place; y is not used.
+        inward: vectors along x and z into the part, not 0, shape (n, 2).
+        rays: ray caster of the part.
     """
     height = refired(field, nodes, target, rays)
     missed = np.flatnonzero(~np.isfinite(height))
@@ -401,10 +404,10 @@ def refired_inwards(
 
 
 def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> Array:
-    """Return the heights (n,) of nodes after a move sideways to `target` (n, 3).
+    """Return the heights (n,), m, of nodes after a move sideways to `target` (n, 3).
 
-    Ends of intervals stay on the surface, and other nodes keep their height. NaN where the height
-    of the surface changes by more than `COLUMN.max_height_change`.
+    Ends of intervals stay on the surface, and other nodes keep their height. The result is NaN
+    where the height of the surface changes by more than `COLUMN.max_height_change`.
     """
     height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):
@@ -412,13 +415,14 @@ def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> A
         base = target[rows].copy()
         base[:, 1] = rays.surface.bounds[0, 1] - field.spacing[1]
         ray, t, face = rays.all(base, (0.0, 1.0, 0.0))
-        right = rays.surface.face_normals[face, 1] * facing > COLUMN.wall_normal_y
-        ray, y = ray[right], base[ray[right], 1] + t[right]
-        off = np.abs(y - height[rows[ray]])
-        order = np.lexsort((off, ray))
-        with_hit, head = np.unique(ray[order], return_index=True)
+        matches = rays.surface.face_normals[face, 1] * facing > COLUMN.wall_normal_y
+        ray, y = ray[matches], base[ray[matches], 1] + t[matches]
+        change = np.abs(y - height[rows[ray]])
+        # Of each ray, the hit with the smallest change of height is used.
+        order = np.lexsort((change, ray))
+        with_hit, nearest = np.unique(ray[order], return_index=True)
         value = np.full(len(rows), np.nan)
-        close = off[order][head] <= COLUMN.max_height_change * field.spacing[1]
-        value[with_hit[close]] = y[order][head][close]
+        close = change[order][nearest] <= COLUMN.max_height_change * field.spacing[1]
+        value[with_hit[close]] = y[order][nearest][close]
         height[rows] = value
     return height

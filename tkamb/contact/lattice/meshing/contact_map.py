@@ -1,4 +1,4 @@
-"""The contact surface of a lattice: its nodes, areas and triangles."""
+"""The contact surface of a lattice: nodes, areas and triangles."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,32 +15,31 @@ from tkamb.geometry.surface import Surface
 
 @dataclass(frozen=True)
 class ContactMapSettings:
-    """Which triangle of the insert a contact node lies on."""
+    """The search for the triangle of the insert under a contact node."""
 
     ray_start_height: float = 1e-4
-    """m: height above a node at which the ray that looks for its triangle begins. Chosen: above the
-    rounding of a mesh, below the next surface."""
+    """m: height above a node at which the ray to its triangle begins. Chosen above the rounding of
+    a mesh and below the next surface."""
     on_mesh_distance: float = 1e-6
-    """m: a node this near to a triangle lies on it. Chosen: meshes in single precision round by
-    some 1e-9 m."""
+    """m: a node this near to a triangle lies on it. Chosen because coordinates in single precision
+    are rounded by some 1e-9 m."""
 
 
 CONTACT_MAP = ContactMapSettings()
 
 GAUSS_POINTS = 0.5 + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / (2 * np.sqrt(3.0))
-"""The 2 x 2 Gauss points of a face, in [0, 1]², of equal weight."""
+"""The 2 x 2 Gauss points of a face, in [0, 1]². Their weights are equal."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactMap(ContactSurface):
-    """The contact surface of a lattice: its undeformed contact nodes.
+    """The contact surface of a lattice, with its undeformed contact nodes.
 
-    Normals are area-weighted over the triangles. A node's area is the consistent one of its
-    squares, see `consistent_areas`.
+    Normals are area-weighted means over the triangles. Areas are those of `consistent_areas`.
 
     Args:
-        lift: (c,) m along y, from the node on the mesh to the smooth surface that the mesh
-            stands for; the contact sees the node there.
+        lift: height of the smooth surface above the node on the mesh, m, shape (c,). Gaps are
+            measured from the smooth surface.
     """
 
     lift: Array
@@ -53,7 +52,7 @@ class ContactMap(ContactSurface):
 
 
 def contact_map(lattice: Lattice, insert: Surface) -> tuple[Index, ContactMap]:
-    """Return the contact nodes (c,) that carry a triangle, and their map."""
+    """Return the contact nodes (c,) that belong to a triangle, and their map."""
     nodes, triangles = np.unique(lattice.contact_triangles, return_inverse=True)
     triangles = triangles.reshape(-1, 3).astype(np.int64)
     points = lattice.nodes[nodes]
@@ -70,35 +69,33 @@ def contact_map(lattice: Lattice, insert: Surface) -> tuple[Index, ContactMap]:
 
 
 def contact_squares(triangles: Index) -> Index:
-    """Return the cell faces (k/2, 4) that the triangles of a `Lattice` halve.
+    """Return the cell faces (k/2, 4) of the contact triangles (k, 3) of a `Lattice`.
 
-    `Lattice.contact_triangles` holds the first half of every face and then, in the same order,
-    the second half; both share the face's first and third corner.
+    The first half of the triangles are the first halves of the faces, the second half are the
+    second halves in the same order. Both share the face's first and third corner.
     """
     first, second = np.split(triangles, 2)
     if not np.array_equal(first[:, [0, 2]], second[:, [0, 1]]):
-        raise ValueError("the contact triangles are not halves of cell faces, in order")
+        raise ValueError("the contact triangles are not halves of cell faces in the same order")
     return np.column_stack([first, second[:, 2]])
 
 
 def consistent_areas(points: Array, squares: Index) -> Array:
-    """Return the area (n,) that belongs to each node, m².
+    """Return the tributary area (n,) of each node, m².
 
-    A uniform pressure p on the cell faces acts on node i with the consistent nodal force p A_i,
-    where N_i is the bilinear shape function of the node on each of its faces:
+    With the bilinear shape functions N_i of the faces, the area of node i is
 
         A_i = sum over faces of the integral of N_i dA
 
-    The force over this area is therefore p at every node, also at a corner, at an outline that
-    crosses the grid at an angle, and where a face is drawn out to a triangle. Equal shares of
-    the triangles would give the two corners of a square that its diagonal does not meet half
-    the area of the other two.
+    A uniform pressure p has the consistent nodal forces p A_i. So force over area is p at every
+    node, also at corners, at oblique outlines and on faces that are almost triangles. Equal shares
+    of the triangles would depend on the diagonals of the faces.
 
     Args:
-        points: (n, 3) m.
-        squares: (m, 4) nodes of the faces, in order around each.
+        points: m, shape (n, 3).
+        squares: nodes around each face, shape (m, 4).
 
-    Reference:
+    Source:
         Hughes, The Finite Element Method, Dover 2000, section 3.2 (bilinear quadrilateral).
     """
     corners = points[squares]
@@ -114,18 +111,18 @@ def consistent_areas(points: Array, squares: Index) -> Array:
 
 
 def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
-    """Return how far down from each point the insert goes, m; to the last exit, voids included."""
+    """Return the thickness of the insert below each point, m, including voids."""
     inside = points - [0.0, 1e-3 * spacing[1], 0.0]
     distance = rays.last_exit(inside, (0.0, -1.0, 0.0))
-    whole = points[:, 1] - rays.surface.bounds[0, 1]
-    return np.where(np.isfinite(distance), distance + 1e-3 * spacing[1], whole)
+    to_lowest = points[:, 1] - rays.surface.bounds[0, 1]
+    return np.where(np.isfinite(distance), distance + 1e-3 * spacing[1], to_lowest)
 
 
 def _lift(points: Array, rays: RayCaster) -> Array:
-    """Return how far the smooth surface is above the points, m; 0 for one not on the mesh."""
+    """Return the height of the smooth surface above the points, m; 0 for points off the mesh."""
     up = np.array([0.0, 1.0, 0.0])
     distance, face, weights = rays.first_in_face(points + CONTACT_MAP.ray_start_height * up, -up)
-    on = np.abs(distance - CONTACT_MAP.ray_start_height) < CONTACT_MAP.on_mesh_distance
+    on_mesh = np.abs(distance - CONTACT_MAP.ray_start_height) < CONTACT_MAP.on_mesh_distance
     lift = np.zeros(len(points))
-    lift[on], _ = CurvedSurface.of(rays.surface).shift(face[on], weights[on], up)
+    lift[on_mesh], _ = CurvedSurface.of(rays.surface).shift(face[on_mesh], weights[on_mesh], up)
     return lift

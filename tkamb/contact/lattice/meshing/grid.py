@@ -1,8 +1,8 @@
-"""From any closed insert to a lattice: nodes, cells, springs and the contact surface.
+"""From a closed insert to a lattice: nodes, cells and the contact surface.
 
-After Sharma (2008), section 4.1: a grid over the bounding box, as cubic as the box permits;
-rays along its lines; nodes moved onto the surface by at most half a cell; classes; connectivity.
-Pieces that stand on nothing, and crumbs of the rim, are left out.
+The steps follow Sharma (2008), section 4.1: a grid of nearly cubic cells over the bounding box;
+rays along its lines; nodes moved onto the surface by at most half a cell; classes of nodes; cells.
+Pieces that do not stand on the bottom, and very small pieces at the rim, are omitted.
 """
 
 import logging
@@ -24,8 +24,8 @@ from tkamb.contact.lattice.meshing.cells import (
     scaled_jacobians,
     shortest_edges,
 )
-from tkamb.contact.lattice.meshing.columns import NodeField, settle_columns
-from tkamb.contact.lattice.meshing.walls import settle_walls
+from tkamb.contact.lattice.meshing.columns import NodeField, place_columns
+from tkamb.contact.lattice.meshing.walls import move_to_walls
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.height_field import inside_intervals
@@ -39,23 +39,23 @@ class PieceSettings:
     """Separate pieces of a lattice."""
 
     least_piece_share: float = 0.01
-    """1: a piece with a smaller share of the largest piece's cells is a crumb of the rim, and left
-    out. Chosen: a body of an insert is larger."""
+    """1: smallest number of cells of a piece, relative to the largest piece. Smaller pieces are
+    omitted. Chosen because they are fragments of the rim."""
     line_spacing: float = 2.5e-4
-    """m: distance of the lines that measure the volume of overlapping bodies. Chosen: the volume is
-    then within 0.1 %."""
+    """m: distance of the lines that measure the volume of overlapping bodies. Chosen because the
+    error of the volume is then below 0.1 %."""
 
 
 PIECE = PieceSettings()
 
 LOWER_FACE = 2
-"""Row of `FACES` that holds a cell's lower corners."""
+"""Row of `FACES` with a cell's lower corners."""
 OUTER_SKIN_TURNED = (0, 3, 4)
-"""Rows of `FACES` whose corners run clockwise as seen from outside."""
+"""Rows of `FACES` with corners in clockwise order, seen from outside."""
 
 
 def connected_pieces(cells: Index) -> Index:
-    """Return the piece (c,) of each cell (c, 8); the cells of a piece share whole faces."""
+    """Return the piece (c,) of each cell (c, 8). The cells of a piece are joined by whole faces."""
     face, joined = _sorted_faces(cells)
     a, b = face[:-1][joined] // len(FACES), face[1:][joined] // len(FACES)
     graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(cells), len(cells)))
@@ -63,13 +63,13 @@ def connected_pieces(cells: Index) -> Index:
 
 
 def standing_pieces(cells: Index, bottom: Mask) -> Mask:
-    """Say which cells (c, 8) belong to a piece that stands on the bottom and is no crumb.
+    """Return the mask (c,) of the cells of large pieces that stand on the bottom.
 
-    A piece that stands on nothing has no fixed node, so that no load could be carried by it.
+    A piece that does not stand on the bottom has no fixed node, and its stiffness is singular.
 
     Args:
-        cells: (c, 8) nodes.
-        bottom: (n,) whether a node lies in the flat bottom.
+        cells: nodes of the cells, shape (c, 8).
+        bottom: mask of the nodes in the flat bottom, shape (n,).
     """
     if not len(cells):
         return np.ones(0, bool)
@@ -85,12 +85,12 @@ def standing_pieces(cells: Index, bottom: Mask) -> Mask:
 
 @dataclass(frozen=True)
 class MissingPart:
-    """The largest part of a mesh that its lattice does not hold, insert frame.
+    """The largest part of a mesh that its lattice lacks, insert frame.
 
     Args:
         volume: m³.
-        extents: (3,) m, along x, y and z.
-        centre: (3,) m, of its bounding box.
+        extents: extents along x, y and z, m.
+        centre: centre of its bounding box, m.
     """
 
     volume: float
@@ -98,22 +98,16 @@ class MissingPart:
     centre: tuple[float, ...]
 
     def __str__(self) -> str:
-        """Return its size and place in words."""
+        """Return the size and the place in words."""
         size = " x ".join(f"{value / MILLIMETRE:.3g}" for value in self.extents)
         where = ", ".join(f"{value / MILLIMETRE:.1f}" for value in self.centre)
         return f"a part of {size} mm at ({where}) mm of the insert frame"
 
 
 def missing_part(nodes: Array, cells: Index, spacing: Array, insert: Surface) -> MissingPart | None:
-    """Return the largest connected part of the mesh that no cell holds; None if there is none.
+    """Return the largest connected part of the mesh outside of all cells; None if there is none.
 
-    It is sought on a grid of points, two to a cell along each axis.
-
-    Args:
-        nodes: (n, 3) m.
-        cells: (c, 8).
-        spacing: (3,) m.
-        insert: the mesh, closed, insert frame.
+    The search uses a grid of points with half the lattice's `spacing` (3,), m.
     """
     step = spacing / 2.0
     lines = [
@@ -135,7 +129,7 @@ def missing_part(nodes: Array, cells: Index, spacing: Array, insert: Surface) ->
 
 
 def outer_skin(nodes: Array, cells: Index) -> Surface:
-    """Return the closed skin of the cells, two triangles to a face, outward."""
+    """Return the closed outer surface of the cells, two triangles per face."""
     rings = cells[:, FACES].copy()
     rings[:, OUTER_SKIN_TURNED] = rings[:, OUTER_SKIN_TURNED, ::-1]
     face, joined = _sorted_faces(cells)
@@ -146,11 +140,11 @@ def outer_skin(nodes: Array, cells: Index) -> Surface:
 
 
 def solid_volume(insert: Surface, centres: Array) -> float:
-    """Return the volume (m³) that the mesh's bodies fill; where two overlap, it counts once.
+    """Return the volume of the mesh's bodies, m³. Where two bodies overlap, it counts once.
 
     Args:
-        insert: closed.
-        centres: (c, 3) m, points within it, a few to a cubic millimetre.
+        insert: closed mesh.
+        centres: points in all its bodies, m, shape (c, 3), a few per cubic millimetre.
     """
     if not (insert.winding.at(centres) > 1).any():
         return insert.volume
@@ -163,16 +157,19 @@ def solid_volume(insert: Surface, centres: Array) -> float:
 
 
 def volume_error(nodes: Array, cells: Index, insert: Surface) -> float:
-    """Return by how much the cells' volume differs from the mesh's, as a share of it."""
+    """Return the relative error of the cells' volume."""
     corners = nodes[cells]
     return float(cell_volumes(corners).sum() / solid_volume(insert, corners.mean(axis=1)) - 1.0)
 
 
 def _sorted_faces(cells: Index) -> tuple[Index, Mask]:
-    """Return the cells' faces (6c,), 6 cell + row of `FACES`, equal ones one after the other.
+    """Return the faces of all cells, with the two copies of an inner face next to each other.
 
-    Also which (6c - 1,) are the same face as the next one. The smallest and the largest of its
-    nodes name a face of a grid.
+    The smallest and the largest node identify a face of a grid.
+
+    Returns:
+        Number 6 cell + row of `FACES` of each face, shape (6c,), and whether it is the same face
+        as the next one, shape (6c - 1,).
     """
     ends = np.sort(cells[:, FACES].reshape(-1, 4), axis=1)[:, [0, 3]]
     order = np.lexsort((ends[:, 1], ends[:, 0]))
@@ -184,7 +181,7 @@ _log = logging.getLogger("tkamb")
 
 
 INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
-"""Node classes: inside, top surface, flat bottom, any other surface (walls, underside)."""
+"""Node classes: inside, top surface, flat bottom, other surfaces (walls, underside)."""
 
 
 @dataclass(frozen=True)
@@ -192,20 +189,20 @@ class GridSettings:
     """The regular grid of a lattice."""
 
     max_edge_ratio: float = 1.4
-    """1: longest over shortest edge of a grid cell. Chosen: flatter hexahedra are too stiff in
-    bending."""
+    """1: longest over shortest edge of a grid cell. Chosen because flatter hexahedra are too stiff
+    in bending."""
     bottom_tolerance: float = 5e-5
-    """m: nodes this near the plane of the flat bottom lie in it. Chosen: what meshes of flat
-    bottoms vary by."""
+    """m: nodes this near to the plane of the flat bottom lie in it. Chosen because flat bottoms of
+    meshes vary by as much."""
     max_cells: int = 1_000_000
-    """Cells of a grid over the bounding box. Chosen: a knee's at 0.35 mm, which takes more than
-    fifty gigabytes."""
+    """Largest number of cells of a grid over the bounding box. Chosen because a knee has as many at
+    0.35 mm, which take more than 50 GB."""
     least_jacobian: float = 0.05
-    """1: a surface cell with a smaller scaled Jacobian is left out. Chosen: its stiffness would be
+    """1: a cell with a smaller scaled Jacobian is omitted. Chosen because its stiffness would be
     ill-conditioned."""
     least_edge: float = 0.2
-    """Share of the spacing, 1: a surface cell with a shorter edge is left out. Chosen: its
-    stiffness would be ill-conditioned."""
+    """1: a cell with a shorter edge, relative to the smallest spacing, is omitted. Chosen because
+    its stiffness would be ill-conditioned."""
 
 
 GRID = GridSettings()
@@ -216,18 +213,18 @@ class Lattice:
     """Nodes and cells of an insert, insert frame, SI.
 
     Args:
-        nodes: (n, 3) m.
-        index: (n, 3) index (i, j, k) in the structured grid.
-        node_class: (n,) INTERNAL, CONTACT, BOTTOM or OTHER.
-        spacing: (3,) m, of the undistorted grid.
-        origin: (3,) m, of the grid's node (0, 0, 0).
-        cells: (c, 8) nodes in the order of VTK's hexahedron.
-        contact_triangles: (k, 3) nodes, outward, over the contact nodes.
-        dropped_nodes: members of the part that belong to no cell, left out.
-        dropped_cells: cells left out (inverted, bridging a gap, or loose).
-        mended_rays: (3,) lines along x, y, z mended from their neighbours.
-        closed_gaps: gaps narrower than a cell, filled.
-        thin_intervals: parts thinner than half a cell, left out or held by one node.
+        nodes: m, shape (n, 3).
+        index: index (i, j, k) of each node in the structured grid, shape (n, 3).
+        node_class: INTERNAL, CONTACT, BOTTOM or OTHER, shape (n,).
+        spacing: spacing of the undistorted grid, m, shape (3,).
+        origin: position of the grid's node (0, 0, 0), m, shape (3,).
+        cells: nodes of the cells in the order of VTK's hexahedron, shape (c, 8).
+        contact_triangles: nodes of outward triangles over the contact nodes, shape (k, 3).
+        dropped_nodes: number of omitted nodes, which belong to no cell.
+        dropped_cells: number of omitted cells (inverted, across a gap, or in a loose piece).
+        mended_rays: number of vertical lines with crossings corrected from their neighbours.
+        closed_gaps: number of filled gaps, narrower than a cell.
+        thin_intervals: number of intervals thinner than half a cell, with one node.
         size_notices: notices about the cells' size, in words.
     """
 
@@ -247,7 +244,7 @@ class Lattice:
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What was mended, filled or left out, in plain words; empty when nothing was."""
+        """Notices of corrections and omissions, in words."""
         counts = (
             (self.mended_rays, "{} rays with an odd number of crossings mended from neighbours"),
             (self.closed_gaps, "{} gaps narrower than a cell filled"),
@@ -260,12 +257,12 @@ class Lattice:
 
     @cached_property
     def springs(self) -> Springs:
-        """Springs that join each cell's nodes, each once."""
+        """Springs between the nodes of each cell, each spring once."""
         return join_springs(self.cells, len(self.nodes))
 
     @cached_property
     def piece_of_node(self) -> Index:
-        """Piece (n,) of each node; two pieces share no cell face."""
+        """Number (n,) of each node's piece; two pieces share no cell face."""
         piece = np.zeros(len(self.nodes), np.int64)
         piece[self.cells] = connected_pieces(self.cells)[:, None]
         return piece
@@ -282,25 +279,25 @@ class Lattice:
 
 
 def build_grid(insert: Surface, target_size: float) -> Lattice:
-    """Return the lattice of a closed insert, whatever its volume; see `whole_lattice`.
+    """Return the lattice of a closed insert without a check of its volume; see `whole_lattice`.
 
-    Mended rays and a post (cam-post contact is not modelled) are logged, by the logger "tkamb".
+    The logger "tkamb" logs corrected rays, and a post (cam-post contact is not modelled).
 
     Args:
         insert: closed surface in the insert frame (flat bottom in y = 0 facing -y).
-        target_size: wanted edge of a cell, m.
+        target_size: desired edge of a cell, m.
 
     Raises:
-        InputError: the surface is open beyond mending, thinner than the cells, or they are
-            more than `GRID.max_cells`.
+        InputError: the surface has too large holes, no cell fits into it, or there would be more
+            than `GRID.max_cells` cells.
     """
     lattice = make_grid(insert, target_size)
-    tell_repairs(lattice, insert)
+    log_corrections(lattice, insert)
     return lattice
 
 
-def tell_repairs(lattice: Lattice, insert: Surface) -> None:
-    """Log mended rays and a post."""
+def log_corrections(lattice: Lattice, insert: Surface) -> None:
+    """Log corrected rays and a post."""
     if lattice.mended_rays:
         _log.warning(
             "%s: %d rays through gaps in the mesh mended", insert.name, lattice.mended_rays
@@ -311,19 +308,20 @@ def tell_repairs(lattice: Lattice, insert: Surface) -> None:
 
 
 def make_grid(insert: Surface, target_size: float) -> Lattice:
-    """Return what `build_grid` does, and log nothing."""
+    """Return the lattice of `build_grid` without logging."""
     extent = insert.bounds[1] - insert.bounds[0]
     spacing = grid_spacing(extent, target_size)
-    # Checked before any array is made: a mesh in millimetres would ask for 1e9 times as many cells.
+    # This check comes before any array, because a mesh in millimetres would have 1e9 times as many
+    # cells.
     count = float((extent / spacing).prod())
     if count > GRID.max_cells:
         raise InputError(
-            f"cells of {target_size / MILLIMETRE:g} mm make {count:.2g} of them",
+            f"{count:.2g} cells of {target_size / MILLIMETRE:g} mm are too many",
             insert.name,
-            f"take larger ones ({GRID.max_cells:.0e} at most), and check the mesh's unit",
+            f"take larger cells ({GRID.max_cells:.0e} at most), and check the mesh's unit",
         )
-    field = settle_columns(insert, spacing)
-    settle_walls(field, insert)
+    field = place_columns(insert, spacing)
+    move_to_walls(field, insert)
     cells, dropped_cells = _sound_cells(field, insert)
     if not len(cells):
         raise InputError(
@@ -335,16 +333,16 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
 
 
 def grid_spacing(extent: Array, target_size: float) -> Array:
-    """Return the edges (3,) of the grid cells that divide a box (3,) evenly, m.
+    """Return the edges (3,), m, of cells that divide a box (3,) evenly.
 
-    The target is kept unless the box is so thin that the edge ratio would pass 1.4; then the
-    nearest size (by ratio) that keeps it is taken.
+    They are near to the target size. If their ratio would exceed `GRID.max_edge_ratio`, the size
+    nearest to the target that gives a smaller ratio is used.
     """
     if target_size <= 0.0:
         raise InputError(
             f"a cell size of {target_size / MILLIMETRE:g} mm", hint="give a positive size"
         )
-    # Sizes are tried outwards from the target until all three spacings fit near-cubic cells.
+    # Smaller and larger sizes are tried until the cells are nearly cubic.
     for percent in range(400):
         for size in (target_size / 1.01**percent, target_size * 1.01**percent):
             spacing = extent / np.maximum(np.round(extent / size), 1.0)
@@ -356,7 +354,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
 
 
 def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
-    """Return the cells (c, 8) by flat grid number that fill the part, and how many were left."""
+    """Return the usable cells (c, 8), as flat grid numbers, and the number of omitted cells."""
     shape = field.member.shape
     corner = np.argwhere(_all_corners(field.member))
     grid = corner[:, None, :] + CORNERS
@@ -378,7 +376,7 @@ def _all_corners(member: Mask) -> Mask:
 
 
 def _bridges_gap(field: NodeField, cells: Index) -> Mask:
-    """Say which cells have an upright edge whose ends lie in different intervals of a line."""
+    """Return the mask of cells with a vertical edge between different intervals of a line."""
     number = field.interval.ravel()[cells]
     low, high = number[:, [0, 1, 4, 5]], number[:, [3, 2, 7, 6]]
     return ((low >= 0) & (high >= 0) & (low != high)).any(axis=1)
@@ -409,23 +407,23 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
 
 
 def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
-    """Return the class of every grid node (flat); a node in fewer than 8 cells is outside."""
-    outside = np.bincount(cells.ravel(), minlength=field.member.size) < 8
-    result = np.where(outside, OTHER, INTERNAL).astype(np.int8)
+    """Return the class of every grid node (flat). Inner nodes belong to 8 cells."""
+    on_surface = np.bincount(cells.ravel(), minlength=field.member.size) < 8
+    result = np.where(on_surface, OTHER, INTERNAL).astype(np.int8)
     result[field.top.ravel()] = CONTACT
     result[_on_bottom(field)] = BOTTOM
     return result
 
 
 def _on_bottom(field: NodeField) -> Mask:
-    """Say which grid nodes (flat) lie in the flat bottom."""
+    """Return the mask of grid nodes (flat) in the flat bottom."""
     height = field.points[..., 1].ravel()
     flat = np.abs(height) <= max(GRID.bottom_tolerance, 0.02 * field.spacing[1])
     return field.lower_end.ravel() & flat
 
 
 def _contact_triangles(index: Index, node_class: NDArray[np.int8], shape: tuple) -> Index:
-    """Return outward triangles over squares of four contact columns without a cliff."""
+    """Return outward triangles over squares of contact columns that differ by at most one layer."""
     number = np.full((shape[0], shape[2]), -1)
     height = np.zeros((shape[0], shape[2]), np.int64)
     contact = np.flatnonzero(node_class == CONTACT)

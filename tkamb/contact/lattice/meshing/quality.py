@@ -1,8 +1,8 @@
-"""How well a lattice represents its mesh: volume, edges, corners, shear, and repairs.
+"""The quality of a lattice: volume, edges, corners, shear and corrections.
 
-A grid that follows a surface in cells can lose what is thinner than a cell, or a whole part where
-the mesh is faulty. The results of a contact do not show that. `whole_lattice` therefore compares
-the volumes of lattice and mesh, and refuses a lattice that differs.
+A lattice can lose features that are thinner than a cell, and whole parts of a faulty mesh. The
+results of a contact do not show this. So `whole_lattice` compares the volumes of lattice and mesh,
+and rejects a lattice with another volume.
 """
 
 import logging
@@ -13,9 +13,9 @@ import numpy as np
 from tkamb.contact.lattice.meshing.cells import EDGES, cell_volumes, scaled_jacobians
 from tkamb.contact.lattice.meshing.grid import (
     Lattice,
+    log_corrections,
     make_grid,
     missing_part,
-    tell_repairs,
     volume_error,
 )
 from tkamb.errors import InputError
@@ -29,36 +29,36 @@ _log = logging.getLogger("tkamb")
 
 @dataclass(frozen=True)
 class VolumeSettings:
-    """Limits of the difference between the volumes of a lattice and its mesh."""
+    """Limits of the relative difference between the volumes of a lattice and its mesh."""
 
     tolerance: float = 0.02
-    """Largest difference, as a share of the mesh's volume. Chosen: stiffness and pressure of an
-    insert of 8 mm change by about as much."""
+    """1: largest difference. Chosen because stiffness and pressure of an insert of 8 mm change by
+    about as much."""
     sizes: tuple[float, ...] = (1.0, 0.95, 0.9, 0.85, 0.8)
-    """Cell sizes that are tried in turn, as shares of the wanted one. Chosen: the last makes twice
-    as many cells."""
+    """1: cell sizes that are tried in turn, relative to the desired size. Chosen because the last
+    one gives twice as many cells."""
     beyond_refinement: float = 0.1
-    """1: larger differences count as a missing part, which smaller cells do not bring back; they
-    are not tried. Chosen: a coarse grid loses less."""
+    """1: after a larger difference no smaller cells are tried. Chosen because a whole part is then
+    missing, not a thin rim."""
 
 
 VOLUME = VolumeSettings()
 
 
 def whole_lattice(insert: Surface, target_size: float) -> Lattice:
-    """Return the lattice of a closed insert, of the same volume as the mesh within 2 %.
+    """Return the lattice of a closed insert, with the volume of the mesh within 2 %.
 
-    Where cells of the wanted size lose more, somewhat smaller ones are taken, with a notice: how
-    much of thin rims is lost varies with the size. The logger "tkamb" logs mended
-    rays, smaller cells, and a post (cam-post contact is not modelled).
+    If cells of the desired size change the volume by more, somewhat smaller cells are used, with a
+    notice, because the loss at thin rims varies with the size. The logger "tkamb" logs smaller
+    cells, corrected rays, and a post (cam-post contact is not modelled).
 
     Args:
         insert: closed surface in the insert frame (flat bottom in y = 0 facing -y).
-        target_size: wanted edge of a cell, m.
+        target_size: desired edge of a cell, m.
 
     Raises:
-        InputError: as `build_grid`, or no such size keeps the volume: the largest missing part is
-            named.
+        InputError: see `build_grid`; or no size keeps the volume, and the message names the
+            largest missing part.
     """
     first: tuple[Lattice, float] | None = None
     for share in VOLUME.sizes:
@@ -70,7 +70,7 @@ def whole_lattice(insert: Surface, target_size: float) -> Lattice:
                 words = _smaller_cells(target_size, share, first[1])
                 _log.warning("%s: %s", insert.name, words)
                 lattice = replace(lattice, size_notices=(words,))
-            tell_repairs(lattice, insert)
+            log_corrections(lattice, insert)
             return lattice
         if abs(first[1]) > VOLUME.beyond_refinement:
             break
@@ -79,18 +79,18 @@ def whole_lattice(insert: Surface, target_size: float) -> Lattice:
 
 
 def _smaller_cells(target_size: float, share: float, error: float) -> str:
-    """Return the notice that smaller cells than wanted were taken, and why."""
+    """Return the notice about smaller cells than desired, with the reason."""
     size = target_size / MILLIMETRE
     return (
-        f"cells of {share * size:.3g} mm instead of {size:.3g} mm, which change the volume of the "
-        f"part by {100 * error:+.1f} %"
+        f"cells of {share * size:.3g} mm are used instead of {size:.3g} mm, because those would "
+        f"change the volume of the part by {100 * error:+.1f} %"
     )
 
 
 def _volume_refusal(
     lattice: Lattice, error: float, insert: Surface, target_size: float
 ) -> InputError:
-    """Return the refusal of a lattice whose volume is not the mesh's."""
+    """Return the error about a lattice that has another volume than its mesh."""
     part = missing_part(lattice.nodes, lattice.cells, lattice.spacing, insert)
     lacks = f"; it lacks {part}" if error < 0 and part is not None else ""
     return InputError(
@@ -98,27 +98,27 @@ def _volume_refusal(
         f"{'less' if error < 0 else 'more'} volume than the mesh, more than the "
         f"{100 * VOLUME.tolerance:g} % that are allowed{lacks}",
         insert.name,
-        "take smaller cells; a part that stands on nothing, or is thinner than a cell, cannot be "
-        "kept",
+        "take smaller cells; a lattice cannot have a part that does not stand on the bottom, or is "
+        "thinner than a cell",
     )
 
 
 @dataclass(frozen=True)
 class LatticeQuality:
-    """Measures of a lattice; lengths and volumes in SI, angles in rad.
+    """Measures of a lattice.
 
     Args:
         nodes: number of nodes.
         cells: number of cells.
         springs: number of springs.
-        volume: m³, of all cells.
-        mesh_volume: m³, enclosed by the surface.
+        volume: volume of all cells, m³.
+        mesh_volume: volume that the mesh encloses, m³.
         edge_ratio: longest over shortest edge of a cell: median, 95th percentile, largest.
-        shear: angle of a cell's upright edges to the normal of its layer: median, 95th
+        shear: angle between a cell's upright edges and the normal of its layer, rad: median, 95th
             percentile, largest.
         least_jacobian: least scaled Jacobian at a corner of a cell (1 for a box).
-        notices: what was mended or left out, in plain words.
-        post: a post whose contact with a cam is not modelled, if there is one.
+        notices: corrections and omissions, in words.
+        post: the post (its contact with a cam is not modelled), or None.
     """
 
     nodes: int
@@ -181,10 +181,9 @@ def _edge_ratios(points: Array) -> Array:
 
 
 def _shear(points: Array) -> Array:
-    """Return the angle (c,) between a cell's mean upright edge and its layer's normal, rad."""
+    """Return the angle (c,), rad, between a cell's mean upright edge and its layer's normal."""
     edges = points[:, EDGES[:, 1]] - points[:, EDGES[:, 0]]
     along_x, upright, along_z = (edges[:, 4 * a : 4 * a + 4].mean(axis=1) for a in range(3))
-    # Shear is the angle between the upright edges and the normal of the cell's plan.
     normal = np.cross(along_z, along_x)
     cosine = np.einsum("ci,ci->c", normal, upright)
     cosine /= np.linalg.norm(normal, axis=1) * np.linalg.norm(upright, axis=1)

@@ -1,12 +1,12 @@
-"""Nodes moved sideways onto walls, which rays along y cannot see, and into notches.
+"""Sideways moves of nodes onto walls, which vertical rays do not meet, and into notches.
 
-Walls: where a node has no cell beside it, a ray along z or x from the node finds the wall. If the
-wall is nearer than half a cell, the node is moved onto it. If it is farther, the node outside is
-moved inwards onto it.
+Walls: if a node has no cell beside it, a ray along x or z gives the distance of the wall. Within
+half a cell the node is moved onto the wall. Otherwise the next node, which is outside, is moved
+inwards onto the wall.
 
 Notches: a grid follows an oblique surface in steps, and each step leaves a wedge that belongs to
-no cell. The node outside the wedge is moved into the corner of the part. Where the surface runs
-straight on, the node is moved almost onto the line between its two neighbours.
+no cell. The node outside of the wedge is moved into the corner of the part. If the surface is
+straight there, the node is moved almost onto the line between its two neighbours.
 """
 
 from dataclasses import dataclass
@@ -25,26 +25,27 @@ class NotchSettings:
     """Nodes that are moved into notches of the surface."""
 
     corner_margin: float = 0.1
-    """1: share of the way that a node stays short of the line between its neighbours. Chosen: on
-    the line the cell's corner would be flat."""
+    """1: a node is moved towards the line between its neighbours, except for this share of the way.
+    Chosen because on the line the cell's corner would be flat."""
     corner_inset: float = 1e-3
-    """1: distance of a node from its corner, as a share of the way to the node across the diagonal.
-    Chosen: rays along y then hit the part."""
+    """1: distance of a node from its corner, relative to the distance of the node across the
+    diagonal. Chosen because vertical rays then meet the part."""
     ray_start_cells: float = 0.1
-    """Cells: depth below the top, or height above the bottom, of the points that are tested for
-    being inside the part. Chosen: above the rounding of a mesh, within the cell."""
+    """Cells: distance below the top, or above the bottom, of points that are tested for being
+    inside the part. Chosen above the rounding of a mesh and within the cell."""
     max_move_diagonals: float = 0.75
-    """Diagonals of a cell's face: largest move of a node. Chosen: a larger one would turn the cell
-    inside out."""
+    """Diagonals of a cell's face: largest move of a node. Chosen because a larger move would invert
+    the cell."""
 
 
 NOTCH = NotchSettings()
 
 
 def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
-    """Admit nodes outside a step of the surface, where a grid square has three members.
+    """Make the fourth node of a grid square a member, if the other three are members.
 
-    Steps of the outline in a layer come first, then steps between layers.
+    Steps of the outline in a layer come first, then steps between layers. `field` is changed in
+    place. `before` (nx, ny, nz, 3), m, are the nodes before moves onto walls.
     """
     for axes in ((0, 2), (0, 1), (2, 1)):
         member = field.member.copy()
@@ -63,7 +64,7 @@ def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
 
 
 def _shifted(mask: Mask, step: Index) -> Mask:
-    """Return mask[i + di, j + dj, k + dk], False outside."""
+    """Return mask[i + di, j + dj, k + dk], and False outside of the grid."""
     padded = np.pad(mask, 1)
     window = tuple(slice(1 + d, 1 + d + n) for d, n in zip(step, mask.shape, strict=True))
     return padded[window]
@@ -74,11 +75,11 @@ class Notch:
     """Squares of the grid that lack one node.
 
     Args:
-        axes: the plane of the squares.
-        node: the nodes that are missing.
-        first: their neighbours along the first axis.
-        second: their neighbours along the second axis.
-        across: the nodes across the diagonal.
+        axes: the two axes of the squares.
+        node: missing nodes.
+        first: neighbours along the first axis.
+        second: neighbours along the second axis.
+        across: nodes across the diagonal.
     """
 
     axes: tuple[int, int]
@@ -89,15 +90,15 @@ class Notch:
 
 
 def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> None:
-    """Move missing nodes into the corner of the part, or onto the line between neighbours."""
+    """Move the missing nodes into the corner of the part, or to the line between neighbours."""
     first, second, across = (field.points[n] for n in (notch.first, notch.second, notch.across))
-    own, middle = before[notch.node], 0.5 * (first + second)
+    start, middle = before[notch.node], 0.5 * (first + second)
     flat = notch.axes == (0, 2)
     upper, lower = (
         e[notch.first] & e[notch.second] & flat for e in (field.upper_end, field.lower_end)
     )
     if flat:
-        middle[:, 1] = np.where(upper | lower, middle[:, 1], own[:, 1])
+        middle[:, 1] = np.where(upper | lower, middle[:, 1], start[:, 1])
     corner = middle.copy()
     corner[:, notch.axes[0]], corner[:, notch.axes[1]] = (
         second[:, notch.axes[0]],
@@ -110,42 +111,42 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
     corner = _towards(corner, across, NOTCH.corner_inset, 0.0)
     winding = rays.surface.winding
     is_corner = winding.inside(_towards(corner, across, 0.0, within))
-    keep = is_corner | winding.inside(_towards(middle, across, 0.1, within))
-    target = np.where(is_corner[:, None], corner, middle + NOTCH.corner_margin * (own - middle))
+    usable = is_corner | winding.inside(_towards(middle, across, 0.1, within))
+    target = np.where(is_corner[:, None], corner, middle + NOTCH.corner_margin * (start - middle))
     if flat:
         probe = np.where(is_corner[:, None], corner, middle)
         field.points[..., 1][notch.node] = middle[:, 1]
         field.upper_end[notch.node], field.lower_end[notch.node] = upper, lower
         target[:, 1] = refired(field, notch.node, probe, rays)
-    reach = NOTCH.max_move_diagonals * np.linalg.norm(field.spacing[list(notch.axes)])
-    keep &= np.linalg.norm((target - own)[:, notch.axes], axis=1) <= reach
-    _settle(field, notch, target, keep, flat)
+    max_move = NOTCH.max_move_diagonals * np.linalg.norm(field.spacing[list(notch.axes)])
+    usable &= np.linalg.norm((target - start)[:, notch.axes], axis=1) <= max_move
+    _add_members(field, notch, target, usable, flat)
 
 
-def _towards(point: Array, other: Array, share: float, rise: Array | float) -> Array:
-    """Return points moved sideways towards others by a share of the way, and up by `rise`."""
-    result = point + share * (other - point)
+def _towards(point: Array, goal: Array, share: float, rise: Array | float) -> Array:
+    """Return points moved sideways by a share of the way to goals, and up by `rise`, m."""
+    result = point + share * (goal - point)
     result[:, 1] = point[:, 1] + rise
     return result
 
 
-def _settle(field: NodeField, notch: Notch, target: Array, keep: Mask, flat: bool) -> None:
-    """Admit the nodes to keep.
+def _add_members(field: NodeField, notch: Notch, target: Array, usable: Mask, flat: bool) -> None:
+    """Make the usable nodes members at their target positions.
 
-    In a flat notch, a node between two nodes of the top belongs to the top itself. Otherwise the
-    upper face of its cell would carry no contact, and the face's other nodes would carry too much.
+    In a horizontal square, a node between two top nodes becomes a top node. Otherwise the forces on
+    the other nodes of its cell's upper face would be too large.
     """
-    dropped, chosen = (tuple(n[mask] for n in notch.node) for mask in (~keep, keep))
-    field.upper_end[dropped] = field.lower_end[dropped] = False
-    field.points[chosen] = target[keep]
-    field.member[chosen] = True
-    both = field.top[notch.first] & field.top[notch.second] & flat
-    both &= ~field.has_top(notch.node)
-    field.top[chosen] = both[keep]
+    rejected, added = (tuple(n[mask] for n in notch.node) for mask in (~usable, usable))
+    field.upper_end[rejected] = field.lower_end[rejected] = False
+    field.points[added] = target[usable]
+    field.member[added] = True
+    is_top = field.top[notch.first] & field.top[notch.second] & flat
+    is_top &= ~field.has_top(notch.node)
+    field.top[added] = is_top[usable]
 
 
 STEPS = ((0, 1), (0, -1), (2, 1), (2, -1))
-"""Axis and sign of the four ways sideways."""
+"""Axis and sign of the four sideways directions."""
 
 
 @dataclass(frozen=True)
@@ -153,11 +154,11 @@ class WallSettings:
     """Nodes that are moved onto side walls."""
 
     wall_inset: float = 1e-6
-    """Cells: distance that a node stays inside the wall it is moved to. Chosen: rays along y still
-    hit."""
+    """1: distance inside the wall of a node that is moved to it, relative to the move. Chosen
+    because vertical rays then meet the part."""
     ray_start_cells: float = 0.1
-    """Cells: depth below the node's surface at which rays sideways begin. Chosen: above the
-    rounding of a mesh, within the cell."""
+    """Cells: distance inside the surface at which sideways rays of end nodes begin. Chosen above
+    the rounding of a mesh and within the cell."""
 
 
 WALL_NODE = WallSettings()
@@ -165,20 +166,20 @@ WALL_NODE = WallSettings()
 
 @dataclass(frozen=True, eq=False)
 class WallHits:
-    """Cells and walls beside the nodes of the grid in one of the four directions.
+    """The walls beside the nodes of the grid in one of the four directions.
 
     Args:
-        open: (nx, ny, nz) the node is a member without a cell on this side. At an end of an
-            interval, the next node inside the interval must be one too.
-        distance: (nx, ny, nz) m, distance to the wall; inf: there is none.
+        open: mask of the members without a cell on this side, shape (nx, ny, nz). For the end of
+            an interval, the next node inside the interval must be such a member too.
+        distance: distance to the wall, m, shape (nx, ny, nz); inf if there is none.
     """
 
     open: Mask
     distance: Array
 
 
-def settle_walls(field: NodeField, surface: Surface) -> None:
-    """Move nodes of `field` sideways onto the walls, and admit nodes outside (in place)."""
+def move_to_walls(field: NodeField, surface: Surface) -> None:
+    """Move nodes of `field` sideways onto the walls, and add nodes from outside (in place)."""
     rays = surface.rays
     before = field.points.copy()
     firing = _firing_points(field)
@@ -189,7 +190,7 @@ def settle_walls(field: NodeField, surface: Surface) -> None:
 
 
 def _firing_points(field: NodeField) -> Array:
-    """Return the nodes' points, those at the ends of intervals moved into the part."""
+    """Return the points at which sideways rays begin; at ends of intervals they are inside."""
     result = field.points.copy()
     height = field.points[..., 1]
     for end, step in ((field.upper_end, -1), (field.lower_end, 1)):
@@ -199,17 +200,17 @@ def _firing_points(field: NodeField) -> Array:
 
 
 def _filled_cells(field: NodeField, surface: Surface) -> Mask:
-    """Say which cells have eight members and their centre in the part (before walls)."""
-    m, y = field.member, field.points[..., 1]
-    whole = np.ones(tuple(n - 1 for n in m.shape), bool)
-    centre = np.zeros(whole.shape)
+    """Return the mask of cells that have eight members and their centre in the part."""
+    member, y = field.member, field.points[..., 1]
+    complete = np.ones(tuple(n - 1 for n in member.shape), bool)
+    centre = np.zeros(complete.shape)
     for i, j, k in np.ndindex(2, 2, 2):
-        corner = tuple(slice(o, o + n) for o, n in zip((i, j, k), whole.shape, strict=True))
-        whole &= m[corner]
+        corner = tuple(slice(o, o + n) for o, n in zip((i, j, k), complete.shape, strict=True))
+        complete &= member[corner]
         centre += y[corner] / 8.0
     x, z = ((line[1:] + line[:-1]) / 2.0 for line in field.lines)
     intervals = inside_intervals(surface, 1, z, x)
-    filled = np.zeros_like(whole)
+    filled = np.zeros_like(complete)
     a, b = intervals.second, intervals.first
     rank = np.arange(len(a)) - np.searchsorted(b * len(x) + a, b * len(x) + a)
     for r in range(int(rank.max(initial=-1)) + 1):
@@ -217,23 +218,23 @@ def _filled_cells(field: NodeField, surface: Surface) -> Mask:
         low, high = np.full((len(x), len(z)), np.inf), np.full((len(x), len(z)), -np.inf)
         low[a[at], b[at]], high[a[at], b[at]] = intervals.lower[at], intervals.upper[at]
         filled |= (centre > low[:, None]) & (centre < high[:, None])
-    return whole & filled
+    return complete & filled
 
 
 def _walls_beside(
     field: NodeField, firing: Array, rays: RayCaster, surface: Surface
 ) -> list[WallHits]:
-    """Return, for each of STEPS, which members have no cell that way and where the wall is."""
+    """Return the members without a cell and the distances of walls in each direction of STEPS."""
     cells = np.pad(_filled_cells(field, surface), 1)
     result = []
     for axis, sign in STEPS:
         beside = cells[1:] if sign > 0 else cells[:-1]
         if axis == 2:
             beside = cells[:, :, 1:] if sign > 0 else cells[:, :, :-1]
-        other = 2 - axis
+        cross_axis = 2 - axis
         joined = beside[:, 1:] | beside[:, :-1]
-        joined = np.moveaxis(joined, other, 0)
-        joined = np.moveaxis(joined[1:] | joined[:-1], 0, other)
+        joined = np.moveaxis(joined, cross_axis, 0)
+        joined = np.moveaxis(joined[1:] | joined[:-1], 0, cross_axis)
         free = field.member & ~joined
         above, below = np.zeros_like(free), np.zeros_like(free)
         above[:, :-1], below[:, 1:] = free[:, 1:], free[:, :-1]
@@ -249,48 +250,44 @@ def _walls_beside(
 
 
 def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCaster) -> None:
-    """Move members that have a wall within half a cell onto it."""
+    """Move members onto walls within half a cell."""
     move = np.zeros((*field.member.shape, 2))
     for column, axis in ((0, 0), (1, 2)):
-        forth, back = (hit.distance for hit in hits[axis : axis + 2])
+        forward, backward = hits[axis : axis + 2]
+        ahead, behind = forward.distance, backward.distance
         tie = COLUMN.tie * field.spacing[axis]
-        chosen = np.minimum(forth, back) <= 0.5 * field.spacing[axis] + tie
-        forwards = forth <= back + tie
-        way = np.where(forwards, forth, -back)
-        move[..., column] = np.where(chosen & (np.abs(way) > tie), way, 0.0)
-        _leave_far_side(hits[axis : axis + 2], chosen & ~forwards, chosen & forwards)
+        near = np.minimum(ahead, behind) <= 0.5 * field.spacing[axis] + tie
+        is_ahead = ahead <= behind + tie
+        step = np.where(is_ahead, ahead, -behind)
+        move[..., column] = np.where(near & (np.abs(step) > tie), step, 0.0)
+        # These walls have their node. In a thin part, the wall on the other side still needs the
+        # node outside.
+        forward.distance[near & is_ahead] = np.inf
+        backward.distance[near & ~is_ahead] = np.inf
     nodes: Nodes = np.nonzero((move != 0.0).any(axis=-1))
     target = _corner_or_wall(firing[nodes], move[nodes], rays)
     height = refired_inwards(field, nodes, target, -move[nodes], rays)
-    good = np.isfinite(height)
-    nodes = tuple(index[good] for index in nodes)
+    valid = np.isfinite(height)
+    nodes = tuple(index[valid] for index in nodes)
     target[:, 1] = height
-    field.points[nodes] = target[good]
-
-
-def _leave_far_side(pair: list[WallHits], forth_left: Mask, back_left: Mask) -> None:
-    """Drop the walls onto which nodes are moved.
-
-    In a thin part, the wall on the other side remains for the node outside it.
-    """
-    pair[0].distance[back_left] = np.inf
-    pair[1].distance[forth_left] = np.inf
+    field.points[nodes] = target[valid]
 
 
 def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
-    """Return the new positions (n, 3) of nodes with walls at `move` (n, 2) along x and z; 0: none.
+    """Return the new positions (n, 3), m, of nodes beside walls.
 
-    With two walls, a node moves to their corner if this lies in the part. Otherwise it moves to the
-    foot of its perpendicular on the line through the two hits.
+    `move` (n, 2), m, is the vector to the walls along x and z, 0 without a wall. With two walls, a
+    node moves to their corner if this lies in the part. Otherwise it moves to the foot of its
+    perpendicular on the line through the two hits.
     """
     move = move * (1.0 - WALL_NODE.wall_inset)
     corner = start.copy()
     corner[:, [0, 2]] += move
-    both = np.flatnonzero((move != 0.0).all(axis=1))
-    if both.size:
-        tested = corner[both].copy()
-        tested[:, [0, 2]] -= 1e-3 * move[both]
-        cut = both[~rays.surface.winding.inside(tested)]
+    with_two_walls = np.flatnonzero((move != 0.0).all(axis=1))
+    if with_two_walls.size:
+        tested = corner[with_two_walls].copy()
+        tested[:, [0, 2]] -= 1e-3 * move[with_two_walls]
+        cut = with_two_walls[~rays.surface.winding.inside(tested)]
         u, w = move[cut].T
         foot = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
         corner[cut[:, None], [0, 2]] = start[cut][:, [0, 2]] + foot
@@ -298,7 +295,7 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
 
 
 def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCaster) -> None:
-    """Admit nodes outside the part onto the wall between them and a member beside them."""
+    """Move nodes outside of the part onto the wall between them and a member, and add them."""
     move = np.zeros((*field.member.shape, 2))
     upper, lower, top = (np.ones(field.member.shape, bool) for _ in range(3))
     height = np.full(field.member.shape, np.nan)
@@ -307,24 +304,24 @@ def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCas
         tie = COLUMN.tie * spacing
         near = hit.open & (hit.distance < spacing + tie)
         i, j, k = np.nonzero(near)
-        to = [i, j, k]
-        to[axis] = to[axis] + sign
-        fits = (to[axis] >= 0) & (to[axis] < field.member.shape[axis])
-        node: Nodes = (i[fits], j[fits], k[fits])
-        goal: Nodes = (to[0][fits], to[1][fits], to[2][fits])
-        outside = ~field.member[goal]
-        node, goal = tuple(n[outside] for n in node), tuple(g[outside] for g in goal)
+        beside = [i, j, k]
+        beside[axis] = beside[axis] + sign
+        in_grid = (beside[axis] >= 0) & (beside[axis] < field.member.shape[axis])
+        node: Nodes = (i[in_grid], j[in_grid], k[in_grid])
+        added: Nodes = (beside[0][in_grid], beside[1][in_grid], beside[2][in_grid])
+        outside = ~field.member[added]
+        node, added = tuple(n[outside] for n in node), tuple(n[outside] for n in added)
         column = 0 if axis == 0 else 1
-        move[..., column][goal] = -sign * np.maximum(spacing - hit.distance[node], tie)
-        upper[goal] &= field.upper_end[node]
-        lower[goal] &= field.lower_end[node]
-        top[goal] &= field.top[node]
-        height[goal] = before[..., 1][node]
-    pulled = np.nonzero((move != 0.0).any(axis=-1))
-    _admit_at(field, pulled, before, move[pulled], (lower, upper, top), height, rays)
+        move[..., column][added] = -sign * np.maximum(spacing - hit.distance[node], tie)
+        upper[added] &= field.upper_end[node]
+        lower[added] &= field.lower_end[node]
+        top[added] &= field.top[node]
+        height[added] = before[..., 1][node]
+    nodes = np.nonzero((move != 0.0).any(axis=-1))
+    _add_at(field, nodes, before, move[nodes], (lower, upper, top), height, rays)
 
 
-def _admit_at(
+def _add_at(
     field: NodeField,
     nodes: Nodes,
     before: Array,
@@ -333,32 +330,36 @@ def _admit_at(
     height: Array,
     rays: RayCaster,
 ) -> None:
+    """Move nodes onto walls and make them members, if their rays meet the part.
+
+    `move` (n, 2), m, are vectors to the walls along x and z, 0 without a wall. `ends` are masks of
+    future lower ends, upper ends and top nodes, and `height` has the heights, m, of these ends.
+    """
     start = before[nodes]
     target = start.copy()
     target[:, [0, 2]] += _foot(move)
     field.lower_end[nodes], field.upper_end[nodes] = ends[0][nodes], ends[1][nodes]
     at_end = field.lower_end[nodes] | field.upper_end[nodes]
     field.points[..., 1][nodes] = np.where(at_end, height[nodes], start[:, 1])
-    settled = refired_inwards(field, nodes, target, move, rays)
-    good = np.isfinite(settled)
-    bad = tuple(n[~good] for n in nodes)
-    field.lower_end[bad] = field.upper_end[bad] = False
-    nodes = tuple(n[good] for n in nodes)
-    target[:, 1] = settled
-    field.points[nodes] = target[good]
+    new_height = refired_inwards(field, nodes, target, move, rays)
+    valid = np.isfinite(new_height)
+    rejected = tuple(n[~valid] for n in nodes)
+    field.lower_end[rejected] = field.upper_end[rejected] = False
+    nodes = tuple(n[valid] for n in nodes)
+    target[:, 1] = new_height
+    field.points[nodes] = target[valid]
     field.member[nodes] = True
     field.top[nodes] = ends[2][nodes] & ~field.has_top(nodes)
 
 
 def _foot(move: Array) -> Array:
-    """Return the moves (n, 2) of nodes onto their only hit or between their two hits.
+    """Return the moves (n, 2), m, of nodes onto walls at `move` along x and z.
 
-    With two hits, a node moves to the foot of its perpendicular on the line through them.
+    With two walls, a node moves to the foot of its perpendicular on the line through the hits.
     """
-
     move = move * (1.0 + WALL_NODE.wall_inset)
-    both = (move != 0.0).all(axis=1)
+    with_two_walls = (move != 0.0).all(axis=1)
     result = move.copy()
-    u, w = move[both].T
-    result[both] = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
+    u, w = move[with_two_walls].T
+    result[with_two_walls] = np.column_stack([u * w**2, w * u**2]) / (u**2 + w**2)[:, None]
     return result
