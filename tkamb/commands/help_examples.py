@@ -1,4 +1,4 @@
-"""Examples at the end of each command's --help; the tests parse every one of them."""
+"""Examples at the end of each command's --help. The tests parse every example."""
 
 import argparse
 
@@ -82,7 +82,7 @@ def add_examples(parser: argparse.ArgumentParser) -> None:
     """Write the examples at the end of each command's help.
 
     Args:
-        parser: of the whole command line.
+        parser: parser of the whole command line.
     """
     for command, leaf in leaf_parsers(parser):
         examples = EXAMPLES.get(command)
