@@ -1,7 +1,6 @@
-"""Tables of the scene that a reader of files takes: the patient and what was recorded.
+"""Tables of the scene for the patient and the recordings.
 
-Units are in the key names. A reader converts to SI where it uses a value, so that each key is
-declared here and nowhere else.
+Units are in the key names. The code that uses a value converts it to SI.
 """
 
 from pathlib import Path
@@ -27,18 +26,18 @@ Side = Literal["right", "left"]
 
 
 class PatientTable(SceneTable):
-    """The patient. The URDF holds the chain ankle-tibia-femur-patella."""
+    """The patient. The URDF holds the chain of ankle, tibia, femur and patella."""
 
     urdf: Path
     side: Side = Field(description="the knee that is modelled")
-    # From a six-year-old child with a tumour prosthesis to the heaviest patients.
+    # limits: a six-year-old child with a tumour prosthesis, the heaviest patients
     mass_kg: Annotated[Number, within(20, 300, "give it in kilograms")] = Field(
         description="body mass, 20 to 300; forces in BW are relative to it"
     )
     sex: Literal["male", "female"] | None = Field(
         None, description="only for segments without <inertial>: picks the de Leva table"
     )
-    # From the same child to very tall adults.
+    # limits: the same child, very tall adults
     height_mm: Annotated[
         Number | None, within(1000, 2300, "give the standing height in millimetres")
     ] = Field(None, description="body height, 1000 to 2300")
@@ -55,7 +54,7 @@ class PatientTable(SceneTable):
 class MarkerSegmentTable(SceneTable):
     """A segment with skin markers: the shank, the thigh, or a neighbour of one of them."""
 
-    name: str = Field(description="'shank' and 'thigh' are the knee's; others are neighbours")
+    name: str = Field(description="'shank', 'thigh', or the name of a neighbour of one of them")
     markers_mm: dict[str, Vector] = Field(
         min_length=1,
         description="marker -> position in the tibia link (shank), the femur link (thigh) or the "
@@ -73,7 +72,7 @@ class MarkerSegmentTable(SceneTable):
     )
 
     @model_validator(mode="after")
-    def _hangs_somewhere(self) -> Self:
+    def _joint_is_complete(self) -> Self:
         knee = self.name in ("shank", "thigh")
         present = [v is not None for v in (self.joined_to, self.joint_mm, self.centre_mm)]
         if any(present) if knee else not all(present):
@@ -93,25 +92,25 @@ class MarkersTable(SceneTable):
     """The knee's motion and the shank in the laboratory, from skin markers."""
 
     method: Literal["segments", "chain"] = Field(
-        description="'segments': rigid fits of shank and thigh, each by itself; 'chain': all "
-        "segments at once, held together by their joints. Both are computed and compared"
+        description="'segments': separate rigid fits of shank and thigh; 'chain': one fit of all "
+        "segments, connected by their joints. Both are computed and compared"
     )
     knee: Literal["hinge", "free"] = Field(
-        "hinge", description="the chain's knee: flexion alone, or six freedoms"
+        "hinge", description="the chain's knee: flexion alone, or six degrees of freedom"
     )
     coordinates: tuple[Literal["flexion", "adduction", "axial_rotation", "ap", "si", "ml"], ...] = (
         Field(
             ("flexion",),
             min_length=1,
-            description="knee coordinates that are taken from the markers; [contact] releases "
-            "the others",
+            description="knee coordinates that follow from the markers; [contact] releases the "
+            "others",
         )
     )
     neutral_mm: Vector = Field(
-        description="ap, si, ml of the femur link in the insert frame, where a hinge keeps it"
+        description="constant ap, si, ml of the femur link in the insert frame, for a hinge"
     )
     neutral_deg: tuple[float, float] = Field(
-        (0.0, 0.0), description="axial rotation and adduction that a hinge keeps"
+        (0.0, 0.0), description="constant axial rotation and adduction of a hinge"
     )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
@@ -181,11 +180,11 @@ class MotionTable(SceneTable):
         description="low-pass cut-off of the differentiation; 'none' trusts the samples"
     )
     interval_s: tuple[Number, Number] | None = Field(
-        None, description="the part of the recording that is computed; default: all of it"
+        None, description="part of the recording to compute; default: all"
     )
     cycle_s: tuple[Number, Number] | None = Field(
         None,
-        description="the motion's time column is per cent of a cycle, which lies on this interval",
+        description="start and end of the cycle, if the time column of the file is per cent",
     )
     cycle_offset_percent: Number = Field(
         0.0, ge=-100, le=100, description="per cent of the cycle at cycle_s[0]"
@@ -319,8 +318,8 @@ class GroundReactionTable(SceneTable):
     )
     force: Literal["on the foot", "on the plate"] = Field(
         "on the foot",
-        description="what the file's force acts on. 'on the plate' reverses the signs of force and "
-        "free moment (Newton's third law), but not of the centre of pressure. Axes cannot do this",
+        description="the body that the file's force acts on. 'on the plate' reverses the signs of "
+        "force and free moment (Newton's third law), but not of the centre of pressure",
     )
     applied: Literal["cop", "ankle"] = Field(
         "cop", description="'ankle' applies the force alone at the ankle centre (Sharma 2008)"
@@ -347,7 +346,7 @@ class GroundReactionTable(SceneTable):
 
 
 class MeasuredTable(SceneTable):
-    """Axial knee forces of an instrumented implant: compared with the run, never used in it."""
+    """Axial knee forces of an instrumented implant, only for comparison with the run."""
 
     file: Path
     format: TableFormat | None = Field(None, description=FORMAT)
@@ -427,7 +426,7 @@ class EmgTable(SceneTable):
 
     @property
     def sentence(self) -> str:
-        """How the envelopes are made and what they are used for, in plain words."""
+        """A sentence on the computation and the use of the envelopes."""
         first = "" if self.high_pass_Hz == "none" else f"high-passed at {self.high_pass_Hz:g} Hz, "
         own = self.normalised_by == "recording"
         by = "their largest values in that file" if own else "given values"
