@@ -60,9 +60,9 @@ def test_a_key_moves_a_slider_and_the_fine_model_is_computed(page):
 def test_a_failed_state_shows_its_reason_and_the_last_numbers_in_grey(page):
     good = state_after(page, change("pose", "ap_mm", 0.0))
     assert not good["stale"]
-    apart = state_after(page, change("pose", "ap_mm", 55.0))
-    assert apart["stale"] and "does not lie over the insert" in apart["mark"]
-    assert (apart["shown"], apart["request"]) == (good["shown"], good["request"])
+    dislocated = state_after(page, change("pose", "ap_mm", 55.0))
+    assert dislocated["stale"] and "does not lie over the insert" in dislocated["mark"]
+    assert (dislocated["shown"], dislocated["request"]) == (good["shown"], good["request"])
     beyond = state_after(page, change("pose", "ap_mm", 70.0))
     assert beyond["stale"] and "-60 to 60" in beyond["mark"]
     page.forgive("400")

@@ -33,12 +33,12 @@ def test_the_scene_of_the_page_gives_the_results_of_the_starter(tmp_path):
     )
     for name, text in written:
         (tmp_path / "knee" / name).write_text(text, encoding="utf-8")
-    own = tkamb.simulate(tmp_path / "knee" / "scene.toml", frames=first)
+    of_page = tkamb.simulate(tmp_path / "knee" / "scene.toml", frames=first)
     for name in ("ground_reaction_ap_N", "ground_reaction_si_N", "force_total_BW"):
-        np.testing.assert_allclose(own[name], started[name], rtol=1e-3)
+        np.testing.assert_allclose(of_page[name], started[name], rtol=1e-3)
     # The recorded patella of the starter was solved on finer meshes.
-    np.testing.assert_allclose(own["quadriceps_N"], started["quadriceps_N"], rtol=3e-3)
-    assert "Nobody was measured" not in str(own.summary["notes"])
+    np.testing.assert_allclose(of_page["quadriceps_N"], started["quadriceps_N"], rtol=3e-3)
+    assert "Nobody was measured" not in str(of_page.summary["notes"])
 
 
 def test_a_folder_with_files_is_refused_and_stays_unchanged(tmp_path, capfd):

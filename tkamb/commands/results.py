@@ -48,8 +48,8 @@ def _compare(options: argparse.Namespace) -> int:
 
     result = compare_folders(options.folders, options.axis)
     html = comparison_html(result, options.frame)
-    place = options.out or Path("out") / "compare"
-    with claimed_directory(place, options.force) as folder:
+    directory = options.out or Path("out") / "compare"
+    with claimed_directory(directory, options.force) as folder:
         write_text(folder / PAGE_NAME, html)
     lines = [*table_lines(result), f"page: {folder / PAGE_NAME}"]
     text = json.dumps(result.as_dict(), indent=2) if options.json else "\n".join(lines)

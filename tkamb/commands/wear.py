@@ -173,5 +173,5 @@ def _prepared(options: argparse.Namespace) -> "WearRun":
 
 
 def _stem(case: Path) -> str:
-    place = case.resolve()
-    return place.name if os.path.isdir(place) else place.parent.name
+    path = case.resolve()
+    return path.name if os.path.isdir(path) else path.parent.name

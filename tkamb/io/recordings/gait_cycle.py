@@ -168,9 +168,9 @@ class Cycle:
                 path,
                 "drop cycle_s, or give per cent of the cycle",
             )
-        whole = percent[-1] - percent[0] > 100 - 1e-9
+        complete = percent[-1] - percent[0] > 100 - 1e-9
         steps = np.abs(np.diff(knee, axis=0)).max(axis=0)
-        closed = bool(whole and np.all(np.abs(knee[-1] - knee[0]) <= steps))
+        closed = bool(complete and np.all(np.abs(knee[-1] - knee[0]) <= steps))
         if offset_percent and not closed:
             raise InputError(
                 "is not a closed cycle, so it has no frame before or after its ends",
@@ -199,7 +199,7 @@ class Cycle:
         return self.start + np.append(np.unique(np.round(elapsed, 12)), self.period)
 
     def wrapped(self, at: Array, sampled: Array) -> Array:
-        """Return times inside the recorded cycle that differ from `at` by whole periods."""
+        """Return times inside the recorded cycle that differ from `at` by complete periods."""
         if not self.closed or not self.offset_percent:
             return np.clip(at, sampled[0], sampled[-1])
         return np.clip(sampled[0] + np.mod(at - sampled[0], self.period), sampled[0], sampled[-1])

@@ -238,8 +238,8 @@ _CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are
 
 def _opposite(names: list[str]) -> str:
     last = names[2]
-    turned = f"-{last[-1]}" if last[0] != "-" else f"+{last[-1]}"
-    return ",".join([*names[:2], turned])
+    reversed_axis = f"-{last[-1]}" if last[0] != "-" else f"+{last[-1]}"
+    return ",".join([*names[:2], reversed_axis])
 
 
 def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
@@ -315,13 +315,13 @@ def _check_size(
     advice = ", ".join(
         f"'{u}' would make it {extent * LENGTH[u] / MILLIMETRE:.4g} mm" for u in fits
     )
-    why = (
+    reason = (
         f"which no such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
     )
     if size[0] <= extent * LENGTH[unit] <= size[1]:
-        why = "smaller than any person's knee"
+        reason = "smaller than any person's knee"
     raise InputError(
-        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {why}",
+        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {reason}",
         path,
         f"check the unit: {advice}" if fits else "check the mesh and its unit",
     )

@@ -199,11 +199,11 @@ def _find_unrecorded(
     ]
     needed = [role for role in missing if role not in released]
     if needed:
-        more = "" if needed == ["flexion"] else ", or release it: [contact] released"
+        release_hint = "" if needed == ["flexion"] else ", or release it: [contact] released"
         raise InputError(
             f"has no column for {', '.join(needed)} (it has {', '.join(recorded.columns)})",
             recorded.path,
-            f"name it in [motion] columns{more}",
+            f"name it in [motion] columns{release_hint}",
         )
     return tuple(missing)
 
@@ -274,8 +274,8 @@ def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
             question = "check [motion] columns, sequence, angle_unit and the meshes' axes"
             values, limits, unit = knee[:, i] / DEGREE, LIMITS_DEG[name], "deg"
             low, high = limits
-            turned = name == "flexion" and bending is not None
-            if turned and values.min() < low <= -values.max() and -values.min() <= high:
+            is_flexion = name == "flexion" and bending is not None
+            if is_flexion and values.min() < low <= -values.max() and -values.min() <= high:
                 question = (
                     f'if bending is negative in it, set [motion] signs_turned = ["{bending}"]'
                 )

@@ -217,16 +217,16 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
         ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),
         ("the origin of knee_ap", "tibia", _origin(joints["knee_ap"])[:3, 3], SHANK),
     )
-    for name, link, place, (low, high) in checks:
-        away = float(np.linalg.norm(place))
+    for name, link, position, (low, high) in checks:
+        distance = float(np.linalg.norm(position))
         if (
-            not low <= away <= high
-            or place[1] < 0
-            or np.hypot(*place[[0, 2]]) > PATELLA_LINK.max_lateral_share * away
+            not low <= distance <= high
+            or position[1] < 0
+            or np.hypot(*position[[0, 2]]) > PATELLA_LINK.max_lateral_share * distance
         ):
-            words = ", ".join(f"{value:.4g}" for value in place)
+            words = ", ".join(f"{value:.4g}" for value in position)
             raise InputError(
-                f"{name} is at ({words}) m in '{link}', {away:.4g} m from its origin",
+                f"{name} is at ({words}) m in '{link}', {distance:.4g} m from its origin",
                 path,
                 f"it must lie {low:g} to {high:g} m above it, along y, in metres",
             )
@@ -276,13 +276,13 @@ def _segment(
 def _fixed_pose(robot: ElementTree.Element, link: str, base: str, path: Path) -> Array:
     """Return the pose of `link` in `base`, which must be joined to it by fixed joints."""
     parents = {joint.find("child").get("link"): joint for joint in robot.findall("joint")}  # type: ignore[union-attr]
-    result, place = np.eye(4), link
-    while place != base:
-        joint = parents.get(place)
+    result, name = np.eye(4), link
+    while name != base:
+        joint = parents.get(name)
         if joint is None or joint.get("type") != "fixed":
             raise InputError(f"link '{link}' is not fixed to '{base}'", path, "use fixed joints")
         result = _origin(joint) @ result
-        place = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
+        name = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
     return result
 
 

@@ -116,13 +116,13 @@ def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
     """Return the byte order ("" for text), the elements, and the first byte of the data."""
     if not content.startswith(b"ply"):
         raise ValueError("it does not begin with 'ply'")
-    order, elements, place = None, list[_Element](), 0
+    order, elements, position = None, list[_Element](), 0
     for _ in range(_MOST_HEADER_LINES):
-        end = content.find(b"\n", place)
+        end = content.find(b"\n", position)
         if end < 0:
             break
-        words = content[place:end].decode("latin-1").split()
-        place = end + 1
+        words = content[position:end].decode("latin-1").split()
+        position = end + 1
         if words[:1] == ["format"]:
             order = _ORDERS.get(words[1])
         elif words[:1] == ["element"]:
@@ -138,7 +138,7 @@ def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
         elif words[:1] == ["end_header"]:
             if order is None:
                 raise ValueError("its format is none of ascii, binary_little_endian, _big_endian")
-            return order, elements, place
+            return order, elements, position
     raise ValueError("its header has no end")
 
 
@@ -164,16 +164,16 @@ def _ply_text(
             words = next((w for w in (line.split() for line in lines) if w), None)
             if words is None:
                 raise ValueError(f"it is cut short: {row} of {element.count} of {element.name}")
-            place, own = 0, []
+            position, items = 0, []
             for _, _, length in element.properties:
-                count = int(words[place]) if length else 1
-                place += bool(length)
-                own.append(words[place : place + count])
-                if len(own[-1]) < count:
+                count = int(words[position]) if length else 1
+                position += bool(length)
+                items.append(words[position : position + count])
+                if len(items[-1]) < count:
                     raise ValueError(f"{element.name} {row} is cut short")
-                place += count
+                position += count
             for n in columns:
-                values.extend(float(word) for word in own[n])
+                values.extend(float(word) for word in items[n])
             ends.append(len(values))
         yield element.name, (np.array(values), np.array(ends, np.int64))
 
@@ -183,7 +183,7 @@ def _ply_binary(
 ) -> Iterator[tuple[str, tuple[Array, Index]]]:
     """Yield the name of each element of a binary file, its values, and where each item ends."""
     for element in elements:
-        columns, place = _columns_to_read(element), start
+        columns, position = _columns_to_read(element), start
         if element.name == "vertex" and len(columns) < 3:
             raise ValueError("its vertices lack x, y or z")
         rows, start = _equal_rows(content, start, element, order)
@@ -195,7 +195,7 @@ def _ply_binary(
             ends = table.shape[1] * np.arange(1, element.count + 1)
             yield element.name, (table.ravel(), ends)
             continue
-        values, ends_, start = _uneven_rows(content, place, element, order, columns)
+        values, ends_, start = _uneven_rows(content, position, element, order, columns)
         yield element.name, (values, ends_)
 
 
@@ -204,19 +204,19 @@ def _equal_rows(
 ) -> tuple[NDArray | None, int]:
     """Return an element's rows and where they end; None if its lists differ in length."""
     fields: list[tuple[Any, ...]] = []
-    place = start
+    position = start
     for n, (_, kind, length) in enumerate(element.properties):
         dtype = np.dtype(order + kind)
         shape: tuple[int, ...] = ()
         if length:
             header = np.dtype(order + length)
-            if element.count == 0 or len(content) < place + header.itemsize:
+            if element.count == 0 or len(content) < position + header.itemsize:
                 return None, start
-            shape = (int(np.frombuffer(content, header, 1, place)[0]),)
+            shape = (int(np.frombuffer(content, header, 1, position)[0]),)
             fields.append((f"n{n}", header))
-            place += header.itemsize
+            position += header.itemsize
         fields.append((f"p{n}", dtype, shape))
-        place += dtype.itemsize * int(np.prod(shape))
+        position += dtype.itemsize * int(np.prod(shape))
     row = np.dtype(fields)
     end = start + row.itemsize * element.count
     if len(content) < end:
@@ -277,24 +277,24 @@ def read_binary_stl(path: Path) -> Array | None:
     content = path.read_bytes()
     if len(content) < _HEADER or _is_text(content):
         return None
-    solids, place = list[Array](), 0
-    while len(content) - place >= _HEADER:
-        available = len(content) - place - _HEADER
-        count = int.from_bytes(content[place + 80 : place + _HEADER], "little")
-        if place == 0 and count in (0, 2**32 - 1) and available >= _TRIANGLE.itemsize:
+    solids, position = list[Array](), 0
+    while len(content) - position >= _HEADER:
+        available = len(content) - position - _HEADER
+        count = int.from_bytes(content[position + 80 : position + _HEADER], "little")
+        if position == 0 and count in (0, 2**32 - 1) and available >= _TRIANGLE.itemsize:
             count = available // _TRIANGLE.itemsize
             _log.warning("%s: does not say how many triangles it has; %d are read", path, count)
         if count == 0 or count * _TRIANGLE.itemsize > available:
             break
-        solids.append(np.frombuffer(content, _TRIANGLE, count, place + _HEADER)["corners"])
-        place += _HEADER + count * _TRIANGLE.itemsize
-        if not _another_solid(content, place):
+        solids.append(np.frombuffer(content, _TRIANGLE, count, position + _HEADER)["corners"])
+        position += _HEADER + count * _TRIANGLE.itemsize
+        if not _another_solid(content, position):
             break
     if not solids:
         _refuse_cut_short(content, path)
         return None
-    if place < len(content):
-        _log.warning("%s: %d bytes after the last triangle left out", path, len(content) - place)
+    if position < len(content):
+        _log.warning("%s: %d bytes after the last triangle left out", path, len(content) - position)
     return np.concatenate(solids).reshape(-1, 3).astype(np.float64)
 
 
@@ -305,15 +305,15 @@ def _is_text(content: bytes) -> bool:
     return content.lstrip()[:5].lower() == b"solid" and words and b"\0" not in begin
 
 
-def _another_solid(content: bytes, place: int) -> bool:
+def _another_solid(content: bytes, position: int) -> bool:
     """Return whether another complete solid with finite corners begins at a byte."""
-    available = len(content) - place - _HEADER
+    available = len(content) - position - _HEADER
     if available < _TRIANGLE.itemsize:
         return False
-    count = int.from_bytes(content[place + 80 : place + _HEADER], "little")
+    count = int.from_bytes(content[position + 80 : position + _HEADER], "little")
     if count == 0 or count * _TRIANGLE.itemsize > available:
         return False
-    corners = np.frombuffer(content, _TRIANGLE, count, place + _HEADER)["corners"]
+    corners = np.frombuffer(content, _TRIANGLE, count, position + _HEADER)["corners"]
     return bool(np.isfinite(corners).all())
 
 

@@ -35,7 +35,7 @@ class PatientTable(SceneTable):
         description="body mass, 20 to 300; forces in BW are relative to it"
     )
     sex: Literal["male", "female"] | None = Field(
-        None, description="only for segments without <inertial>: picks the de Leva table"
+        None, description="selects the de Leva table, for segments without <inertial>"
     )
     # limits: the same child, very tall adults
     height_mm: Annotated[
@@ -172,12 +172,14 @@ class MotionTable(SceneTable):
             "roles whose columns are multiplied by -1, for a file with the opposite sign convention"
         ),
     )
-    angle_unit: AngleUnit | None = Field(None, description="of the file; markers need none")
+    angle_unit: AngleUnit | None = Field(
+        None, description="unit of angles in the file; not for markers"
+    )
     length_unit: LengthUnit | None = Field(
-        None, description="of the file; .trc and .c3d state their own"
+        None, description="unit of lengths in the file; .trc and .c3d files state it"
     )
     cutoff_Hz: Number | Literal["none"] = Field(
-        description="low-pass cut-off of the differentiation; 'none' trusts the samples"
+        description="cut-off of the low-pass filter; 'none': the samples are not filtered"
     )
     interval_s: tuple[Number, Number] | None = Field(
         None, description="part of the recording to compute; default: all"
@@ -254,7 +256,8 @@ class TibiaTable(SceneTable):
     )
     angle_unit: AngleUnit = "deg"
     length_unit: LengthUnit | None = Field(
-        None, description="of the file; needed for pose, and for markers unless the file says"
+        None,
+        description="unit of lengths in the file; needed if the file does not state it",
     )
     cutoff_Hz: Number | Literal["none"] | None = Field(
         None, description="low-pass cut-off; default: the motion's"
@@ -297,13 +300,13 @@ class GroundReactionTable(SceneTable):
         default_factory=dict,
         description=(
             "role -> column: time (s), force_1..3 (N, along the file's x, y, z), "
-            "point_1..3 (centre of pressure; the one along the vertical may be missing: the "
-            "plate then is at the laboratory's height 0), moment_1..3 (N·m, free moment at that "
-            "point; those not named and not in the file are zero)"
+            "point_1..3 (centre of pressure; the vertical component may be missing: the "
+            "plate is then at height 0 of the laboratory), moment_1..3 (N·m, free moment at that "
+            "point; missing components are zero)"
         ),
     )
     length_unit: LengthUnit | None = Field(
-        None, description="of the file; a .c3d mostly states its own"
+        None, description="unit of lengths in the file; a .c3d usually states it"
     )
     force_unit: str | None = Field(
         None,
@@ -311,7 +314,7 @@ class GroundReactionTable(SceneTable):
         "unknown one",
     )
     moment_unit: str | None = Field(
-        None, description="of a .c3d: unit of its moment channels (Nm, Nmm, Ncm), likewise"
+        None, description="of a .c3d: unit of its moment channels (Nm, Nmm, Ncm), if needed"
     )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
@@ -355,7 +358,7 @@ class MeasuredTable(SceneTable):
         "lateral at least one, the third follows from the other two; compression is positive; "
         "time is in s, by default the column of that name"
     )
-    unit: Literal["N", "kN", "lbf"] = Field(description="of the forces")
+    unit: Literal["N", "kN", "lbf"] = Field(description="unit of the forces")
     offset_s: Number = Field(
         description="time of [motion] minus time of the file; 0 for a common clock"
     )
@@ -428,8 +431,8 @@ class EmgTable(SceneTable):
     def sentence(self) -> str:
         """A sentence on the computation and the use of the envelopes."""
         first = "" if self.high_pass_Hz == "none" else f"high-passed at {self.high_pass_Hz:g} Hz, "
-        own = self.normalised_by == "recording"
-        by = "their largest values in that file" if own else "given values"
+        by_recording = self.normalised_by == "recording"
+        by = "their largest values in that file" if by_recording else "given values"
         use = {
             "report": "they are only compared with the activations",
             "target": f"the cost holds {self.weight} (a - e)^2 for each",

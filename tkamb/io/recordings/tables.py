@@ -448,8 +448,8 @@ def _why_uneven(cells: list[str], names: list[str]) -> str:
     if len(cells) < len(names):
         return "add the missing cell or comma"
     # Decimal commas cut each number into two integers, so that rows are about twice as long.
-    whole = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
-    if whole and 4 * len(cells) > 5 * len(names):
+    integers_only = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
+    if integers_only and 4 * len(cells) > 5 * len(names):
         return "write decimal points, not commas"
     return "give every column a name in the header"
 

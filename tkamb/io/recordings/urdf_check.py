@@ -116,8 +116,8 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
         if not _finite(text, attributes[key]):
             numbers = "a number" if attributes[key] == 1 else f"{attributes[key]} numbers"
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
-        place = element.tag == "origin" and key == "xyz"
-        if place and np.abs(numbers_of(element, key)).max() > _FARTHEST:
+        is_position = element.tag == "origin" and key == "xyz"
+        if is_position and np.abs(numbers_of(element, key)).max() > _FARTHEST:
             hint = "give xyz in metres, not in millimetres"
             raise InputError(f'<origin xyz="{text}"> is beyond {_FARTHEST:g} m', where, hint)
         if key in ("value", *_INERTIA) and abs(float(text)) > _HEAVIEST:
@@ -177,10 +177,10 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
             "connect all links by joints to one tree with one root, without a loop",
         )
     for name in links:
-        place, steps = name, 0
-        while place in parents and steps <= len(links):
-            place, steps = parents[place], steps + 1
-        if place != roots[0]:
+        ancestor, steps = name, 0
+        while ancestor in parents and steps <= len(links):
+            ancestor, steps = parents[ancestor], steps + 1
+        if ancestor != roots[0]:
             raise InputError(
                 f"link '{name}' is part of a loop", path, "connect the links to one tree"
             )
@@ -239,12 +239,12 @@ def _check_axes(
 ) -> None:
     """Raise unless each joint has the expected type and axis, and does not mimic another."""
     axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in expected}
-    turned = [
+    flipped = [
         name
         for name, (kind, axis) in expected.items()
         if kind == "revolute" and np.allclose(axes[name], -np.array(axis), atol=1e-9)
     ]
-    if {"knee_axial_rotation", "knee_adduction"} <= set(turned) and len(turned) == 2:
+    if {"knee_axial_rotation", "knee_adduction"} <= set(flipped) and len(flipped) == 2:
         other = "left" if side == "right" else "right"
         raise InputError(
             f"its axes of knee_axial_rotation and knee_adduction are those of a {other} knee",
@@ -286,12 +286,12 @@ def _check_order(
     """Raise unless the joints form a chain at one point, without mass between them."""
     masses = {str(link.get("name")): link.find("inertial/mass") for link in robot.findall("link")}
     order = f"the order is {between[0]}, {', '.join(names)}, {between[1]}"
-    place = between[0]
+    link = between[0]
     for name in names:
         parent, child = ends_of(joints[name])
-        if parent != place:
-            raise InputError(f"joint '{name}' has parent '{parent}', not '{place}'", path, order)
-        place = child
+        if parent != link:
+            raise InputError(f"joint '{name}' has parent '{parent}', not '{link}'", path, order)
+        link = child
         origin = joints[name].find("origin")
         numbers = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
         if name != names[0] and numbers.any():
@@ -302,8 +302,8 @@ def _check_order(
         if name != names[-1] and mass is not None and numbers_of(mass, "value", "0").any():
             hint = "links inside the chain have none: put it on tibia or femur"
             raise InputError(f"link '{child}' has a mass", path, hint)
-    if place != between[1]:
-        raise InputError(f"joint '{names[-1]}' leads to '{place}'", path, order)
+    if link != between[1]:
+        raise InputError(f"joint '{names[-1]}' leads to '{link}'", path, order)
 
 
 def check_inertia(link: ElementTree.Element, path: Path, needed: bool) -> None:
