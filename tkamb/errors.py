@@ -88,11 +88,11 @@ def renamed(module: str, name: str, names: Mapping[str, Any]) -> Any:
 
     Args:
         module: dotted name of the module.
-        name: name that was asked for.
+        name: requested name.
         names: former name -> object.
 
     Raises:
-        AttributeError: the module has nothing of that name.
+        AttributeError: the module has no such name.
     """
     if name not in names:
         raise AttributeError(f"module '{module}' has no attribute '{name}'")

@@ -403,7 +403,7 @@ class Replacement:
         written = {name: path.name for name, path in self._written.items()}
         journal = {"written": written, "removed": self._removed}
         write_text(self.folder / JOURNAL, json.dumps(journal))
-        self._written.clear()  # from here on the journal owns them
+        self._written.clear()  # now the journal lists them
         finish_replacement(self.folder)
 
     def discard(self) -> None:

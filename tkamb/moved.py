@@ -236,4 +236,4 @@ class _MovedFinder(MetaPathFinder):
 def accept_old_names() -> None:
     """Make former import paths work. Repeated calls have no effect."""
     if not any(isinstance(finder, _MovedFinder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _MovedFinder())  # before the path of a moved folder is searched
+        sys.meta_path.insert(0, _MovedFinder())  # before Python searches a moved folder

@@ -1,7 +1,9 @@
 """Test of a contact model against the contract of contact models.
 
-from tkamb.testing import check_contact_model
-check_contact_model(MyModel(resolution=1e-3))
+    from tkamb.testing import check_contact_model
+    check_contact_model(MyModel(resolution=1e-3))
+
+A missing property raises `ConformanceError`.
 """
 
 from dataclasses import dataclass, is_dataclass

@@ -344,11 +344,10 @@ class _Data:
         """Return the first byte of the data.
 
         Header and POINT:DATA_START both state the first block of the data. If they differ, the
-        block is used from which the frames fit the size of the file.
+        frames must fit the size of the file from exactly one of the two blocks.
 
         Raises:
-            InputError: no block within the file, or header and POINT:DATA_START contradict each
-                other and the frames fit from neither or from both.
+            InputError: no block is within the file, or the frames fit from neither or from both.
         """
         stated = self.parameters.integers("POINT:DATA_START")
         blocks = list(dict.fromkeys([self.header.data_block, *stated[:1]]))

@@ -104,8 +104,8 @@ def differentiate_poses(
     """Low-pass filter poses of a body and differentiate them twice.
 
     Positions are filtered as coordinates, and orientations as sign-continuous quaternions that are
-    normalised afterwards. The result does not depend on the axes of either frame. That of the
-    positions depends on the body's origin. With s the filtered quaternion,
+    normalised afterwards. The result does not depend on the axes of either frame. Only the
+    positions depend on the body's origin. With s the filtered quaternion,
 
         omega = 2 vec(s* s') / |s|^2,   alpha = 2 vec(s* s'') / |s|^2 - 2 omega (s . s') / |s|^2
 

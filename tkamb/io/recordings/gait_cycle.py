@@ -199,7 +199,7 @@ class Cycle:
         return self.start + np.append(np.unique(np.round(elapsed, 12)), self.period)
 
     def wrapped(self, at: Array, sampled: Array) -> Array:
-        """Return times inside the recorded cycle that differ from `at` by complete periods."""
+        """Return times inside the recorded cycle that differ from `at` by whole periods."""
         if not self.closed or not self.offset_percent:
             return np.clip(at, sampled[0], sampled[-1])
         return np.clip(sampled[0] + np.mod(at - sampled[0], self.period), sampled[0], sampled[-1])

@@ -134,8 +134,8 @@ class MotionTable(SceneTable):
 
     `interpretation = "coordinates"`: columns are the six knee coordinates (Grood-Suntay) of
     the femoral component in the insert frame. `"pose"`: columns are a rotation sequence and
-    a translation that place the femoral mesh in the insert mesh's own axes. `"markers"`: skin
-    markers of shank and thigh, see [motion.markers]; they place the shank too.
+    a translation, the pose of the femoral mesh in the insert mesh's axes. `"markers"`: skin
+    markers of shank and thigh, see [motion.markers]. They also give the pose of the shank.
     """
 
     file: Path
@@ -237,7 +237,7 @@ class TibiaTable(SceneTable):
     """The pose of the shank in the laboratory (x forward, y up, z right).
 
     One of: `sagittal` (a forward lean about z over a fixed ankle), `pose` (columns of a
-    file that place the tibia link), `markers` (rigid fit of shank markers).
+    file with the pose of the tibia link), `markers` (rigid fit of shank markers).
     """
 
     kind: Literal["sagittal", "pose", "markers"]
@@ -380,7 +380,7 @@ Positive = Annotated[Number, Field(gt=0)]
 class EmgTable(SceneTable):
     """Surface EMG: envelopes that are compared with the activations, or constrain them.
 
-    An envelope is the rectified signal, low-passed without phase shift, over its normalising
+    An envelope is the rectified signal, low-passed without phase shift and divided by a normalising
     value.
     """
 

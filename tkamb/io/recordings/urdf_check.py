@@ -201,7 +201,7 @@ def check_chain(
     """Raise an InputError unless the joints are exactly those of docs/patient.md.
 
     Checked are type, axis, limits, order and identity origins of the six knee joints and of the
-    three joints of the patella. Links between them have no mass. Only the ankle may move, too.
+    three joints of the patella. Links between them have no mass. Except the ankle, no other joint may move.
 
     Args:
         robot: tree of a right leg, or of a mirrored left leg.
