@@ -325,7 +325,9 @@ class _Reader:
         if not np.isfinite(used).all() or len(set(used)) < len(used):
             raise InputError("names one channel twice", where, EXPORT)
         if len(used) and (used.min() < 1 or used.max() > len(names)):
-            raise InputError(f"asks for channel {used.max():g} of {len(names)}", where, EXPORT)
+            raise InputError(
+                f"names channel {used.max():g}, but there are {len(names)}", where, EXPORT
+            )
         rows = [int(channel_number) - 1 for channel_number in used]
         force = self._parameters.texts("FORCE_PLATFORM:UNITS")
         return PlateRecord(

@@ -163,7 +163,7 @@ def parse_c3d(content: bytes, path: Path) -> C3dFile:
         raise InputError("is cut short: its parameters are missing", path, "copy it again")
     machine = content[start + 3]
     if machine not in (_DEC, _MIPS, _INTEL):
-        raise InputError(f"is of an unknown machine ({machine})", path, EXPORT)
+        raise InputError(f"states an unknown machine code ({machine})", path, EXPORT)
     header = _header(content, machine)
     end = (header.data_block - 1) * BLOCK
     records = _parameters(content, start + 4, end if end > start else len(content), machine)

@@ -250,8 +250,9 @@ def _complete_part(
     start = int(before[-1]) + 1 if len(before) else 0
     end = last + int(after[0]) if len(after) else len(stamps)
     part = recorded.part(slice(start, end))
-    line = f"used from {part.time[0]:.4f} to {part.time[-1]:.4f} s: beside it are values that are "
-    return replace(part, notices=(*part.notices, line + "not numbers"))
+    interval = f"{part.time[0]:.4f} to {part.time[-1]:.4f} s"
+    notice = f"used from {interval}: values before or after are not numbers"
+    return replace(part, notices=(*part.notices, notice))
 
 
 def _read_table(source: GroundReactionTable) -> RecordedReaction:

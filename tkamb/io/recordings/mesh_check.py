@@ -125,7 +125,7 @@ class MeshHealth:
             f"{_count_noun(self.components, 'component')}",
             *self._parts(),
             f"  {self._closedness()}",
-            *(f"  would be mended when loaded: {phrase}" for phrase in self.repairs),
+            *(f"  would be repaired when loaded: {phrase}" for phrase in self.repairs),
             *self._defects(),
             f"  extents {size} in file units: {self._unit_question()}",
             *self._axis_questions(),

@@ -316,7 +316,7 @@ def _check_size(
         f"'{u}' would make it {extent * LENGTH[u] / MILLIMETRE:.4g} mm" for u in fits
     )
     reason = (
-        f"which no such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
+        f"no size of a part of a knee ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
     )
     if size[0] <= extent * LENGTH[unit] <= size[1]:
         reason = "smaller than any person's knee"

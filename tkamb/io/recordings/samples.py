@@ -142,7 +142,7 @@ def check_steps(
     if rate[k] > fastest:
         raise InputError(
             f"{what} steps from {values[k] / scale:.4g} to {values[k + 1] / scale:.4g} {unit} "
-            f"between {time[k]:g} and {time[k + 1]:g} s, which nobody does",
+            f"between {time[k]:g} and {time[k + 1]:g} s, which is impossible",
             path,
             "check whether a cell is mistyped, and whether the time is in seconds",
         )

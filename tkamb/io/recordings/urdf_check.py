@@ -201,7 +201,8 @@ def check_chain(
     """Raise an InputError unless the joints are exactly those of docs/patient.md.
 
     Checked are type, axis, limits, order and identity origins of the six knee joints and of the
-    three joints of the patella. Links between them have no mass. Except the ankle, no other joint may move.
+    three joints of the patella. Links between them have no mass. No other joint may move, except
+    the ankle.
 
     Args:
         robot: tree of a right leg, or of a mirrored left leg.
