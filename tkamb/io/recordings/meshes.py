@@ -340,14 +340,7 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
 
 
 def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
-    """Warn or raise if the file rounds its coordinates too coarsely, far from the origin.
-
-    Args:
-        corners: (n, 3), file units.
-        unit: unit of the file.
-        path: the file.
-        name: name of the part.
-    """
+    """Warn or raise if coordinates (n, 3), far from the origin, are rounded too coarsely."""
     rounding = coordinate_rounding(corners) * LENGTH[unit]
     if rounding <= MESH_FILE.rounding_notice:
         return

@@ -264,10 +264,7 @@ def _bending_role(recorded: Table, source: MotionTable) -> str:
 def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
     """Raise if knee coordinates (n, 6) are impossible.
 
-    Args:
-        knee: the coordinates.
-        path: path of the file, for messages.
-        bending: role of the column with the sign of flexion, or None.
+    `bending` is the role of the column with the sign of flexion, or None.
     """
     for i, name in enumerate(KNEE_COORDINATES):
         if name in LIMITS_DEG:

@@ -319,13 +319,8 @@ def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
     """Return a label per marker; "" for a marker without a label.
 
     The line of labels has a label every three cells. Some programs write blanks in place of tabs.
-    Then the labels are read in order, if there are as many as markers.
-
-    Args:
-        names: line of labels.
-        axes: line of axes, like X1, Y1, Z1.
-        usual: median number of cells in a row.
-        path: the file, for messages.
+    Then the labels are read in order, if there are as many as markers. `usual` is the median number
+    of cells in a row.
     """
     count = max(len(axes.split()) // 3, math.ceil((usual - 2) / 3))
     cells = [cell.strip() for cell in names.split("\t")][2:]
