@@ -35,7 +35,9 @@ def add_compare(commands: Any) -> None:
     compare.add_argument(
         "--out", type=Path, metavar="DIR", help=f"folder for {PAGE_NAME}; default out/compare"
     )
-    compare.add_argument("--force", action="store_true", help="write into any folder")
+    compare.add_argument(
+        "--force", action="store_true", help="write into a folder that tkamb did not make"
+    )
     compare.add_argument("--json", action="store_true", help="print the differences as JSON")
     compare.set_defaults(command=_compare)
 
@@ -76,11 +78,15 @@ def add_export(commands: Any) -> None:
     export.add_argument(
         "--out", type=Path, metavar="DIR2", help="folder for --vtp, or file for --deck (.inp, .feb)"
     )
-    export.add_argument("--frame", type=int, metavar="K", help="for --deck: frame number")
+    export.add_argument(
+        "--frame", type=int, metavar="K", help="for --deck: row of results.csv, from 0"
+    )
     export.add_argument(
         "--resolution", type=float, metavar="MM", help="for --deck: edge of the hexahedra"
     )
-    export.add_argument("--force", action="store_true", help="--out may be any folder")
+    export.add_argument(
+        "--force", action="store_true", help="--out may be a folder that tkamb did not make"
+    )
     export.set_defaults(command=_export)
 
 
