@@ -1,4 +1,4 @@
-"""Invalid inputs made from a seed; `scripts/study_abuse` gives them to tkamb.
+"""Invalid inputs from a seed, with which `scripts/study_abuse` calls tkamb.
 
 Each kind is a function (folder, chance) -> arguments of the command line. It writes its input into
 the empty folder.
@@ -30,7 +30,7 @@ RUN = ("--frames", "0:1")
 
 
 def arguments(folder: Path, chance: random.Random) -> list[str]:
-    """A valid command line with words changed, doubled, dropped or inserted."""
+    """Return a valid command line with words changed, doubled, dropped or inserted."""
     commands = [
         ["run", str(MODEL / "scene.toml"), "--out", str(folder / "out"), *RUN],
         ["press", *(str(MODEL / name) for name in MESHES), "--load", "10", "--resolution", "9"],
@@ -57,7 +57,7 @@ def arguments(folder: Path, chance: random.Random) -> list[str]:
 
 
 def odd_files(folder: Path, chance: random.Random) -> list[str]:
-    """A path that is no regular file, given where a file is expected."""
+    """Return a command line with a path that is no regular file."""
     path = folder / "odd.stl"
     kind = chance.randint(0, 6)
     if kind == 0:
@@ -92,7 +92,7 @@ def odd_files(folder: Path, chance: random.Random) -> list[str]:
 
 
 def scenes(folder: Path, chance: random.Random) -> list[str]:
-    """The shipped scene with keys of other values, lines lost, or bytes changed."""
+    """Write the shipped scene with other values of keys, missing lines or changed bytes."""
     scene = copied(folder) / "scene.toml"
     if chance.random() < 0.3:
         scene.write_bytes(spoilt(scene.read_bytes(), chance))
@@ -108,7 +108,7 @@ def scenes(folder: Path, chance: random.Random) -> list[str]:
 
 
 def tables(folder: Path, chance: random.Random) -> list[str]:
-    """A recording with cells, rows, columns or bytes changed."""
+    """Write a recording with changed cells, rows, columns or bytes."""
     path = copied(folder) / chance.choice(TABLES)
     if chance.random() < 0.3:
         path.write_bytes(spoilt(path.read_bytes(), chance))
@@ -135,7 +135,7 @@ def tables(folder: Path, chance: random.Random) -> list[str]:
 
 
 def urdfs(folder: Path, chance: random.Random) -> list[str]:
-    """A URDF with elements dropped, doubled or nested, or with changed numbers."""
+    """Write a URDF with dropped, doubled or nested elements, or with changed numbers."""
     path = copied(folder) / "patient.urdf"
     text = path.read_text(encoding="utf-8")
     for _ in range(chance.randint(1, 3)):
@@ -161,7 +161,7 @@ def urdfs(folder: Path, chance: random.Random) -> list[str]:
 
 
 def meshes(folder: Path, chance: random.Random) -> list[str]:
-    """A mesh that is truncated, has changed bytes, or is of another format than its suffix."""
+    """Write a mesh that is cut short, has changed bytes, or another format than its suffix."""
     copied(folder)
     name = chance.choice(MESHES)
     path = folder / name
@@ -185,7 +185,7 @@ def meshes(folder: Path, chance: random.Random) -> list[str]:
 
 
 def folders(folder: Path, chance: random.Random) -> list[str]:
-    """A folder of results with files changed, dropped, swapped or added."""
+    """Write a folder of results with changed, dropped, swapped or added files."""
     out = folder / "out"
     shutil.copytree(os.environ["TKAMB_ABUSE_RESULTS"], out)
     names = ["results.csv", "summary.json", "contact.h5", ".tkamb", ".tkamb-commit", ".frames"]
@@ -219,7 +219,7 @@ def folders(folder: Path, chance: random.Random) -> list[str]:
 
 
 def forged(folder: Path, chance: random.Random) -> list[str]:
-    """A forged folder of results, with right hashes and wrong content."""
+    """Write a forged folder of results, with correct hashes of wrong content."""
     results = Path(os.environ["TKAMB_ABUSE_RESULTS"])
     out = str(forge(folder, results, chance))
     made = str(folder / "made")
@@ -239,7 +239,7 @@ def forged(folder: Path, chance: random.Random) -> list[str]:
 
 
 def toml(folder: Path, chance: random.Random) -> list[str]:
-    """A scene, material, springs file or --set text that is short but expensive to read."""
+    """Write a short TOML text that is expensive to read: scene, material, springs or --set."""
     count = chance.choice([100, 5_000, 200_000, 2_000_000])
     key = chance.choice(["a", "contact.options.x", "motion", "material.table"])
     text = chance.choice(
@@ -277,7 +277,7 @@ def toml(folder: Path, chance: random.Random) -> list[str]:
 
 
 def options(folder: Path, chance: random.Random) -> list[str]:
-    """A valid command line with odd values for one or two of its options.
+    """Return a valid command line with odd values of one or two options.
 
     The folder `precious` holds another program's files, which must not change.
     """
@@ -344,7 +344,7 @@ PRECIOUS_NAMES = ("results.csv", "summary.json", "scene.toml", "patient.urdf", "
 
 
 def opensim(folder: Path, chance: random.Random) -> list[str]:
-    """An OpenSim model, a motion or markers with lines, words or bytes changed, imported."""
+    """Write an OpenSim model, motion or markers with changed lines, words or bytes, to import."""
     shutil.copytree(opensim_leg().name, folder, dirs_exist_ok=True)
     for _ in range(chance.choice([1, 1, 2])):
         path = folder / chance.choice(["leg.osim"] * 4 + ["leg.mot", "leg.trc"])
@@ -432,7 +432,7 @@ def run(folder: Path) -> list[str]:
 
 
 def spoilt(content: bytes, chance: random.Random) -> bytes:
-    """Return the bytes truncated, or with some flipped, doubled or inserted."""
+    """Return the bytes cut short, or with some bytes changed, doubled or inserted."""
     spoilt = bytearray(content)
     for _ in range(chance.choice([1, 1, 5, 50])):
         if not spoilt:

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure the lattice: time, memory, and how approach, force, area and peak settle.
+"""Measure time and memory of the lattice, and the convergence of its results with the cell size.
 
 Each row runs in its own process with one thread, so that its peak memory can be measured;
 OMP_NUM_THREADS and TKAMB_THREADS change the number of threads. `approach_s` is the time that it
@@ -29,7 +29,7 @@ from tkamb.contact.registry import contact_model
 
 
 def measure(case, data, name, resolution, load, repeats):
-    """Return one row."""
+    """Return the row of one case, model and resolution."""
     pair, at = contact_pair(case, data, "polyethylene")
     model = contact_model(name, resolution, cache=False)
     begun = time.perf_counter()

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Build the sdist from the files that git knows, and the wheel from the sdist.
+"""Build the sdist from the files in git, and the wheel from the sdist.
 
 Usage: scripts/build_package.py FOLDER
 """
@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def build(folder: Path) -> tuple[Path, Path]:
-    """Return the sdist and the wheel, both in the folder."""
+    """Build sdist and wheel in the folder; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as temporary:
@@ -39,7 +39,7 @@ def build(folder: Path) -> tuple[Path, Path]:
 
 
 def known_files() -> list[str]:
-    """Return the paths of the files that git knows and that exist."""
+    """Return the paths of the existing files in git."""
     listed = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, text=True
     ).stdout

@@ -1,8 +1,8 @@
-"""A pytest plugin that records the functions of the package that each test calls, and its time.
+"""A pytest plugin that records the time of each test and the functions of the package it calls.
 
     python -m pytest -p called_functions --called out/called.jsonl tests/test_x.py
 
-One line of JSON a test: its name, seconds, and the functions as "file:Class.function".
+It writes one line of JSON per test: its name, seconds, and the functions as "file:Class.function".
 """
 
 import json
@@ -18,7 +18,7 @@ PACKAGE = str(ROOT / "tkamb")
 
 
 def pytest_addoption(parser):
-    parser.addoption("--called", type=Path, help="where the lines go")
+    parser.addoption("--called", type=Path, help="file for the lines")
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -46,5 +46,5 @@ def pytest_runtest_protocol(item):
 
 
 def function_of(code):
-    """Return "Class.function" of a code object; a lambda or loop belongs to its function."""
+    """Return "Class.function" of a code object; for a lambda or loop, its enclosing function."""
     return code.co_qualname.split(".<locals>")[0].split(".<lambda>")[0]

@@ -28,11 +28,11 @@ class ErrorCaseSettings:
     """The cases from which known errors are measured."""
 
     insert_mm: float = 16.0
-    """mm; edge length of the inserts. Chosen: small enough for fine cells, and wide enough that the
-    contact does not reach the outline."""
+    """mm: edge length of the inserts. Chosen because it allows fine cells, and the contact does not
+    reach the outline."""
     vertex_spacing_mm: float = 0.25
-    """mm; distance between the vertices of the surfaces. Chosen: facets then change no pressure
-    noticeably."""
+    """mm: distance between the vertices of the surfaces. Chosen because facets then hardly change
+    the pressure."""
 
 
 ERROR_CASE = ErrorCaseSettings()
@@ -181,7 +181,7 @@ def _slope(thickness_mm: float, degrees: float) -> Height:
 
 
 def _rim(thickness_mm: float, fillet_mm: float) -> Height:
-    """Return a plateau that ends at x = 5 mm, with a fillet, in a slope of 60 deg."""
+    """Return the height of a plateau that ends at x = 5 mm in a slope of 60 deg, with a fillet."""
     return lambda x, z: thickness_mm * MILLIMETRE - _rounded(x - 5 * MILLIMETRE, fillet_mm)
 
 
@@ -195,18 +195,18 @@ def _rounded(beyond: Array, fillet_mm: float) -> Array:
 
 
 def _punch(half_mm: float, fillet_mm: float) -> Height:
-    """Return a round punch, flat to a radius, with a fillet."""
+    """Return the height of a round punch with a flat face of a radius and a fillet."""
     return lambda x, z: _rounded(np.hypot(x, z) - half_mm * MILLIMETRE, fillet_mm)
 
 
 def _runner(radius_mm: float, half_mm: float, fillet_mm: float) -> Height:
-    """Return a roller along x that ends with fillets."""
+    """Return the height of a roller along x with fillets at its ends."""
     across = _ball(1e4, radius_mm)
     return lambda x, z: across(0 * x, z) + _rounded(np.abs(x) - half_mm * MILLIMETRE, fillet_mm)
 
 
 def _upside_down(height: Height, width_mm: float) -> Surface:
-    """Return a body whose underside is at a height over the lowest point, in y = 0."""
+    """Return a body with an underside of a height function; its lowest point is at y = 0."""
     size, top = (width_mm * MILLIMETRE, width_mm * MILLIMETRE), 30.0 * MILLIMETRE
     whole = block(
         lambda x, z: np.maximum(top - height(x, z), MILLIMETRE),

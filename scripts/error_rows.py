@@ -22,7 +22,7 @@ class ErrorReferenceSettings:
     """The reference of the known errors."""
 
     resolution_mm: float = 0.5
-    """mm; resolution of the reference. Chosen: half of the finest compared resolution."""
+    """mm: resolution of the reference. Chosen because it is half of the finest compared one."""
 
 
 ERROR_REFERENCE = ErrorReferenceSettings()
@@ -43,7 +43,7 @@ SETTINGS: dict[str, dict[str, tuple[float, ...]]] = {
         "foundation-linear": (2.0, 1.0),
     },
 }
-"""Material -> contact model -> resolutions, mm, that are measured."""
+"""Material -> contact model -> measured resolutions, mm."""
 COMPARED = ("approach", "mean_pressure", "peak_pressure", "area")
 
 
@@ -97,10 +97,10 @@ def solve(case: ErrorCase, material: str, contact: str, resolution_mm: float) ->
 
 
 def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
-    """Return the errors of all settings that were solved together with their references.
+    """Return the errors of all settings of which the setting and its reference are solved.
 
     Args:
-        solved: `solved_key` -> what `solve` returned.
+        solved: `solved_key` -> result of `solve`.
     """
     result = []
     for case in error_cases():
@@ -161,7 +161,7 @@ def read_error_rows(path: Path) -> list[ErrorRow]:
     """Read rows of a file.
 
     Raises:
-        InputError: it holds none.
+        InputError: the file holds no rows.
     """
     try:
         return [ErrorRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]

@@ -1,4 +1,4 @@
-"""Forged folders of results, made from a seed, with right hashes and wrong content."""
+"""Forged folders of results from a seed, with correct hashes of wrong content."""
 
 import hashlib
 import json
@@ -17,7 +17,7 @@ SECRET = "somebody's own file, which no output may hold"
 
 
 UNREADABLE = (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError, MemoryError)
-"""Errors of h5py on an array that was forged before."""
+"""Errors of h5py on a forged array."""
 
 
 def forge(folder: Path, results: Path, chance: random.Random) -> Path:
@@ -32,12 +32,12 @@ def forge(folder: Path, results: Path, chance: random.Random) -> Path:
 
 
 def _summary(out: Path, chance: random.Random) -> None:
-    """Put another value somewhere into summary.json, or take one out."""
+    """Replace or remove a random value of summary.json."""
     path = out / "summary.json"
     content = json.loads(path.read_text(encoding="utf-8"))
     places = [place for place in _places(content) if place]
     place = chance.choice(places)
-    if chance.random() < 0.5:  # keys of the top are read most
+    if chance.random() < 0.5:  # most readers use keys of the top level
         place = place[:1]
     inner = content
     for key in place[:-1]:
@@ -61,7 +61,7 @@ def _summary(out: Path, chance: random.Random) -> None:
 
 
 def _places(value: object, before: tuple = ()) -> list[tuple]:
-    """Return the path of keys to every value in nested objects and lists."""
+    """Return the path of keys to each value in nested objects and lists."""
     found = [before]
     items = value.items() if isinstance(value, dict) else ()
     items = enumerate(value) if isinstance(value, list) else items
@@ -71,7 +71,7 @@ def _places(value: object, before: tuple = ()) -> list[tuple]:
 
 
 def _maps(out: Path, chance: random.Random) -> None:
-    """Replace an array of contact.h5 by one of another shape, type, value or place."""
+    """Replace an array of contact.h5 by an array of another shape, type, value or location."""
     secret = out.parent / "secret.txt"
     secret.write_text(SECRET * 2000)
     with h5py.File(out / "contact.h5", "a") as file:

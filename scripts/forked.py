@@ -1,4 +1,4 @@
-"""Commands in forked processes, which have tkamb's imports already, so that a study takes minutes.
+"""Commands in forked processes. They share tkamb's imports, so that a study takes minutes.
 
 A child can be killed, interrupted and limited as any other process.
 """
@@ -35,7 +35,7 @@ NEEDED = (
 
 
 def import_all(report: bool = True) -> None:
-    """Import what commands need, before the first fork.
+    """Import the modules that commands need, before the first fork.
 
     Args:
         report: whether the reports of runs are drawn; they take longer than short runs.
@@ -125,7 +125,7 @@ class Forked:
             os.kill(self.pid, number)
 
     def printed(self) -> tuple[str, str]:
-        """Return what was printed on standard output and standard error."""
+        """Return the text of standard output and standard error."""
         texts = []
         for file in self._files:
             file.seek(0)

@@ -1,4 +1,4 @@
-"""Makes the tables of docs/known_errors.md from scripts/data/known_error_cases.json."""
+"""Tables of docs/known_errors.md, from scripts/data/known_error_cases.json."""
 
 from collections.abc import Sequence
 

@@ -14,7 +14,7 @@ from tkamb.io.scene.case import load_case
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 AXES = np.diag([-1.0, 1.0, -1.0])
-"""Subjects DM and JW: mesh x posterior, y superior, z medial."""
+"""Mesh axes of subjects DM and JW: x posterior, y superior, z medial."""
 
 
 def two_condyles(varus=0.0, radius=22e-3, apart=11e-3, flex=1.0):
@@ -116,7 +116,7 @@ def contact_pair(case: str, data: Path | None, material_name: str):
 
 
 def nearby(at, step=1.0):
-    """Return the pose a frame later: 0.3 mm back, 1 deg flexed about z, 0.3 deg turned."""
+    """Return a neighbouring pose: 0.3 mm posterior, 1 deg more flexion, 0.3 deg axial rotation."""
     moved = knee_pose(step * np.array([-0.3e-3, 0, 0, np.radians(0.3), 0, np.radians(1.0)]))
     turned = at.copy()
     turned[:3, :3] = moved[:3, :3] @ at[:3, :3]

@@ -20,7 +20,7 @@ PATIENCE_S = 1800.0
 
 @contextmanager
 def browser_page(width: int, height: int) -> Iterator[Page]:
-    """Give an empty page of a size in pixels."""
+    """Yield an empty page of a size in pixels."""
     with sync_playwright() as driver:
         arguments = [*SOFTWARE_GRAPHICS, "--no-sandbox"]
         browser = driver.chromium.launch(executable_path=find_browser(), args=arguments)
@@ -30,7 +30,7 @@ def browser_page(width: int, height: int) -> Iterator[Page]:
 
 @contextmanager
 def live_page(page: Page, spacing_mm: float) -> Iterator[LiveWindow]:
-    """Open the shipped knee by the lattice, and wait until its first fine answer is shown."""
+    """Open the shipped knee with the lattice, and wait for its first fine answer."""
     with tempfile.TemporaryDirectory() as folder:
         window = open_live(SCENE, frame=60, contact="lattice", folder=Path(folder))
         window.set_resolution(spacing_mm)
@@ -44,7 +44,7 @@ def live_page(page: Page, spacing_mm: float) -> Iterator[LiveWindow]:
 
 
 def wait_until(page: Page, condition: str) -> None:
-    """Poll a condition; the page's policy forbids the browser to evaluate text by itself."""
+    """Poll a condition, because the page's policy forbids the browser's own wait."""
     end = time.monotonic() + PATIENCE_S
     while not page.evaluate(f"() => Boolean({condition})"):
         if time.monotonic() > end:

@@ -52,7 +52,7 @@ def timed(label, make, right, entries):
 
 
 def superlu(matrix, order):
-    """Return a SuperLU factorisation: in the given order of unknowns; None: in SuperLU's own."""
+    """Return a SuperLU factorisation in an order of unknowns; None: the order of SuperLU."""
     options = {"SymmetricMode": True}
     if order is None:
         made = linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options)
@@ -117,9 +117,11 @@ def pypardiso(matrix):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, nargs=3, default=[26, 5, 40], help="along x, y, z")
-    parser.add_argument("--edge", type=float, default=2.0, help="mm")
-    parser.add_argument("--skip", nargs="*", default=[], help="names not to run")
+    parser.add_argument(
+        "--cells", type=int, nargs=3, default=[26, 5, 40], help="number of cells along x, y, z"
+    )
+    parser.add_argument("--edge", type=float, default=2.0, help="edge of a cell, mm")
+    parser.add_argument("--skip", nargs="*", default=[], help="names of programs to skip")
     options = parser.parse_args()
     edge = options.edge * 1e-3
     nodes, index, cells = block(options.cells, edge)

@@ -13,7 +13,7 @@ COPIED = {
     **{f"models/{p.parent.name}.md": f"models/{p.parent.name}/README.md"
        for p in sorted(ROOT.glob("models/*/README.md"))},
 }  # fmt: skip
-"""Page -> the file that it is made from."""
+"""Page -> its source file."""
 API = (
     "run.simulation.simulate", "io.scene.scene.load_scene", "io.scene.scene.Scene",
     "run.results.Results", "run.results_folder.read_results", "run.maps.ContactMaps",
@@ -22,7 +22,7 @@ API = (
     "contact.registry.contact_model", "contact.model", "contact.result.ContactResult",
     "contact.pair", "testing", "errors",
 )  # fmt: skip
-"""Public names, documented on the page of the API."""
+"""Public names on the page of the API."""
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 

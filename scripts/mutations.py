@@ -1,4 +1,4 @@
-"""One-line faults in Python source: the places that can be changed, and the changed text.
+"""Faults of one line in Python source: the places to change, and the changed text.
 
 A seed draws from all possible faults; the same seed and source give the same faults.
 """
@@ -51,7 +51,7 @@ class Fault:
 
 
 class _Finder(ast.NodeVisitor):
-    """Collects the faults of a module; messages, annotations and defaults are left alone."""
+    """Collects the possible faults of a module, except in messages, annotations and defaults."""
 
     def __init__(self, file: str, text: str) -> None:
         self.file, self.lines, self.faults = file, text.encode().splitlines(), []
@@ -59,7 +59,7 @@ class _Finder(ast.NodeVisitor):
         self._function = False
 
     def visit_FunctionDef(self, node):
-        if self._function:  # a function within one counts as part of it
+        if self._function:  # an inner function counts as part of the outer one
             return self.generic_visit(node)
         self._function = True
         self.visit_ClassDef(node)
@@ -121,7 +121,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def _source(self, node):
-        """Return a node's text, its first line if it has more."""
+        """Return the first line of a node's text."""
         end = node.end_col_offset if node.lineno == node.end_lineno else None
         return self.lines[node.lineno - 1][node.col_offset : end].decode()
 
@@ -147,7 +147,7 @@ def all_faults(root: Path, folders: tuple[str, ...]) -> list[Fault]:
 
 
 def drawn(root: Path, faults: list[Fault], count: int, seed: int) -> list[Fault]:
-    """Return some of the faults: kinds in turn, at most one per line, all with valid syntax.
+    """Return some faults with valid syntax, at most one per line; the kinds alternate.
 
     Their order depends only on their own source, so that a change elsewhere changes few of them.
     """

@@ -41,14 +41,14 @@ LAWS = ("linear", "nonlinear")
 LOADS_N = (1000.0, 2500.0)
 VARUS_DEG = (0.0, 0.3)
 LEAST_PRESSURE = 0.1e6
-"""Pa; nodes with a smaller pressure do not count towards the area."""
+"""Pa: smallest pressure of a node that counts towards the area."""
 WARM_PRESSES = 5
 LIMITS = {
     ("lattice", "linear"): {"approach": 2.0, "force": 2.0, "peak": 4.0, "area": 5.0},
     ("fe", "linear"): {"approach": 1.5, "peak": 2.0},
     ("lattice", "nonlinear"): {"approach": 5.0},
 }
-"""Largest difference from `PEER` that was specified, in per cent."""
+"""Largest specified difference from `PEER`, per cent."""
 DOCS, DATA = ROOT / "docs", ROOT / "scripts" / "data"
 
 
@@ -90,7 +90,7 @@ def took_row(job, nodes, prepare, cold, warm, memory):
 
 
 def found(result):
-    """Return the quantities of a result to compare, defined alike for every model.
+    """Return the quantities to compare, with the same definition for every model.
 
     The effective area is (sum F)²/sum(F p). A uniform pressure on this area has the same force and
     the same sum(F p). Nodes with a very small pressure hardly change it.
@@ -113,7 +113,7 @@ def same_case(row):
 
 
 def differences(row, peer):
-    """Return the differences of a row from the peer's, in per cent; of both condyles the larger."""
+    """Return the differences of a row from the peer's, per cent; the larger of both condyles."""
     forces = [row[side] / peer[side] - 1 for side in ("medial_N", "lateral_N")]
     apart = {
         "approach": row["approach_mm"] / peer["approach_mm"] - 1,
@@ -213,7 +213,7 @@ def picture(rows):
 
 
 def measured_rows(options):
-    """Return the rows of all jobs; finished rows come first."""
+    """Return the rows of all jobs, finished rows first."""
     find_program()
     kept = KeptRows(claim_directory(options.out), options.resume)
     rows = []
@@ -246,8 +246,8 @@ def main():
     parser.add_argument("--varus", type=float, nargs="+", default=VARUS_DEG, metavar="DEG")
     parser.add_argument("--laws", nargs="+", choices=LAWS, default=LAWS)
     parser.add_argument("--out", type=Path, metavar="FOLDER")
-    parser.add_argument("--resume", action="store_true", help="keep the rows that are there")
-    parser.add_argument("--page", action="store_true", help="make the page in docs/")
+    parser.add_argument("--resume", action="store_true", help="keep finished rows")
+    parser.add_argument("--page", action="store_true", help="write the page in docs/")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:

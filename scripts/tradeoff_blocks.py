@@ -1,4 +1,4 @@
-"""The trade-off as blocks of Markdown between two markers, made from the study's JSON alone."""
+"""Blocks of Markdown on the trade-off, from the study's JSON."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -82,7 +82,7 @@ def short_block(rows: Sequence[Row]) -> list[str]:
 def known_errors_json(rows: Sequence[Row], cases: Sequence[ErrorRow] = ()) -> str:
     """Return the text of `tkamb/run/known_errors.json`, setting by setting.
 
-    Settings of another program are left out, and those that failed on a case of the study.
+    Settings of another program, and settings that failed on a case of the study, are left out.
 
     Args:
         rows: rows of the trade-off study, whose material is polyethylene.
@@ -128,7 +128,7 @@ def _known_error(
 
 
 def _settings(rows: Sequence[Row]) -> dict[Setting, list[Row]]:
-    """Return the rows of each setting, a model's variants together, coarse resolutions first."""
+    """Return the rows of each setting, sorted by model, with coarse resolutions first."""
     found: dict[Setting, list[Row]] = {}
     for row in rows:
         found.setdefault(setting_of(row), []).append(row)

@@ -1,4 +1,4 @@
-"""What every test finds: Ctrl-C as a terminal sends it, and a browser for those that ask."""
+"""Setup of all tests: the usual handler of Ctrl-C, and a fixture of a browser."""
 
 import signal
 
@@ -6,12 +6,12 @@ import pytest
 
 import headless
 
-# A shell that starts the tests in the background has them, and what they start, ignore SIGINT.
+# Tests that a shell starts in the background, and their child processes, would ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
 def chromium():
-    """One browser for all pages of the tests."""
+    """Return one browser for all tests."""
     with headless.chromium() as browser:
         yield browser

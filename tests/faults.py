@@ -1,4 +1,4 @@
-"""File operations of which a chosen one fails, as on a full or broken disk."""
+"""Simulated failure of one file operation, as on a full or broken disk."""
 
 import builtins
 import io
@@ -14,10 +14,10 @@ ERRORS = (ENOSPC, EIO, EACCES)
 
 
 class Faults:
-    """Counts the opens, writes, flushes, syncs and renames in one folder; one of them fails.
+    """Counts the opens, writes, flushes, syncs and renames in one folder, and makes one fail.
 
     Args:
-        folder: folder in which calls are counted; calls on other files are not touched.
+        folder: folder in which calls are counted; calls on other files are not changed.
         number: number of the call that fails, from 0; None: no call fails.
         error: errno of the failure.
     """
@@ -35,12 +35,12 @@ class Faults:
 
     @contextmanager
     def injected(self, patch):
-        """Replace the calls by versions that count and may fail while the block runs."""
+        """Replace the calls, while the block runs, by versions that count and may fail."""
         opened, path_of = io.open, {}
 
         def opening(file, mode="r", *args, **options):
             path = path_of.get(file, file) if isinstance(file, int) else file
-            if not isinstance(file, int):  # else it is open already
+            if not isinstance(file, int):  # a descriptor is open already
                 self.hit("open", path)
             stream = opened(file, mode, *args, **options)
             if any(letter in mode for letter in "wxa+"):
@@ -53,7 +53,7 @@ class Faults:
             path_of[descriptor] = path
             return descriptor
 
-        def synced(descriptor):  # counted, and left out: tests have no power cuts
+        def synced(descriptor):  # counted but not executed: tests have no power cuts
             self.hit("fsync", os.readlink(f"/proc/self/fd/{descriptor}"))
 
         with patch.context() as inner:

@@ -12,7 +12,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
 def write_mirrored_patient(folder):
-    """Write the left twin into `folder`; return its scene's path."""
+    """Write the mirrored patient into `folder`; return the path of its scene."""
     import tomllib
 
     scene = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))
@@ -46,9 +46,9 @@ def mirror_mesh(path):
 
 def _negate_columns(path, names):
     rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    chosen = [rows[0].index(name) for name in names]
+    columns = [rows[0].index(name) for name in names]
     for row in rows[1:]:
-        for k in chosen:
+        for k in columns:
             row[k] = repr(-float(row[k]))
     path.write_text("\n".join(",".join(row) for row in rows) + "\n", encoding="utf-8")
 
@@ -67,7 +67,7 @@ def _mirrored_urdf(text):
 
     def axis(match):
         x, y, z = (float(part) for part in match[2].split())
-        z = -z  # the first rule has negated z of every axis: restore the axis of the right knee
+        z = -z  # undo the first substitution, which has negated z of every axis
         if match[1] in ("revolute", "continuous"):
             x, y = -x, -y
         return match[0].replace(match[2], f"{x + 0.0!r} {y + 0.0!r} {z + 0.0!r}")

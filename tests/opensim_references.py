@@ -1,6 +1,6 @@
-"""What OpenSim computes: kept in tests/data, or made now where OpenSim is at hand.
+"""Results of OpenSim, stored in tests/data.
 
-TKAMB_OPENSIM_PYTHON may name a Python that has `opensim`; the numbers are then made anew.
+If TKAMB_OPENSIM_PYTHON names a Python with `opensim`, the results are computed instead.
 """
 
 import json
@@ -19,7 +19,7 @@ WEIGHTS = np.sin(1.0 + np.arange(12.0)).reshape(3, 4)
 
 @cache
 def references() -> dict:
-    """Return model name -> what OpenSim says of it."""
+    """Return model name -> results of OpenSim."""
     python = os.environ.get("TKAMB_OPENSIM_PYTHON")
     if python is None:
         return json.loads((ROOT / "tests" / "data" / "opensim_references.json").read_text())

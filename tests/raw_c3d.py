@@ -1,4 +1,4 @@
-"""C3D files byte by byte: of any machine, in integers or floats, with any parameter."""
+"""Writer of C3D files of any machine, in integers or floats, with any parameter."""
 
 import struct
 from pathlib import Path
@@ -9,7 +9,7 @@ MACHINES = {"intel": 84, "dec": 85, "mips": 86}
 
 
 class RawC3d:
-    """Writes a recording as a machine would, from points (n, m, 3) and analog words (k, c)."""
+    """Writes a recording in the number format of a machine."""
 
     def __init__(self, machine="intel", *, integers=False, scale=0.1, first=1, rate=100.0):
         self.machine, self.integers, self.scale = machine, integers, scale
@@ -23,7 +23,7 @@ class RawC3d:
         return self
 
     def float32(self, values):
-        """Return floats as the machine has them."""
+        """Return the bytes of 32-bit floats in the machine's format."""
         values = np.asarray(values, float)
         if self.machine != "dec":
             return values.astype(self.order + "f4").tobytes()
@@ -31,11 +31,14 @@ class RawC3d:
         return np.ascontiguousarray(halves).tobytes()
 
     def int16(self, values):
-        """Return 16-bit integers, signed or not."""
+        """Return the bytes of 16-bit integers, signed or unsigned."""
         return np.asarray(values, np.int64).astype(self.order + "u2").tobytes()
 
     def write(self, path: Path, points, analog=None, samples=10, frames=None):
-        """Write the file; `frames` is what its header states, by default what it holds."""
+        """Write a file of points (n, m, 3) and analog words (k, c).
+
+        The header states `frames`, by default the number of frames in the file.
+        """
         count, markers = points.shape[:2]
         channels = 0 if analog is None else analog.shape[1]
         stated = -self.scale if not self.integers else self.scale
@@ -61,7 +64,7 @@ class RawC3d:
         return path
 
     def _section(self):
-        """Return the parameter section, whole blocks."""
+        """Return the parameter section, filled to whole blocks."""
         records = []
         for number, (group, values) in enumerate(self.parameters.items(), 1):
             records.append((-number, group, b"\0"))

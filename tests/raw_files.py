@@ -1,7 +1,7 @@
-"""Raw files of a scene, read and smoothed with numpy and scipy alone: nothing of tkamb.
+"""Readers of a scene's files and a filter, with numpy and scipy only, independent of tkamb.
 
-Tables (.csv, .sto), markers (.trc), binary STL; the quintic smoothing spline that
-`tkamb.io.recordings.filtering` documents, written anew.
+Files are tables (.csv, .sto), markers (.trc) and binary STL. The filter is a second implementation
+of the quintic smoothing spline of `tkamb.io.recordings.filtering`.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 
 def read_table(path):
-    """Return the columns of a .csv or .sto file."""
+    """Return name -> column (n,) of a .csv or .sto file."""
     lines = Path(path).read_text(encoding="utf-8").splitlines()
     if Path(path).suffix == ".sto":
         lines = lines[[line.strip() for line in lines].index("endheader") + 1 :]
@@ -58,7 +58,7 @@ def rotation(sequence, degrees):
 
 
 def axes_matrix(text):
-    """Return R with v_here = R v_file of "-x,+y,-z"."""
+    """Return R with v_anatomical = R v_file, for file axes like "-x,+y,-z"."""
     rows = [np.eye(3)["xyz".index(a[1])] * (-1 if a[0] == "-" else 1) for a in text.split(",")]
     return np.array(rows)
 
@@ -88,7 +88,7 @@ def smoothed(time, values, cutoff):
 
 
 def smoothed_cycle(time, values, cutoff):
-    """Return the smoothing spline of one closed cycle: the middle one of three."""
+    """Return the smoothing spline of three equal cycles; its middle is that of a closed cycle."""
     once = np.array(values, float)
     once[0] = once[-1] = 0.5 * (once[0] + once[-1])
     period = time[-1] - time[0]
@@ -96,8 +96,9 @@ def smoothed_cycle(time, values, cutoff):
     return smoothed(times, np.concatenate([once[:-1], once[:-1], once]), cutoff)
 
 
-def fit(own_mm, seen):
-    """Return the pose that carries points (m, 3) mm nearest to those seen (m, 3) m."""
-    own, seen = np.array(list(own_mm)) / 1e3, np.array(seen)
-    turn, _ = Rotation.align_vectors(seen - seen.mean(axis=0), own - own.mean(axis=0))
-    return pose(turn.as_matrix(), seen.mean(axis=0) - turn.apply(own.mean(axis=0)))
+def fit(reference_mm, measured):
+    """Return the pose that moves reference points (m, 3) mm nearest to measured points (m, 3) m."""
+    reference, measured = np.array(list(reference_mm)) / 1e3, np.array(measured)
+    centre, mean = reference.mean(axis=0), measured.mean(axis=0)
+    turn, _ = Rotation.align_vectors(measured - mean, reference - centre)
+    return pose(turn.as_matrix(), mean - turn.apply(centre))

@@ -1,4 +1,4 @@
-"""The shipped knee bend as a starting point: copies of its scene with keys changed or left out."""
+"""Copies of the shipped knee bend, with keys of its scene changed or left out."""
 
 import shutil
 import tempfile
@@ -8,18 +8,18 @@ from pathlib import Path
 
 MODEL = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 HELD = []
-"""Folders that go when the tests end."""
+"""Temporary folders, which are deleted when the tests end."""
 
 
 def write_scene(folder, drop=(), **changes):
     """Write a copy of the shipped patient into `folder`; return the scene's path.
 
-    The contact is by `foundation`, for speed, unless the changes name another.
+    The contact model is `foundation`, for speed, unless the changes name another model.
 
     Args:
-        folder: where to; the model's files are copied there.
+        folder: the new folder, with copies of all files of the patient.
         drop: tables to leave out.
-        changes: "table__key" = value.
+        changes: "table__key" = value; None removes the key.
     """
     shutil.copytree(MODEL, folder, dirs_exist_ok=True)
     content = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))
@@ -43,7 +43,7 @@ def write_scene(folder, drop=(), **changes):
 
 @cache
 def fast_scene():
-    """Return the path of the shipped scene by `foundation`, the same for all tests."""
+    """Return the path of a copy of the shipped scene with `foundation`, which all tests share."""
     held = tempfile.TemporaryDirectory(prefix="tkamb-tests-")
     HELD.append(held)
     return write_scene(Path(held.name) / "deep_knee_bend")

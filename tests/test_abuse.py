@@ -1,4 +1,4 @@
-"""A few of the inputs of scripts/study_abuse and scripts/fuzz_http: none breaks anything."""
+"""Some abusive inputs of scripts/study_abuse and scripts/fuzz_http do no damage."""
 
 import subprocess
 import sys
@@ -21,12 +21,12 @@ def test_abusive_inputs_break_nothing(inputs, seed):
         "--seed",
         str(seed),
     ]
-    ran = subprocess.run(command, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == 0, process.stdout + process.stderr
 
 
 def test_hostile_requests_break_no_server():
-    """To `tkamb view` and `tkamb live`."""
+    """The servers are those of `tkamb view` and `tkamb live`."""
     command = [sys.executable, SCRIPTS / "fuzz_http", "--inputs", "150"]
-    ran = subprocess.run(command, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == 0, process.stdout + process.stderr

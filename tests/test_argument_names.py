@@ -1,4 +1,4 @@
-"""Messages name the argument to a caller in Python, and the option on the command line."""
+"""An error names the argument in Python, and the option on the command line."""
 
 from pathlib import Path
 

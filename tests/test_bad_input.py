@@ -1,4 +1,4 @@
-"""Bad input: one line that says what, where and how to mend it, exit status 2, nothing written."""
+"""Bad input gives one line (what, where, what to do), exit status 2 and no output folder."""
 
 import csv
 
@@ -11,7 +11,7 @@ from tkamb.cli import main
 
 
 def refused(capfd, *arguments):
-    """Run the command line and return its one line on stderr."""
+    """Run a command that must refuse its input, and return its one line on stderr."""
     assert main([str(argument) for argument in arguments]) == 2
     lines = capfd.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
@@ -65,7 +65,7 @@ def rewrite(path, change):
         ({"implant__femoral__position_mm": [0.0, 40.0, 0.0]}, "neither condyle is near"),
     ],
 )
-def test_scene_that_cannot_be_used(tmp_path, capfd, changes, words):
+def test_an_unusable_scene_is_refused(tmp_path, capfd, changes, words):
     assert words in run_refused(capfd, write_scene(tmp_path, **changes))
 
 
@@ -110,7 +110,7 @@ def test_singular_inertia(tmp_path, capfd):
 
 
 def test_urdf_with_a_joint_of_no_known_type(tmp_path, capfd):
-    """Pinocchio's parser prints lines of its own about it."""
+    """tkamb checks the type first, because Pinocchio's parser would print more lines."""
     path = write_scene(tmp_path)
     urdf = tmp_path / "patient.urdf"
     urdf.write_text(urdf.read_text().replace('"revolute"', '"hinge"', 1))
@@ -168,8 +168,8 @@ def test_time_in_milliseconds(tmp_path, capfd):
 
 def test_a_mesh_file_cut_short(tmp_path, capfd):
     path = write_scene(tmp_path)
-    whole = (tmp_path / "insert.stl").read_bytes()
-    (tmp_path / "insert.stl").write_bytes(whole[: len(whole) // 2])
+    content = (tmp_path / "insert.stl").read_bytes()
+    (tmp_path / "insert.stl").write_bytes(content[: len(content) // 2])
     assert "cut short" in run_refused(capfd, path)
 
 
@@ -187,7 +187,7 @@ def test_a_mesh_file_cut_short(tmp_path, capfd):
         (),
     ],
 )
-def test_bad_arguments_are_one_line_too(capfd, arguments):
+def test_bad_arguments_give_one_line(capfd, arguments):
     with pytest.raises(SystemExit) as caught:
         main(list(arguments))
     lines = capfd.readouterr().err.strip().splitlines()
@@ -197,7 +197,7 @@ def test_bad_arguments_are_one_line_too(capfd, arguments):
 
 
 @pytest.mark.parametrize("load", ["-5", "nan", "inf", "1e9"])
-def test_impossible_load(capfd, load):
+def test_an_impossible_load_is_refused(capfd, load):
     line = refused(
         capfd,
         "press",
@@ -235,5 +235,5 @@ def test_set_overrides_a_key_and_checks_it(tmp_path, capfd):
 
 
 @pytest.mark.parametrize("command", ["new", "wear"])
-def test_a_name_longer_than_a_folder_holds_is_one_line(capfd, command):
+def test_too_long_a_name_of_a_folder_gives_one_line(capfd, command):
     assert "File name too long" in refused(capfd, command, "n" * 300)

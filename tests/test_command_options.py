@@ -1,4 +1,4 @@
-"""Options that several commands have, and what the command line sets up."""
+"""The option --no-cache, and the number of threads that the command line sets."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ SCENE = fast_scene()
 
 
 @pytest.mark.slow
-def test_no_cache_reaches_the_model(tmp_path, monkeypatch, capsys):
+def test_no_cache_writes_no_cache(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "kept"))
     run = ["run", str(SCENE), "--frames", "50:51", "--resolution", "1.5", "--contact"]
     first, second = tmp_path / "first", tmp_path / "second"
@@ -26,14 +26,18 @@ def test_no_cache_reaches_the_model(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "third").exists()
 
 
-@pytest.mark.parametrize(("given", "threads"), [({}, "1"), ({"OMP_NUM_THREADS": "3"}, "3")])
-def test_blas_keeps_to_one_thread_unless_told_otherwise(given, threads):
+@pytest.mark.parametrize(("setting", "threads"), [({}, "1"), ({"OMP_NUM_THREADS": "3"}, "3")])
+def test_blas_uses_one_thread_unless_the_environment_sets_a_number(setting, threads):
     code = (
         "import os, sys; from tkamb.cli import main; main(['contact', 'list']); "
         "print(os.environ['OMP_NUM_THREADS'])"
     )
-    kept = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
-    ran = subprocess.run(
-        [sys.executable, "-c", code], env=kept | given, capture_output=True, text=True, check=True
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    process = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment | setting,
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    assert ran.stdout.splitlines()[-1] == threads
+    assert process.stdout.splitlines()[-1] == threads

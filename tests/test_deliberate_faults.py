@@ -1,4 +1,4 @@
-"""Each one-line fault of deliberate_faults.toml is noticed by the test that names its physics."""
+"""Each fault of deliberate_faults.toml, a change of one line, makes its test fail."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ def test_the_line_is_there_once_and_the_test_exists(fault):
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
-    """A copy of the project that faults are put into; data beside it by a link."""
+    """Return a copy of the project for the faults, with a link to the data beside it."""
     folder = tmp_path_factory.mktemp("faults")
     project = folder / "project"
     project.mkdir()
@@ -40,18 +40,18 @@ def tree(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault["physics"])
-def test_the_fault_is_noticed(tree, fault):
-    """The named test fails with the fault, and passes without it as part of the suite."""
+def test_the_fault_makes_its_test_fail(tree, fault):
+    """The named test fails with the fault. Without it, the test passes as part of the suite."""
     path = tree / fault["file"]
-    honest = path.read_text("utf-8")
-    path.write_text(honest.replace(fault["before"], fault["after"]), "utf-8")
+    original = path.read_text("utf-8")
+    path.write_text(original.replace(fault["before"], fault["after"]), "utf-8")
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", fault["test"]]
     settings = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
-        ended = subprocess.run(
+        process = subprocess.run(
             command, cwd=tree, env=os.environ | settings, capture_output=True, text=True
         )
     finally:
-        path.write_text(honest, "utf-8")
-    assert ended.returncode == 1, ended.stdout[-2000:]
-    assert "1 failed" in ended.stdout
+        path.write_text(original, "utf-8")
+    assert process.returncode == 1, process.stdout[-2000:]
+    assert "1 failed" in process.stdout

@@ -1,4 +1,4 @@
-"""Tables D-1 to D-12: whole, and each thing found wrong in them computed anew."""
+"""Tables D-1 to D-12 are complete, and each error found in them is computed again."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ FINDINGS = {row["check"]: row for row in d.findings()}
 
 
 def below_zero(values, rounding=5e-3):
-    """Percentages of the bend per design where values are negative by more than rounding."""
+    """Return design -> per cent of the knee bend at which values are below -rounding."""
     percent = d.table(1).percent.astype(int)
     cells = {name: percent[values[:, i] < -rounding].tolist() for i, name in enumerate(d.designs())}
     return {name: rows for name, rows in cells.items() if rows}

@@ -1,4 +1,4 @@
-"""The pages for newcomers: messages exist in the source, command lines are understood."""
+"""Documentation: quoted messages exist, command lines and links are valid, lists are complete."""
 
 import re
 import shlex
@@ -19,21 +19,21 @@ COMMAND = re.compile(r"^    tkamb (.+?)(?: {2,}#.*)?$", re.MULTILINE)
 
 
 def source_text():
-    """Return all of the source with the seams of strings that go on in the next line removed."""
+    """Return the source of the package, with strings of several lines joined."""
     text = "\n".join(p.read_text(encoding="utf-8") for p in sorted((ROOT / "tkamb").rglob("*.py")))
     return re.sub(r'"\s*\n\s*f?"', "", text)
 
 
-def test_every_message_of_the_page_is_one_of_the_program_s():
+def test_every_message_of_the_faq_is_in_the_source():
     text = source_text()
-    found = MESSAGE.findall((DOCS / "faq.md").read_text(encoding="utf-8"))
-    assert len(found) >= 15
-    missing = [words for words in found if words not in text]
+    messages = MESSAGE.findall((DOCS / "faq.md").read_text(encoding="utf-8"))
+    assert len(messages) >= 15
+    missing = [words for words in messages if words not in text]
     assert not missing
 
 
 @pytest.mark.parametrize("page", ["your_own_patient.md", "commands.md", "../README.md"])
-def test_every_command_line_of_the_page_is_understood(page):
+def test_every_command_line_of_the_page_is_parsed(page):
     lines = COMMAND.findall((DOCS / page).read_text(encoding="utf-8"))
     assert len(lines) > 5
     for line in lines:
@@ -41,7 +41,7 @@ def test_every_command_line_of_the_page_is_understood(page):
             _parser().parse_args(shlex.split(line))
 
 
-def test_every_link_between_the_pages_leads_somewhere():
+def test_every_link_between_pages_leads_to_a_file():
     pages = [*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "models").glob("*/README.md")]
     for page in pages:
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
@@ -49,13 +49,13 @@ def test_every_link_between_the_pages_leads_somewhere():
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_the_paper_s_numbers_stand_in_the_pages_that_they_link():
+def test_numbers_of_the_paper_are_on_the_linked_pages():
     text = (DOCS / "paper.md").read_text(encoding="utf-8")
     quoted = re.findall(r"\[([\d.]+(?: of \d+)?)\]\(([a-z_]+\.md)\)", text)
     assert len(quoted) >= 5
     for number, page in quoted:
-        there = (DOCS / page).read_text(encoding="utf-8")
-        assert re.search(rf"(?<![\d.]){re.escape(number)}(?![\d.]*\d)", there), (number, page)
+        linked = (DOCS / page).read_text(encoding="utf-8")
+        assert re.search(rf"(?<![\d.]){re.escape(number)}(?![\d.]*\d)", linked), (number, page)
 
 
 def test_every_page_is_on_the_site_and_in_the_list():
@@ -67,15 +67,15 @@ def test_every_page_is_on_the_site_and_in_the_list():
         assert name == "pages.md" or f"({name})" in listed, f"add {name} to pages.md"
 
 
-def test_the_readme_s_python_runs_after_its_first_command():
-    """The demo installs no extra: the example must do without pandas and its like."""
+def test_the_python_example_of_the_readme_runs():
+    """The example needs no optional package, because the demo installs none."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
     extras = ("pandas", "pyvista", "daqp", "pooch", "pyarrow", "distributed", "playwright")
     code = f"import sys\nsys.modules.update(dict.fromkeys({extras}))\n{example}"
-    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
-    assert ran.stdout.strip().endswith(")")
+    process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.strip().endswith(")")
 
 
 def test_the_readme_is_two_screens_and_the_changelog_one():
@@ -83,14 +83,14 @@ def test_the_readme_is_two_screens_and_the_changelog_one():
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 80
 
 
-def test_one_version_everywhere():
+def test_citation_changelog_and_package_have_one_version():
     cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert f"version: {tkamb.__version__}\n" in cited
     released = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(r"^## (\S+) - \d{4}-\d\d-\d\d$", released, re.M).group(1) == tkamb.__version__
 
 
-def test_all_brings_every_extra_that_a_user_may_want():
+def test_the_extra_all_installs_every_extra_for_users():
     with (ROOT / "pyproject.toml").open("rb") as file:
         extras = tomllib.load(file)["project"]["optional-dependencies"]
     (everything,) = extras["all"]

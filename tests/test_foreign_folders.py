@@ -1,4 +1,4 @@
-"""Folders of results from other people: no file outside is read, one line refuses them."""
+"""A forged folder of results is refused in one line, and no file outside it is read."""
 
 import json
 import shutil
@@ -20,8 +20,8 @@ from forged_folders import SECRET, _rehash
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("foreign") / "results"
-    given = ["--contact", "foundation", "--resolution", "6", "--frames", "0:1"]
-    assert main(["run", str(MODEL / "scene.toml"), *given, "--out", str(out)]) == 0
+    options = ["--contact", "foundation", "--resolution", "6", "--frames", "0:1"]
+    assert main(["run", str(MODEL / "scene.toml"), *options, "--out", str(out)]) == 0
     return out
 
 
@@ -35,9 +35,9 @@ def copy(results, tmp_path):
 def refused(capfd, *arguments):
     capfd.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1 and "not foreseen" not in said
-    return said
+    message = capfd.readouterr().err
+    assert message.count("\n") == 1 and "not foreseen" not in message
+    return message
 
 
 @pytest.mark.parametrize("how", ["external", "link", "soft", "virtual"])
@@ -59,8 +59,8 @@ def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, how):
             layout[:] = h5py.VirtualSource(str(secret), "x", shape=shape)
             file.create_virtual_dataset("points_m", layout)
     _rehash(copy)
-    said = refused(capfd, "export", copy, "--vtp", "--out", tmp_path / "made")
-    assert "points_m" in said and ("link" in said or "another file" in said)
+    message = refused(capfd, "export", copy, "--vtp", "--out", tmp_path / "made")
+    assert "points_m" in message and ("link" in message or "another file" in message)
     assert not (tmp_path / "made").exists()
 
 
@@ -84,7 +84,7 @@ def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, how):
         ("saturated_muscles", ["soleus"]),
     ],
 )
-def test_a_summary_of_other_kinds_is_refused(copy, capfd, key, value):
+def test_a_summary_with_values_of_wrong_types_is_refused(copy, capfd, key, value):
     path = copy / "summary.json"
     sys.set_int_max_str_digits(0) if value == 10**400 else None
     path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
@@ -94,14 +94,16 @@ def test_a_summary_of_other_kinds_is_refused(copy, capfd, key, value):
 
 
 @pytest.mark.parametrize("key", ["friction", "resolution_mm"])
-def test_a_contact_table_of_other_values_is_refused_by_wear(copy, tmp_path, capfd, key):
+def test_a_negative_contact_value_in_the_summary_is_refused_by_wear(copy, tmp_path, capfd, key):
     path = copy / "summary.json"
     content = json.loads(path.read_text())
     content["contact"] |= {key: -1}
     path.write_text(json.dumps(content))
     _rehash(copy)
-    said = refused(capfd, "wear", copy, "--cycles", 1, "--updates", 1, "--out", tmp_path / "made")
-    assert f"contact.{key}" in said
+    message = refused(
+        capfd, "wear", copy, "--cycles", 1, "--updates", 1, "--out", tmp_path / "made"
+    )
+    assert f"contact.{key}" in message
 
 
 def test_a_frame_without_its_flexion_is_refused(copy, capfd):
@@ -130,7 +132,7 @@ def test_maps_of_another_shape_are_refused(copy, capfd):
     assert "pressure_Pa" in refused(capfd, "report", copy)
 
 
-def test_verify_writes_control_characters_out_and_errors_to_stderr(copy, capfd):
+def test_verify_escapes_control_characters_and_writes_errors_to_stderr(copy, capfd):
     path = copy / "summary.json"
     summary = json.loads(path.read_text())
     summary["inputs"] = {"/nothing/\x1b[31mred\nline": "0" * 64}
@@ -138,6 +140,6 @@ def test_verify_writes_control_characters_out_and_errors_to_stderr(copy, capfd):
     _rehash(copy)
     capfd.readouterr()
     assert main(["verify", str(copy)]) == 1
-    shown = capfd.readouterr()
-    assert "\x1b" not in shown.out + shown.err
-    assert "no such file" in shown.err
+    printed = capfd.readouterr()
+    assert "\x1b" not in printed.out + printed.err
+    assert "no such file" in printed.err

@@ -1,4 +1,4 @@
-"""The gallery's examples: each runs, leaves its picture and holds the number that it asserts."""
+"""Each example of the gallery runs, writes its picture and passes its assertions."""
 
 import runpy
 from pathlib import Path
@@ -10,12 +10,12 @@ EXAMPLES = sorted(GALLERY.glob("*.py"))
 
 
 RECORDED = {"dm_gait": "dm", "jw_squat": "jw"}
-"""Example -> the subject whose recordings it needs."""
+"""Example -> subject of the recordings that it needs."""
 SLOW = {"cohort", "insert_shapes", "knee_drop", *RECORDED}
 
 
 def marked(example):
-    """The example as a parameter: slow and skipped without data where it is on recordings."""
+    """Return an example as a parameter. Examples with recordings are slow and need their data."""
     marks = [pytest.mark.slow] if example.stem in SLOW else []
     if example.stem in RECORDED:
         folder = Path(__file__).parents[2] / "shared" / "data" / RECORDED[example.stem]
@@ -25,7 +25,7 @@ def marked(example):
 
 
 @pytest.mark.parametrize("example", [marked(example) for example in EXAMPLES])
-def test_the_example_holds_its_number(example, tmp_path, monkeypatch):
+def test_the_example_passes_its_assertions(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     runpy.run_path(str(example))
@@ -33,6 +33,6 @@ def test_the_example_holds_its_number(example, tmp_path, monkeypatch):
     assert (GALLERY / f"{example.stem}.png").is_file(), "run scripts/make_gallery"
 
 
-def test_there_are_examples_that_assert_something():
+def test_every_example_has_an_assertion():
     assert len(EXAMPLES) >= 12
     assert all("\nassert " in path.read_text(encoding="utf-8") for path in EXAMPLES)

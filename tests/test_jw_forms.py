@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(
     not JW.is_dir(), reason="subject JW's files are not beside the project"
 )
 FORCES_N = {2.275: 1039.0, 2.675: 838.0, 3.475: 1006.0, 3.675: 861.0}
-"""Time (s) -> total contact force (N) of the original model, as an earlier version computed it.
+"""Time (s) -> total contact force (N) of the original model, by an earlier version of tkamb.
 
 The contact model is the elastic foundation at a resolution of 3 mm.
 """
@@ -25,11 +25,11 @@ def original() -> str:
 
 def cut(text: str, tag: str, folder: Path) -> str:
     """Move a set of the model into its own file; return the text that refers to this file."""
-    found = re.search(rf"<{tag} .*?</{tag}>", text, re.S)
-    assert found
-    held = f'<OpenSimDocument Version="40000">{found[0]}</OpenSimDocument>'
-    (folder / f"{tag}.xml").write_text(held, encoding="utf-8")
-    return text.replace(found[0], f'<{tag} file="{tag}.xml"/>')
+    match = re.search(rf"<{tag} .*?</{tag}>", text, re.S)
+    assert match
+    document = f'<OpenSimDocument Version="40000">{match[0]}</OpenSimDocument>'
+    (folder / f"{tag}.xml").write_text(document, encoding="utf-8")
+    return text.replace(match[0], f'<{tag} file="{tag}.xml"/>')
 
 
 def massless(text: str, inertia: str) -> str:
@@ -59,7 +59,7 @@ def form(name: str, folder: Path) -> bytes:
 
 
 def imported(model: Path, out: Path) -> Path:
-    """Import og3's walk with a model; return the scene."""
+    """Import the gait trial og3 with a model; return the path of the scene."""
     mesh = JW / "geometry"
     arguments = ["import", model, "--c3d", JW / "motion" / "jw_ngait_og3.c3d", "--side", "right"]
     arguments += ["--mass-kg", "66.7", "--femoral", mesh / "femoral_component.stl"]

@@ -1,4 +1,4 @@
-"""The page of `tkamb live` in a headless browser: keys, sliders, states that fail, what is kept."""
+"""The page of `tkamb live` in a headless browser: keys, sliders, failed states, saved states."""
 
 import io
 
@@ -25,8 +25,8 @@ def page(chromium, tmp_path_factory):
     server.close()
 
 
-def at_rest(page, action):
-    """Do something, and return the state of the page when all is answered."""
+def state_after(page, action):
+    """Do an action, and return the state of the page after all answers."""
     page.evaluate(action)
     page.wait(f"{IDLE} && !tkamb.bench.timer")
     return page.evaluate(
@@ -48,7 +48,7 @@ def test_a_knee_object_has_a_page_without_frames(page):
     assert page.evaluate("() => document.getElementById('pose-thickness_mm')") is None
 
 
-def test_a_key_moves_a_slider_and_the_fine_model_answers(page):
+def test_a_key_moves_a_slider_and_the_fine_model_is_computed(page):
     page.evaluate("() => document.getElementById('pose-flexion_deg').focus()")
     before = page.evaluate("() => tkamb.bench.state.flexion_deg")
     page.press("ArrowRight")
@@ -57,29 +57,31 @@ def test_a_key_moves_a_slider_and_the_fine_model_answers(page):
     assert page.evaluate("() => document.getElementById('mark').className") == ""
 
 
-def test_a_state_without_an_answer_says_why_and_keeps_the_last_one_grey(page):
-    good = at_rest(page, change("pose", "ap_mm", 0.0))
+def test_a_failed_state_shows_its_reason_and_the_last_numbers_in_grey(page):
+    good = state_after(page, change("pose", "ap_mm", 0.0))
     assert not good["stale"]
-    lost = at_rest(page, change("pose", "ap_mm", 55.0))
-    assert lost["stale"] and "does not lie over the insert" in lost["mark"]
-    assert (lost["shown"], lost["request"]) == (good["shown"], good["request"])
-    odd = at_rest(page, change("pose", "ap_mm", 70.0))
-    assert odd["stale"] and "-60 to 60" in odd["mark"]
+    dislocated = state_after(page, change("pose", "ap_mm", 55.0))
+    assert dislocated["stale"] and "does not lie over the insert" in dislocated["mark"]
+    assert (dislocated["shown"], dislocated["request"]) == (good["shown"], good["request"])
+    beyond = state_after(page, change("pose", "ap_mm", 70.0))
+    assert beyond["stale"] and "-60 to 60" in beyond["mark"]
     page.forgive("400")
-    assert not at_rest(page, change("pose", "ap_mm", 0.0))["stale"]
+    assert not state_after(page, change("pose", "ap_mm", 0.0))["stale"]
 
 
-def test_ticking_a_coordinate_releases_it(page):
-    held = at_rest(page, change("pose", "adduction_deg", 0.5))
-    free = at_rest(page, "() => tkamb.bench.inputs['release adduction_deg'].click()")
-    assert free["request"]["released"] == ["si", "adduction"]
-    assert free["numbers"]["adduction_deg"] != pytest.approx(0.5, abs=0.01)
-    assert free["numbers"]["medial_share"] != pytest.approx(held["numbers"]["medial_share"], abs=1)
-    at_rest(page, "() => tkamb.bench.inputs['release adduction_deg'].click()")
+def test_a_ticked_coordinate_is_released(page):
+    prescribed = state_after(page, change("pose", "adduction_deg", 0.5))
+    released = state_after(page, "() => tkamb.bench.inputs['release adduction_deg'].click()")
+    assert released["request"]["released"] == ["si", "adduction"]
+    assert released["numbers"]["adduction_deg"] != pytest.approx(0.5, abs=0.01)
+    assert released["numbers"]["medial_share"] != pytest.approx(
+        prescribed["numbers"]["medial_share"], abs=1
+    )
+    state_after(page, "() => tkamb.bench.inputs['release adduction_deg'].click()")
 
 
-def test_what_is_kept_stands_in_a_row_and_runs(page):
-    at_rest(page, change("tibial", "slope_deg", 4.0))
+def test_a_saved_state_has_a_row_and_a_scene_that_runs(page):
+    state_after(page, change("tibial", "slope_deg", 4.0))
     page.evaluate("() => document.getElementById('keep').click()")
     page.wait("document.getElementById('saved').textContent.startsWith('saved: ')")
     path = page.evaluate("() => document.getElementById('saved').textContent").split(": ")[1]
@@ -89,8 +91,8 @@ def test_what_is_kept_stands_in_a_row_and_runs(page):
     assert page.problems == []
 
 
-def test_the_saved_picture_holds_the_map_and_words_below_it(page):
-    at_rest(page, "() => document.getElementById('reset').click()")
+def test_the_saved_picture_has_the_map_and_text_below_it(page):
+    state_after(page, "() => document.getElementById('reset').click()")
     assert page.evaluate("() => tkamb.bench.answer.request.tibial.slope_deg") == 0.0
     picture = np.asarray(Image.open(io.BytesIO(page.saved("#picture"))).convert("RGB"), int)
     pane = page.evaluate("() => document.getElementById('pane').clientHeight")
@@ -101,7 +103,7 @@ def test_the_saved_picture_holds_the_map_and_words_below_it(page):
 
 
 def test_every_text_has_enough_contrast(page):
-    """WCAG 2.2, success criterion 1.4.3: 4.5 to 1, disabled and hidden elements left out."""
+    """The limit is 4.5 to 1 (WCAG 2.2, criterion 1.4.3). Hidden elements are not checked."""
     assert page.evaluate(CONTRAST) == []
 
 

@@ -99,7 +99,7 @@ def test_mirrored_twice_is_the_same_and_stays_outward():
 
 def test_wrong_unit_names_the_right_one(tmp_path):
     path = save(tmp_path / "plate.stl", plate())
-    message = refused("no such part", path, "m")
+    message = refused("no size of a part", path, "m")
     assert "'mm' would make it 60 mm" in message
 
 

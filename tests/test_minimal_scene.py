@@ -1,4 +1,4 @@
-"""Only what the scene requires: which files are opened and which modules are imported."""
+"""A run opens only the files and imports only the modules that its scene requires."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ print(json.dumps({
 }))
 """
 
-SHOWN = """
+REPORT = """
 import sys
 import tkamb.show.report, tkamb.run.results_folder
 heavy = ("scipy", "trimesh", "pinocchio", "pydantic", "fcl", "numba")
@@ -34,54 +34,57 @@ print([name for name in heavy if name in sys.modules])
 MUSCLES = ("quadriceps", "patellar_ligament", "patella")
 
 
-def watched(path):
-    done = subprocess.run(
+def traced_run(path):
+    """Run a scene; return its opened files, imported modules, status and flexion moment."""
+    process = subprocess.run(
         [sys.executable, "-c", WATCH, str(path)], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    assert process.returncode == 0, process.stderr
+    return json.loads(process.stdout)
 
 
-def test_a_report_waits_for_nothing_that_computes():
-    done = subprocess.run([sys.executable, "-c", SHOWN], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+def test_a_report_imports_no_numerical_library():
+    process = subprocess.run(
+        [sys.executable, "-c", REPORT], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == "[]"
 
 
-def test_patient_and_motion_alone_touch_nothing_else(tmp_path):
+def test_a_scene_of_patient_and_motion_opens_only_their_files(tmp_path):
     drop = ("contact", "implant", "ligament", "tibia", "ground_reaction", *MUSCLES)
-    seen = watched(write_scene(tmp_path, drop))
-    names = {name.rsplit("/", 1)[-1] for name in seen["files"]}
+    record = traced_run(write_scene(tmp_path, drop))
+    names = {name.rsplit("/", 1)[-1] for name in record["files"]}
     assert names == {"scene.toml", "patient.urdf", "motion.csv"}
-    for module in seen["modules"]:
+    for module in record["modules"]:
         assert not module.startswith(("tkamb.contact", "tkamb.run.maps"))
         assert module not in (
             "tkamb.knee.ligaments",
             "tkamb.knee.extensor",
             "tkamb.io.recordings.meshes",
         )
-    assert seen["others"] == []
-    assert seen["status"] == ["ok"] * 3
+    assert record["others"] == []
+    assert record["status"] == ["ok"] * 3
 
 
 def test_without_contact_no_mesh_is_read_and_no_contact_imported(tmp_path):
-    seen = watched(write_scene(tmp_path, ("contact", *MUSCLES)))
-    assert not any(name.endswith(".stl") for name in seen["files"])
-    assert not any(module.startswith("tkamb.contact") for module in seen["modules"])
-    assert "tkamb.knee.ligaments" in seen["modules"]
+    record = traced_run(write_scene(tmp_path, ("contact", *MUSCLES)))
+    assert not any(name.endswith(".stl") for name in record["files"])
+    assert not any(module.startswith("tkamb.contact") for module in record["modules"])
+    assert "tkamb.knee.ligaments" in record["modules"]
 
 
 def test_without_ligaments_no_ligament_module(tmp_path):
-    seen = watched(write_scene(tmp_path, ("ligament",)))
-    assert "tkamb.knee.ligaments" not in seen["modules"]
-    assert "tkamb.contact.foundation" in seen["modules"]
-    assert not any("lattice" in module or "hertz" in module for module in seen["modules"])
+    record = traced_run(write_scene(tmp_path, ("ligament",)))
+    assert "tkamb.knee.ligaments" not in record["modules"]
+    assert "tkamb.contact.foundation" in record["modules"]
+    assert not any("lattice" in module or "hertz" in module for module in record["modules"])
 
 
-def test_parts_that_are_left_out_do_not_change_what_stays(tmp_path):
-    """The external moments hang on motion, segments and ground alone."""
-    whole = watched(write_scene(tmp_path / "a"))
-    bare = watched(write_scene(tmp_path / "b", ("contact", "implant", "ligament", *MUSCLES)))
+def test_external_moments_do_not_depend_on_omitted_parts(tmp_path):
+    """External moments depend on motion, segments and ground reaction only."""
+    whole = traced_run(write_scene(tmp_path / "a"))
+    bare = traced_run(write_scene(tmp_path / "b", ("contact", "implant", "ligament", *MUSCLES)))
     whole_moment, bare_moment = (np.array(s["flexion_moment"]) for s in (whole, bare))
-    # Without [patella] its 0.1 kg ride on the femur at the joint's neutral place.
+    # Without [patella], its mass of 0.1 kg is fixed to the femur.
     assert whole_moment == pytest.approx(bare_moment, abs=0.2)
     assert np.abs(whole_moment - bare_moment).max() > 0

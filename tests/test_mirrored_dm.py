@@ -1,8 +1,8 @@
-"""Subject DM written as a left knee: every file reflected, the same physics.
+"""Subject DM, written as a left knee, gives the same results.
 
-Reflection in the sagittal plane (z): meshes, poses, markers and plates as files, URDF, points
-of the scene. Places and forces change the sign of z; rotations and torques are pseudo-vectors,
-which change those of x and y. The files are written to a temporary folder.
+All files (meshes, poses, markers, plates, URDF) and the points of the scene are reflected in the
+sagittal plane. Positions and forces change the sign of z. Rotations and torques are pseudo-vectors:
+they change the signs of x and y. The files are written to a temporary folder.
 """
 
 import tomllib
@@ -36,33 +36,33 @@ needs_dm = pytest.mark.skipif(
 @pytest.mark.slow
 @needs_dm
 def test_mirrored_dm_is_the_same_knee(tmp_path):
-    """To 0.1 % of each column's size, in stance and swing, muscles and pressure included."""
+    """All columns agree to 0.1 % of their largest value, in stance and swing."""
     right = simulate(load_scene(MODEL / "scene.toml", FEW), frames=FRAMES)
     left = simulate(load_scene(write_mirrored_dm(tmp_path), FEW), frames=FRAMES)
     assert left["status"] == right["status"]
     assert np.isfinite(right["force_total_N"]).any()
     names = [n for n in right.columns if n not in (*TIMES, "status")]
     assert set(right.columns) == set(left.columns)
-    apart = {}
+    differences = {}
     for name in names:
-        one, other = right[name], left[name]
-        assert np.array_equal(np.isnan(one), np.isnan(other)), name
-        size = np.nanmax(np.abs(one), initial=0.0)
-        worst = np.nanmax(np.abs(one - other), initial=0.0)
+        original, mirrored = right[name], left[name]
+        assert np.array_equal(np.isnan(original), np.isnan(mirrored)), name
+        size = np.nanmax(np.abs(original), initial=0.0)
+        worst = np.nanmax(np.abs(original - mirrored), initial=0.0)
         if worst > 1e-3 * size + 1e-6:
-            apart[name] = (worst, size)
-    assert not apart
+            differences[name] = (worst, size)
+    assert not differences
 
 
 def test_a_moment_is_reflected_as_a_pseudo_vector():
-    """The reflection itself: a moment is the cross product of two reflected vectors."""
+    """A moment is the cross product of two reflected vectors."""
     point, force = np.array([0.1, -0.4, 0.03]), np.array([20.0, 700.0, -30.0])
     reflected = np.cross(MIRROR @ point, MIRROR @ force)
     assert np.allclose(reflected, -MIRROR @ np.cross(point, force))
 
 
 def write_mirrored_dm(folder):
-    """Write the left twin of subject DM into `folder`; return its scene's path."""
+    """Write subject DM as a left knee into `folder`; return the path of the scene."""
     scene = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))
     scene["patient"]["side"] = "left"
     urdf = (MODEL / "patient.urdf").read_text(encoding="utf-8")
@@ -72,11 +72,11 @@ def write_mirrored_dm(folder):
         table["mesh"] = source.name
         _write_stl(folder / source.name, read_stl(source)[:, ::-1] @ MIRROR)
     columns = scene["motion"]["columns"]
-    turned = [columns[role] for role in ("rotation_1", "rotation_2", "translation_3")]
-    _negate(scene["motion"], folder, turned)
+    negated = [columns[role] for role in ("rotation_1", "rotation_2", "translation_3")]
+    _negate(scene["motion"], folder, negated)
     columns = scene["ground_reaction"]["columns"]
-    turned = [columns[role] for role in ("force_3", "point_3", "moment_1", "moment_2")]
-    _negate(scene["ground_reaction"], folder, turned)
+    negated = [columns[role] for role in ("force_3", "point_3", "moment_1", "moment_2")]
+    _negate(scene["ground_reaction"], folder, negated)
     _mirror_markers(scene["tibia"], folder)
     _mirror_points(scene)
     path = folder / "scene.toml"
@@ -85,7 +85,7 @@ def write_mirrored_dm(folder):
 
 
 def _mirror_points(table):
-    """Flip every point of the scene, in place: keys that end in _mm and hold three numbers."""
+    """Reflect every point of the scene in place: keys that end in _mm, with three numbers."""
     for key, value in table.items():
         if isinstance(value, dict):
             _mirror_points(value)
@@ -101,14 +101,14 @@ def _mirror_points(table):
 
 
 def _negate(table, folder, names):
-    """Write the table's .sto with the sign of some columns turned."""
+    """Write the .sto file of a table with some columns negated."""
     source = MODEL / table["file"]
     table["file"] = source.name
     head, body = source.read_text(encoding="utf-8").split("endheader\n", 1)
     rows = [line.split("\t") for line in body.splitlines()]
-    chosen = [rows[0].index(name) for name in names]
+    columns = [rows[0].index(name) for name in names]
     for row in rows[1:]:
-        for k in chosen:
+        for k in columns:
             row[k] = _negated(row[k])
     text = head + "endheader\n" + "\n".join("\t".join(row) for row in rows) + "\n"
     (folder / source.name).write_text(text, encoding="utf-8")
@@ -126,7 +126,7 @@ def _mirror_markers(table, folder):
 
 
 def _negated(cell):
-    """Return a number's text with its sign turned; gaps stay gaps."""
+    """Return the text of a number with the opposite sign; gaps stay unchanged."""
     cell = cell.strip()
     if not cell or "nan" in cell:
         return cell

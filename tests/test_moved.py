@@ -22,30 +22,30 @@ from tkamb.moved import FOLDERS, MODULES, new_name
 )
 def test_an_old_path_gives_the_same_object_and_warns(old, new, name):
     code = f"from {old} import {name} as a; from {new} import {name} as b; assert a is b"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-W", "always", "-c", code], capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr
-    assert f"{old} is now {new}" in done.stderr
+    assert process.returncode == 0, process.stderr
+    assert f"{old} is now {new}" in process.stderr
 
 
-def test_a_module_stays_what_it_is_when_an_old_path_has_led_to_it():
+def test_a_module_keeps_its_name_and_files_after_an_import_by_its_old_path():
     code = (
         "import tkamb.output, tkamb.show; from importlib import reload, resources; "
         "assert tkamb.show.__spec__.name == tkamb.show.__name__ == 'tkamb.show'; "
         "assert resources.files('tkamb.show').joinpath('view').is_dir(); "
         "assert reload(tkamb.show) is tkamb.output"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
 
 
-def test_every_new_place_exists():
+def test_every_new_module_exists():
     for new in (*FOLDERS.values(), *MODULES.values()):
         import_module(new)
 
 
-def test_what_has_not_moved_is_left_alone():
+def test_names_of_modules_that_have_not_moved_are_unchanged():
     assert new_name("tkamb.contact.hertz") is None
     assert new_name("tkamb.bodyguard") is None
     assert new_name("tkamb.studies.stability") is None

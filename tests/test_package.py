@@ -1,4 +1,4 @@
-"""The wheel: built from the sdist, it holds every file of the package and nothing else."""
+"""The wheel that is built from the sdist holds exactly the files of the package."""
 
 import subprocess
 import sys
@@ -10,12 +10,12 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_the_wheel_made_from_the_sdist_holds_the_whole_package(tmp_path):
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, ROOT / "scripts" / "build_package.py", tmp_path],
         capture_output=True,
         text=True,
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     (wheel,) = tmp_path.glob("*.whl")
     assert len(list(tmp_path.glob("*.tar.gz"))) == 1
     listed = subprocess.run(
@@ -26,19 +26,19 @@ def test_the_wheel_made_from_the_sdist_holds_the_whole_package(tmp_path):
         (entry,) = (name for name in names if name.endswith("entry_points.txt"))
         assert "tkamb = tkamb.__main__:main" in archive.read(entry).decode()
         assert any(name.endswith("licenses/LICENSE") for name in names)
-    held = {name for name in names if ".dist-info/" not in name}
-    assert held == {name for name in listed if (ROOT / name).is_file()}
+    packed = {name for name in names if ".dist-info/" not in name}
+    assert packed == {name for name in listed if (ROOT / name).is_file()}
 
 
 def test_python_m_tkamb_is_the_command():
-    ran = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "tkamb", "--version"], capture_output=True, text=True, check=True
     )
-    assert ran.stdout.startswith("tkamb ")
+    assert process.stdout.startswith("tkamb ")
 
 
 def test_a_folder_that_holds_the_clone_does_not_hide_the_package(tmp_path):
-    """An editable install is a path: the clone's own folder, without __init__, comes after it."""
+    """With an editable install, a folder `tkamb` without __init__ does not hide the package."""
     (tmp_path / "tkamb").symlink_to(ROOT)
     with (ROOT / "pyproject.toml").open("rb") as file:
         assert tomllib.load(file)["tool"]["setuptools"]["package-dir"] == {"": "."}
@@ -51,7 +51,7 @@ def test_a_folder_that_holds_the_clone_does_not_hide_the_package(tmp_path):
         "import tkamb\n"
         "print(tkamb.__file__)"
     )
-    ran = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
     )
-    assert Path(ran.stdout.strip()).resolve() == ROOT / "tkamb" / "__init__.py"
+    assert Path(process.stdout.strip()).resolve() == ROOT / "tkamb" / "__init__.py"

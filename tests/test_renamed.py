@@ -1,4 +1,4 @@
-"""Python names of the last release that are spelt otherwise now still work, with a warning."""
+"""Renamed Python names of the last release still work, with a warning."""
 
 import importlib
 import pickle
@@ -25,8 +25,8 @@ def test_the_hint_of_an_error_is_accepted_under_its_former_name():
     ],
 )
 def test_a_renamed_class_is_found_under_its_former_name(module, former, name):
-    place = importlib.import_module(module)
+    module_object = importlib.import_module(module)
     with pytest.warns(DeprecationWarning, match=name):
-        assert getattr(place, former) is getattr(place, name)
+        assert getattr(module_object, former) is getattr(module_object, name)
     with pytest.raises(AttributeError, match="nothing_of_this"):
-        _ = place.nothing_of_this
+        _ = module_object.nothing_of_this

@@ -1,4 +1,4 @@
-"""`tkamb new`: its files run as they are, and it replaces no file of the user."""
+"""The files of `tkamb new` run unchanged, and the command replaces no file of the user."""
 
 import re
 
@@ -10,45 +10,45 @@ from scenes import MODEL
 from tkamb.cli import main
 
 
-def test_what_is_laid_out_runs_as_it_is(tmp_path):
+def test_the_new_scene_runs_unchanged(tmp_path):
     assert main(["new", str(tmp_path / "knee")]) == 0
     started = tkamb.simulate(tmp_path / "knee" / "scene.toml", contact="foundation")
     shipped = tkamb.simulate(MODEL / "scene.toml", contact="foundation", frames=slice(30, 81, 10))
     np.testing.assert_allclose(started["flexion_deg"], shipped["flexion_deg"], rtol=1e-6)
-    # Fewer triangles and two of the six ligaments: the leg and its loads are the shipped ones.
+    # The new scene has fewer triangles and two of the six ligaments, but the same leg and loads.
     np.testing.assert_allclose(started["quadriceps_N"], shipped["quadriceps_N"], rtol=0.02)
     np.testing.assert_allclose(started["force_total_BW"], shipped["force_total_BW"], rtol=0.05)
 
 
-def test_the_small_scene_of_the_page_is_the_starter_in_other_names_units_and_axes(tmp_path):
-    """Centimetres, a plate of its own axes and the force on the plate; the patella is solved."""
+def test_the_scene_of_the_page_gives_the_results_of_the_starter(tmp_path):
+    """The page has centimetres, other plate axes, the force on the plate and a solved patella."""
     assert main(["new", str(tmp_path / "knee")]) == 0
     page = (MODEL.parents[1] / "docs" / "your_own_patient.md").read_text(encoding="utf-8")
     written = re.findall(r"^`(\S+)`:\n\n```\w+\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert len(written) == 4
-    laid_out = {"ligament": [], "contact.model": "foundation", "contact.resolution_mm": 2.0}
+    overrides = {"ligament": [], "contact.model": "foundation", "contact.resolution_mm": 2.0}
     first = slice(0, 6, 5)
     started = tkamb.simulate(
-        tkamb.load_scene(tmp_path / "knee" / "scene.toml", laid_out), frames=first
+        tkamb.load_scene(tmp_path / "knee" / "scene.toml", overrides), frames=first
     )
     for name, text in written:
         (tmp_path / "knee" / name).write_text(text, encoding="utf-8")
-    own = tkamb.simulate(tmp_path / "knee" / "scene.toml", frames=first)
+    of_page = tkamb.simulate(tmp_path / "knee" / "scene.toml", frames=first)
     for name in ("ground_reaction_ap_N", "ground_reaction_si_N", "force_total_BW"):
-        np.testing.assert_allclose(own[name], started[name], rtol=1e-3)
-    # the solved patella against the recorded one, which was solved on finer meshes
-    np.testing.assert_allclose(own["quadriceps_N"], started["quadriceps_N"], rtol=3e-3)
-    assert "Nobody was measured" not in str(own.summary["notes"])
+        np.testing.assert_allclose(of_page[name], started[name], rtol=1e-3)
+    # The recorded patella of the starter was solved on finer meshes.
+    np.testing.assert_allclose(of_page["quadriceps_N"], started["quadriceps_N"], rtol=3e-3)
+    assert "Nobody was measured" not in str(of_page.summary["notes"])
 
 
-def test_a_folder_that_holds_something_is_left_as_it_is(tmp_path, capfd):
+def test_a_folder_with_files_is_refused_and_stays_unchanged(tmp_path, capfd):
     (tmp_path / "mine.txt").write_text("mine")
     assert main(["new", str(tmp_path)]) == 2
     assert "not empty" in capfd.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_an_empty_folder_is_taken(tmp_path):
+def test_an_empty_folder_is_accepted(tmp_path):
     assert main(["new", str(tmp_path / "empty")]) == 0
     (tmp_path / "second").mkdir()
     assert main(["new", str(tmp_path / "second")]) == 0
@@ -56,7 +56,7 @@ def test_an_empty_folder_is_taken(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["file", "file/below"])
-def test_a_place_that_is_no_folder_is_refused(tmp_path, capfd, name):
+def test_a_path_that_is_no_folder_is_refused(tmp_path, capfd, name):
     (tmp_path / "file").write_text("mine")
     assert main(["new", str(tmp_path / name)]) == 2
     assert len(capfd.readouterr().err.strip().splitlines()) == 1

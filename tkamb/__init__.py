@@ -1,4 +1,4 @@
-"""tkamb: what happens inside a total knee replacement.
+"""tkamb: forces, contact and wear inside a total knee replacement.
 
     import tkamb
     scene = tkamb.load_scene("models/deep_knee_bend/scene.toml")
@@ -84,22 +84,22 @@ accept_old_names()
 def code_identity(part: str = "") -> str:
     """Return the SHA-256 of the source of a subpackage, by default of the whole package.
 
-    Code that only shows results or reads arguments is left out, because it changes no number.
+    Code that only shows results or parses arguments is left out, because it changes no number.
 
     Args:
-        part: path of the subpackage below the package, like "contact/lattice".
+        part: path of the subpackage inside the package, like "contact/lattice".
     """
     digest, package = hashlib.sha256(), Path(__file__).parent
     for path in sorted((package / part).rglob("*.py")):
         name = path.relative_to(package)
-        shows = name.parts[0] in ("show", "commands") or name.stem == "cli"
-        if not shows and not name.stem.endswith("_report"):
+        is_output = name.parts[0] in ("show", "commands") or name.stem == "cli"
+        if not is_output and not name.stem.endswith("_report"):
             digest.update(name.as_posix().encode() + path.read_bytes())
     return digest.hexdigest()
 
 
 def __getattr__(name: str) -> Any:
-    if name == "show":  # the package; called, it is the former name of `view`
+    if name == "show":  # the subpackage; `tkamb.show(...)` is the former name of `tkamb.view(...)`
         return import_module("tkamb.show")
     if name not in _HOMES:
         raise AttributeError(f"module 'tkamb' has no attribute '{name}'")

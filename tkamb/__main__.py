@@ -7,7 +7,7 @@ from collections.abc import Sequence
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status.
 
-    An interrupt while the program itself is still being read is one line too.
+    Ctrl-C during the import of tkamb prints one line, not a traceback.
     """
     try:
         from tkamb.cli import main as command

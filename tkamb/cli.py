@@ -1,4 +1,4 @@
-"""The command line: it parses the arguments, calls a command and returns the exit status."""
+"""The command line parses the arguments, calls a command and returns the exit status."""
 
 import argparse
 import gc
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 COLLECTED_AT = (20_000, 100)
 """Thresholds of Python's garbage collector: new objects before a collection, and collections before
-older objects are included. With Python's defaults (700 and 10) the libraries' objects are searched
+older objects are included. Python's defaults (700 and 10) search the objects of the libraries
 five times, which takes 3 % of a run."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `tkamb` and return its exit status: 0 done, 1 nothing computed, 2 bad input."""
+    """Run `tkamb`; return exit status 0 (success), 1 (no result, failed check) or 2 (bad input)."""
     _keep_to_one_thread()
-    os.environ["MPLBACKEND"] = "agg"  # commands draw into files; an unknown one would end them
+    os.environ["MPLBACKEND"] = "agg"  # commands draw into files only
     gc.set_threshold(*COLLECTED_AT)
     options = argparse.Namespace()
 
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser = _parser()
         parser.parse_args(arguments, options)
         check_options(parser, sys.argv[1:] if arguments is None else arguments, options)
-        threads()  # refuses a bad TKAMB_THREADS here
+        threads()  # raises if TKAMB_THREADS is invalid
         log_to_stderr()
         return int(options.command(options))
 
@@ -56,8 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _keep_to_one_thread() -> None:
     """Limit BLAS to one thread, unless the environment sets a number or NumPy is loaded already.
 
-    Memory limits the lattice's solves. More threads wait for each other, which takes several times
-    longer on a busy machine.
+    Memory bandwidth limits the solves of the lattice. More threads wait for each other, which takes
+    several times longer on a busy machine.
     """
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     if "numpy" not in sys.modules and not any(name in os.environ for name in limits):
@@ -65,7 +65,7 @@ def _keep_to_one_thread() -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser whose errors are one line, without the usage."""
+    """Parser that prints an error as one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         for kind, words in (("float", "is not a number"), ("int", "is not a whole number")):
@@ -177,17 +177,17 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _scene_of(options: argparse.Namespace) -> "Scene":
-    """Return the scene of `run` with the values of the command line."""
+    """Return the scene of `run`, with the overrides of the command line."""
     from tkamb.io.scene import load_scene
 
     overrides = overrides_of(options)
     scene = load_scene(options.scene, overrides, options.preset)
     if not options.no_cache:
         return scene
-    more = without_cache(scene.contact.model if scene.contact else None)
+    cache_options = without_cache(scene.contact.model if scene.contact else None)
     return load_scene(
         options.scene,
-        overrides | {f"contact.options.{k}": v for k, v in more.items()},
+        overrides | {f"contact.options.{k}": v for k, v in cache_options.items()},
         options.preset,
     )
 

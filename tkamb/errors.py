@@ -1,4 +1,4 @@
-"""The one error family: what went wrong, where, and what to do about it, in one line."""
+"""The errors of tkamb. A message is one line: where the error is, what is wrong, what to do."""
 
 import difflib
 import warnings
@@ -9,10 +9,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class MessageSettings:
-    """How messages are written."""
+    """The length of messages."""
 
     max_names: int = 8
-    """Largest number of names in a message. Chosen: a message stays short."""
+    """Largest number of names in a message. Chosen because a message should be short."""
 
 
 MESSAGE = MessageSettings()
@@ -23,8 +23,8 @@ class TkambError(Exception):
 
     Args:
         what: what is wrong.
-        where: file, key, argument or frame; None: nowhere in particular.
-        hint: what the user can do; None: nothing is known.
+        where: file, key, argument or frame; None: no place.
+        hint: advice to the user; None: no advice.
         mend: former name of `hint`, accepted until release 0.3.
     """
 
@@ -53,7 +53,7 @@ class TkambError(Exception):
 
 
 def _warn_of_old_name() -> None:
-    """Warn the caller of an error's method that `mend` is called `hint`."""
+    """Warn that `mend` is now called `hint`; the warning shows the line of the caller."""
     warnings.warn("'mend' of an error is now called 'hint'", DeprecationWarning, stacklevel=3)
 
 
@@ -68,12 +68,12 @@ class ComputationError(TkambError):
 
 
 def not_installed(package: str, where: object, extra: str) -> InputError:
-    """Return the error for a missing package that belongs to an extra of tkamb."""
+    """Return the error for a missing package, with the pip command of tkamb's extra."""
     return InputError(f"{package} is not installed", where, f"pip install 'tkamb[{extra}]'")
 
 
 def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
-    """Return "did you mean ..." with similar names, and the first of all names."""
+    """Return a hint: "did you mean ..." with similar names, then the first of `names`."""
     all_names = list(names)
     lower = {each.lower(): each for each in all_names}
     close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.6)
@@ -88,11 +88,11 @@ def renamed(module: str, name: str, names: Mapping[str, Any]) -> Any:
 
     Args:
         module: dotted name of the module.
-        name: name that was asked for.
+        name: requested name.
         names: former name -> object.
 
     Raises:
-        AttributeError: the module has nothing of that name.
+        AttributeError: the module has no such name.
     """
     if name not in names:
         raise AttributeError(f"module '{module}' has no attribute '{name}'")

@@ -1,13 +1,13 @@
-"""Files that users name are read with limits; files that tkamb writes are whole or not there.
+"""Reading of files with size limits; writing of files that are never incomplete.
 
-Reading: regular files of a known size alone, and at once. A FIFO would wait for ever, a device has
-no end, and a table of gigabytes is not a recording: each is refused before a byte of it is read.
+Reading: only regular files up to a size limit are read. A FIFO would block for ever, a device has
+no end, and a table of gigabytes is not a recording. They are refused before a byte is read.
 
-Writing: a file is written beside its place, then renamed. Files that belong together are first all
-written beside their places; then a journal that names them makes the change certain, and they are
-renamed. A kill before the journal leaves the old files. After a kill with a journal, the next
-command that opens the folder finishes the renames (`finish_replacement`). So a folder has the old
-state or the new one.
+Writing: a file is written under a temporary name in the same folder, then renamed. Files that
+belong together are all written first. Then a journal lists them, and they are renamed. If the
+process is killed before the journal is written, the old files remain. If it is killed later, the
+next command that opens the folder finishes the renames (`finish_replacement`). So a folder has
+the complete old state or the complete new state.
 """
 
 import csv
@@ -37,14 +37,15 @@ class FileLimitSettings:
     """Largest sizes of the files that are read."""
 
     text_bytes: float = 16 * MEGABYTE
-    """Bytes of a scene, a URDF or a summary. Chosen: a thousand times the size of the shipped
-    ones."""
+    """bytes: largest scene, URDF or summary. Chosen because the shipped files are a thousand times
+    smaller."""
     table_bytes: float = 512 * MEGABYTE
-    """Bytes of a recording. Chosen: an hour of fifty channels at 200 Hz has 500 MB."""
+    """bytes: largest recording. Chosen because an hour of fifty channels at 200 Hz has 500 MB."""
     mesh_bytes: float = 1000 * MEGABYTE
-    """Bytes of a mesh. Chosen: twenty million triangles in a binary STL."""
+    """bytes: largest mesh. Chosen because twenty million triangles in a binary STL have this
+    size."""
     xml_depth: int = 100
-    """Nested elements of an XML file; a URDF has 5, an OpenSim model 20."""
+    """Largest depth of nested elements in an XML file. A URDF has 5, an OpenSim model 20."""
 
 
 FILE_LIMITS = FileLimitSettings()
@@ -53,7 +54,7 @@ FILE_LIMITS = FileLimitSettings()
 SAVE_AS_UTF8 = "save it as UTF-8 text"
 
 HASH_LIMIT = 100_000 * MEGABYTE
-"""Bytes of a file of which the SHA-256 is taken: five minutes of reading."""
+"""bytes: largest file for a SHA-256. Reading it takes five minutes."""
 
 
 def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: bool = True) -> int:
@@ -61,17 +62,17 @@ def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: 
 
     Args:
         path: the file.
-        limit: bytes.
-        what: what to call it in messages.
-        follow: whether it may be a symbolic link.
+        limit: largest size, bytes.
+        what: kind of file, for messages.
+        follow: whether the path may be a symbolic link.
 
     Raises:
-        InputError: no such file, another kind of file, too large, or not to be opened.
+        InputError: the file does not exist, is not regular, is too large or cannot be opened.
     """
-    # O_NONBLOCK: opening a FIFO that nobody writes to would wait; regular files ignore it.
+    # Without O_NONBLOCK, opening a FIFO would wait for a writer. Regular files ignore the flag.
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
     try:
-        descriptor = os.open(os.fspath(path), flags)  # text: `tkamb run --profile` hears it
+        descriptor = os.open(os.fspath(path), flags)  # `tkamb run --profile` lists str paths
     except FileNotFoundError:
         raise InputError(f"no such {what}", path, "check the path") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL character in the path
@@ -86,10 +87,10 @@ def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: 
 
 
 def check_readable(status: os.stat_result, path: str | Path, limit: float) -> None:
-    """Raise unless what was found at a path is a regular file of at most `limit` bytes.
+    """Raise unless a file's status is that of a regular file of at most `limit` bytes.
 
     Raises:
-        InputError: a folder, FIFO, device or socket, or too large.
+        InputError: the path is a folder, FIFO, device or socket, or the file is too large.
     """
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"is {_kind(status.st_mode)}, not a file", path, "give a regular file")
@@ -104,7 +105,7 @@ def read_bytes(
     """Return the content of a regular file.
 
     Raises:
-        InputError: as `open_regular`, or it cannot be read.
+        InputError: as `open_regular`, or reading fails.
     """
     with os.fdopen(open_regular(path, limit, what=what), "rb") as file:
         try:
@@ -123,7 +124,7 @@ def read_text(
     """Return the content of a regular text file, with line ends as `\\n`.
 
     Raises:
-        InputError: as `read_bytes`, or it is not text in that encoding.
+        InputError: as `read_bytes`, or the content is not text in this encoding.
     """
     try:
         text = read_bytes(path, limit, what=what).decode(encoding)
@@ -135,10 +136,10 @@ def read_text(
 def read_json(
     path: str | Path, limit: float = FILE_LIMITS.text_bytes, *, what: str = "file"
 ) -> Any:
-    """Return what a JSON file holds.
+    """Return the content of a JSON file.
 
     Raises:
-        InputError: as `read_bytes`, or not JSON, or nested beyond all measure.
+        InputError: as `read_bytes`, or the content is not JSON or too deeply nested.
     """
     try:
         return json.loads(read_text(path, limit, what=what))
@@ -152,14 +153,14 @@ def read_xml(
     """Return the root element of an XML file.
 
     Raises:
-        InputError: as `read_bytes`, or not XML, or it declares entities (which could grow without
-            end or name other files), or nested more than `FILE_LIMITS.xml_depth` elements deep.
+        InputError: as `read_bytes`, or the content is not XML, declares entities (they can grow
+            without end or name other files) or nests elements too deeply.
     """
     return parse_xml(read_bytes(path, limit, what=what), path, what=what)
 
 
 def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Element:
-    """Return the root element of XML that was read from a path.
+    """Return the root element of the content of an XML file.
 
     Raises:
         InputError: as `read_xml`.
@@ -183,27 +184,27 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
         place = f"{expat.ErrorString(error.code)}: line {error.lineno}, column {error.offset + 1}"
         what, hint = f"is not a readable {what} ({place})", _xml_hint(content, parser)
         raise InputError(what, path, hint) from None
-    except (ValueError, LookupError) as error:  # the last: an unknown encoding
+    except (ValueError, LookupError) as error:  # LookupError: an unknown encoding
         raise InputError(f"is not a readable {what} ({error})", path, SAVE_AS_UTF8) from None
 
 
 def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
-    """Return a hint for an error of the parser, from the bytes around its place."""
-    at = max(parser.ErrorByteIndex, 0)
-    near = content[max(at - 1, 0) : at + 12]
+    """Return a hint for an error of the parser, from the bytes around the error."""
+    position = max(parser.ErrorByteIndex, 0)
+    near = content[max(position - 1, 0) : position + 12]
     if re.match(rb"<[\s\d=]", near):
         return "write &lt; for a < in a text"
     if re.search(rb"&(?!\w{1,8};|#)", near):
         return "write &amp; for a & in a text"
     if any(byte > 127 for byte in near):
         return SAVE_AS_UTF8
-    if not content.strip() or at >= len(content.rstrip()) - 1:
+    if not content.strip() or position >= len(content.rstrip()) - 1:
         return "the file ends too early: copy or download it again"
     return "correct that line, or open and save the file in the program that wrote it"
 
 
 class _ShallowBuilder(TreeBuilder):
-    """Builds a tree of elements, and refuses one that is too deep while it is being read."""
+    """Builds a tree of elements. It raises as soon as the elements are too deeply nested."""
 
     def __init__(self, path: str | Path) -> None:
         super().__init__()
@@ -226,10 +227,10 @@ _NAMED = re.compile(rb'<\w+[^<>]*?\sfile="([^"<>]+)"')
 
 
 def named_files(path: Path) -> list[Path]:
-    """Return the files that elements of an XML file name with file="…", and those that these name.
+    """Return the files that an XML file refers to by file="…", and the files that these refer to.
 
     Args:
-        path: an OpenSim model, whose sets may stand in files of their own.
+        path: an OpenSim model. Its sets may be separate files.
 
     Raises:
         InputError: as `read_bytes`.
@@ -237,9 +238,9 @@ def named_files(path: Path) -> list[Path]:
     result: list[Path] = []
     waiting = [path]
     while waiting:
-        folder = waiting.pop()
-        for name in _NAMED.findall(read_bytes(folder)):
-            other = folder.parent / os.fsdecode(name).replace("\\", "/")
+        source = waiting.pop()
+        for name in _NAMED.findall(read_bytes(source)):
+            other = source.parent / os.fsdecode(name).replace("\\", "/")
             if other.is_file() and other not in (path, *result):
                 result.append(other)
                 waiting.append(other)
@@ -247,7 +248,7 @@ def named_files(path: Path) -> list[Path]:
 
 
 def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:
-    """Raise unless a path leads to a regular file of at most `limit` bytes that can be read.
+    """Raise unless a path is a readable regular file of at most `limit` bytes.
 
     Raises:
         InputError: as `open_regular`.
@@ -260,10 +261,10 @@ def sha256_of(path: str | Path, limit: float = HASH_LIMIT) -> str:
 
     Args:
         path: the file.
-        limit: bytes.
+        limit: largest size, bytes.
 
     Raises:
-        InputError: no such file, too large, or it cannot be read.
+        InputError: the file does not exist, is too large or cannot be read.
     """
     with os.fdopen(open_regular(path, limit), "rb") as file:
         try:
@@ -283,14 +284,15 @@ def _kind(mode: int) -> str:
 
 
 MARKER = ".tkamb"
-"""File that marks a folder as tkamb's own (`tkamb.io.claim`) and names its temporary files."""
+"""File that marks a folder as made by tkamb (`tkamb.io.claim`). It holds the token of its temporary
+files."""
 JOURNAL = ".tkamb-commit"
 CHOOSE_OUT = "choose another --out, or remove it"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]*")
 
 
 def folder_token(folder: Path) -> str | None:
-    """Return what the names of a folder's temporary files begin with; None: it has no marker."""
+    """Return the token in the names of a folder's temporary files; None without a valid marker."""
     try:
         result = read_json(folder / MARKER)
     except InputError:
@@ -300,16 +302,16 @@ def folder_token(folder: Path) -> str | None:
 
 
 def temporary_path(folder: Path) -> Path:
-    """Return a new path for a temporary file in a folder; the folder's own by its token."""
+    """Return a new path for a temporary file in a folder. Its name has the folder's token."""
     token = folder_token(folder) or "loose"
     return folder / f".tkamb-{token}-{secrets.token_hex(6)}.part"
 
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[Path]:
-    """Give a temporary path in the same folder that takes the place of `path` at the end.
+    """Yield a temporary path in the same folder. At the end its file replaces `path`.
 
-    When the block raises, `path` is left as it was.
+    When the block raises, `path` stays unchanged.
 
     Raises:
         InputError: the folder cannot be written.
@@ -325,7 +327,7 @@ def replaced_file(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8, whole or not at all.
+    """Write `text` as UTF-8, completely or not at all.
 
     Raises:
         InputError: the folder cannot be written.
@@ -335,15 +337,15 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_new_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 into a file that is not there yet, whole or not at all.
+    """Write `text` as UTF-8 into a new file, completely or not at all.
 
     Raises:
-        InputError: something of that name is there, or the folder cannot be written.
+        InputError: the name is in use, or the folder cannot be written.
     """
     temporary = temporary_path(path.parent)
     try:
         write_synced(temporary, text)
-        os.link(temporary, path)  # unlike a rename, it fails where the name is taken
+        os.link(temporary, path)  # unlike a rename, a link fails if the name is in use
     except FileExistsError:
         raise InputError("exists already", path, CHOOSE_OUT) from None
     except (OSError, ValueError) as error:
@@ -354,8 +356,8 @@ def write_new_text(path: Path, text: str) -> None:
 
 def write_synced(path: Path, text: str) -> None:
     """Write `text` as UTF-8 and flush it to the disk."""
-    # Names of files that are not UTF-8 come as lone surrogates, which UTF-8 does not have:
-    # "\udcff" is written as these six characters, in JSON a valid escape for the same name.
+    # A file name that is not UTF-8 contains lone surrogates, which UTF-8 cannot encode. "\udcff" is
+    # written as these six characters, which JSON reads as the same name.
     with open(path, "w", encoding="utf-8", errors="backslashreplace") as file:
         file.write(text)
         file.flush()
@@ -370,7 +372,7 @@ def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
 
 
 class Replacement:
-    """Files of one folder that are to take their places together.
+    """Files of one folder that are replaced together.
 
     Args:
         folder: an existing folder.
@@ -382,37 +384,37 @@ class Replacement:
         self._removed: list[str] = []
 
     def path(self, name: str) -> Path:
-        """Return where to write what takes the place of the file of that name."""
+        """Return the temporary path for the new version of a file."""
         return self._written.setdefault(name, temporary_path(self.folder))
 
     def current(self, name: str) -> Path:
-        """Return where that file is now: what was written, or else what is in its place."""
+        """Return the path of the new version of a file, or of the old one if there is no new."""
         return self._written.get(name, self.folder / name)
 
     def remove(self, name: str) -> None:
-        """Remove the file of that name on `commit`, if there is one."""
+        """Remove the file of this name on `commit`, if it exists."""
         self._removed.append(name)
 
     def commit(self) -> None:
-        """Put all files in their places."""
+        """Replace and remove the files."""
         for path in self._written.values():
             with open(path, "rb") as file:
                 os.fsync(file.fileno())
         written = {name: path.name for name, path in self._written.items()}
         journal = {"written": written, "removed": self._removed}
         write_text(self.folder / JOURNAL, json.dumps(journal))
-        self._written.clear()  # from here on the journal owns them
+        self._written.clear()  # now the journal lists them
         finish_replacement(self.folder)
 
     def discard(self) -> None:
-        """Remove what was written and did not take its place."""
+        """Remove new files that were not committed."""
         for path in self._written.values():
             _remove(path)
 
 
 @contextmanager
 def replaced_together(folder: Path) -> Iterator[Replacement]:
-    """Give a `Replacement` that is done at the end; when the block raises, nothing changes.
+    """Yield a `Replacement` and commit it at the end. When the block raises, nothing changes.
 
     Raises:
         InputError: the folder cannot be written.
@@ -428,17 +430,17 @@ def replaced_together(folder: Path) -> Iterator[Replacement]:
 
 
 def replacement_pending(folder: Path) -> bool:
-    """Say whether a kill left files of a folder that have yet to take their places."""
+    """Return whether a killed process left files of a folder to be renamed."""
     return os.path.lexists(folder / JOURNAL)
 
 
 def finish_replacement(folder: Path) -> None:
-    """Put files in their places that a journal names; nothing without one.
+    """Rename the files that a folder's journal lists. Without a journal, do nothing.
 
-    May be done any number of times, by one process at a time.
+    The call can be repeated, but only by one process at a time.
 
     Raises:
-        InputError: the journal is not one of tkamb's, or the folder cannot be written.
+        InputError: the journal is invalid, or the folder cannot be written.
     """
     journal = folder / JOURNAL
     if not replacement_pending(folder):
@@ -453,7 +455,7 @@ def finish_replacement(folder: Path) -> None:
         raise InputError("names files outside its folder", journal, "remove it")
     try:
         for name, temporary in written.items():
-            with suppress(FileNotFoundError):  # in its place already
+            with suppress(FileNotFoundError):  # already renamed
                 os.replace(folder / temporary, folder / name)
         for name in removed:
             (folder / name).unlink(missing_ok=True)
@@ -464,10 +466,10 @@ def finish_replacement(folder: Path) -> None:
 
 
 def claim_directory(path: str | Path) -> Path:
-    """Make the output folder and prove that it can be written, before anything is computed.
+    """Make the output folder and check that a file can be written into it.
 
     Raises:
-        InputError: it is a file, or cannot be made or written.
+        InputError: the path is a file, or the folder cannot be made or written.
     """
     path = Path(path)
     try:
@@ -482,7 +484,7 @@ def claim_directory(path: str | Path) -> Path:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file if possible; the reason of a failure was reported before."""
+    """Remove a file if possible. A failure is ignored, because its cause has been reported."""
     with suppress(OSError, ValueError):
         path.unlink(missing_ok=True)
 

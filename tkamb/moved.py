@@ -32,7 +32,7 @@ FOLDERS = {
     "tkamb.muscles": "tkamb.run.muscles",
     "tkamb.plausibility": "tkamb.run.plausibility",
 }
-"""Folder of release 0.1 -> folder where its modules are now."""
+"""Folder of release 0.1 -> its new folder."""
 MODULES = {
     "tkamb.activities": "tkamb.io.activities",
     "tkamb.atomic": "tkamb.files",
@@ -205,15 +205,15 @@ class _Alias(Loader):
         self.own_spec: ModuleSpec | None = None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """Return the module at its new place; the old name is one more name of it."""
+        """Import the module by its new name and return it."""
         module = import_module(self.target)
         self.own_spec = module.__spec__
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Restore the module's own spec, by which its files are found.
+        """Restore the module's spec, which the import by the old name has replaced.
 
-        The module has been executed under its new name; the import has replaced the spec.
+        The module has already been executed under its new name.
         """
         module.__spec__ = self.own_spec
 
@@ -224,7 +224,7 @@ class _MovedFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return a spec of the new module; None: it has not moved."""
+        """Return a spec that imports the new module; None: the module has not moved."""
         new = new_name(fullname)
         if new is None:
             return None
@@ -234,6 +234,6 @@ class _MovedFinder(MetaPathFinder):
 
 
 def accept_old_names() -> None:
-    """Make former import paths work; once per process."""
+    """Make former import paths work. Repeated calls have no effect."""
     if not any(isinstance(finder, _MovedFinder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _MovedFinder())  # before the path of a moved folder is searched
+        sys.meta_path.insert(0, _MovedFinder())  # before Python searches a moved folder

@@ -1,7 +1,9 @@
 """Test of a contact model against the contract of contact models.
 
-from tkamb.testing import check_contact_model
-check_contact_model(MyModel(resolution=1e-3))
+    from tkamb.testing import check_contact_model
+    check_contact_model(MyModel(resolution=1e-3))
+
+A missing property raises `ConformanceError`.
 """
 
 from dataclasses import dataclass, is_dataclass
@@ -27,15 +29,15 @@ class ModelCheckSettings:
     """Tolerances of the test."""
 
     stiffness_tolerance: float = 0.1
-    """1: relative difference of the stiffnesses over 10 and over 5 % of the approach. Chosen: the
-    force has small steps where single nodes come into contact."""
+    """1: largest relative difference of the stiffnesses over 10 and 5 % of the approach. Chosen
+    because the force has small steps when single nodes come into contact."""
 
 
 MODEL_CHECK = ModelCheckSettings()
 
 
 class ConformanceError(TkambError):
-    """A contact model does not have a property of the contract, which the message names."""
+    """A contact model lacks a property of the contract. The message names the property."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ class ConformanceCase:
         pose: (4, 4) pose_femoral_in_insert; its y is ignored.
         load: N, compressive.
         tolerance: 1, relative tolerance of forces, approach and pressure.
-        integral_tolerance: relative, of the integral of pressure over the map.
+        integral_tolerance: 1, relative tolerance of the integral of pressure over the map.
     """
 
     pair: ContactPair
@@ -77,7 +79,7 @@ def check_contact_model(
         integral_tolerance: 1, relative tolerance of the integral of pressure over the map.
 
     Raises:
-        ConformanceError: the first property that the model does not have.
+        ConformanceError: the model lacks a property of the contract.
     """
     pair = two_sphere_pair() if pair is None else pair
     pose = knee_pose([0, 0, 0, 0, np.radians(0.2), np.radians(10)]) if pose is None else pose
@@ -96,10 +98,10 @@ def check_contact_model(
 
 
 def two_sphere_pair() -> ContactPair:
-    """Return two spheres of 20 mm, 24 mm apart along z, above a block of polyethylene."""
+    """Return two spheres of 20 mm radius, centres 24 mm apart along z, and a polyethylene block."""
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=SPHERE_RADIUS)
-    aside = np.array([0.0, 0.0, SPHERE_OFFSET])
-    vertices = np.concatenate([sphere.vertices - aside, sphere.vertices + aside])
+    offset = np.array([0.0, 0.0, SPHERE_OFFSET])
+    vertices = np.concatenate([sphere.vertices - offset, sphere.vertices + offset])
     faces = np.concatenate([sphere.faces, sphere.faces + len(sphere.vertices)])
     block = trimesh.creation.box(BLOCK)
     on_floor = np.array([0.0, BLOCK[1] / 2, 0.0])
@@ -146,9 +148,11 @@ def _check_load(
     _require(pressed.status is ContactStatus.OK, what, "; ".join(pressed.flags))
     reaction = -pressed.wrench_on_insert[1]
     _require(_close(reaction, case.load, case.tolerance, case.load), what, f"{reaction} N")
-    rest = np.delete(np.arange(16), 7)
+    all_but_y = np.delete(np.arange(16), 7)
     _require(
-        _close(pressed.pose.ravel()[rest], np.asarray(case.pose).ravel()[rest], 1e-12, 1.0),
+        _close(
+            pressed.pose.ravel()[all_but_y], np.asarray(case.pose).ravel()[all_but_y], 1e-12, 1.0
+        ),
         "pressing keeps rotation, x and z",
     )
     again = model.evaluate(state, pressed.pose)

@@ -1,4 +1,4 @@
-"""Units at the file edges; inside the package everything is SI and radians."""
+"""Factors from units of files to SI. Inside the package all values are in SI and radians."""
 
 import math
 

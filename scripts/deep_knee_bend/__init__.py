@@ -1,1 +1,1 @@
-"""How models/deep_knee_bend is made: one idea per module, every number in dimensions."""
+"""Modules that make models/deep_knee_bend. All its numbers are in `dimensions`."""

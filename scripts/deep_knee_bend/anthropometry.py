@@ -1,4 +1,4 @@
-"""Segments of a man by de Leva, J Biomech 29:1223 (1996): shares of mass and of length.
+"""Segments of a man by de Leva, J Biomech 29:1223 (1996), as shares of mass and length.
 
 Lengths are scaled from de Leva's mean man to the subject's height; centres are measured
 from the proximal joint; radii of gyration (sagittal, transverse, longitudinal) are shares of
@@ -21,9 +21,9 @@ class Segment:
     length: float
     centre: float
     inertia_sagittal: float
-    """About the AP axis."""
+    """kg m²: moment of inertia about the AP axis."""
     inertia_transverse: float
-    """About the ML axis: flexion."""
+    """kg m²: moment of inertia about the ML axis (flexion)."""
     inertia_longitudinal: float
 
 
@@ -39,6 +39,6 @@ FOOT_MASS = 0.0137 * d.MASS_KG
 
 HAT_MASS = d.MASS_KG - 2.0 * (THIGH.mass + SHANK.mass + FOOT_MASS)
 HAT_CENTRE = 350.0 * SCALE
-"""Centre of head, arms and trunk above the hips: their de Leva centres, arms at the chest."""
+"""mm: centre of mass of head, arms (at the chest) and trunk above the hips, by de Leva."""
 HAT_INERTIA = HAT_MASS * 0.255**2
-"""About its own centre, radius of gyration 255 mm: trunk, head and arms about that centre."""
+"""kg m²: inertia of head, arms and trunk about their centre; radius of gyration 255 mm."""

@@ -8,13 +8,13 @@ import numpy as np
 from deep_knee_bend import dimensions as d
 
 DOME_CENTRE = np.array([d.DOME_RADIUS - d.BUTTON_THICKNESS, 0.0])
-"""Centre of the dome (anterior, superior) in the patellar frame, mm."""
+"""mm: centre of the dome (anterior, superior) in the patellar frame."""
 
 RINGS, SECTORS = 24, 132
 
 
 def mesh():
-    """Closed triangulation (vertices mm, faces) in the patellar frame."""
+    """Return vertices (mm) and faces of the closed button, in the patellar frame."""
     radii = d.BUTTON_RADIUS * np.arange(1, RINGS + 1) / RINGS
     dome = DOME_CENTRE[0] - np.sqrt(d.DOME_RADIUS**2 - radii**2)
     rings = [_ring(r, x) for r, x in zip(radii, dome, strict=True)]

@@ -1,6 +1,6 @@
-"""The patient's URDF: ankle, six knee joints, patella; masses and inertias by de Leva.
+"""The patient's URDF: ankle, six knee joints, patella, and masses and inertias by de Leva.
 
-The foot is still and light: its mass is a point at the ankle centre, on the tibia link.
+The foot is light and does not move: it is a point mass at the ankle centre, on the tibia link.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ RANGES = {"prismatic": (-0.2, 0.2), "revolute": (-3.2, 3.2)}
 
 
 def insert_height(si_start):
-    """Height (mm) of the insert frame above the ankle; the knee centre is the femoral origin."""
+    """Return the height (mm) of the insert frame above the ankle; knee centre: femoral origin."""
     return round(body.SHANK.length - si_start, 3)
 
 
@@ -52,7 +52,7 @@ def urdf(si_start):
 
 
 def _tibia():
-    """Mass, centre (m) and principal moments of shank and foot together, ankle at the origin."""
+    """Return mass, centre (m) and principal moments of shank with foot; the origin is the ankle."""
     height = (body.SHANK.length - body.SHANK.centre) * 1e-3
     mass = body.SHANK.mass + body.FOOT_MASS
     centre = body.SHANK.mass * height / mass
@@ -91,7 +91,7 @@ def _link(name, mass, centre, moments):
 
 
 def _series(joints, first, last, origin):
-    """Joints one after the other, with massless links between."""
+    """Return the elements of consecutive joints, with massless links between them."""
     lines, parent = [], first
     for name, kind, axis in joints:
         child = last if name == joints[-1][0] else f"{name}_link"

@@ -1,7 +1,7 @@
-"""Compares the shipped files with those that the script makes: equal bytes, or equal numbers.
+"""Comparison of the shipped files with the files that the script makes.
 
-Libraries of another platform may round the last digit differently, so texts are equal when
-their words are and their numbers differ by less than 2e-6 (mm, deg, N), and meshes when
+Libraries of another platform may round the last digit differently. Therefore texts are equal when
+their words are equal and their numbers differ by less than 2e-6 (mm, deg, N). Meshes are equal when
 their corners differ by less than 1e-5 mm (a last digit in single precision).
 """
 
@@ -15,7 +15,7 @@ STL_HEADER, STL_RECORD = 84, 50
 
 
 def differences(made, shipped):
-    """Return one line per file that is missing or differs."""
+    """Return one line per missing or different file."""
     found = []
     for path in sorted(made.iterdir()):
         other = shipped / path.name

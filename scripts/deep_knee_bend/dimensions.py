@@ -1,4 +1,4 @@
-"""Every chosen number of the model. Lengths mm, angles deg, unless the name says otherwise.
+"""All numbers of the model. Lengths are in mm and angles in deg, unless the name says otherwise.
 
 The sagittal profile of the femoral component is described by the direction of its outward
 normal: phi = 0 distal, 90 posterior, -90 anterior.
@@ -15,7 +15,7 @@ SAGITTAL_ARCS = (
     (100.0, 150.0, 17.0),  # far posterior, deep flexion
 )
 ORIGIN_PHI = 60.0
-"""The centre of the arc that holds this normal is the origin."""
+"""The femoral origin is the centre of the arc with this normal."""
 
 CORONAL_RADIUS = 22.0
 CONDYLE_SPACING_HALF = 23.0
@@ -65,16 +65,16 @@ AXIAL_ROTATION_END = 6.0
 CONTACT_AP_START = -2.0
 CONTACT_AP_END = -5.5
 SHANK_LEAN = (4.0, 32.0)
-"""Forward, standing and at the bottom."""
+"""Forward lean of the shank, standing and at the bottom of the squat."""
 
 # --- extensor mechanism ------------------------------------------------------------------
 QUADRICEPS_ORIGIN = (32.0, 205.0, 0.0)
-"""Vastus intermedius, anterior shaft of the femur, femoral frame."""
+"""Origin of the vastus intermedius on the anterior shaft of the femur, in the femoral frame."""
 SUPERIOR_POLE = (8.0, 20.0, 0.0)
 INFERIOR_POLE = (6.0, -21.0, 0.0)
-"""Ends of quadriceps and patellar ligament, patellar frame."""
+"""Ends of quadriceps and patellar ligament on the patella, in the patellar frame."""
 TUBEROSITY = (38.0, -19.0, 3.0)
-"""Tibial tuberosity, insert frame."""
+"""Tibial tuberosity, in the insert frame."""
 PATELLAR_LIGAMENT_LENGTH = 50.0
 QUADRICEPS_HALF_THICKNESS = 3.5
 QUADRICEPS_WIDTH_HALF = 5.0
@@ -83,10 +83,10 @@ PATELLA_CENTRE_OF_MASS = (4.0, 0.0, 0.0)
 # --- squat -------------------------------------------------------------------------------
 GRAVITY = 9.80665
 ANKLE_HEIGHT_SHARE = 0.039
-"""Ankle centre above the floor, of body height."""
+"""Height of the ankle centre above the floor, share of body height."""
 CENTRE_OF_PRESSURE = (18.0, 66.0)
-"""In front of the ankle when standing and at the bottom."""
+"""Distance in front of the ankle, standing and at the bottom."""
 LEG_SHARE = (0.5, 0.7)
-"""Of body weight on the tested leg, standing and at the bottom."""
+"""Share of body weight on the tested leg, standing and at the bottom."""
 FOOT_SPACING_HALF = 88.0
-"""Ankles under the hips: legs upright in the frontal plane."""
+"""Half the distance of the ankles, which are under the hips: the legs are upright from in front."""

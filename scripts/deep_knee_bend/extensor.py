@@ -1,9 +1,10 @@
-"""The patella's sagittal motion: dome in the groove, ligament of constant length, at balance.
+"""The patella's motion in the femur's sagittal plane.
 
-In the femur's sagittal plane. The dome's centre runs on the curve one dome radius off the
-groove's floor, so the gap is zero by construction. The frictionless contact force passes
-through the dome's centre, so the massless patella is at rest when quadriceps and patellar
-ligament balance about that centre and across its normal.
+The dome touches the groove, and the patellar ligament has a constant length. The dome's centre
+moves on the curve at a distance of one dome radius from the groove's floor, so that the gap is
+zero. The frictionless contact force passes through the dome's centre. Therefore the massless
+patella is in equilibrium when the moments of quadriceps and patellar ligament about this centre
+and their forces along the groove cancel.
 """
 
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ BETA_RANGE = (-0.3, 0.4)
 
 @dataclass(frozen=True)
 class PatellaPose:
-    """Patella in the femoral frame: mm and rad, force ratios and where it touches (rad)."""
+    """Pose of the patella in the femoral frame (mm, rad), force ratios, and contact angle (rad)."""
 
     ap: float
     si: float
@@ -40,7 +41,7 @@ class PatellaPose:
 
 
 def groove_frame(phi):
-    """Point (2,) and outward unit normal (2,) of the groove's floor."""
+    """Return point (2,) mm and outward unit normal (2,) of the groove's floor at `phi`."""
     tangent = FEMORAL.groove(phi + STEP) - FEMORAL.groove(phi - STEP)
     normal = np.array([tangent[1], -tangent[0]]) / np.linalg.norm(tangent)
     return FEMORAL.groove(phi), normal * np.sign(normal @ normal_at(phi))
@@ -48,7 +49,7 @@ def groove_frame(phi):
 
 @lru_cache(maxsize=1)
 def outline():
-    """Outline (n, 2) mm that the quadriceps wraps: the component's sections in its path."""
+    """Return the outline (n, 2) mm of the component that the quadriceps wraps."""
     vertices, faces = FEMORAL.mesh()
     stations = np.linspace(-d.QUADRICEPS_WIDTH_HALF, d.QUADRICEPS_WIDTH_HALF, 7)
     return sagittal_outline(
@@ -62,7 +63,7 @@ def _rotated(angle, point):
 
 
 ARM = np.array(d.INFERIOR_POLE[:2]) - button.DOME_CENTRE
-"""From the dome's centre to the inferior pole, patellar frame."""
+"""Vector from the dome's centre to the inferior pole, in the patellar frame."""
 
 
 def _dome_centre(phi):
@@ -71,7 +72,10 @@ def _dome_centre(phi):
 
 
 def _contact(beta, tuberosity):
-    """Contact (rad) where the ligament spans when its bone arm is beta off the straight line."""
+    """Return the contact angle (rad) at which the ligament has its length.
+
+    `beta` (rad) is the angle between ARM and the line from the dome's centre to the tuberosity.
+    """
     radius = np.linalg.norm(ARM)
     square = d.PATELLAR_LIGAMENT_LENGTH**2 - tuberosity[2] ** 2
     wanted = radius * np.cos(beta) + np.sqrt(square - (radius * np.sin(beta)) ** 2)
@@ -90,7 +94,7 @@ def _cross(a, b):
 
 
 def _state(beta, tuberosity):
-    """Pose of the patella at beta, and the moment about the dome's centre that is left over."""
+    """Return the patella's pose at beta, and the residual moment about the dome's centre."""
     phi = _contact(beta, tuberosity)
     normal = groove_frame(phi)[1]
     centre = _dome_centre(phi)

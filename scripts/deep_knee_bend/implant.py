@@ -1,5 +1,4 @@
-"""The shipped knee's implant from `dimensions`; tkamb.studies.designs says how the surfaces are
-made."""
+"""The implant of the shipped knee, from `dimensions`, by tkamb.studies.designs."""
 
 from deep_knee_bend import dimensions as d
 from tkamb.studies.designs.design import Articulation

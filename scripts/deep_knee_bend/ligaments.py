@@ -1,8 +1,8 @@
-"""The bundles: attachments, law, and their strain over the motion.
+"""The ligament bundles: attachments, stiffness, and strain over the motion.
 
-Femoral attachments are in the femoral frame, tibial attachments in the insert frame (mm), so that
-their positions relative to the implant can be read off. The frame of the tibia link differs from
-the insert frame by a translation.
+Femoral attachments are in the femoral frame, tibial attachments in the insert frame (mm). They show
+the positions relative to the implant. The frame of the tibia link differs from the insert frame by
+a translation.
 """
 
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from tkamb.geometry.frames import knee_pose, transform
 
 @dataclass(frozen=True)
 class Bundle:
-    """One straight bundle; `strain` at flexion `reference` (deg) sets its slack length."""
+    """A straight bundle. `strain` at flexion `reference` (deg) gives its slack length."""
 
     name: str
     femur: tuple[float, float, float]
     tibia: tuple[float, float, float]
     stiffness: float
-    """N/mm"""
+    """Stiffness, N/mm."""
     strain: float
     reference: float
 
@@ -36,17 +36,17 @@ BUNDLES = (
 
 
 def lengths(bundle, coordinates):
-    """Length (f,) mm of a bundle at knee coordinates (f, 6), mm and rad."""
+    """Return the length (f,) mm of a bundle at knee coordinates (f, 6), mm and rad."""
     femur = transform(knee_pose(coordinates), np.array(bundle.femur))
     return np.linalg.norm(femur - np.array(bundle.tibia), axis=1)
 
 
 def slack_length(bundle, coordinates):
-    """Slack length (mm) from the reference strain, at the frame nearest the reference."""
+    """Return the slack length (mm) from the strain at the frame nearest to the reference."""
     frame = np.argmin(np.abs(np.degrees(coordinates[:, 5]) - bundle.reference))
     return lengths(bundle, coordinates)[frame] / (1.0 + bundle.strain)
 
 
 def strains(bundle, coordinates):
-    """Strain (f,) of a bundle; negative: slack."""
+    """Return the strain (f,) of a bundle; negative: slack."""
     return lengths(bundle, coordinates) / slack_length(bundle, coordinates) - 1.0

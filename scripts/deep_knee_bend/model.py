@@ -1,4 +1,4 @@
-"""All files of the model, made in order."""
+"""All files of the model."""
 
 from deep_knee_bend import button, chain, readme, scene, tables
 from deep_knee_bend.extensor import patella_motion
@@ -9,7 +9,7 @@ from tkamb.studies.designs import solids
 
 
 def make(folder):
-    """Write every made file into the folder."""
+    """Write all files of the model into the folder."""
     for name, part in (("femoral_component", FEMORAL), ("insert", INSERT)):
         solids.write_stl(folder / f"{name}.stl", *part.mesh())
     solids.write_stl(folder / "patellar_button.stl", *button.mesh())

@@ -1,7 +1,8 @@
-"""The recorded motion of the knee: flexion, rotation and contact path chosen, the rest solved.
+"""The "recorded" motion of the knee. Flexion, axial rotation and contact path are chosen.
 
-The femur lies where an evenly loaded frictionless femur would lie mediolaterally: the two
-contact points are as far from the middle as each other, so the dishes' slopes cancel.
+The other coordinates are solved. Mediolaterally, the femur is in equilibrium without friction and
+under an even load: the two contact points have equal distances from the middle, so that the slopes
+of the dishes cancel.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ KNOTS = np.radians([0.0, 6.0, 12.0, 24.0, 36.0, 60.0, 90.0, 120.0])
 
 @dataclass(frozen=True)
 class KneeMotion:
-    """Frames of the knee: s, mm and rad; coordinates (f, 6) in KNEE_COORDINATES' order."""
+    """Frames of the knee: times (s) and coordinates (f, 6), mm and rad, as in KNEE_COORDINATES."""
 
     time: np.ndarray
     coordinates: np.ndarray
@@ -27,7 +28,7 @@ class KneeMotion:
 
 
 def flexion_at(time):
-    """Flexion (rad): constant rate between two smooth ramps, at rest at both ends."""
+    """Return flexion (rad): constant rate between smooth ramps, with zero rate at both ends."""
     steady = d.FLEXION_END / (d.DURATION_S - d.RAMP_S)
     s = np.clip(np.minimum(time, d.DURATION_S - time) / d.RAMP_S, 0.0, 1.0)
     ramp = steady * d.RAMP_S * (s**6 - 3.0 * s**5 + 2.5 * s**4)
@@ -36,20 +37,20 @@ def flexion_at(time):
 
 
 def axial_rotation_at(flexion):
-    """External rotation of the femur (rad): quick at first, flattening towards the end."""
+    """Return the external rotation of the femur (rad); its rate decreases with flexion."""
     return np.radians(d.AXIAL_ROTATION_END) * np.sin(
         np.pi / 2 * flexion / np.radians(d.FLEXION_END)
     )
 
 
 def contact_path_at(flexion):
-    """Mean AP position (mm) of the two contact points."""
+    """Return the mean AP position (mm) of the two contact points."""
     s = flexion / np.radians(d.FLEXION_END)
     return d.CONTACT_AP_START + (d.CONTACT_AP_END - d.CONTACT_AP_START) * s * (2.0 - s)
 
 
 def _settled(articulation, flexion):
-    """AP and ML (mm) at a flexion: mean contact on its path, ML slopes under it balanced."""
+    """Return AP and ML (mm) at a flexion: mean contact on its path, ML slopes in balance."""
     rotation, wanted = axial_rotation_at(flexion), contact_path_at(flexion)
     wanted += articulation.insert.low_point_ap - d.DISH_LOW_POINT_AP
 
@@ -68,13 +69,13 @@ def _settled(articulation, flexion):
 
 
 def _start(articulation, flexion, wanted):
-    """AP place (mm) at which the medial ridge's lowest point is where contact is wanted."""
+    """Return the AP (mm) that puts the lowest point of the medial ridge at `wanted`."""
     anterior, superior = articulation.femoral.profile.point(flexion)
     return wanted - (anterior * np.cos(flexion) - superior * np.sin(flexion))
 
 
 def knee_motion(articulation=ARTICULATION, frames=d.FRAMES):
-    """Return the KneeMotion of all frames; the contact path starts at the dishes' low point."""
+    """Return the KneeMotion. Its contact path starts at the low point of the dishes."""
     time = np.linspace(0.0, d.DURATION_S, frames)
     flexion = flexion_at(time)
     place_at = CubicSpline(KNOTS, [_settled(articulation, f) for f in KNOTS], bc_type="natural")

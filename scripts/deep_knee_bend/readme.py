@@ -1,4 +1,4 @@
-"""The model's README: the template beside this file, filled with the model's own numbers."""
+"""The model's README: README.template.md, filled with the model's numbers."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def readme(motion, patella, bend):
 
 
 def _number(value):
-    """A number without needless digits, never minus zero."""
+    """Return a number as text, without trailing zeros or a negative zero."""
     return f"{round(float(value), 3) + 0.0:g}"
 
 

@@ -1,11 +1,11 @@
-"""The whole body in the sagittal plane: trunk lean from balance, then the ground reaction.
+"""The body in the sagittal plane: trunk lean from balance, then the ground reaction.
 
-Both feet stand flat side by side and both legs do the same, so the body is a chain of
-three: two shanks, two thighs, and head-arms-trunk. The trunk leans so that the centre of
-mass is over the planned centre of pressure. Force and true centre of pressure then follow
-from the centre of mass' acceleration and the rate of angular momentum. The tested leg takes
-its share, because the centre of mass moves sideways towards it: upright forces under both
-feet balance the body in the frontal plane, so neither foot needs to push sideways.
+Both feet stand flat side by side and both legs move alike. So the body is a chain of three
+segments: shanks, thighs, and head-arms-trunk. The trunk leans so that the centre of mass is over
+the planned centre of pressure. Force and true centre of pressure follow from the acceleration of
+the centre of mass and the rate of angular momentum. The tested leg has its share of the load,
+because the centre of mass moves sideways towards it. Vertical forces under both feet balance the
+body in the frontal plane, so that no foot pushes sideways.
 """
 
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ MILLI = 1e-3
 
 @dataclass(frozen=True)
 class Squat:
-    """Frames: lean of shank and trunk (rad, forward), force (f, 3) N and its point (f, 3) mm.
+    """Forward lean of shank and trunk (rad), force (f, 3) N and its point (f, 3) mm, per frame.
 
-    Laboratory: x forward, y up, z right; below the tested ankle's centre is x = z = 0 and
-    the floor y = 0.
+    Laboratory: x forward, y up, z right. The origin is on the floor below the centre of the tested
+    ankle.
     """
 
     shank_lean: np.ndarray
@@ -35,24 +35,24 @@ class Squat:
 
 
 def smooth(flexion):
-    """0 standing, 1 at the bottom."""
+    """Return the progress of the squat: 0 standing, 1 at the bottom."""
     s = flexion / np.radians(d.FLEXION_END)
     return s * s * (3.0 - 2.0 * s)
 
 
 def shank_lean(flexion):
-    """Forward lean (rad) of the shank."""
+    """Return the forward lean (rad) of the shank."""
     start, end = np.radians(d.SHANK_LEAN)
     return start + (end - start) * np.sin(np.pi / 2 * flexion / np.radians(d.FLEXION_END))
 
 
 def ankle_height():
-    """Height (mm) of the ankle centre above the floor."""
+    """Return the height (mm) of the ankle centre above the floor."""
     return d.ANKLE_HEIGHT_SHARE * d.HEIGHT
 
 
 def _forward(lean):
-    """Unit vectors (f, 2) along a segment that leans forward, from distal to proximal."""
+    """Return unit vectors (f, 2) along a segment that leans forward, from distal to proximal."""
     return np.stack([np.sin(lean), np.cos(lean)], axis=1)
 
 
@@ -90,7 +90,7 @@ def squat(time, flexion):
 
 
 def _dynamics(time, parts, centre):
-    """Ground force (f, 2) N on both feet and its moment (f,) N m about the centre of mass."""
+    """Return ground force (f, 2) N on both feet and moment (f,) N m about the centre of mass."""
     force = d.MASS_KG * _second_derivative(time, centre) * MILLI
     force[:, 1] += d.MASS_KG * d.GRAVITY
     moment = np.zeros(len(time))

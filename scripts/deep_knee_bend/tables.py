@@ -1,4 +1,4 @@
-"""The recorded columns: motion, shank lean and ground reaction as CSV texts."""
+"""CSV texts of motion, shank lean and ground reaction."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def csv(columns):
 
 
 def motion_csv(motion, patella):
-    """Knee coordinates and the patella's place in the femoral frame."""
+    """Return the CSV of the knee coordinates and the patella's pose in the femoral frame."""
     ap, si, ml, rotation, adduction, flexion = motion.coordinates.T
     columns = [
         ("time_s", motion.time, 2),
@@ -34,12 +34,12 @@ def motion_csv(motion, patella):
 
 
 def tibia_csv(motion, squat):
-    """Forward lean of the shank."""
+    """Return the CSV of the shank's forward lean."""
     return csv([("time_s", motion.time, 2), ("lean_deg", np.degrees(squat.shank_lean), 7)])
 
 
 def ground_reaction_csv(motion, squat):
-    """Force on the tested foot and its point, laboratory axes."""
+    """Return the CSV of the force on the tested foot and its point, in the laboratory's axes."""
     names = ("x", "y", "z")
     columns = [("time_s", motion.time, 2)]
     columns += [(f"force_{n}_N", squat.force[:, i], 5) for i, n in enumerate(names)]
@@ -48,5 +48,5 @@ def ground_reaction_csv(motion, squat):
 
 
 def in_tibia(point, si_start):
-    """A point (mm) of the insert frame in the tibia link."""
+    """Return a point (mm) of the insert frame in the frame of the tibia link."""
     return (point[0], point[1] + chain.insert_height(si_start), point[2])

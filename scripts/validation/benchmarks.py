@@ -34,9 +34,9 @@ class BenchmarkSettings:
     """Presses on implants that are compared with publications."""
 
     sensel: float = 1.27 * MILLIMETRE
-    """m; edge of a sensel of the pressure film in the publications."""
+    """m: edge of a sensel of the pressure film in the publications."""
     resolution_mm: float = 2.0
-    """mm: resolution of every press on an implant. Chosen: the whole page takes minutes."""
+    """mm: resolution of every press on an implant. Chosen because the page then takes minutes."""
 
 
 BENCHMARK = BenchmarkSettings()
@@ -55,7 +55,7 @@ def _only(result: ContactResult) -> CondyleContact:
 
 
 def spheres() -> Values:
-    """Return the sphere on a bonded layer over the exact solution, and forces at doubled depth.
+    """Return a sphere on a bonded layer over the exact solution, and forces at doubled depth.
 
     The contact is four cells in radius.
     """
@@ -79,7 +79,7 @@ def spheres() -> Values:
 
 
 def _doubled(model: Any, state: Any, depth: float = 5e-5) -> float:
-    """Return the reaction at twice an approach over that at the approach."""
+    """Return the ratio of the reactions at twice an approach and at the approach."""
     touch = model.press(state, 0.0, UPRIGHT).pose
     force = []
     for times in (1.0, 2.0):
@@ -112,7 +112,7 @@ def patch() -> Values:
 
 
 def refinement() -> Values:
-    """Return approaches under that plate at 1.5 mm, off finite elements of 0.75 mm, %."""
+    """Return differences (%) of the approach at 1.5 mm from finite elements of 0.75 mm."""
     pair = _plate_on_box()
 
     def approach(name: str, size_mm: float) -> float:
@@ -127,12 +127,12 @@ def refinement() -> Values:
 
 
 def speed(trade_off: Path) -> Values:
-    """Return how many times longer finite elements take than the source's lattice, per position.
+    """Return the ratio of the times of finite elements and the source's lattice, per position.
 
     Both on the two condyles with cells of 2 mm, as `tkamb tradeoff` measured them in one run.
 
     Args:
-        trade_off: its JSON.
+        trade_off: JSON of the trade-off study.
     """
     rows = json.loads(trade_off.read_text(encoding="utf-8"))
     seconds = {
@@ -211,7 +211,7 @@ def foundation(designs: Path) -> Values:
 
 
 def _both(design: Design, name: str) -> Array:
-    """Peak pressures (2,) Pa of the medial condyle at 15 and 60 deg, whole component."""
+    """Return peak pressures (2,) Pa of the medial condyle at 15 and 60 deg, whole component."""
     pressed = PressedDesign(design, BENCHMARK.resolution_mm)
     pressed.model = _model(name, BENCHMARK.resolution_mm)
     results = [pressed.press_both(flexion * DEGREE, 2400.0) for flexion in (15.0, 60.0)]
@@ -219,7 +219,7 @@ def _both(design: Design, name: str) -> Array:
 
 
 def given_load_or_approach() -> Values:
-    """Return the foundation's error at a given load over that at a given approach, toroid."""
+    """Return the ratio of the foundation's errors at a given load and a given approach, toroid."""
     linear = materials.material("polyethylene-linear")
     femoral = balls(25e-3, 0.0, waist=0.8)
     pair = ContactPair(femoral, block(dishes(9e-3, 50e-3, 0.0), (26e-3, 26e-3)), linear)
@@ -247,7 +247,7 @@ def film() -> Values:
 
 
 def measured_stress(designs: Path) -> Values:
-    """Return the average contact stress (MPa) of the six designs at 2000 N a knee, medians."""
+    """Return the median contact stress (MPa) of the six designs at 2000 N per knee."""
     flexions = (0.0, 15.0, 60.0)
     result = np.array(
         [
@@ -263,7 +263,7 @@ def measured_stress(designs: Path) -> Values:
 
 
 def _variant(designs: Path, dish: float, coronal: float, thickness: float = 9.0) -> PressedDesign:
-    """The fixed Sigma's femur on other dishes: sagittal and coronal radius, thickness, mm."""
+    """Return the fixed Sigma's femur on other dishes of sagittal and coronal radius, mm."""
     design = load_design(designs / "sigma_fb")
     insert = replace(
         design.insert,
@@ -280,14 +280,14 @@ def _variant(designs: Path, dish: float, coronal: float, thickness: float = 9.0)
 
 
 def _peak(pressed: PressedDesign, flexion: float, load: float, turn: float = 0.0) -> float:
-    """Peak pressure (Pa); the femur is turned about the middle of the knee by `turn` deg."""
+    """Return the peak pressure (Pa) with the femur turned by `turn` deg about the knee's middle."""
     shift = pressed.design.femoral.ridge_half * MILLIMETRE * np.sin(turn * DEGREE)
     result = pressed.press_alone("medial", flexion * DEGREE, load, turn * DEGREE, shift)
     return _only(result).peak_pressure
 
 
 def conformity(designs: Path) -> Values:
-    """Return what conformity does to peak pressure at 3000 N a knee, 0, 60 and 90 deg.
+    """Return the effect of conformity on peak pressure at 3000 N per knee, 0, 60 and 90 deg.
 
     Conforming: dishes of 50 mm along and 20.6 mm across under a femur of 20 mm across; less
     conforming: 80 and 23.5 mm.
@@ -302,7 +302,7 @@ def conformity(designs: Path) -> Values:
 
 
 def thickness_and_plane(designs: Path) -> Values:
-    """Return how peak pressure depends on thickness and on the plane of conformity, 60 deg.
+    """Return the effects of thickness and plane of conformity on peak pressure, at 60 deg.
 
     Conformity r/R is raised by a tenth, across from 0.85 and along from 0.5.
     """

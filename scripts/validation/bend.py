@@ -11,11 +11,11 @@ from tkamb.run.simulation import simulate
 
 @dataclass(frozen=True)
 class BendStudySettings:
-    """The shipped bend beside publications."""
+    """Comparison of the shipped bend with publications."""
 
     stride: int = 10
-    """Every so many of the 101 frames are computed; contact by Hertz, since only the forces of the
-    leg are compared."""
+    """Stride of the 101 frames. The contact model is Hertz, because only the forces of the leg are
+    compared."""
 
 
 BEND_STUDY = BendStudySettings()
@@ -49,7 +49,7 @@ def bend(scene: Path) -> dict[str, float]:
 
 
 def alignment(scene: Path) -> dict[str, float]:
-    """Return how much the femoral adjustment changes the total force of that bend, BW at most."""
+    """Return the largest change of the total force (BW) of the bend by the femoral adjustment."""
     adjusted = load_scene(scene, {"contact.adjust": True, "contact.model": "foundation"})
     result = simulate(adjusted, resolution_mm=2.0, frames=slice(0, 101, BEND_STUDY.stride))
     return {"alignment": float(np.nanmax(np.abs(result["adjust_force_change_BW"])))}

@@ -1,4 +1,4 @@
-"""One cell of tables D-3 to D-6: a condyle of a design pressed at the table's own force.
+"""One cell of tables D-3 to D-6: a condyle of a design, pressed with the force in the table.
 
 Each condyle is pressed alone, so that it carries the table's force whatever the medial-lateral
 split. Inputs that the source does not publish are assumptions with a range: flexion at a percentage
@@ -33,9 +33,9 @@ RANGES = {
     "mobile_axial_rotation_deg": (-2.0, 2.0),
     "size": (0.93, 1.07),
 }
-"""Flexion is linear in the percentage of the bend; AP of the contact is about the low point; a
-mobile insert turns with the femur and leaves little rotation between them; neighbouring sizes of
-a family differ by about 7 %."""
+"""Ranges of the assumed inputs. Flexion is linear in the percentage of the bend. AP of the contact
+is relative to the dish's low point. A mobile insert turns with the femur, so that the rotation
+between them is small. Neighbouring sizes of a family differ by about 7 %."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Assumption:
     """Assumed inputs of one knee that the source does not publish.
 
     Args:
-        flexion_start: rad, at 0 % of the bend.
-        flexion_end: rad, at 100 %.
-        ap: m, of the contact in front of the dish's low point.
-        axial_rotation: rad, of the femur on the insert, external positive.
+        flexion_start: flexion at 0 % of the bend, rad.
+        flexion_end: flexion at 100 % of the bend, rad.
+        ap: distance of the contact in front of the dish's low point, m.
+        axial_rotation: external rotation of the femur on the insert, rad.
         size: factor on every length of the implant.
     """
 
@@ -62,9 +62,9 @@ class Cell:
     """Results of a pressed condyle.
 
     Args:
-        area: m², in contact.
-        overlap: m², of the undeformed insert that the femur overlaps: the source's area.
-        force: N.
+        area: contact area, m².
+        overlap: area of the undeformed insert that the femur overlaps, m²: the area in the source.
+        force: contact force, N.
     """
 
     area: float
@@ -78,7 +78,7 @@ class Cell:
 
     @property
     def overlap_pressure(self) -> float:
-        """Force over the overlapping area, Pa: the source's mean pressure."""
+        """Force over the overlapping area, Pa: the mean pressure in the source."""
         return self.force / self.overlap
 
 
@@ -111,7 +111,7 @@ class PressedDesign:
 
     Args:
         design: the implant.
-        resolution_mm: of the lattice.
+        resolution_mm: cell size of the lattice.
     """
 
     def __init__(self, design: Design, resolution_mm: float = 2.0):
@@ -123,13 +123,13 @@ class PressedDesign:
         self._states: dict[str, Any] = {}
 
     def cell(self, condyle: Condyle, percent: float, load: float, case: Assumption) -> Cell | None:
-        """Press one condyle with `load` (N); None where it cannot be carried."""
+        """Press one condyle with `load` (N); None if the press fails."""
         state, square = self._prepared(condyle), case.size**2
         result = self.model.press(state, load / square, self.pose(condyle, percent, case))
         carried = result.medial or result.lateral
         if result.status is not ContactStatus.OK or carried is None:
             return None
-        # the same pose again, now with the source's rule: only the areas differ
+        # the same pose with the source's rule for the area
         again = self.source_rule.evaluate(state, result.pose, result)
         overlap = again.medial or again.lateral
         if overlap is None:
@@ -146,7 +146,7 @@ class PressedDesign:
     ) -> ContactResult:
         """Press one condyle at a flexion (rad) with `load` (N).
 
-        It stands over its low point, turned about its own vertical by axial_rotation (rad) and
+        The condyle is over its low point, rotated about its vertical by axial_rotation (rad) and
         moved anteriorly by shift (m).
         """
         pose = self.pose(condyle, 0.0, Assumption(flexion, flexion, 0.0, axial_rotation, 1.0))
@@ -166,7 +166,7 @@ class PressedDesign:
         return self._states[condyle]
 
     def pair(self, condyle: Condyle) -> ContactPair:
-        """Return one condyle, cut off in the middle and open there, and the insert, m."""
+        """Return one condyle, cut open in the middle, and the insert, m."""
         both = self.whole()
         medial, lateral = condyle_faces(both.femoral, 0.0)
         alone = both.femoral.faces[medial if condyle == "medial" else lateral]
@@ -187,7 +187,7 @@ class PressedDesign:
         return ContactPair(femoral, insert, material, self.design.bearing)
 
     def pose(self, condyle: Condyle, percent: float, case: Assumption) -> Array:
-        """Pose whose condyle touches its dish `ap` in front of the low point.
+        """Return the pose in which a condyle touches its dish `ap` in front of the low point.
 
         On a dish of radius R a condyle of radius r touches where the normals agree: its centre
         lies (1 - r/R) ap in front of the low point.
@@ -230,7 +230,7 @@ def table_cell(design: str, condyle: Condyle, row: int) -> tuple[float, float]:
 
 
 def in_public_units(cells: Iterable[Cell]) -> Array:
-    """Return (n, 4): area mm², overlap mm², mean pressure MPa, the same over the overlap."""
+    """Return (n, 4): area and overlap, mm², and mean pressure over each, MPa."""
     rows = [
         (
             c.area / MILLIMETRE**2,

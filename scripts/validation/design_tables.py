@@ -1,4 +1,4 @@
-"""Tables D-3 to D-6 beside parametric designs that are pressed at the tables' own forces."""
+"""Comparison of tables D-3 to D-6 with parametric designs, pressed with the tables' forces."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -28,10 +28,10 @@ FOLDERS = {
     "NKII UCP": "nkii_ucp",
     "NKII CP": "nkii_cp",
 }
-"""Of models/designs, by the tables' names."""
+"""Name of a design in the tables -> folder in models/designs."""
 CONDYLES: tuple[Condyle, Condyle] = ("medial", "lateral")
 QUANTITIES = ("area_mm2", "overlap_mm2", "mean_pressure_MPa", "overlap_pressure_MPa")
-"""Contact area, the source's area, and force over each."""
+"""Contact area, area by the source's rule, and force over each."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class DesignTableSettings:
     """Tables of designs."""
 
     samples: int = 6
-    """Number of samples besides the nominal case. Chosen: the table takes hours, not days."""
+    """Number of samples besides the nominal case. Chosen because the table then takes hours."""
 
 
 DESIGN_TABLE = DesignTableSettings()
@@ -87,9 +87,9 @@ def press_tables(
 
     Args:
         folder: models/designs.
-        rows: of the tables, 0 for the start of the bend.
-        resolution_mm: of the lattice.
-        announce: called with a line on each design that is done.
+        rows: row numbers of the tables; 0 is the start of the bend.
+        resolution_mm: cell size of the lattice.
+        announce: function that gets a line of text per finished design.
     """
     result = []
     for name in dissertation.designs():
@@ -134,11 +134,11 @@ def by_design(rows: Sequence[dict[str, Any]], quantity: str, condyle: Condyle) -
 
 
 def pairs_in_order(ours: Array, table: Array) -> tuple[int, int]:
-    """Return how many pairs of designs are in the table's order, and how many pairs there are.
+    """Return the number of pairs of designs in the table's order, and the number of all pairs.
 
     Args:
         ours: (6,) one number per design.
-        table: (6,) the table's.
+        table: (6,) the table's numbers.
     """
     pairs = list(combinations(range(len(table)), 2))
     right = sum((ours[i] - ours[j]) * (table[i] - table[j]) > 0 for i, j in pairs)

@@ -1,4 +1,4 @@
-"""The dissertation's tables D-1 to D-12 (Sharma 2008), and what was found wrong in them.
+"""The dissertation's tables D-1 to D-12 (Sharma 2008), and the errors in them.
 
 The tables are kept as printed. `corrected` gives table D-12 with the two NKII columns exchanged,
 which is the one change that a comparison needs. Other findings are data beside the tables
@@ -32,8 +32,8 @@ class Table:
 
     Args:
         number: 1 for D-1.
-        page: of appendix D, counted by its running heads.
-        heading: as printed, with the unit.
+        page: page of appendix D, counted by its running heads.
+        heading: printed heading, with the unit.
         unit: "BW", "mm2" or "MPa".
         percent: (11,) % of the deep knee bend (not degrees).
         mean: (11, 6) in the unit, columns as in `designs()`.
@@ -60,12 +60,12 @@ def designs() -> tuple[str, ...]:
 
 
 def subjects(design: str) -> int:
-    """Return how many subjects had this design."""
+    """Return the number of subjects with a design."""
     return int(_read("tables")["subjects"][design])
 
 
 def findings() -> tuple[dict[str, Any], ...]:
-    """Return what was found wrong in the tables; each row names its check and the cells."""
+    """Return the errors in the tables; each row names its check and the cells."""
     return tuple(_read("findings")["finding"])
 
 
@@ -92,7 +92,7 @@ def table(number: int) -> Table:
 
 
 def corrected(number: int) -> Table:
-    """Return a table as printed, but D-12 with its NKII columns exchanged."""
+    """Return a table as printed; in D-12 the NKII columns are exchanged."""
     printed = table(number)
     if number != SI_FORCE:
         return printed
@@ -136,7 +136,7 @@ def si_surplus(corrected_columns: bool) -> Array:
 
 
 def patellar_surplus() -> Array:
-    """Return PF - |Q - PL| (11, 6) BW: negative where no patella can be in equilibrium.
+    """Return PF - |Q - PL| (11, 6) BW. If it is negative, the patella cannot be in equilibrium.
 
     Three forces on a body of small mass close a triangle, whatever their directions.
     """
@@ -145,7 +145,7 @@ def patellar_surplus() -> Array:
 
 
 def unexplained_pull() -> Array:
-    """Return SI force - PL - 1 BW (11, 6) BW: what muscles and ligaments must carry at least.
+    """Return SI force - PL - 1 BW (11, 6) BW, the least force of other muscles and ligaments.
 
     Along the tibia, contact = ground reaction + patellar ligament + the rest. One leg's ground
     reaction is below 1 BW in a slow bend, and the ligament pulls along the tibia with its whole

@@ -16,7 +16,7 @@ from tkamb.contact.result import ContactResult
 from tkamb.geometry.frames import Array
 
 Field = Callable[[Array, Array], Array]
-"""Pressure (n,) Pa at x (n,) and z (n,) m; 0 where nothing touches."""
+"""Function of x (n,) and z (n,), m: pressure (n,), Pa; 0 without contact."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class FilmReading:
     """Reading of the film.
 
     Args:
-        force: N, pressures times the area of a cell, summed.
-        area: m², of the cells that read a pressure.
-        peak_pressure: Pa, of the highest cell.
-        cells: how many read a pressure.
-        perimeter_cells: how many of them have a neighbour that reads none.
+        force: sum of pressures times the area of a cell, N.
+        area: area of the cells with a pressure, m².
+        peak_pressure: largest pressure of a cell, Pa.
+        cells: number of cells with a pressure.
+        perimeter_cells: number of these cells with a neighbour without pressure.
     """
 
     force: float
@@ -39,12 +39,12 @@ class FilmReading:
 
     @property
     def mean_pressure(self) -> float:
-        """Force over area, Pa; NaN where nothing is read."""
+        """Force over area, Pa; NaN without a pressure."""
         return self.force / self.area if self.cells else float("nan")
 
     @property
     def perimeter_share(self) -> float:
-        """Perimeter cells over cells: Fregly and Sawyer's area ratio; NaN where nothing is read."""
+        """Perimeter cells over cells (area ratio of Fregly and Sawyer); NaN without a pressure."""
         return self.perimeter_cells / self.cells if self.cells else float("nan")
 
 
@@ -54,8 +54,8 @@ class PressureFilm:
 
     Args:
         cell: m, edge of a sensel.
-        offset: of a cell's corner from the origin, in cells along x and z.
-        threshold: Pa, below which a cell reads nothing.
+        offset: distance of a cell's corner from the origin along x and z, in cells.
+        threshold: smallest pressure that a cell reads, Pa.
     """
 
     cell: float
@@ -66,9 +66,9 @@ class PressureFilm:
         """Read a field within a rectangle.
 
         Args:
-            field: pressure at points.
-            low: (2,) m, least x and z that the field reaches.
-            high: (2,) m, largest.
+            field: function of the pressure at points.
+            low: (2,) m, smallest x and z of the field.
+            high: (2,) m, largest x and z of the field.
         """
         x, z = (
             self.cell * (np.arange(np.floor(a / self.cell) - 2, np.ceil(b / self.cell) + 3) + o)
@@ -93,15 +93,15 @@ def hertz_field(semi_axes: tuple[float, float], peak: float) -> Field:
     """Return p = p0 sqrt(1 - x²/a² - z²/b²), a Hertz ellipse about the origin.
 
     Args:
-        semi_axes: a, b, m.
-        peak: p0, Pa.
+        semi_axes: semi-axes a and b, m.
+        peak: peak pressure p0, Pa.
     """
     a, b = semi_axes
     return lambda x, z: peak * np.sqrt(np.maximum(1.0 - (x / a) ** 2 - (z / b) ** 2, 0.0))
 
 
 def film_of(result: ContactResult, state: PreparedContact) -> tuple[Field, Array, Array]:
-    """Return a contact result's pressure as a field, and the rectangle (2,), (2,) m it fills."""
+    """Return a result's pressure as a field, and the corners (2,), (2,) m of its rectangle."""
     x, _, z = result.points.T
     between = LinearTriInterpolator(Triangulation(x, z, state.triangles), result.pressure)
     loaded = result.points[result.pressure > 0.0][:, [0, 2]]
@@ -116,7 +116,7 @@ def worst_errors(semi_axes: tuple[float, float], cell: float, places: int = 12) 
     Args:
         semi_axes: m.
         cell: m, edge of a sensel.
-        places: of the grid along each axis within one cell.
+        places: number of positions of the grid along each axis, within one cell.
 
     Returns:
         force, peak, mean and area, each as |read - exact| / exact.

@@ -1,4 +1,4 @@
-"""docs/validation.md: every published number beside ours, from what `scripts/validate` stored."""
+"""docs/validation.md: published numbers and tkamb's, from the results of `scripts/validate`."""
 
 import math
 import tomllib
@@ -53,7 +53,7 @@ pressures in MPa. Contact: force and area where the surfaces touch; overlap: the
 
 @cache
 def published() -> dict[str, Any]:
-    """Return sources, values and what is not compared."""
+    """Return sources, values, and values that are not compared."""
     text = (Path(__file__).parent / "published.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
@@ -64,7 +64,7 @@ def hit(value: Row, ours: float) -> bool:
 
 
 def badge(values: dict[str, float]) -> str:
-    """Return the line that counts what lies within its band: the source's own, else one of ours."""
+    """Return the line that counts the values within their bands."""
     rows = [row for row in published()["value"] if row["id"] in values]
     within = sum(hit(row, values[row["id"]]) for row in rows)
     line = f"**{within} of {len(rows)} published values within their band**"

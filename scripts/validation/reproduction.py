@@ -1,4 +1,4 @@
-"""Compute what docs/dissertation.md compares with Sharma (2008), by the preset sharma-2008.
+"""Compute the numbers of docs/dissertation.md with the preset sharma-2008.
 
 Facts of the source stand in `reproduction.toml`, appendix D in `dissertation_tables.toml`. The page
 takes some other numbers from scripts/data/validation.json; they are not computed here.
@@ -37,7 +37,7 @@ class ReproductionSettings:
     """The reproduction of the dissertation."""
 
     stride: int = 10
-    """Every `stride`-th of the 101 frames of the shipped bend is computed. Source: appendix D has
+    """Stride of the 101 frames of the shipped bend. Source: appendix D has
     0, 10, ... 100 %."""
 
 
@@ -59,7 +59,7 @@ def lattice(model: Path) -> Values:
     start = time.process_time()
     state = contact.prepare(pair)
     prepared = time.process_time()
-    contact.press(state, LOAD / 10, pose)  # compiles what is not on disk yet
+    contact.press(state, LOAD / 10, pose)  # compiles code that is not in the cache
     pressed = time.process_time()
     result = contact.press(state, LOAD, pose)
     ended = time.process_time()
@@ -137,9 +137,9 @@ def adjustment(model: Path) -> Values:
 
 
 def lift_off(scene: Path) -> Values:
-    """Return in how many positions a coronal error lifts a condyle off, adjusted and unadjusted.
+    """Return the number of positions with lift-off by a coronal error, adjusted and unadjusted.
 
-    The result also has the least share of the load that a condyle carries.
+    The result also has the smallest share of the load on a condyle.
     """
 
     error, flexions = LIFTED

@@ -1,4 +1,4 @@
-"""docs/dissertation.md: chapters 4 and 5 and appendix D of Sharma (2008) beside tkamb's numbers."""
+"""docs/dissertation.md: chapters 4 and 5 and appendix D of Sharma (2008), and tkamb's numbers."""
 
 import string
 import tomllib

@@ -1,1 +1,1 @@
-"""The commands of `tkamb`: arguments in, exit status out; nothing is computed here."""
+"""The commands of `tkamb` parse arguments, call the code that computes, and print results."""

@@ -1,4 +1,4 @@
-"""`tkamb check`: its arguments, and its lines, picture or page."""
+"""`tkamb check`: its arguments, printed findings, and picture or page."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ POLICY = (
     "default-src 'none'; style-src-elem {style}; style-src-attr 'unsafe-inline'; "
     "img-src data:; base-uri 'none'; form-action 'none'"
 )
-"""Content security policy of the page: nothing is loaded from elsewhere."""
+"""Content security policy of the page: the browser loads nothing from elsewhere."""
 
 
 def add_check(commands: Any) -> None:
@@ -67,7 +67,7 @@ def _write_picture(check: "SceneCheck", path: Path) -> None:
 
 
 def check_html(check: "SceneCheck", figure: "Figure") -> str:
-    """Return the page: questions first, then the picture, then the content of each file."""
+    """Return the HTML page: questions, then the picture, then the content of each file."""
     from tkamb.show.pages import asset, policy_sources, render
     from tkamb.show.style import svg_text
 

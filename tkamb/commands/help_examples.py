@@ -1,4 +1,4 @@
-"""Examples at the end of each command's --help; the tests parse every one of them."""
+"""Examples at the end of each command's --help. The tests parse every example."""
 
 import argparse
 
@@ -79,11 +79,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 
 
 def add_examples(parser: argparse.ArgumentParser) -> None:
-    """Write the examples at the end of each command's help.
-
-    Args:
-        parser: of the whole command line.
-    """
+    """Write the examples at the end of the help of each command of a parser."""
     for command, leaf in leaf_parsers(parser):
         examples = EXAMPLES.get(command)
         if examples:

@@ -1,4 +1,4 @@
-"""`tkamb import` and `tkamb data`: their arguments, and what they print."""
+"""`tkamb import` and `tkamb data`: their arguments and printed lines."""
 
 import argparse
 import re
@@ -22,15 +22,14 @@ def add_data(commands: Any) -> None:
     get.add_argument("name", choices=NAMES, help="dm: Grand Challenge subject DM")
     source = get.add_mutually_exclusive_group()
     source.add_argument(
-        "--from", dest="source", type=Path, metavar="DIR", help="downloaded by hand"
+        "--from", dest="source", type=Path, metavar="DIR", help="folder of files downloaded by hand"
     )
-    source.add_argument("--url", metavar="URL", help="of a mirror with the same paths")
+    source.add_argument("--url", metavar="URL", help="address of a mirror with the same paths")
     get.add_argument(
         "--to",
         type=Path,
         metavar="DIR",
-        help="default: ../shared/data/dm, where the scenes of models/dm look from the "
-        "project's folder",
+        help="folder for the data; default: ../shared/data/dm, which the scenes of models/dm use",
     )
     get.set_defaults(command=_get)
 
@@ -39,64 +38,77 @@ def _get(options: argparse.Namespace) -> int:
     from tkamb.io.datasets import download, take_from
 
     dataset = read_dataset(options.name)
-    to = options.to or dataset.folder
+    folder = options.to or dataset.folder
     if options.source is not None:
-        got = take_from(dataset, to, options.source)
-        why = f"not in {options.source}"
+        files = take_from(dataset, folder, options.source)
+        reason = f"not in {options.source}"
     else:
-        got = download(dataset, to, options.url)
-        why = "their address is not known; no scene needs them; --from DIR copies them"
-    print(f"{to}: {dataset.says} ({dataset.licence}, {dataset.repository})")
-    print(f"  {len(got.written)} files written, {len(got.kept)} were there, each by its SHA-256")
-    if got.absent:
-        print(f"  not there ({why}): {', '.join(got.absent)}")
+        files = download(dataset, folder, options.url)
+        reason = "their address is not known; no scene needs them; --from DIR copies them"
+    print(f"{folder}: {dataset.says} ({dataset.licence}, {dataset.repository})")
+    counts = f"{len(files.written)} files written, {len(files.kept)} were there"
+    print(f"  {counts}; the SHA-256 of each is as expected")
+    if files.absent:
+        print(f"  missing ({reason}): {', '.join(files.absent)}")
     return 0
 
 
 def add_import(commands: Any) -> None:
-    """Add the command's parser."""
-    p = commands.add_parser("import", help="a patient from an OpenSim model and a recording")
-    p.add_argument("model", type=Path, metavar="MODEL.osim", help="an OpenSim model")
-    source = p.add_mutually_exclusive_group(required=True)
-    source.add_argument("--c3d", type=Path, metavar="F", help="markers and force plates")
-    source.add_argument("--trc", type=Path, metavar="F", help="markers")
-    source.add_argument("--motion", type=Path, metavar="F", help="the model's coordinates")
-    p.add_argument("--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions")
-    p.add_argument(
+    """Add the command `import` to the parser's commands."""
+    command = commands.add_parser("import", help="a patient from an OpenSim model and a recording")
+    command.add_argument("model", type=Path, metavar="MODEL.osim", help="an OpenSim model")
+    source = command.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "--c3d", type=Path, metavar="F", help="recording of markers and force plates"
+    )
+    source.add_argument("--trc", type=Path, metavar="F", help="recording of markers")
+    source.add_argument(
+        "--motion", type=Path, metavar="F", help="motion file of the model's coordinates"
+    )
+    command.add_argument(
+        "--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions"
+    )
+    command.add_argument(
         "--grf-force",
         metavar="NAME,NAME",
         help="first part of the names of the foot's columns in --grf, like ground_force_2; several "
         "are summed",
     )
-    p.add_argument(
+    command.add_argument(
         "--static",
         type=Path,
         metavar="F",
-        help="standing trial, from which the marker positions on the segments follow",
+        help="standing trial, which gives the marker positions on the segments",
     )
-    p.add_argument("--side", choices=("right", "left"), required=True, help="side of the knee")
-    p.add_argument("--mass-kg", type=float, required=True, metavar="KG", help="mass of the subject")
+    command.add_argument(
+        "--side", choices=("right", "left"), required=True, help="side of the knee"
+    )
+    command.add_argument(
+        "--mass-kg", type=float, required=True, metavar="KG", help="mass of the subject"
+    )
     for part in ("femoral", "insert", "patella"):
-        p.add_argument(f"--{part}", type=Path, metavar="F", help=f"mesh of the {part} component")
-        p.add_argument(
+        command.add_argument(
+            f"--{part}", type=Path, metavar="F", help=f"mesh of the {part} component"
+        )
+        command.add_argument(
             f"--{part}-frame",
             metavar="NAME",
             help="body or frame of the model that this mesh belongs to",
         )
-    p.add_argument(
+    command.add_argument(
         "--femur-bone",
         type=Path,
         metavar="F",
         help="mesh of the femur that the quadriceps may wrap",
     )
-    p.add_argument(
+    command.add_argument(
         "--mesh-unit",
         "--units",
         dest="mesh_unit",
         choices=tuple(LENGTH),
         help="unit of all meshes; it is never guessed",
     )
-    p.add_argument(
+    command.add_argument(
         "--mesh-axes",
         "--axes",
         dest="mesh_axes",
@@ -104,29 +116,31 @@ def add_import(commands: Any) -> None:
         help="axes of the meshes that point anterior, superior and to the right; write "
         "--mesh-axes=-x,+y,-z",
     )
-    _add_poses(p)
-    _add_inferred(p)
-    p.add_argument(
+    _add_poses(command)
+    _add_inferred(command)
+    command.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder of scene and patient.urdf"
     )
-    p.add_argument("--scene", default="scene.toml", metavar="NAME", help="name of the scene file")
-    p.add_argument(
+    command.add_argument(
+        "--scene", default="scene.toml", metavar="NAME", help="name of the scene file"
+    )
+    command.add_argument(
         "--contact",
         choices=("foundation", "lattice"),
         default="foundation",
         help="the scene's contact model; default: %(default)s",
     )
-    p.add_argument(
+    command.add_argument(
         "--activity",
         choices=get_args(Activity),
         help="activity whose published values the report shows",
     )
-    p.add_argument(
+    command.add_argument(
         "--muscles",
         action="store_true",
         help="all muscles of the model share the load ([muscles]); default: the quadriceps alone",
     )
-    p.add_argument(
+    command.add_argument(
         "--cycle",
         type=_cycle,
         nargs="?",
@@ -135,10 +149,10 @@ def add_import(commands: Any) -> None:
         help="plot against per cent of the gait cycle: 0 and 100 %% at these times (s); without "
         "A:B, or with the word plates: two foot strikes on the force plates",
     )
-    p.add_argument(
+    command.add_argument(
         "--note", action="append", default=[], metavar="TEXT", help="sentence for the report"
     )
-    scale = p.add_mutually_exclusive_group()
+    scale = command.add_mutually_exclusive_group()
     scale.add_argument(
         "--scale-mass",
         dest="scale",
@@ -153,40 +167,47 @@ def add_import(commands: Any) -> None:
         default=None,
         help="use the model's masses unchanged",
     )
-    p.set_defaults(command=_import)
+    command.set_defaults(command=_import)
 
 
-def _add_inferred(p: argparse.ArgumentParser) -> None:
-    """Add the options that replace what is inferred from the files."""
-    p.add_argument("--knee", metavar="JOINT", help="the femorotibial joint of the model")
-    p.add_argument(
-        "--plates", type=_numbers, metavar="2,3", help="force plates under this foot, or none"
+def _add_inferred(command: argparse.ArgumentParser) -> None:
+    """Add the options that replace values inferred from the files."""
+    command.add_argument("--knee", metavar="JOINT", help="name of the model's femorotibial joint")
+    command.add_argument(
+        "--plates",
+        type=_numbers,
+        metavar="2,3",
+        help="numbers of the force plates under this foot, or the word none",
     )
-    p.add_argument(
+    command.add_argument(
         "--interval", type=_interval, metavar="A:B", help="part of the recording to use, s"
     )
-    p.add_argument(
+    command.add_argument(
         "--laboratory-axes",
         metavar="FORWARD,UP,RIGHT",
         help="axes of the recording that point forward, up, right",
     )
-    p.add_argument("--without", type=_names, default=(), metavar="A,B", help="markers to leave out")
-    p.add_argument(
+    command.add_argument(
+        "--without", type=_names, default=(), metavar="A,B", help="markers to leave out"
+    )
+    command.add_argument(
         "--marker-prefix", metavar="NAME", help="prefix of the marker labels to use: JW of JW:RHeel"
     )
-    p.add_argument(
+    command.add_argument(
         "--length-unit", choices=("m", "cm", "mm"), help="length unit of a .c3d that states none"
     )
-    p.add_argument("--force-unit", metavar="N", help="force unit of a .c3d that states none")
-    p.add_argument("--moment-unit", metavar="Nmm", help="moment unit of a .c3d that states none")
-    p.add_argument(
+    command.add_argument("--force-unit", metavar="N", help="force unit of a .c3d that states none")
+    command.add_argument(
+        "--moment-unit", metavar="Nmm", help="moment unit of a .c3d that states none"
+    )
+    command.add_argument(
         "--method",
         choices=("segments", "chain"),
         default="segments",
         help="fit the markers of thigh and shank separately, or the whole leg as a chain; default: "
         "segments",
     )
-    p.add_argument(
+    command.add_argument(
         "--cutoff-hz",
         type=float,
         default=6.0,
@@ -195,46 +216,50 @@ def _add_inferred(p: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_poses(p: argparse.ArgumentParser) -> None:
+def _add_poses(command: argparse.ArgumentParser) -> None:
     """Add the options of recorded poses of the implant."""
-    p.add_argument(
+    command.add_argument(
         "--poses",
         type=Path,
         metavar="F",
         help="recorded poses of the femoral mesh in the axes of the insert mesh",
     )
-    p.add_argument(
+    command.add_argument(
         "--pose-columns",
         type=_names,
         metavar="R1,R2,R3,X,Y,Z",
-        help="columns of --poses: three angles, three places",
+        help="columns of --poses: three angles, then three positions",
     )
-    p.add_argument(
+    command.add_argument(
         "--pose-sequence",
         metavar="XYZ",
-        help="sequence of their angles; upper case: intrinsic (Rx Ry Rz)",
+        help="sequence of the angles in --poses; upper case: intrinsic (Rx Ry Rz)",
     )
-    p.add_argument(
-        "--pose-units", type=_names, metavar="rad,m", help="units of their angles and places"
+    command.add_argument(
+        "--pose-units",
+        type=_names,
+        metavar="rad,m",
+        help="units of the angles and positions in --poses",
     )
-    p.add_argument(
+    command.add_argument(
         "--pose-signs-turned",
         type=_names,
         default=(),
         metavar="ROLES",
-        help="angles and places whose sign is reversed: rotation_1, …",
+        help="angles and positions to reverse in sign: rotation_1, …",
     )
-    p.add_argument(
+    command.add_argument(
         "--stride",
         type=_interval,
         metavar="A:B",
         help="times of the recording, s, at 0 and 100 %% of the poses",
     )
-    p.add_argument(
+    command.add_argument(
         "--stance",
         type=_interval,
         metavar="A:B",
-        help="part of the poses' time over which the knee centre in the shank is averaged",
+        help="interval of the poses' time column for the mean position of the knee centre in the "
+        "shank",
     )
 
 
@@ -279,10 +304,10 @@ def _import(options: argparse.Namespace) -> int:
 
 
 def import_request(options: argparse.Namespace) -> "ImportRequest":
-    """Return what a command line asks for.
+    """Return the request of a command line.
 
     Raises:
-        InputError: options that do not go together, or numbers that cannot be.
+        InputError: options exclude each other, or a number is out of range.
     """
     from tkamb.io.importing.request import ImportRequest
     from tkamb.io.recordings.unit_words import GivenUnits

@@ -13,7 +13,7 @@ from tkamb.units import LENGTH
 
 UNIT_OPTIONS = ("--units", "--mesh-unit")
 AXES_OPTIONS = ("--axes", "--mesh-axes")
-"""Two spellings of an option, which every command on meshes accepts."""
+"""Every command on meshes accepts both spellings of an option."""
 
 
 def add_press(commands: Any) -> None:
@@ -76,8 +76,8 @@ def add_press(commands: Any) -> None:
     press.add_argument(
         "--restore-when",
         choices=("both", "either"),
-        help="with --adjust: whether penetration and angle, or either of them, must exceed the "
-        "adjustment to undo it; default: both",
+        help="with --adjust: restore the rotation of --pose when penetration and angle after the "
+        "press exceed the adjustment (both), or when one of them does (either); default: both",
     )
     press.add_argument(
         "--out", type=Path, metavar="F.vtp", help="file for the pressure map, for ParaView"
@@ -140,7 +140,7 @@ def add_mesh(commands: Any) -> None:
     )
     lattice.add_argument("insert", type=Path, metavar="INSERT", help="mesh of the insert")
     lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
-    _add_units(lattice, "of the mesh")
+    _add_units(lattice, "unit of the mesh")
     _add_side(lattice)
     lattice.add_argument(
         "--out", type=Path, metavar="F.vtu", help="file for the lattice, for ParaView or meshio"
@@ -201,8 +201,8 @@ def _contact_list(options: argparse.Namespace) -> int:
     for name, line in contact_descriptions().items():
         print(f"{name:18s} {line}")
     print(
-        "times are those of one press; a frame is one press, with released coordinates twenty to "
-        "eighty"
+        "times are for one press; a frame takes one press, with released coordinates 20 to 80 "
+        "presses"
     )
     return 0
 
@@ -243,7 +243,7 @@ def add_no_cache(command: argparse.ArgumentParser) -> None:
 
 
 def without_cache(contact: str | None) -> dict[str, Any]:
-    """Return the options of a contact model without a cache on disk.
+    """Return the option that turns off the cache of a contact model on disk.
 
     Raises:
         InputError: there is no such model, or it has no cache.

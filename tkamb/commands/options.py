@@ -1,7 +1,7 @@
-"""Options: what commands on a scene share, and which options mean nothing beside which others.
+"""Options that several commands share, and rules that refuse options without effect.
 
 An option that would be ignored is refused, because the user expects an effect. `RULES` has the
-rules by command; `tests/test_option_rules.py` checks that it has every option of every command.
+rules by command. `tests/test_option_rules.py` checks that each option has an effect or a rule.
 """
 
 import argparse
@@ -51,14 +51,14 @@ def add_preset(command: Any) -> None:
 
 
 def add_force(command: argparse.ArgumentParser) -> None:
-    """Add --force to a command that writes one file."""
+    """Add --force to a command whose --out is one file."""
     command.add_argument(
         "--force", action="store_true", help="--out may replace a file that tkamb did not write"
     )
 
 
 def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Return dotted key -> value for the scene, from the options of `add_scene_options`."""
+    """Return dotted scene key -> value, from the options of `add_scene_options`."""
     overrides = dict(options.set)
     if options.contact:
         overrides["contact.model"] = options.contact
@@ -99,10 +99,10 @@ class Rule:
 
     Args:
         option: name of the option on the command line.
-        needs: options of which at least one must be given; empty: none.
-        excludes: options beside which the option has no effect.
-        because: reason, which follows "does not go with --x" or "needs --x".
-        unless: value of the excluded option beside which the option has an effect.
+        needs: options; at least one of them must be given. Empty: none is needed.
+        excludes: options that take away the effect of `option`.
+        because: reason, printed after "does not go with --x" or "needs --x".
+        unless: value of the excluded option with which `option` has an effect.
     """
 
     option: str
@@ -122,7 +122,7 @@ MODELS_OWN = "the file holds the model's coordinates, not markers"
 NO_OUTPUT = "nothing is written"
 ONE_BY_ONE = "it varies one input at a time"
 WORKERS_OF_CLUSTER = Rule(
-    "--workers", excludes=("--dask",), because="a cluster has its own", unless="local"
+    "--workers", excludes=("--dask",), because="a cluster has its own workers", unless="local"
 )
 
 RULES: dict[str, tuple[Rule, ...]] = {
@@ -140,11 +140,13 @@ RULES: dict[str, tuple[Rule, ...]] = {
         Rule("--contact", needs=MESHES, because="contact is between the two"),
         *(Rule(option, needs=("--poses",)) for option in POSE_OPTIONS),
         Rule("--poses", excludes=("--motion",), because=MODELS_OWN),
-        Rule("--stride", excludes=("--cycle",), because="either says where 0 and 100 % lie"),
+        Rule("--stride", excludes=("--cycle",), because="both state where 0 and 100 % lie"),
         Rule("--muscles", needs=("--patella",), because="the quadriceps pulls on it"),
-        Rule("--stride", excludes=("--interval",), because="either chooses the part"),
+        Rule("--stride", excludes=("--interval",), because="both choose the part to use"),
         Rule("--plates", needs=("--c3d",), because="other files hold no plates"),
-        Rule("--laboratory-axes", excludes=("--motion",), because="the model's ground is meant"),
+        Rule(
+            "--laboratory-axes", excludes=("--motion",), because="forces are in the model's ground"
+        ),
         Rule("--without", excludes=("--motion",), because=MODELS_OWN),
         Rule("--method", excludes=("--motion",), because=MODELS_OWN),
         Rule("--method", excludes=("--poses",), because=POSED),
@@ -173,13 +175,13 @@ RULES: dict[str, tuple[Rule, ...]] = {
     "cohort": (WORKERS_OF_CLUSTER,),
     "wear": (
         Rule("--springs", needs=("--simulator",)),
-        Rule("--period", needs=("--simulator",), because="a scene has its own clock"),
+        Rule("--period", needs=("--simulator",), because="a scene has its own times"),
     ),
     "view": (
         Rule(
             "--port",
             excludes=("--html", "--png", "--gif", "--mp4"),
-            because="a window alone has a port",
+            because="only a window has a port",
         ),
         Rule("--force", needs=("--html", "--png", "--gif", "--mp4"), because=NO_OUTPUT),
     ),
@@ -187,9 +189,11 @@ RULES: dict[str, tuple[Rule, ...]] = {
         Rule("--out", needs=("--vtp", "--deck"), because="--sto names its own file"),
         Rule("--frame", needs=("--deck",)),
         Rule("--resolution", needs=("--deck",)),
-        Rule("--force", excludes=("--sto",), because="it replaces nothing"),
+        Rule("--force", excludes=("--sto",), because="--sto replaces no file"),
     ),
-    "tradeoff": (Rule("SCENE", excludes=("--quick",), because="it measures two cases of its own"),),
+    "tradeoff": (
+        Rule("SCENE", excludes=("--quick",), because="--quick measures two cases of its own"),
+    ),
     "press": (
         Rule("--force", needs=("--out",), because=NO_OUTPUT),
         Rule("--restore-when", needs=("--adjust",)),
@@ -202,46 +206,46 @@ RULES: dict[str, tuple[Rule, ...]] = {
 def check_options(
     parser: argparse.ArgumentParser, arguments: Sequence[str], options: argparse.Namespace
 ) -> None:
-    """Raise if an option is given that has no effect beside the other options.
+    """Raise if an option has no effect because of the other options.
 
     Args:
         parser: parser of the whole command line.
-        arguments: arguments that it has accepted.
+        arguments: arguments that the parser has accepted.
         options: the parsed options.
 
     Raises:
         InputError: an option has no effect; the message names what it needs or excludes.
     """
-    command, leaf, rest = command_of(parser, arguments)
-    given = _given(leaf, rest)
+    command, leaf, remaining = command_of(parser, arguments)
+    present = _option_names(leaf, remaining)
     for rule in RULES.get(command, ()):
-        if rule.option not in given:
+        if rule.option not in present:
             continue
-        why = f": {rule.because}" if rule.because else ""
-        if rule.needs and not given & {*rule.needs}:
+        reason = f": {rule.because}" if rule.because else ""
+        if rule.needs and not present & {*rule.needs}:
             raise InputError(
-                f"needs {' or '.join(rule.needs)}{why}",
+                f"needs {' or '.join(rule.needs)}{reason}",
                 rule.option,
                 f"leave it out, or give {rule.needs[0]}",
             )
         for other in rule.excludes:
             value = getattr(options, other.lstrip("-").replace("-", "_"), None)
-            if other in given and (rule.unless is None or value != rule.unless):
-                raise InputError(f"does not go with {other}{why}", rule.option, "leave one out")
+            if other in present and (rule.unless is None or value != rule.unless):
+                raise InputError(f"does not go with {other}{reason}", rule.option, "leave one out")
 
 
 def command_of(
     parser: argparse.ArgumentParser, arguments: Sequence[str]
 ) -> tuple[str, argparse.ArgumentParser, Sequence[str]]:
     """Return the command's name, its own parser, and the arguments after its name."""
-    names, rest = [], list(arguments)
+    names, remaining = [], list(arguments)
     while verbs := _verbs(parser):
-        at = next((k for k, word in enumerate(rest) if word in verbs), None)
-        if at is None:
+        index = next((k for k, word in enumerate(remaining) if word in verbs), None)
+        if index is None:
             break
-        names.append(rest[at])
-        parser, rest = verbs[rest[at]], rest[at + 1 :]
-    return " ".join(names), parser, rest
+        names.append(remaining[index])
+        parser, remaining = verbs[remaining[index]], remaining[index + 1 :]
+    return " ".join(names), parser, remaining
 
 
 def leaf_parsers(
@@ -262,10 +266,10 @@ def _verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser
     return {}
 
 
-def _given(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str]:
-    """Return the long names of all given options, also of abbreviated ones.
+def _option_names(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str]:
+    """Return the long names of all options among the arguments, even if abbreviated.
 
-    An optional positional argument is named by its metavar.
+    The metavar stands for an optional positional argument.
     """
     names = {
         name: next(o for o in action.option_strings if o.startswith("--"))
@@ -273,7 +277,7 @@ def _given(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str
         for name in action.option_strings
         if any(o.startswith("--") for o in action.option_strings)
     }
-    given = set()
+    present = set()
     for word in arguments:
         if word == "--":
             break
@@ -281,9 +285,9 @@ def _given(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str
         full = [name for name in names if name.startswith(option)] if option[:2] == "--" else []
         match = option if option in names else full[0] if len(full) == 1 else None
         if match is not None:
-            given.add(names[match])
+            present.add(names[match])
     result, _ = parser.parse_known_args(list(arguments))
     for action in parser._actions:
         if action.nargs == "?" and not action.option_strings and getattr(result, action.dest):
-            given.add(str(action.metavar))
-    return given
+            present.add(str(action.metavar))
+    return present

@@ -24,18 +24,20 @@ def add_compare(commands: Any) -> None:
     compare.add_argument(
         "--axis",
         choices=("flexion", "cycle", "time"),
-        help="common axis; default: that of all runs",
+        help="horizontal axis; default: the axis that all runs have",
     )
     compare.add_argument(
         "--frame",
         type=int,
         metavar="K",
-        help="frame of the first run whose maps are shown; default: that of the largest force",
+        help="frame of the first run to show maps of; default: the frame of the largest force",
     )
     compare.add_argument(
         "--out", type=Path, metavar="DIR", help=f"folder for {PAGE_NAME}; default out/compare"
     )
-    compare.add_argument("--force", action="store_true", help="write into a folder not tkamb's")
+    compare.add_argument(
+        "--force", action="store_true", help="write into a folder that tkamb did not make"
+    )
     compare.add_argument("--json", action="store_true", help="print the differences as JSON")
     compare.set_defaults(command=_compare)
 
@@ -48,8 +50,8 @@ def _compare(options: argparse.Namespace) -> int:
 
     result = compare_folders(options.folders, options.axis)
     html = comparison_html(result, options.frame)
-    place = options.out or Path("out") / "compare"
-    with claimed_directory(place, options.force) as folder:
+    directory = options.out or Path("out") / "compare"
+    with claimed_directory(directory, options.force) as folder:
         write_text(folder / PAGE_NAME, html)
     lines = [*table_lines(result), f"page: {folder / PAGE_NAME}"]
     text = json.dumps(result.as_dict(), indent=2) if options.json else "\n".join(lines)
@@ -76,11 +78,15 @@ def add_export(commands: Any) -> None:
     export.add_argument(
         "--out", type=Path, metavar="DIR2", help="folder for --vtp, or file for --deck (.inp, .feb)"
     )
-    export.add_argument("--frame", type=int, metavar="K", help="for --deck: row of results.csv")
+    export.add_argument(
+        "--frame", type=int, metavar="K", help="for --deck: row of results.csv, from 0"
+    )
     export.add_argument(
         "--resolution", type=float, metavar="MM", help="for --deck: edge of the hexahedra"
     )
-    export.add_argument("--force", action="store_true", help="--out may be a folder not tkamb's")
+    export.add_argument(
+        "--force", action="store_true", help="--out may be a folder that tkamb did not make"
+    )
     export.set_defaults(command=_export)
 
 
@@ -102,7 +108,8 @@ def _export_deck(options: argparse.Namespace) -> int:
     from tkamb.run.frame_press import SUFFIX, frame_press
 
     if options.out.suffix.lower() != SUFFIX[options.deck]:
-        raise InputError(f"is no {SUFFIX[options.deck]} file", options.out, "name it so")
+        suffix = SUFFIX[options.deck]
+        raise InputError(f"is no {suffix} file", options.out, f"give a name like frame{suffix}")
     if options.resolution is not None and not 0 < options.resolution <= MAP_GRID.coarsest_mm:
         hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
         raise InputError(f"resolution {options.resolution} mm", "--resolution", hint)
@@ -132,10 +139,10 @@ def _export_maps(options: argparse.Namespace) -> int:
         raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
     with claimed_directory(options.out, options.force) as folder:
         names = write_map_series(results.maps, folder)
-    more = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
-    more += "; without the post's pressure" if "post_force_N" in results.columns else ""
+    remarks = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
+    remarks += "; without the post's pressure" if "post_force_N" in results.columns else ""
     frames = f"{len(names) - 1} of {len(results)} frames"
-    print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{more}")
+    print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{remarks}")
     return 0
 
 

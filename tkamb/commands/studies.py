@@ -1,4 +1,4 @@
-"""`tkamb tradeoff`, `tkamb stability` and `tkamb cohort`: their arguments, and what they print."""
+"""`tkamb tradeoff`, `tkamb stability` and `tkamb cohort`: their arguments and printed lines."""
 
 import argparse
 import json
@@ -16,19 +16,15 @@ class CohortOutputSettings:
     """Length of the output of `tkamb cohort`."""
 
     max_failed_runs: int = 10
-    """Largest number of failed runs that are printed; the folder lists all. Chosen: they fit on a
-    screen."""
+    """Largest number of failed runs that are printed; the folder lists all. Chosen because ten
+    lines fit on a screen."""
 
 
 COHORT_OUTPUT = CohortOutputSettings()
 
 
 def add_cohort(commands: Any) -> None:
-    """Add `cohort` to the command line.
-
-    Args:
-        commands: the parser's subcommands.
-    """
+    """Add `cohort` to the command line."""
     command = commands.add_parser(
         "cohort", help="run subjects, trials and designs, and write one table"
     )
@@ -81,7 +77,7 @@ def _cohort(options: argparse.Namespace) -> int:
         force=options.force,
         progress=lambda runs, count: tqdm(runs, total=count, unit="run", disable=None),
     )
-    failed = [n for n, one in outcomes.items() if one.reason]
+    failed = [n for n, outcome in outcomes.items() if outcome.reason]
     for n in failed[: COHORT_OUTPUT.max_failed_runs]:
         say(f"run {n} ({cohort.runs[n].words()}): {outcomes[n].reason}")
     if len(failed) > COHORT_OUTPUT.max_failed_runs:
@@ -98,7 +94,7 @@ def _cohort(options: argparse.Namespace) -> int:
 
 
 T = TypeVar("T")
-NOT_OURS = "write into a folder that is not tkamb's, or another command's"
+NOT_OURS = "write into a folder of another command, or that tkamb did not make"
 
 
 def add_tradeoff(commands: Any) -> None:
@@ -111,14 +107,14 @@ def add_tradeoff(commands: Any) -> None:
         type=Path,
         nargs="?",
         metavar="SCENE",
-        help="your own scene, which is measured, too",
+        help="scene to measure in addition to tkamb's cases",
     )
     size = tradeoff.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="two cases, 2 mm, within a minute")
     size.add_argument("--full", action="store_true", help="every setting on every case")
     tradeoff.add_argument("--peer", choices=("calculix",), help="compare with another program")
     tradeoff.add_argument(
-        "--recompute", action="store_true", help="compute the references again, too (slow)"
+        "--recompute", action="store_true", help="also compute the references again (slow)"
     )
     tradeoff.add_argument("--resume", action="store_true", help="go on with a stopped study")
     tradeoff.add_argument(
@@ -162,23 +158,23 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     cases = study.cases_of(jobs)
     kept_rows = KeptRows(directory, options.resume)
     references = study.references_for(cases, options.recompute, say, kept_rows)
-    rows, whole = gather(
+    rows, complete = gather(
         study.run_tradeoff(jobs, references, kept_rows), study.expected_seconds(jobs, cases)
     )
-    result = len(rows)
-    if whole and options.peer:
+    row_count = len(rows)
+    if complete and options.peer:
         sizes = {job.resolution_mm for job in jobs if job.label == DEFAULT}
-        more, whole = gather(
+        peer_rows, complete = gather(
             study.run_peer(cases, references, kept_rows, sizes), [1.0] * len(cases)
         )
-        rows += more
+        rows += peer_rows
     body: list[BodyRow] = []
     planned = 0
-    if whole and not options.quick:
+    if complete and not options.quick:
         planned = len(CHANGES)
-        body, whole = gather(run_body_trade(kept_rows), [1.0] * planned)
+        body, complete = gather(run_body_trade(kept_rows), [1.0] * planned)
     rows = with_fronts(rows)
-    lines = [*unfinished(result + len(body), len(jobs) + planned), *table(rows, references)]
+    lines = [*unfinished(row_count + len(body), len(jobs) + planned), *table(rows, references)]
     lines += ["", *comparison(rows), "", *recommendations(rows)]
     if body:
         lines += ["", *body_table(body)]
@@ -186,8 +182,8 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
     text = as_json(rows)
     _write(directory, "tradeoff", text, lines, picture(rows) if rows else None)
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'tradeoff.png'}"]))
-    if not whole:
-        raise KeyboardInterrupt(_goes_on(directory))
+    if not complete:
+        raise KeyboardInterrupt(_resume_hint(directory))
     if not any(row.errors for row in rows):
         say("no case could be computed")
         return 1
@@ -231,40 +227,40 @@ def _study_stability(options: argparse.Namespace, directory: Path) -> int:
     workers = PoolOptions(options.workers).workers
     cases = study.stability_cases(options.quick)
     rows = KeptRows(directory, options.resume)
-    judged = study.run_stability(cases, kept=rows, workers=workers)
-    verdicts, whole = gather(judged, [1.0] * len(cases))
-    if not whole:
+    verdict_source = study.run_stability(cases, kept=rows, workers=workers)
+    verdicts, complete = gather(verdict_source, [1.0] * len(cases))
+    if not complete:
         verdicts = study.kept_verdicts(cases, rows)
     text = json.dumps(study.summary(verdicts), indent=1, allow_nan=False)
     lines = [*unfinished(len(verdicts), len(cases)), *table(verdicts)]
     _write(directory, "stability", text, lines, picture(verdicts) if verdicts else None)
     print(text if options.json else "\n".join([*lines, f"picture: {directory / 'stability.png'}"]))
-    if not whole:
-        raise KeyboardInterrupt(_goes_on(directory))
+    if not complete:
+        raise KeyboardInterrupt(_resume_hint(directory))
     if failed := sum(verdict.failed for verdict in verdicts):
         say(f"{failed} of {len(verdicts)} cases failed")
         return 1
     return 0
 
 
-def gather(found: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:
-    """Collect rows under a progress bar with the time left.
+def gather(row_source: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:
+    """Collect rows under a progress bar that shows the remaining time.
 
     Args:
-        found: the rows as they come.
-        costs: how long each is expected to take, in any unit.
+        row_source: iterator that computes the rows.
+        costs: expected time of each row, in any unit.
 
     Returns:
-        The rows, and whether they are all: Ctrl-C ends the collecting, not the command.
+        The rows, and whether all were computed. Ctrl-C ends the collecting, not the command.
     """
     from tqdm import tqdm
 
     rows: list[T] = []
-    look = "{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
-    with tqdm(total=sum(costs), bar_format=look, smoothing=0.05, disable=None) as bar:
+    bar_format = "{desc} {percentage:3.0f}%|{bar}| {elapsed}, {remaining} left"
+    with tqdm(total=sum(costs), bar_format=bar_format, smoothing=0.05, disable=None) as bar:
         bar.set_description_str(f"0 of {len(costs)} rows")
         try:
-            for row, cost in zip(found, costs, strict=False):
+            for row, cost in zip(row_source, costs, strict=False):
                 rows.append(row)
                 bar.set_description_str(f"{len(rows)} of {len(costs)} rows", refresh=False)
                 bar.update(cost)
@@ -274,16 +270,16 @@ def gather(found: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:
 
 
 def unfinished(count: int, total: int) -> list[str]:
-    """Return the line that heads the table of a study that was stopped; none of a whole one."""
+    """Return the line above the table of a stopped study; no line for a complete study."""
     return [] if count == total else [f"stopped: {count} of {total} rows", ""]
 
 
-def _goes_on(directory: Path) -> str:
+def _resume_hint(directory: Path) -> str:
     return f"finished rows are in {directory}; --resume continues from there"
 
 
 def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
-    """Write a study's JSON, table and picture, each whole or not at all."""
+    """Write a study's JSON, table and picture. Each file is complete or not written."""
     from tkamb.files import replaced_file, write_text
 
     write_text(directory / f"{name}.json", text + "\n")

@@ -1,4 +1,4 @@
-"""`tkamb uncertainty`: its arguments, and what it prints."""
+"""`tkamb uncertainty`: its arguments and printed lines."""
 
 import argparse
 from pathlib import Path
@@ -11,17 +11,17 @@ if TYPE_CHECKING:
     from tkamb.studies.uncertainty.run import Uncertainty
 
 SHOWN = 5
-"""Number of inputs that are printed."""
+"""Number of inputs that are printed per result."""
 QUICK_CONTACT = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
 QUICK_FRAMES = 11
 """Number of frames of a screening without --frames."""
 LEAST_SHOWN = 0.01
 """1: smallest share of a variance that is printed."""
 TERMS = 2
-"""Regressors per input: its value and its square. By chance alone each explains a share 1/n of the
-variance of n samples."""
+"""Number of regressors per input: its value and its square. By chance alone, a regressor explains
+a share 1/n of the variance of n samples."""
 NOTABLE_FAILED = 0.05
-"""1: share of failed samples of a frame above which a line warns of the bands."""
+"""1: share of failed samples in a frame. A larger share gives a warning."""
 
 
 def add_uncertainty(commands: Any) -> None:
@@ -51,7 +51,7 @@ def add_uncertainty(commands: Any) -> None:
         help="vary one input at a time; takes seconds, writes nothing",
     )
     command.add_argument(
-        "--force", action="store_true", help="write into a folder that is not tkamb's"
+        "--force", action="store_true", help="write into a folder that tkamb did not make"
     )
     command.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     command.set_defaults(command=_uncertainty)
@@ -84,14 +84,14 @@ def _uncertainty(options: argparse.Namespace) -> int:
     for line in warnings_of(result):
         say(line)
     print("\n".join([*headline(result), f"bands: {directory / 'bands.csv'}"]))
-    if all(one.failed.all() for one in result.samples):
+    if all(sample.failed.all() for sample in result.samples):
         say("every frame of every sample failed")
         return 1
     return 0
 
 
 def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    """Print the effect of one input at a time, with few frames unless the options say otherwise."""
+    """Print the effect of each input alone. Without --frames, only a few frames are computed."""
     from tqdm import tqdm
 
     from tkamb.io.scene import load_scene
@@ -132,7 +132,7 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
 
 def headline(uncertainty: "Uncertainty") -> list[str]:
-    """Return the band of the peak force and the most influential inputs, in lines of text."""
+    """Return lines of text: the band of the peak force and the most influential inputs."""
     from numpy import isfinite, nanargmax
 
     from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
@@ -142,35 +142,41 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
         return ["no frame of the nominal run has a force"]
     peak = int(nanargmax(total))
     flexion = uncertainty.results["flexion_deg"][peak]
-    of_samples = uncertainty.results.summary["uncertainty"]["peak_force_total_BW"]
-    words = of_samples["words"]
-    if of_samples["median"] is None:
+    sampled_peak = uncertainty.results.summary["uncertainty"]["peak_force_total_BW"]
+    words = sampled_peak["words"]
+    if sampled_peak["median"] is None:
         why = uncertainty.results.why_no_band(peak)
         value = f"{total[peak]:.2f} BW with the inputs as given, no median or band: {why}"
     else:
         value = (
-            f"median {of_samples['median']:.2f} BW, 5 to 95 %: {of_samples['p05']:.2f} to "
-            f"{of_samples['p95']:.2f}"
+            f"median {sampled_peak['median']:.2f} BW, 5 to 95 %: {sampled_peak['p05']:.2f} to "
+            f"{sampled_peak['p95']:.2f}"
         )
     peaks = peaks_of(uncertainty.results.summary)
-    lines = [f"peak {name} force: {peak_words(one)} BW" for name, one in peaks.items()]
+    lines = [f"peak {name} force: {peak_words(peak)} BW" for name, peak in peaks.items()]
     lines += [f"({peak_legend(peaks)})"] if peaks else []
     lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
     limits = muscle_limits(uncertainty.results)
     lines += [limits.line()] if limits is not None else []
-    of_chance = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
-    chance = f"; up to {of_chance:.0%} each is chance" if of_chance >= LEAST_SHOWN else ""
+    chance_share = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
+    chance = f"; up to {chance_share:.0%} each is chance" if chance_share >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):
         rows = [row for row in uncertainty.tornado if row.result == result][:SHOWN]
         parts = ", ".join(f"{row.name} {row.share:.0%}" for row in rows if row.share >= LEAST_SHOWN)
         if parts:
             lines.append(f"{result} varies by {parts} (shares of variance, by regression{chance})")
-    for name, one in uncertainty.results.summary["uncertainty"].get("measured_inside", {}).items():
-        more = one.get("share_with_discrepancy")
+    for name, share in (
+        uncertainty.results.summary["uncertainty"].get("measured_inside", {}).items()
+    ):
+        with_discrepancy = share.get("share_with_discrepancy")
         lines.append(
-            f"the measured {name} force lies within 5 to 95 % in {one['share']:.0%} of "
-            f"{one['frames']} frames"
-            + ("" if more is None else f", with the discrepancy in {more:.0%}")
+            f"the measured {name} force lies within 5 to 95 % in {share['share']:.0%} of "
+            f"{share['frames']} frames"
+            + (
+                ""
+                if with_discrepancy is None
+                else f", with the discrepancy in {with_discrepancy:.0%}"
+            )
         )
     if words := (uncertainty.results.summary.get("discrepancy") or {}).get("words"):
         lines.append(words)
@@ -190,7 +196,7 @@ def _with_error(value: float, error: float) -> str:
 
 
 def warnings_of(uncertainty: "Uncertainty") -> list[str]:
-    """Return the limits of the bands, in lines of text."""
+    """Return lines of text: the limits of the bands."""
     lines, summary = [], uncertainty.results.summary["uncertainty"]
     if summary["not_varied"]:
         names = ", ".join(summary["not_varied"])

@@ -1,4 +1,4 @@
-"""`tkamb view` and `tkamb live`: windows on a run and on a knee."""
+"""`tkamb view` shows runs in 3D; `tkamb live` moves and presses a knee by sliders."""
 
 import argparse
 import os
@@ -33,7 +33,9 @@ def add_view(commands: Any) -> None:
     view.add_argument("--frame", type=int, default=0, metavar="K", help="first frame that is shown")
     view.add_argument("--camera", default="oblique", metavar="NAME", help=", ".join(CAMERAS))
     view.add_argument("--lattice", action="store_true", help="draw the lattice, too")
-    view.add_argument("--html", type=Path, metavar="F", help="write one file instead of a window")
+    view.add_argument(
+        "--html", type=Path, metavar="F", help="write one HTML file instead of a window"
+    )
     view.add_argument("--png", type=Path, metavar="F", help="write a picture of the frame")
     for kind in ("gif", "mp4"):
         view.add_argument(
@@ -92,8 +94,8 @@ def _check(options: argparse.Namespace) -> None:
     """Check options and output files, before the runs are read.
 
     Raises:
-        InputError: an option that cannot be, or a file that cannot be written.
-        ComputationError: a picture is wanted and there is no browser.
+        InputError: an option is invalid, or a file cannot be written.
+        ComputationError: --png is given, but there is no browser.
     """
     check_port(options.port)
     if options.camera not in CAMERAS:
@@ -125,11 +127,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def check_port(port: int) -> None:
-    """Raise where a number is no port.
-
-    Raises:
-        InputError: it is not 0 to 65535.
-    """
+    """Raise an InputError unless a port is 0 to 65535."""
     if not 0 <= port <= HIGHEST_PORT:
         raise InputError(f"no port {port}", "--port", f"give 0 (any) to {HIGHEST_PORT}")
 

@@ -1,4 +1,4 @@
-"""`tkamb wear`: its arguments, and what it prints."""
+"""`tkamb wear`: its arguments and printed lines."""
 
 import argparse
 import math
@@ -96,7 +96,7 @@ def add_wear(commands: Any) -> None:
     )
     wear.add_argument("--out", type=Path, metavar="DIR", help="output folder")
     wear.add_argument(
-        "--force", action="store_true", help="write into a folder that is not tkamb's"
+        "--force", action="store_true", help="write into a folder that tkamb did not make"
     )
     wear.add_argument("--resume", action="store_true", help="go on with an interrupted simulation")
     wear.add_argument("--json", action="store_true", help="print wear.json")
@@ -173,5 +173,5 @@ def _prepared(options: argparse.Namespace) -> "WearRun":
 
 
 def _stem(case: Path) -> str:
-    place = case.resolve()
-    return place.name if os.path.isdir(place) else place.parent.name
+    path = case.resolve()
+    return path.name if os.path.isdir(path) else path.parent.name

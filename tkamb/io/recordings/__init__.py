@@ -1,1 +1,1 @@
-"""Files into clean SI objects: patient, motion, force plate, meshes."""
+"""Readers that convert files of a patient, motion, ground reaction or mesh to objects in SI."""

@@ -1,8 +1,8 @@
 """C3D recordings: markers, force plates and other analog channels, in SI, with gaps as NaN.
 
-The clock is the recording's own: frame k of the file is at (first frame + k)/rate, with the
-first frame counted from zero, so that a trial cut out of a longer one keeps its times. A sample
-with a negative residual, or at exactly (0, 0, 0), was not seen: a gap.
+Frame k of the file is at the time (first frame + k)/rate. The first frame is counted from zero, so
+that a trial cut out of a longer one keeps its times. A marker with a negative residual, or at
+exactly (0, 0, 0), is missing in that frame: a gap.
 
 Markers, channels and each plate are read separately. A fault in one of them is stored, and raised
 only when that part is used.
@@ -31,7 +31,7 @@ class C3dValueSettings:
     """Which values of a C3D file are measurements."""
 
     max_value: float = 1e12
-    """Largest value in any unit: a larger one was not measured, and its square may overflow."""
+    """Largest measured value in any unit. A larger value is damaged and becomes a gap."""
 
 
 C3D_VALUE = C3dValueSettings()
@@ -46,17 +46,18 @@ class Recording:
         rate_Hz: frames per second of the markers.
         first_frame: number of the first frame, counted from zero.
         labels: (m) names of the markers as in the file; `marker 7` for a marker without one.
-        points: (n, m, 3) m; gaps are NaN. In the file's unit while `length_unit` is None.
+        points: (n, m, 3) m, marker positions, gaps NaN; in the file's unit if `length_unit` is
+            None.
         residual: (n, m) m, residual of the markers' reconstruction; NaN in gaps.
-        length_unit: "m"; None where the file's word for the unit is not understood.
+        length_unit: "m"; None if the file's word for the unit is unknown.
         analog_rate_Hz: samples per second of the channels.
         channels: name -> (k,) samples of each channel that belongs to no plate, like EMG.
         channel_units: name -> unit, as in the file.
-        plates: the force plates that could be read, in the file's order.
-        faults: "markers", "channels" or "plate 2" -> what is wrong with it.
+        plates: the readable force plates, in the file's order.
+        faults: part, like "markers", "channels" or "plate 2" -> its error.
         equal_channels: names that several channels share.
-        notices: remarks on values that were read otherwise than the file states.
-        length_word: the file's own word for its unit of length.
+        notices: remarks on contradictions in the file.
+        length_word: the file's word for its unit of length.
     """
 
     path: Path
@@ -95,12 +96,12 @@ class Recording:
     @property
     def all_notices(self) -> tuple[str, ...]:
         """Remarks on the file and its plates, and on parts that could not be read."""
-        own = [notice for plate in self.plates for notice in plate.notices]
+        plate_notices = [notice for plate in self.plates for notice in plate.notices]
         parts: dict[str, list[str]] = {}
         for part, error in self.faults.items():
             parts.setdefault(error.what, []).append(part)
         unread = [f"not used: {', '.join(part)}: {what}" for what, part in parts.items()]
-        return (*self.notices, *own, *unread)
+        return (*self.notices, *plate_notices, *unread)
 
     def plate(self, number: int) -> ForcePlate:
         """Return a plate by its number.
@@ -124,7 +125,7 @@ class Recording:
         """Return the samples (k,) of a channel that belongs to no plate.
 
         Raises:
-            InputError: no such channel, several of that name, or channels that cannot be read.
+            InputError: no such channel, several of that name, or the channels are unreadable.
         """
         if "channels" in self.faults:
             raise self.faults["channels"]
@@ -146,11 +147,11 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
     Args:
         path: the file.
-        units: units that the file does not state or writes in an unknown way.
+        units: units that the file does not state, or for which it has unknown words.
 
     Raises:
         InputError: no such file, not a regular file, not C3D, cut short, no valid frame rate, or
-            header and parameters contradict each other.
+            a contradiction between header and parameters.
     """
     path = Path(path)
     try:
@@ -162,15 +163,15 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
 @lru_cache(maxsize=2)
 def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
-    """Read a file that was last changed at `changed`, ns; cached for several uses in a run."""
-    with np.errstate(all="ignore"):  # damaged numbers overflow; they are gaps below
+    """Read a file. `changed`, the time of its last change in ns, is part of the cache's key."""
+    with np.errstate(all="ignore"):  # damaged numbers overflow; they become gaps
         file = parse_c3d(read_bytes(path, FILE_LIMITS.table_bytes), path)
         return _Reader(path, file, units).recording()
 
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """Reads each part of a recording separately; `faults` has the error of each failed part."""
+    """Reads each part of a recording separately. `faults` has the errors of unreadable parts."""
 
     path: Path
     file: C3dFile
@@ -187,13 +188,13 @@ class _Reader:
         labels, equal = self._labels()
         scale = self._metres_per_unit()
         points, residual = self.file.points, self.file.residual
-        wild = ~(np.abs(points) < C3D_VALUE.max_value).all(axis=2)
-        points[wild], residual[wild] = np.nan, np.nan
+        damaged = ~(np.abs(points) < C3D_VALUE.max_value).all(axis=2)
+        points[damaged], residual[damaged] = np.nan, np.nan
         analog_rate, names, signals, units = self._analog(rate)
         plates = self._plates(names, signals, units, scale)
         used = {name for plate in plates for name in plate.channels}
         counts = Counter(names)
-        own = [k for k, name in enumerate(names) if name not in used and counts[name] == 1]
+        free = [k for k, name in enumerate(names) if name not in used and counts[name] == 1]
         notices = list(self.file.notices)
         notices += [f"has two markers '{name}'; neither is used" for name in equal]
         return Recording(
@@ -205,8 +206,8 @@ class _Reader:
             residual * (scale or 1.0),
             "m" if scale else None,
             analog_rate,
-            {names[k]: signals[k] for k in own},
-            {names[k]: units[k] for k in own},
+            {names[k]: signals[k] for k in free},
+            {names[k]: units[k] for k in free},
             plates,
             self.faults,
             tuple(sorted(name for name, count in counts.items() if count > 1)),
@@ -224,7 +225,7 @@ class _Reader:
         raise InputError(f"markers have a rate of {rates[0] or 0:g} Hz", self.path, EXPORT)
 
     def _labels(self) -> tuple[tuple[str, ...], list[str]]:
-        """Return a label per marker, and the labels of several markers."""
+        """Return a label per marker, and the labels that several markers share."""
         count = self.file.points.shape[1]
         stated = self._parameters.texts("POINT:LABELS")[:count]
         stated += [""] * (count - len(stated))
@@ -234,13 +235,13 @@ class _Reader:
         return labels, sorted(name for name, n in Counter(labels).items() if n > 1)
 
     def _metres_per_unit(self) -> float | None:
-        """Return metres per unit of length; None where the file's word is not understood."""
+        """Return metres per unit of length; None if the file's word is unknown."""
         words = self._parameters.texts("POINT:UNITS")
         word = words[0] if words else ""
-        own, unit = metres(word), self.units.length
+        scale, unit = metres(word), self.units.length
         if unit is None:
-            return own
-        if own is not None and own != metres(unit):
+            return scale
+        if scale is not None and scale != metres(unit):
             raise InputError(
                 f"is in {word} by its own header, but length_unit says {unit}",
                 self.path,
@@ -249,7 +250,7 @@ class _Reader:
         return metres(unit)
 
     def _analog(self, rate: float) -> tuple[float, list[str], Array, list[str]]:
-        """Return rate (Hz), and names, samples (c, k) and units of the analog channels."""
+        """Return the rate (Hz), names, samples (c, k) and units of the analog channels."""
         header, parameters = self.file.header, self._parameters
         samples = header.samples or 1
         count = self.file.raw_analog.shape[1]
@@ -283,7 +284,7 @@ class _Reader:
     def _plates(
         self, names: list[str], signals: Array, units: list[str], scale: float | None
     ) -> tuple[ForcePlate, ...]:
-        """Return the plates that can be read; the faults of the others are kept."""
+        """Return the readable plates. `faults` gets the error of each unreadable plate."""
         try:
             used = self._parameters.integers("FORCE_PLATFORM:USED")
         except InputError as error:
@@ -301,7 +302,7 @@ class _Reader:
     def _record(
         self, number: int, names: list[str], signals: Array, units: list[str], scale: float | None
     ) -> PlateRecord:
-        """Return what the file says of a plate."""
+        """Return the file's description of a plate."""
         where, k = f"{self.path}: force plate {number}", number - 1
         if "channels" in self.faults:
             raise self.faults["channels"]
@@ -324,8 +325,10 @@ class _Reader:
         if not np.isfinite(used).all() or len(set(used)) < len(used):
             raise InputError("names one channel twice", where, EXPORT)
         if len(used) and (used.min() < 1 or used.max() > len(names)):
-            raise InputError(f"asks for channel {used.max():g} of {len(names)}", where, EXPORT)
-        rows = [int(one) - 1 for one in used]
+            raise InputError(
+                f"names channel {used.max():g}, but there are {len(names)}", where, EXPORT
+            )
+        rows = [int(channel_number) - 1 for channel_number in used]
         force = self._parameters.texts("FORCE_PLATFORM:UNITS")
         return PlateRecord(
             number,
@@ -344,7 +347,10 @@ class _Reader:
         )
 
     def _per_plate(self, key: str, rows: tuple[int, ...] | None) -> Array | None:
-        """Return numbers whose last index is the plate; one plate's may lack that index."""
+        """Return a parameter's numbers, in the shape `rows` per plate; the last index is the plate.
+
+        The file may lack the last index if it has one plate. None: missing or of another size.
+        """
         value = self._parameters.numbers(f"FORCE_PLATFORM:{key}")
         if value is None or not value.size:
             return None
@@ -354,7 +360,7 @@ class _Reader:
         return value.reshape((*shape, -1), order="F")
 
     def _calibration(self, kind: int, k: int) -> Array | None:
-        """Return the calibration matrix (6, c) of plate k, columns by channel; None without."""
+        """Return the calibration matrix (6, c) of plate k, a column per channel, or None."""
         value = self._parameters.numbers("FORCE_PLATFORM:CAL_MATRIX")
         if kind not in (4, 5) or value is None or value.ndim < 2:
             return None
@@ -370,8 +376,8 @@ class _Reader:
     def _zero(self) -> slice | None:
         """Return the samples that FORCE_PLATFORM:ZERO states as unloaded; None if it states none.
 
-        Its frames are those of the recording's own count. In a recording cut out of a longer
-        one they may lie before its first frame; they are then counted from that.
+        ZERO holds frame numbers of the recording. In a recording cut out of a longer one, numbers
+        outside it are counted from its first frame.
         """
         frames = self._parameters.integers("FORCE_PLATFORM:ZERO")
         if len(frames) != 2 or frames[1] < 1 or frames[1] < frames[0]:
@@ -387,7 +393,7 @@ class _Reader:
 
 
 def no_length_unit(word: str, path: Path) -> InputError:
-    """Return the error for a recording whose unit of length is not understood."""
+    """Return the error for a recording with an unknown unit of length."""
     stated = f"the unit '{word}'" if word else "no unit"
     return InputError(
         f"states {stated} for its markers (POINT:UNITS)",
@@ -397,7 +403,7 @@ def no_length_unit(word: str, path: Path) -> InputError:
 
 
 def _check_rates(analog_rate: float | None, rate: float, samples: int, path: Path) -> None:
-    """Raise unless the rates that a file states are those of the samples that it holds."""
+    """Raise unless the stated rates agree with the number of analog samples per frame."""
     if analog_rate is None or analog_rate == 0:
         return  # the number of samples per frame gives the rate
     ratio = analog_rate / rate

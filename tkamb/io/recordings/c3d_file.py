@@ -1,13 +1,13 @@
-"""The container of a C3D file: header, parameters, and the numbers of its frames.
+"""The content of a C3D file: header, parameters, and the numbers of its frames.
 
 Every read is checked against the size of the file, so that a damaged file gives one message.
-The meaning of markers, channels and force plates is in `tkamb.io.recordings.c3d`.
+`tkamb.io.recordings.c3d` interprets the numbers as markers, channels and force plates.
 
 A file begins with a header of 512 bytes. Its parameter section is a chain of records: a group,
 or a parameter with type, dimensions and values. Its data section holds frame after frame: four
 words per marker (x, y, z, residual and cameras), then the analog samples of that frame, channel
-by channel. Words are 16-bit integers or 32-bit floats, by the sign of the scale, in the number
-format of the machine that wrote the file.
+by channel. Words are 16-bit integers if the scale is positive, and 32-bit floats if it is
+negative. Their number format is that of the machine that wrote the file.
 
 Format: C3D user guide, https://www.c3d.org.
 """
@@ -23,9 +23,9 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
 BLOCK = 512
-"""Bytes of a block: the unit in which the format counts places."""
+"""Bytes of a block. The format counts positions in blocks."""
 LARGEST_16_BIT = 65535
-"""The largest frame number that the header can hold; longer recordings state theirs in TRIAL."""
+"""Largest frame number that the header can hold. TRIAL has the numbers of longer recordings."""
 EXPORT = "export the trial again as C3D"
 MOST_DIMENSIONS = 7
 """Largest number of dimensions of a parameter, by the format."""
@@ -45,7 +45,7 @@ class Header:
         samples: analog samples of a channel per frame.
         first: number of the first frame, from 1.
         last: number of the last frame.
-        scale: units per integer; negative: the data are floats.
+        scale: length units per integer step; negative: the data are floats.
         data_block: first block of the data, from 1.
         rate_Hz: frames per second.
     """
@@ -132,13 +132,13 @@ class C3dFile:
     """The content of a file.
 
     Args:
-        header: as the file has it.
-        parameters: all groups.
+        header: the header of the file.
+        parameters: the parameters of all groups.
         first_frame: number of the first frame, counted from zero.
         points: (n, m, 3) in the file's length unit, gaps NaN.
         residual: (n, m) in the file's length unit; NaN in gaps.
         raw_analog: (k, c) analog words before offset and scale.
-        notices: remarks where the data differ from what the file states.
+        notices: remarks on data that differ from the header or the parameters.
     """
 
     header: Header
@@ -151,10 +151,10 @@ class C3dFile:
 
 
 def parse_c3d(content: bytes, path: Path) -> C3dFile:
-    """Return what the bytes of a C3D file hold.
+    """Return the content of a C3D file, from its bytes.
 
     Raises:
-        InputError: not C3D, cut short, or header and parameters that contradict each other.
+        InputError: not C3D, cut short, or a contradiction between header and parameters.
     """
     if len(content) < BLOCK or content[1] != _KEY:
         raise InputError("is not a C3D file", path, "give a recording in C3D")
@@ -163,7 +163,7 @@ def parse_c3d(content: bytes, path: Path) -> C3dFile:
         raise InputError("is cut short: its parameters are missing", path, "copy it again")
     machine = content[start + 3]
     if machine not in (_DEC, _MIPS, _INTEL):
-        raise InputError(f"is of an unknown machine ({machine})", path, EXPORT)
+        raise InputError(f"states an unknown machine code ({machine})", path, EXPORT)
     header = _header(content, machine)
     end = (header.data_block - 1) * BLOCK
     records = _parameters(content, start + 4, end if end > start else len(content), machine)
@@ -193,26 +193,28 @@ def _floats(content: bytes, machine: int) -> Array:
     return np.ascontiguousarray(halves).view("<f4").ravel().astype(float) / 4.0
 
 
-def _parameters(content: bytes, at: int, end: int, machine: int) -> tuple[dict[str, Any], set[str]]:
+def _parameters(
+    content: bytes, position: int, end: int, machine: int
+) -> tuple[dict[str, Any], set[str]]:
     """Return "GROUP:NAME" -> values, and the names of the damaged parameters.
 
     Args:
         content: bytes of the file.
-        at: first byte of the chain of records.
-        end: byte at which the chain ends at the latest.
+        position: first byte of the chain of records.
+        end: largest possible end of the chain, byte.
         machine: code of the machine that wrote the file.
     """
     order = "big" if machine == _MIPS else "little"
     groups: dict[int, str] = {}
     records: list[tuple[int, str, int, int]] = []
     end = min(end, len(content))
-    while at + 2 <= end:
-        size, group = (int(v) for v in np.frombuffer(content, "i1", 2, at))
+    while position + 2 <= end:
+        size, group = (int(v) for v in np.frombuffer(content, "i1", 2, position))
         size = abs(size)
-        link = at + 2 + size
+        link = position + 2 + size
         if size == 0 or link + 2 > end:
             break
-        name = _text(content[at + 2 : link]).upper()
+        name = _text(content[position + 2 : link]).upper()
         offset = int.from_bytes(content[link : link + 2], order)  # type: ignore[arg-type]
         after = link + offset if offset else end
         if group < 0:
@@ -221,7 +223,7 @@ def _parameters(content: bytes, at: int, end: int, machine: int) -> tuple[dict[s
             records.append((group, name, link + 2, min(after, end)))
         if offset < 2:
             break
-        at = after
+        position = after
     values: dict[str, Any] = {}
     damaged: set[str] = set()
     for group, name, first, last in records:
@@ -243,7 +245,7 @@ def _text(content: bytes) -> str:
 
 
 def _value(record: bytes, machine: int) -> Any:
-    """Return the values of a parameter's record; None if it does not hold what it states."""
+    """Return the values of a parameter's record; None if the record is damaged."""
     if len(record) < 2:
         return None
     kind, dimensions = int(np.frombuffer(record, "i1", 1)[0]), record[1]
@@ -266,7 +268,7 @@ def _value(record: bytes, machine: int) -> Any:
 
 
 def _check_agreement(header: Header, parameters: Parameters, path: Path) -> None:
-    """Raise where header and parameters lay out the data differently."""
+    """Raise if header and parameters contradict each other on the layout of the data."""
     used = parameters.integers("POINT:USED")
     if used and used[0] != header.markers:
         raise InputError(
@@ -303,7 +305,7 @@ def _check_agreement(header: Header, parameters: Parameters, path: Path) -> None
 
 @dataclass(frozen=True, eq=False)
 class _Data:
-    """The data section, about to be read."""
+    """Reader of the data section."""
 
     content: bytes
     header: Header
@@ -341,12 +343,11 @@ class _Data:
     def _start(self, notices: list[str]) -> int:
         """Return the first byte of the data.
 
-        The header states the block. POINT:DATA_START replaces it if the frames fit the size of the
-        file only from there.
+        Header and POINT:DATA_START both state the first block of the data. If they differ, the
+        frames must fit the size of the file from exactly one of the two blocks.
 
         Raises:
-            InputError: no block within the file, or header and POINT:DATA_START contradict each
-                other and the size of the file does not decide between them.
+            InputError: no block is within the file, or the frames fit from neither or from both.
         """
         stated = self.parameters.integers("POINT:DATA_START")
         blocks = list(dict.fromkeys([self.header.data_block, *stated[:1]]))
@@ -367,7 +368,7 @@ class _Data:
         return (chosen - 1) * BLOCK
 
     def _fits(self, start: int) -> bool:
-        """Return whether less than a block remains behind the frames if they begin at `start`."""
+        """Return whether the frames, from byte `start`, end within the last block of the file."""
         spare = len(self.content) - start - self._stated() * self._frame
         return 0 <= spare < BLOCK
 
@@ -382,10 +383,10 @@ class _Data:
         return max(first - 1, 0)
 
     def _stated(self) -> int:
-        """Return how many frames the file states.
+        """Return the number of frames that the file states.
 
-        The header's frame numbers have 16 bits. For longer recordings the number is that of the
-        two words of TRIAL, else that of POINT:LONG_FRAMES or POINT:FRAMES if it is above 65535.
+        The header's frame numbers have 16 bits. Longer recordings state the number in the two
+        words of TRIAL, or else in POINT:LONG_FRAMES or POINT:FRAMES.
         """
         wrap = LARGEST_16_BIT + 1
         begin, end = (
@@ -404,7 +405,7 @@ class _Data:
         return header
 
     def _count(self, stored: int, notices: list[str]) -> int:
-        """Return how many of the `stored` frames are read.
+        """Return the number of frames to read; the file has room for `stored` frames.
 
         Raises:
             InputError: the file states no frame, holds fewer frames than it states, or is too
@@ -445,17 +446,17 @@ class _Data:
         return words
 
     def _points(self, words: Array) -> tuple[Array, Array]:
-        """Return places (n, m, 3) and residuals (n, m), gaps NaN.
+        """Return positions (n, m, 3) and residuals (n, m) in the file's unit, gaps NaN.
 
-        The fourth word of a marker holds cameras in its high byte and the residual, in units of
-        the scale, in its low byte; it is negative where the marker was not seen.
+        The fourth word of a marker holds the cameras in its high byte and the residual, in units
+        of the scale, in its low byte. It is negative if the marker is missing.
         """
         scale = abs(self.header.scale)
-        places = words[:, :, :3] * (1.0 if self._word == 4 else scale)
+        positions = words[:, :, :3] * (1.0 if self._word == 4 else scale)
         fourth = words[:, :, 3]
         readable = np.isfinite(fourth) & (np.abs(fourth) < 2**31)
         low_byte = np.where(readable, fourth, 0.0).astype(np.int64) & 0xFF
         residual = np.asarray(low_byte * scale, float)
-        gap = ~np.isfinite(places).all(axis=2) | (fourth < 0) | (places == 0).all(axis=2)
-        places[gap], residual[gap] = np.nan, np.nan
-        return places, residual
+        gap = ~np.isfinite(positions).all(axis=2) | (fourth < 0) | (positions == 0).all(axis=2)
+        positions[gap], residual[gap] = np.nan, np.nan
+        return positions, residual

@@ -1,19 +1,21 @@
 """Zero-phase low-pass filter and differentiation of recorded motion, on any time grid.
 
-The filter is the quintic smoothing spline: of all functions s it takes the one with the
-least
+The filter is the quintic smoothing spline: the function s that minimises
 
     sum_i w_i (x_i - s(t_i))^2 + lambda * integral (s''')^2 dt,     lambda = (2 pi f_c)^-6
 
 with w_i the spacing of the samples. Away from the ends its frequency response is
-1 / (1 + (f / f_c)^6), that of a third-order Butterworth filter run forwards and backwards
-(one half at the cut-off f_c, no phase shift), but samples may be uneven, and first and second
-derivatives are those of one smooth curve. Polynomials of degree two pass unchanged. Ends
-are natural: nothing is padded. The acceleration of a 1 Hz wave through a 6 Hz cut-off errs
-(root mean square over phases, share of its amplitude) by 0.23 at an end, 0.06 a quarter of
-a period of the cut-off inside, 0.013 half a period and 0.002 a period inside; a two-pass
-Butterworth with reflected ends errs by 0.64, 0.16, 0.11 and 0.02. `periodic=True` closes
-the curve: the last sample is the first one of the next cycle, and there are no ends.
+1 / (1 + (f / f_c)^6), that of a third-order Butterworth filter run forwards and backwards: one half
+at the cut-off f_c, no phase shift. Unlike that filter, it accepts uneven samples, and its first and
+second derivatives belong to one smooth curve. Polynomials of degree two pass unchanged.
+
+The ends are natural; samples are not padded. Example: a 1 Hz wave with a cut-off of 6 Hz. The root
+mean square error of its acceleration, as a share of the amplitude, is 0.23 at an end. At a distance
+of a quarter, a half and one period of the cut-off it is 0.06, 0.013 and 0.002. A two-pass
+Butterworth filter with reflected ends has errors of 0.64, 0.16, 0.11 and 0.02.
+
+`periodic=True` closes the curve: the last sample is the first one of the next cycle, and there are
+no ends.
 
 `cutoff_Hz = "none"` interpolates the samples with a quintic spline.
 
@@ -44,13 +46,13 @@ class SplineFilterSettings:
     """The low-pass filter by splines."""
 
     degree: int = 5
-    """Degree of the splines. Chosen: accelerations are then cubic and continuous."""
+    """Degree of the splines. Chosen because accelerations are then cubic and continuous."""
     knots_per_period: int = 16
-    """Knots per period of the cut-off frequency; where samples are denser, knots are thinned to it.
-    Chosen: the splines follow all that the filter passes."""
+    """Largest number of knots per period of the cut-off frequency. Chosen because the splines then
+    follow all frequencies that the filter passes."""
     min_periods: float = 1.0
-    """Periods of the cut-off frequency; a shorter motion is refused. Chosen: the filter's ends
-    would cover all of it."""
+    """Shortest motion, in periods of the cut-off frequency. Chosen because in a shorter motion all
+    samples are near an end."""
 
 
 SPLINE_FILTER = SplineFilterSettings()
@@ -70,9 +72,9 @@ def differentiate_coordinates(
         time: (n,) s, strictly rising.
         coordinates: (n, k) or (n,), any unit; angles unwrapped.
         cutoff_Hz: frequency at which the amplitude is halved, or "none".
-        at: (f,) s, where to evaluate; default: at `time`. Never outside it.
-        periodic: the samples are one closed cycle, time[-1] = time[0] + its period.
-        name: what to call the data in messages.
+        at: (f,) s, times of the result, within `time`; default: `time`.
+        periodic: whether the samples are one closed cycle, from time[0] to time[-1].
+        name: name of the data, for messages.
 
     Returns:
         Value, first and second derivative, each (f, k) or (f,).
@@ -101,23 +103,26 @@ def differentiate_poses(
 ) -> tuple[Array, Array, Array]:
     """Low-pass filter poses of a body and differentiate them twice.
 
-    Positions are filtered as coordinates, orientations as sign-continuous quaternions that
-    are normalised afterwards; that does not depend on the axes chosen for either frame
-    (only, for positions, on the body's origin). With s the filtered quaternion,
+    Positions are filtered as coordinates, and orientations as sign-continuous quaternions that are
+    normalised afterwards. The result does not depend on the axes of either frame. Only the
+    positions depend on the body's origin. With s the filtered quaternion,
 
         omega = 2 vec(s* s') / |s|^2,   alpha = 2 vec(s* s'') / |s|^2 - 2 omega (s . s') / |s|^2
 
     Args:
         time: (n,) s.
         poses: (n, 4, 4) pose_body_in_world, m.
-        cutoff_Hz: as in `differentiate_coordinates`, which states the errors too.
-        at: (f,) s.
-        name: what to call the data in messages.
+        cutoff_Hz: frequency at which the amplitude is halved, or "none".
+        at: (f,) s, times of the result, within `time`; default: `time`.
+        name: name of the data, for messages.
 
     Returns:
-        Poses (f, 4, 4); spatial velocity (f, 6) and spatial acceleration (f, 6), both
-        linear then angular, in the body's axes at the body's origin: v = (R^T p', omega),
-        a = dv/dt component by component, Pinocchio's convention for a free flyer.
+        Poses (f, 4, 4), spatial velocity (f, 6) and spatial acceleration (f, 6). Both are linear,
+        then angular, in the body's axes at the body's origin: v = (R^T p', omega), a = dv/dt
+        component by component. This is Pinocchio's convention for a free flyer.
+
+    Raises:
+        InputError: as `differentiate_coordinates`.
     """
     poses = np.asarray(poses, float)
     if not np.isfinite(poses).all():
@@ -137,7 +142,7 @@ def differentiate_poses(
 
 
 def _continuous(quaternions: Array) -> Array:
-    """Return the same rotations with signs that never jump from one row to the next."""
+    """Return the quaternions (n, 4) with signs that make consecutive rows continuous."""
     turns = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     signs = np.cumprod(np.where(np.concatenate([[False], turns]), -1.0, 1.0))
     return np.asarray(quaternions * signs[:, None])
@@ -171,10 +176,15 @@ def _check_samples(time: Array, values: Array, at: Array, name: str) -> None:
 
 
 def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
-    """Raise an InputError where `frames` resample to times (f,) s too far apart for the cut-off.
+    """Raise an InputError if the resampled times (f,) s are too far apart for the cut-off.
 
     A recording is filtered at its own samples before it is resampled. Results at the frames (a
     solved patella, a rolling femur) are filtered at the rate of the frames.
+
+    Args:
+        time: times of the frames.
+        cutoff_Hz: cut-off of the low-pass filter.
+        frames: the scene's [motion] frames; None: the motion is not resampled.
     """
     if frames is None or cutoff_Hz == "none":
         return
@@ -213,7 +223,7 @@ def _check_cutoff(time: Array, cutoff_Hz: float, name: str) -> None:
 
 
 def _interpolating_spline(time: Array, values: Array, periodic: bool) -> "BSpline":
-    # Imported here, so that a mistake in a table is reported without waiting for scipy.interpolate.
+    # Imported here, because the import is slow and an error in a table should be reported at once.
     from scipy.interpolate import make_interp_spline
 
     if periodic:
@@ -236,7 +246,7 @@ def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bo
     knots = start + step * np.arange(-SPLINE_FILTER.degree, spans + SPLINE_FILTER.degree + 1)
     inside = np.clip(
         time / unit, knots[SPLINE_FILTER.degree], knots[-SPLINE_FILTER.degree - 1]
-    )  # end by rounding
+    )  # rounding may put an end outside
     design = BSpline.design_matrix(inside, knots, SPLINE_FILTER.degree)
     weights = np.gradient(time / unit)
     if periodic:
@@ -255,9 +265,9 @@ def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bo
 def _third_derivative_gram(spans: int, step: float) -> sp.csr_array:
     """Return the integrals of B_i''' B_j''' over all spans of uniform knots.
 
-    The third derivative of a spline of degree five has the third differences of its
-    coefficients, over step^3, as coefficients of degree two; three Gauss points per span
-    integrate their products exactly.
+    The third derivative of a spline of degree five is a spline of degree two. Its coefficients are
+    the third differences of the original coefficients, divided by step^3. Three Gauss points per
+    span integrate the products exactly.
     """
     from scipy.interpolate import BSpline
 

@@ -1,4 +1,4 @@
-"""Force plates of a C3D file: channels to the wrench that the ground exerts on the foot.
+"""Force plates of a C3D file: from channels to the wrench of the ground on the foot.
 
 A plate's axes follow from its corners, in the order of the format: x from corner 2 to corner 1,
 y from corner 4 to corner 1, and z = x × y, which points down if the plate is horizontal. The
@@ -13,14 +13,14 @@ channels give the force and the moment about the transducers' origin in these ax
     type 5   as type 2 after a calibration matrix (6, 8) of eight channels
 
 A calibration matrix gives forces in N (or FORCE_PLATFORM:UNITS) and moments in that unit times
-POINT:UNITS. The channels of a type 4 plate may state other units of force and moment. Then the
-units are used that put the centre of pressure on the plate.
+POINT:UNITS. The channels of a type 4 plate may state other units. Then those units are used that
+put the centre of pressure on the plate.
 
 ORIGIN is the vector o from the transducers' origin to the centre of the surface. The moment about
 this centre is M - o × F. The centre of pressure is not returned: it needs a force threshold.
 
-FORCE_PLATFORM:ZERO names frames in which nobody stands on the plates. The mean of each channel
-over them is subtracted, unless the plate is loaded in them.
+FORCE_PLATFORM:ZERO names frames without load. The mean of each channel over these frames is
+subtracted, unless the plate is loaded in them.
 
 Source: C3D user guide, FORCE_PLATFORM; Kistler's formulae for four three-component sensors.
 """
@@ -43,23 +43,23 @@ _log = logging.getLogger("tkamb")
 
 @dataclass(frozen=True)
 class PlateSettings:
-    """How the channels of a force plate are read."""
+    """Checks of the baseline and the units of a force plate."""
 
     steady_N: float = 10.0
-    """N; largest standard deviation of the vertical force over the frames of ZERO. Chosen: a foot
-    that comes or goes makes more."""
+    """N: largest standard deviation of the vertical force of an unloaded plate, over the frames of
+    ZERO. Chosen because a foot strike or toe-off gives more."""
     baseline_N: float = 20.0
-    """N; a vertical force over the frames of ZERO up to this is drift of the amplifier. Chosen: a
-    foot makes more."""
+    """N: largest mean vertical force over the frames of ZERO that is drift of the amplifier. Chosen
+    because a foot exerts more."""
     baseline_share: float = 0.2
-    """1; share of the largest change of the vertical force. A mean vertical force over the frames
-    of ZERO up to this share is drift too. Chosen: a person who stands on the plate makes more."""
+    """1: the same limit as a share of the largest change of the vertical force; the larger limit
+    holds. Chosen because a standing person exerts more."""
     loaded_N: float = 100.0
-    """N; force from which the centre of pressure of a plate is checked. Chosen: with less it is a
-    quotient of small numbers."""
+    """N: vertical force above which the centre of pressure is checked. Chosen because a smaller
+    force makes it a quotient of small numbers."""
     beside: float = 0.2
-    """Share of the plate's half width by which the centre of pressure may lie outside the
-    corners. Chosen: errors of a loaded plate are smaller."""
+    """1: share of the plate's half width by which the centre of pressure may lie outside the
+    corners. Chosen because a loaded plate has smaller errors."""
 
 
 SETTINGS = PlateSettings()
@@ -77,10 +77,10 @@ class PlateRecord:
         names: names of the channels.
         signals: (c, k) samples of the channels, in the file's units.
         units: units of the channels, as in the file.
-        calibration: (6, c), types 4 and 5: channels to force and moment; None: no matrix.
+        calibration: (6, c), matrix from channels to force and moment (types 4 and 5), or None.
         force_unit: unit of the calibrated forces.
         metres_per_unit: metres per unit of length of the file.
-        zero: samples that the file states as unloaded; None: it states none.
+        zero: samples that the file states as unloaded, or None.
         given: units that the user states.
         where: file and plate, for messages.
     """
@@ -127,7 +127,7 @@ class ForcePlate:
 
     @property
     def wrench(self) -> Array:
-        """(k, 6) force (N) and moment about the file's origin (N·m)."""
+        """Wrench (k, 6): force (N) and moment about the file's origin (N·m)."""
         return np.concatenate([self.force, self.moment + np.cross(self.centre, self.force)], axis=1)
 
 
@@ -157,9 +157,9 @@ def force_plate(record: PlateRecord) -> ForcePlate:
         level = record.signals[:, record.zero].mean(axis=1)
         if kind == 1:
             level[3:5] = 0.0  # the point of the force has no baseline
-        what = _loaded_in_zero(record, force)
-        if what:
-            notices += (what,)
+        reason = _loaded_in_zero(record, force)
+        if reason:
+            notices += (reason,)
         elif np.isfinite(level).all():
             signals = record.signals - level[:, None]
             force, moment, notices = _read(replace(record, signals=signals))
@@ -169,7 +169,7 @@ def force_plate(record: PlateRecord) -> ForcePlate:
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
-    """Return the reason not to subtract the frames of ZERO as a baseline; empty: none."""
+    """Return the reason not to subtract the mean over the frames of ZERO; "": there is none."""
     assert record.zero is not None
     vertical = force[:, 2]
     window = vertical[record.zero]
@@ -185,7 +185,10 @@ def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
 
 
 def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
-    """Return force (k, 3) N and moment (k, 3) N·m about the surface's centre, plate's axes."""
+    """Return force (k, 3) N, moment (k, 3) N·m about the surface's centre, and notices.
+
+    Force and moment are in the plate's axes.
+    """
     if record.kind not in _CALIBRATED:
         signals = record.signals * _scales(record)[:, None]
         return (*_wrench(record.kind, signals, record.origin), ())
@@ -207,7 +210,7 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
     if stated is None or np.allclose(stated, scales, rtol=1e-9):
         return (*result, ())
     other = _wrench(2, wrench * stated[:, None], record.origin)
-    inside = [_on_plate(record.corners, *one) for one in (result, other)]
+    inside = [_on_plate(record.corners, *candidate) for candidate in (result, other)]
     if inside[0] == inside[1]:
         raise InputError(
             f"is of type {record.kind}, and its channels state another unit of moment than "
@@ -225,8 +228,8 @@ def _on_plate(corners: Array, force: Array, moment: Array) -> bool:
         return True
     half = 0.5 * np.linalg.norm([corners[0] - corners[1], corners[0] - corners[3]], axis=1)
     point = np.stack([-moment[loaded, 1], moment[loaded, 0]], axis=1) / force[loaded, 2:3]
-    away = np.median(np.abs(point), axis=0) / half
-    return bool((away <= 1.0 + SETTINGS.beside).all() and (away > 1e-3).any())
+    share = np.median(np.abs(point), axis=0) / half
+    return bool((share <= 1.0 + SETTINGS.beside).all() and (share > 1e-3).any())
 
 
 def _wrench(kind: int, s: Array, origin: Array) -> tuple[Array, Array]:
@@ -319,46 +322,46 @@ class PlateLoadSettings:
     """When a force plate counts as loaded, and which force is drift."""
 
     load_N: float = 20.0
-    """N; force beyond the unloaded level that is a load. Chosen: filters of ground reactions mostly
-    use 20 N."""
+    """N: smallest load, above the unloaded level. Chosen because 20 N is usual for ground
+    reactions."""
     margin_s: float = 0.05
-    """s; the wrench counts from this much before a load to this much after it. Chosen: a foot comes
-    down and leaves within 0.02 s."""
+    """s: time before and after a load in which the wrench is used. Chosen because a foot strikes or
+    leaves within 0.02 s."""
     quiet_share: float = 0.1
-    """1; share of the samples whose median is the unloaded level: those with the smallest forces.
-    Chosen: a plate is unloaded for longer in a usual recording."""
+    """1: share of the samples, those with the smallest forces. Their median is the unloaded level.
+    Chosen because a plate is usually unloaded for longer."""
     quiet_spread_N: float = 2.0
-    """N; largest range of these samples. A larger range gives no unloaded level. Chosen: no foot is
-    so steady."""
+    """N: largest range of these samples. A larger range gives no unloaded level. Chosen because the
+    force of a foot varies more."""
     most_drift_N: float = 60.0
-    """N; largest unloaded level that is drift. Chosen: a larger force is that of a foot."""
+    """N: largest unloaded level that is drift. Chosen because a larger force is that of a foot."""
     drift_N: float = 2.0
-    """N; a larger unloaded level gets a note. Chosen: the median of noise is zero, and 2 N change
-    the force of the knee by less than 0.5 % of a body weight."""
+    """N: a larger unloaded level gets a note. Chosen because the median of noise is zero, and 2 N
+    change the force of the knee by less than 0.5 % of a body weight."""
     unloaded_s: float = 0.1
-    """s; shortest unloaded time from which drift is computed. Chosen: a foot that swings leaves the
-    plate for longer."""
+    """s: shortest unloaded time from which drift is computed. Chosen because a foot in swing leaves
+    the plate for longer."""
 
 
 PLATE_LOAD = PlateLoadSettings()
 
 
 def around_load(force: Array, time: Array) -> np.ndarray:
-    """Return whether each sample (k,) is loaded, or within the margin of a loaded one.
+    """Return whether each sample (k,) is loaded, or within `margin_s` of a loaded sample.
 
     Args:
         force: (k,) N, magnitude of the force on the plate.
         time: (k,) s.
     """
     forces = np.sort(force[np.isfinite(force)])
-    quiet = forces[: math.ceil(PLATE_LOAD.quiet_share * len(forces))]
+    smallest = forces[: math.ceil(PLATE_LOAD.quiet_share * len(forces))]
     steady = (
-        len(quiet)
-        and np.ptp(quiet) <= PLATE_LOAD.quiet_spread_N
-        and quiet[-1] <= PLATE_LOAD.most_drift_N
+        len(smallest)
+        and np.ptp(smallest) <= PLATE_LOAD.quiet_spread_N
+        and smallest[-1] <= PLATE_LOAD.most_drift_N
     )
     loaded = np.flatnonzero(
-        force >= PLATE_LOAD.load_N + (float(np.median(quiet)) if steady else 0.0)
+        force >= PLATE_LOAD.load_N + (float(np.median(smallest)) if steady else 0.0)
     )
     if not len(loaded):
         return np.zeros(len(force), bool)
@@ -371,7 +374,15 @@ def around_load(force: Array, time: Array) -> np.ndarray:
 
 
 def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
-    """Return the median (N) of the vertical force of the unloaded plate; zero if never unloaded."""
-    free = vertical[~on & np.isfinite(vertical)]
+    """Return the median (N) of the vertical force of the unloaded plate.
+
+    It is zero if the plate is unloaded for less than `unloaded_s`.
+
+    Args:
+        vertical: (k,) N, vertical force.
+        on: (k,) whether the plate is loaded, from `around_load`.
+        time: (k,) s.
+    """
+    unloaded = vertical[~on & np.isfinite(vertical)]
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    return float(np.median(free)) if len(free) * step >= PLATE_LOAD.unloaded_s else 0.0
+    return float(np.median(unloaded)) if len(unloaded) * step >= PLATE_LOAD.unloaded_s else 0.0

@@ -1,4 +1,4 @@
-"""The gait cycle: from foot strikes of a force plate, or recorded over its per cent.
+"""The gait cycle: from foot strikes on a force plate, or from a motion over per cent of a cycle.
 
 A foot is on the ground while the vertical ground reaction is at least `contact_force_N`. The
 time at which the force crosses this threshold is interpolated linearly between two samples.
@@ -19,11 +19,11 @@ class GaitSettings:
     """When a foot counts as on the ground."""
 
     contact_force_N: float = 20.0
-    """N, vertical: Zeni et al., Gait & Posture 27:710 (2008); above a plate's noise, reached within
-    some milliseconds of the strike."""
+    """N: smallest vertical force of a foot on the ground; Zeni et al., Gait & Posture 27:710
+    (2008). It is above a plate's noise, and reached within some milliseconds of the strike."""
     shortest_phase_s: float = 0.1
-    """s: a shorter contact or gap is noise. Chosen: stance and swing of walking last 0.6 and 0.4
-    s."""
+    """s: shortest stance or swing; a shorter one is noise. Chosen because stance and swing of
+    walking last 0.6 and 0.4 s."""
 
 
 GAIT = GaitSettings()
@@ -34,9 +34,9 @@ class Gait:
     """Stances of a foot from its force plates.
 
     Args:
-        stances: (n, 2) s, foot strike and toe-off of each stance; NaN where the recording begins or
-            ends within the stance, or has no force there.
-        recorded: s, times of the first and the last sample.
+        stances: (n, 2) s, foot strike and toe-off of each stance; NaN if the recording begins or
+            ends within the stance, or the force is NaN there.
+        recorded: times of the first and the last sample, s.
     """
 
     stances: Array
@@ -61,9 +61,9 @@ class Gait:
         ]
 
     def cycle(self, start: float, end: float) -> tuple[float, float] | None:
-        """Return the cycle (s) between two strikes that overlaps most with `start` to `end`, s.
+        """Return start and end (s) of the cycle that overlaps most with `start` to `end`, s.
 
-        None if no cycle overlaps.
+        A cycle lasts from a foot strike to the next. None: no cycle overlaps.
         """
         strikes = self.foot_strikes
         cycles = list(pairwise(strikes))
@@ -98,7 +98,7 @@ def find_gait(time: Array, vertical: Array) -> Gait:
 
 
 def cycle_percent(time: Array, cycle: tuple[float, float]) -> Array:
-    """Return per cent of a cycle (...,) at times (...,) s; NaN outside it."""
+    """Return per cent of a cycle (...,) at times (...,) s; NaN outside the cycle."""
     start, end = cycle
     percent = 100.0 * (time - start) / (end - start)
     return np.where((percent >= 0.0) & (percent <= 100.0), percent, np.nan)
@@ -121,11 +121,11 @@ def _crossing(time: Array, vertical: Array, after: int) -> float:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A cycle recorded over its per cent, laid on an interval of time.
+    """A cycle recorded over per cent, on an interval of time.
 
     Args:
-        start: s.
-        period: s.
+        start: start of the interval, s.
+        period: length of the interval, s.
         offset_percent: per cent of the cycle at `start`.
         closed: whether 0 and 100 % were recorded and agree.
     """
@@ -150,14 +150,14 @@ class Cycle:
 
         Args:
             percent: (n,) recorded per cent of the cycle.
-            knee: (n, 6) knee coordinates there.
-            interval: s, start and end of the cycle.
+            knee: (n, 6) knee coordinates at `percent`.
+            interval: start and end of the cycle, s.
             offset_percent: per cent of the cycle at the interval's start.
             path: the file, for messages.
 
         Raises:
-            InputError: values that are not per cent, an interval that does not rise, or an
-                offset in a cycle that is not closed.
+            InputError: `percent` is not per cent, the interval does not rise, or a cycle with an
+                offset is not closed.
         """
         start, end = interval
         if not start < end:
@@ -168,9 +168,9 @@ class Cycle:
                 path,
                 "drop cycle_s, or give per cent of the cycle",
             )
-        whole = percent[-1] - percent[0] > 100 - 1e-9
+        complete = percent[-1] - percent[0] > 100 - 1e-9
         steps = np.abs(np.diff(knee, axis=0)).max(axis=0)
-        closed = bool(whole and np.all(np.abs(knee[-1] - knee[0]) <= steps))
+        closed = bool(complete and np.all(np.abs(knee[-1] - knee[0]) <= steps))
         if offset_percent and not closed:
             raise InputError(
                 "is not a closed cycle, so it has no frame before or after its ends",
@@ -180,23 +180,23 @@ class Cycle:
         return Cycle(start, end - start, offset_percent, closed)
 
     def seconds(self, percent: Array) -> Array:
-        """Return times (n,) s of per cent (n,), possibly outside the interval."""
+        """Return the times (n,) s at per cent (n,) of the cycle, possibly outside the interval."""
         return self.start + (percent - self.offset_percent) / 100.0 * self.period
 
     def percent(self, time: Array) -> Array:
-        """Return per cent of the cycle, rising from the offset."""
+        """Return per cent (n,) of the cycle at times (n,) s, rising from the offset."""
         return self.offset_percent + (time - self.start) / self.period * 100.0
 
     def frames(self, sampled: Array, count: int | None) -> Array:
-        """Return the times of the frames: `count` evenly spaced ones, or the recorded ones."""
+        """Return the times of the frames: `count` evenly spaced times, or the recorded times."""
         if not self.closed:
             return np.linspace(sampled[0], sampled[-1], count) if count else sampled
         if count:
             return np.linspace(self.start, self.start + self.period, count)
         if not self.offset_percent:
             return sampled
-        turn = np.mod(sampled[:-1] - self.start, self.period)
-        return self.start + np.append(np.unique(np.round(turn, 12)), self.period)
+        elapsed = np.mod(sampled[:-1] - self.start, self.period)
+        return self.start + np.append(np.unique(np.round(elapsed, 12)), self.period)
 
     def wrapped(self, at: Array, sampled: Array) -> Array:
         """Return times inside the recorded cycle that differ from `at` by whole periods."""

@@ -1,14 +1,14 @@
 """The ground reaction on the foot, from one force plate or from plates that share the load.
 
-The centre of pressure is a quotient, M/F, that means nothing near F = 0. So force and
-moment about the fixed laboratory origin are filtered, which is linear, and the centre of
-pressure is recomputed from them on the plate's level h:
+The centre of pressure is a quotient, M/F, which is undefined at F = 0. Therefore force and moment
+about the laboratory's origin are filtered. The centre of pressure follows from the filtered values,
+at the plate's level h:
 
     x = (M_z + h F_x) / F_y,   z = (h F_z - M_x) / F_y,   T_y = M_y - (z F_x - x F_z)
 
 Below `unloaded_N` of vertical force the point is interpolated linearly in time between the
-loaded frames on either side, and the moment is the one about that point. Force and moment stay
-exactly as measured and filtered; only their reference point is a convention.
+loaded frames on either side, and the moment is the moment about that point. The filtered wrench
+does not change; only its reference point is a convention.
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,7 +31,7 @@ from tkamb.io.recordings.unit_words import GivenUnits
 from tkamb.units import MILLIMETRE
 
 DIRECTIONS = ("forward", "upward", "rightward")
-"""The laboratory's axes, for the reader: a file's own may be others."""
+"""Names of the laboratory's axes in messages. The axes of a file may be others."""
 
 
 @dataclass(frozen=True)
@@ -39,31 +39,31 @@ class GroundReactionSettings:
     """How a measured ground reaction is read and checked."""
 
     level_tolerance: float = 0.01
-    """m: a centre of pressure whose height varies by more is not on a level plate. Chosen: rounding
-    of a level plate is smaller."""
+    """m: largest change of height of the centre of pressure on a level plate. Chosen because
+    rounding is smaller."""
     window: float = 0.5
-    """s: samples farther from the frames than this do not affect them through the filter. Chosen:
-    several times as long as the filter's response."""
+    """s: time before and after the frames in which samples are searched for odd values. Chosen
+    because the filter's response is several times shorter."""
     moment_tolerance: float = 1e-6
-    """N·m. Chosen: horizontal moments above this belong to a point other than the centre of
-    pressure."""
+    """N·m: a larger horizontal moment is about a point other than the centre of pressure."""
     max_ankle_distance: float = 0.5
-    """m: a centre of pressure farther from the ankle is not under the foot of that leg. Chosen:
-    more than the length of a foot."""
+    """m: largest horizontal distance of the centre of pressure from the ankle. Chosen because it is
+    more than the length of a foot; a farther point is under another foot."""
 
 
 GROUND_REACTION = GroundReactionSettings()
 
 LARGEST = {"force": (20000.0, "N"), "moment": (1000.0, "N·m")}
-"""Largest values that are accepted. Force: twice that on a triple jumper's foot. Moment: many times
-any free moment; moments about a plate's own origin are smaller, too."""
+"""Largest accepted values. Force: twice the force on a triple jumper's foot. Moment: many times any
+free moment, and more than moments about a plate's origin."""
 ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
-"""Smallest deviations of an odd sample from its neighbours' curve: as a share of the component's
-peak, as a share of the whole force's peak (the larger of the two holds), and in m for a point."""
+"""Smallest deviations of an odd sample from the curve of its neighbours. ODD_FORCE: share of the
+component's peak. LEAST_ODD_FORCE: share of the largest component's peak; the larger limit holds.
+ODD_POINT: m, for a point."""
 ODD_SHARE_LEFT = 0.1
-"""Share of the smallest odd force deviation: a spike of which the low-pass leaves less is not
-reported. It changes no result by more than 0.5 % of the peak. One sample of 76 N at 1200 Hz leaves
-0.8 N at 6 Hz."""
+"""1: a spike is reported if more than this share of the smallest odd deviation remains after the
+low-pass. Smaller spikes change results by at most 0.5 % of the peak. Example: of one sample of 76 N
+at 1200 Hz, 0.8 N remain at a cut-off of 6 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,13 @@ class GroundReaction:
     Args:
         force: (f, 3) N.
         point: (f, 3) m, the centre of pressure.
-        moment: (f, 3) N·m about that point; vertical while the foot is loaded.
-        loaded: (f,) whether the vertical force is at or above `unloaded_N`.
-        odd: recorded samples around the frames that lie off their neighbours' curve.
+        moment: (f, 3) N·m about `point`; vertical while the foot is loaded.
+        loaded: (f,) whether the vertical force is at least `unloaded_N`.
+        odd: recorded samples around the frames that lie off the curve of their neighbours.
         level_assumed: whether the plate's height is assumed to be 0, because no column states it.
-        drift: number of a plate -> N, its large vertical reading while nobody stands on it.
+        drift: number of a plate -> vertical force of the unloaded plate, N, if it is large.
         notices: remarks on the parts of the file that were used.
-        gait: stances that the recording shows; None where there is no recording.
+        gait: stances of the recording; None without a recording.
     """
 
     force: Array
@@ -95,13 +95,13 @@ class GroundReaction:
 
 @dataclass(frozen=True, eq=False)
 class RecordedReaction:
-    """A foot's ground reaction as a file has it, in the laboratory.
+    """A foot's ground reaction as recorded, in the axes of the laboratory.
 
     Args:
         time: (k,) s.
         force: (k, 3) N.
         point: (k, 3) m.
-        moment: (k, 3) N·m about that point.
+        moment: (k, 3) N·m about `point`.
         level_assumed: whether no column states the plate's height.
         drift: as in `GroundReaction`.
         notices: as in `GroundReaction`.
@@ -116,9 +116,9 @@ class RecordedReaction:
     notices: tuple[str, ...] = ()
 
     def part(self, rows: slice) -> "RecordedReaction":
-        """Return some of the samples."""
-        own = {name: getattr(self, name)[rows] for name in ("time", "force", "point", "moment")}
-        return replace(self, **own)
+        """Return the samples of a slice."""
+        arrays = {name: getattr(self, name)[rows] for name in ("time", "force", "point", "moment")}
+        return replace(self, **arrays)
 
 
 def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -> GroundReaction:
@@ -130,9 +130,8 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
         side: side of the knee; a left foot is mirrored.
 
     Raises:
-        InputError: file or columns cannot be used, do not cover `time`, the force is not
-            mainly upwards, or a centre of pressure is missing or not level while the plate is
-            loaded.
+        InputError: the file or its columns cannot be used or do not cover `time`, the force is not
+            mainly upwards, or the centre of pressure of a loaded plate is missing or not level.
     """
     from_plates = _is_c3d(source)
     recorded = _complete_part((_read_plates if from_plates else _read_table)(source), time, source)
@@ -141,7 +140,7 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
     check_spacing(path, stamps)
     _check_upward(force, source)
     loaded = force[:, 1] >= source.unloaded_N
-    held, point = _own_points(recorded, loaded, path)
+    interpolated, point = _reference_points(recorded, loaded, path)
     near = (stamps >= time[0] - GROUND_REACTION.window) & (
         stamps <= time[-1] + GROUND_REACTION.window
     )
@@ -157,12 +156,14 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
         )
     if side == "left":
         force, point, moment = force @ MIRROR, point @ MIRROR, -moment @ MIRROR
-        held = held @ MIRROR
+        interpolated = interpolated @ MIRROR
     wrench = np.concatenate([force, np.cross(point, force) + moment], axis=1)
     filtered, _, _ = differentiate_coordinates(
         stamps, wrench, source.cutoff_Hz, time, name=str(path)
     )
-    reaction = _at_centre_of_pressure(filtered, level, source.unloaded_N, time, stamps, held)
+    reaction = _at_centre_of_pressure(
+        filtered, level, source.unloaded_N, time, stamps, interpolated
+    )
     return replace(
         reaction,
         odd=odd,
@@ -176,29 +177,34 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
 def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
     """Return times (k,) s, wrench on the foot (k, 6) N and N·m, and plate level (m) of a table.
 
-    The wrench is in the laboratory and about its origin.
+    The wrench is in the laboratory's axes, about the laboratory's origin.
 
     Raises:
-        InputError: columns that cannot be used, or a force that is not mainly upwards.
+        InputError: the columns cannot be used, or the force is not mainly upwards.
     """
     recorded = _read_table(source)
     _check_upward(recorded.force, source)
     loaded = recorded.force[:, 1] >= source.unloaded_N
-    _, point = _own_points(recorded, loaded, source.file)
+    _, point = _reference_points(recorded, loaded, source.file)
     about = np.cross(point, recorded.force) + recorded.moment
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
     return recorded.time, np.concatenate([recorded.force, about], axis=1), level
 
 
-def _own_points(recorded: RecordedReaction, loaded: np.ndarray, path: Path) -> tuple[Array, Array]:
-    """Return the points with interpolation while unloaded, and the moments' points, each (k, 3) m.
+def _reference_points(
+    recorded: RecordedReaction, loaded: np.ndarray, path: Path
+) -> tuple[Array, Array]:
+    """Return the centres of pressure and the reference points of the moments, each (k, 3) m.
 
-    A row with a horizontal moment states the moment about the recorded point of that row.
+    Centres of pressure of the unloaded plate are interpolated. They are the reference points,
+    except in rows with a horizontal moment: its reference point is the recorded point.
     """
-    held = _hold_point(recorded.time, recorded.point, loaded, path)
-    aside = np.abs(recorded.moment[:, [0, 2]]) > GROUND_REACTION.moment_tolerance
-    own: NDArray[np.bool_] = np.asarray(np.isfinite(recorded.point).all(axis=1) & aside.any(axis=1))
-    return held, np.where(own[:, None], recorded.point, held)
+    interpolated = _interpolate_unloaded(recorded.time, recorded.point, loaded, path)
+    horizontal = np.abs(recorded.moment[:, [0, 2]]) > GROUND_REACTION.moment_tolerance
+    about_recorded: NDArray[np.bool_] = np.asarray(
+        np.isfinite(recorded.point).all(axis=1) & horizontal.any(axis=1)
+    )
+    return interpolated, np.where(about_recorded[:, None], recorded.point, interpolated)
 
 
 def recorded_span(source: GroundReactionTable) -> tuple[float, float]:
@@ -221,10 +227,10 @@ def _units(source: GroundReactionTable) -> GivenUnits:
 def _complete_part(
     recorded: RecordedReaction, time: Array, source: GroundReactionTable
 ) -> RecordedReaction:
-    """Return the longest part around the frames without a value that is not a number.
+    """Return the longest part around the frames in which all values are finite.
 
     Raises:
-        InputError: there is such a value among the frames.
+        InputError: a value among the frames is not finite.
     """
     values = np.concatenate([recorded.force, recorded.moment], axis=1)
     gaps: NDArray[np.bool_] = np.asarray(~np.isfinite(values).all(axis=1))
@@ -244,12 +250,13 @@ def _complete_part(
     start = int(before[-1]) + 1 if len(before) else 0
     end = last + int(after[0]) if len(after) else len(stamps)
     part = recorded.part(slice(start, end))
-    line = f"used from {part.time[0]:.4f} to {part.time[-1]:.4f} s: beside it are values that are "
-    return replace(part, notices=(*part.notices, line + "not numbers"))
+    interval = f"{part.time[0]:.4f} to {part.time[-1]:.4f} s"
+    notice = f"used from {interval}: values before or after are not numbers"
+    return replace(part, notices=(*part.notices, notice))
 
 
 def _read_table(source: GroundReactionTable) -> RecordedReaction:
-    """Return the reaction of a table; the points' height is zero if no column states it."""
+    """Return the ground reaction of a table. The height of the points is zero without a column."""
     if source.surface_mm:
         raise InputError(
             "is for plates of a .c3d: a table states its points itself",
@@ -279,42 +286,42 @@ def _odd_samples(
 ) -> tuple[OddSample, ...]:
     """Return the odd samples of force and recorded point (n, 3) while the plate is loaded.
 
-    The low-pass (`cutoff`, Hz) spreads one sample over the time 1 / (2 cutoff). Odd forces that
-    are small after it are not returned.
+    The low-pass filter spreads one sample over the time 1 / (2 cutoff). Odd forces that are small
+    after filtering are not returned.
     """
     if not loaded.any():
         return ()
     spacing = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    left = 1.0 if cutoff == "none" else min(1.0, 2.0 * cutoff * spacing)
+    remaining = 1.0 if cutoff == "none" else min(1.0, 2.0 * cutoff * spacing)
     peaks = np.abs(force).max(axis=0)
     floors = np.maximum(ODD_FORCE * peaks, LEAST_ODD_FORCE * peaks.max())
-    inside = loaded.copy()  # two samples after foot strike and before toe-off do not count
+    inside = loaded.copy()  # without two samples after foot strike and before toe-off
     for shift in (1, 2):
         inside[shift:] &= loaded[:-shift]
         inside[:-shift] &= loaded[shift:]
-    kept = set(stamps[inside].tolist())
+    inside_times = set(stamps[inside].tolist())
     odd: list[OddSample] = []
     for axis in range(3):
-        one = (path, f"{DIRECTIONS[axis]} force", stamps, force[:, axis])
+        series = (path, f"{DIRECTIONS[axis]} force", stamps, force[:, axis])
         floor = float(floors[axis])
-        spikes = odd_samples(*one, floor, 1.0, "N")
-        odd += [spike for spike in spikes if left * spike.away > ODD_SHARE_LEFT * floor]
+        spikes = odd_samples(*series, floor, 1.0, "N")
+        odd += [spike for spike in spikes if remaining * spike.away > ODD_SHARE_LEFT * floor]
         if point is not None:
-            one = (path, f"centre of pressure, {DIRECTIONS[axis]}", stamps, point[:, axis])
-            odd += odd_samples(*one, ODD_POINT, MILLIMETRE, "mm")
-    return tuple(sample for sample in odd if sample.time in kept)
+            series = (path, f"centre of pressure, {DIRECTIONS[axis]}", stamps, point[:, axis])
+            odd += odd_samples(*series, ODD_POINT, MILLIMETRE, "mm")
+    return tuple(sample for sample in odd if sample.time in inside_times)
 
 
 def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
-    """Raise an InputError where the loaded centre of pressure is not under the foot.
+    """Raise an InputError if the centre of pressure of the loaded foot is not under the foot.
 
     Args:
         ground: the ground reaction.
         ankle: (f, 3) m, ankle centre in the laboratory at the same frames.
         path: file of the ground reaction, for the message.
     """
-    away = (ground.point - ankle)[ground.loaded][:, [0, 2]]
-    farthest = float(np.linalg.norm(away, axis=1).max(initial=0.0))
+    horizontal = (ground.point - ankle)[ground.loaded][:, [0, 2]]
+    farthest = float(np.linalg.norm(horizontal, axis=1).max(initial=0.0))
     if farthest > GROUND_REACTION.max_ankle_distance:
         raise InputError(
             f"the centre of pressure lies up to {farthest:.3g} m from the ankle",
@@ -324,29 +331,29 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
 
 
 def _upright_point(source: GroundReactionTable) -> str:
-    """Return the role of the centre of pressure's height, whose column may be missing."""
+    """Return the role of the height of the centre of pressure. Its column may be missing."""
     return f"point_{'xyz'.index(source.laboratory_axes.split(',')[1][-1]) + 1}"
 
 
 def _read_columns(source: GroundReactionTable, recorded: Table) -> tuple[Array, Array, Array]:
-    """Return force (N), point (m) and free moment (N·m), each (n, 3), in the laboratory."""
+    """Return force (N), point (m) and moment about it (N·m), each (n, 3), in the laboratory."""
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
     check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
     rotation = laboratory_rotation(source.laboratory_axes, recorded.path)
     roles_present = {role for role in roles if role in source.columns or role in recorded.columns}
     columns = []
-    # moments about the file's origin need no points: the force then is given there
-    pointless = (
+    # Without point columns, all three moments must be there: they are about the file's origin.
+    without_points = (
         not any(role.startswith("point") for role in roles_present) and len(roles_present) == 6
     )
     for role in roles:
         column = source.columns.get(role, role)
         present = role in roles_present
-        if role.startswith("point") and pointless:
+        if role.startswith("point") and without_points:
             columns.append(np.zeros(recorded.rows))
             continue
         if role.startswith("point") and (present or role != _upright_point(source)):
-            columns.append(recorded.column(column))  # undefined while unloaded
+            columns.append(recorded.column(column))  # may be NaN while unloaded
         elif role.startswith("force") or present:
             columns.append(recorded.column(column))
             _check_size(recorded.path, role[:-2], column, columns[-1])
@@ -358,20 +365,19 @@ def _read_columns(source: GroundReactionTable, recorded: Table) -> tuple[Array, 
 
 
 def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
-    """Raise an InputError where a column (n,) of a kind holds more than a foot exerts."""
+    """Raise an InputError if a column (n,) holds larger values than a foot exerts."""
     largest, unit = LARGEST[kind]
     question = f"check whether a cell is mistyped, and whether the {kind} is in {unit}"
-    filled = np.where(np.isfinite(values), values, 0.0)  # a gap is refused where it is needed
+    filled = np.where(np.isfinite(values), values, 0.0)  # gaps are checked later
     check_range(path, f"foot: column '{column}'", filled, (-largest, largest), unit, question)
 
 
 def _read_plates(source: GroundReactionTable) -> RecordedReaction:
     """Return the ground reaction of a recording's plates.
 
-    The wrenches are summed about the laboratory's origin and kept, each while its plate is
-    loaded: the point lies on the level of the plates' surface or that of a step on them,
-    `surface_mm` above it, and is carried over in time while the vertical force is below
-    `unloaded_N`.
+    The wrenches of the loaded plates are summed about the laboratory's origin. The point lies on
+    the plates' surface, or on a step that is `surface_mm` higher. It is interpolated in time while
+    the vertical force is below `unloaded_N`.
     """
     recording = read_c3d(source.file, _units(source))
     check_roles(source.columns, (), source.file, "ground_reaction")
@@ -391,7 +397,7 @@ def _read_plates(source: GroundReactionTable) -> RecordedReaction:
     for plate in plates:
         in_file = source.sign * plate.wrench
         wrench = np.concatenate([in_file[:, :3] @ rotation.T, in_file[:, 3:] @ rotation.T], axis=1)
-        size = np.linalg.norm(wrench[:, :3], axis=1)  # in any direction: axes are checked below
+        size = np.linalg.norm(wrench[:, :3], axis=1)  # the axes may still be wrong
         on = around_load(size, recording.analog_time)
         wrenches.append(np.where((on | ~np.isfinite(wrench).all(axis=1))[:, None], wrench, 0.0))
         level = unloaded_level(wrench[:, 1], on, recording.analog_time)
@@ -419,7 +425,7 @@ def summed_reaction(
         time: (k,) s.
         wrenches: each (k, 6), force and moment about the laboratory's origin.
         level: m, height of the point.
-        unloaded: N, vertical force below which the point is carried over in time.
+        unloaded: N, vertical force below which the point is interpolated in time.
         path: the file, for messages.
     """
     wrench = np.sum(wrenches, axis=0)
@@ -427,12 +433,15 @@ def summed_reaction(
     point = np.full_like(force, np.nan)
     loaded = force[:, 1] >= unloaded
     point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
-    point = _hold_point(time, point, loaded, path)
+    point = _interpolate_unloaded(time, point, loaded, path)
     return point, about_origin - np.cross(point, force), force
 
 
 def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:
-    """Return the point (k, 3) m at a level where the moment is vertical; see the module."""
+    """Return the points (k, 3) m at a level (m) about which the moment is vertical.
+
+    The equation is in the docstring of the module.
+    """
     fx, fy, fz = force.T
     x = (about_origin[:, 2] + level * fx) / fy
     z = (level * fz - about_origin[:, 0]) / fy
@@ -440,7 +449,7 @@ def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Arra
 
 
 def _check_upward(force: Array, source: GroundReactionTable) -> None:
-    """Raise where the largest force on the foot points down or sideways."""
+    """Raise if the largest force on the foot points down or sideways."""
     up, down = float(force[:, 1].max()), float(-force[:, 1].min())
     aside = float(np.hypot(force[:, 0], force[:, 2]).max())
     if max(down, aside) > max(up, source.unloaded_N):
@@ -455,8 +464,8 @@ def _check_upward(force: Array, source: GroundReactionTable) -> None:
         )
 
 
-def _hold_point(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
-    """Return the points; those of the unloaded plate are interpolated in time."""
+def _interpolate_unloaded(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
+    """Return the points (k, 3) m, interpolated in time while the plate is unloaded."""
     missing = loaded & ~np.isfinite(point).all(axis=1)
     if missing.any():
         raise InputError(
@@ -471,12 +480,12 @@ def _hold_point(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> 
 
 
 def _at_centre_of_pressure(
-    wrench: Array, level: float, unloaded_N: float, time: Array, stamps: Array, held: Array
+    wrench: Array, level: float, unloaded_N: float, time: Array, stamps: Array, interpolated: Array
 ) -> GroundReaction:
     """Return force, point and moment of wrenches (f, 6) about the laboratory origin."""
     force, about_origin = wrench[:, :3], wrench[:, 3:]
     loaded = force[:, 1] >= unloaded_N
-    point = np.stack([np.interp(time, stamps, held[:, k]) for k in range(3)], axis=1)
+    point = np.stack([np.interp(time, stamps, interpolated[:, k]) for k in range(3)], axis=1)
     point[:, 1] = level
     point[loaded] = _centre_of_pressure(force[loaded], about_origin[loaded], level)
     moment = about_origin - np.cross(point, force)

@@ -1,7 +1,7 @@
 """Inverse kinematics: the pose of a chain of segments that fits the measured markers best.
 
-Per frame, with measured markers p_m, weights w_m (zero for a marker that is missing) and the
-chain's markers x_m(q),
+Per frame, with measured markers p_m, weights w_m (zero for a missing marker) and the chain's
+markers x_m(q),
 
     min_q  sum_m w_m |x_m(q) - p_m|²
 
@@ -29,15 +29,14 @@ class InverseKinematicsSettings:
     """The fit of the poses of a leg to its markers, frame by frame."""
 
     step_tolerance: float = 1e-6
-    """m and rad; a frame has converged when its step is smaller. Chosen: far below the noise of
-    markers."""
+    """m and rad: a frame has converged when its step is smaller. Chosen because it is far below the
+    noise of markers."""
     newton_below: float = 0.1
-    """m and rad: after a smaller step the curvature of the residuals is included (Newton's method),
-    before that it is not (Gauss-Newton). Chosen: nearer to the solution Newton's method
-    converges."""
+    """m and rad: after a smaller step, the next step includes the curvature of the residuals
+    (Newton); otherwise it does not (Gauss-Newton). Chosen because Newton's method converges near
+    the solution only."""
     max_iterations: int = 60
-    """Iterations after which a frame without convergence fails. Chosen: frames that converge need
-    fewer."""
+    """Largest number of iterations of a frame. Chosen because frames that converge need fewer."""
 
 
 INVERSE_KINEMATICS = InverseKinematicsSettings()
@@ -55,7 +54,7 @@ class NormalEquations:
         cost: (f,) m², sum of weighted squared distances.
         matrix: (f, n, n) Jᵀ W J.
         right: (f, n) Jᵀ W (p - x).
-        curvature: (f, n, n) part of the Hessian due to the residuals; None: not known.
+        curvature: (f, n, n) part of the Hessian due to the residuals; None: not computed.
     """
 
     cost: Array
@@ -65,11 +64,13 @@ class NormalEquations:
 
     def of(self, frames: Index) -> "NormalEquations":
         """Return the equations of some frames."""
-        bent = None if self.curvature is None else self.curvature[frames]
-        return NormalEquations(self.cost[frames], self.matrix[frames], self.right[frames], bent)
+        curvature = None if self.curvature is None else self.curvature[frames]
+        return NormalEquations(
+            self.cost[frames], self.matrix[frames], self.right[frames], curvature
+        )
 
     def replaced(self, frames: Index, part: "NormalEquations") -> "NormalEquations":
-        """Return the equations with some frames as in `part`."""
+        """Return the equations with those of some frames replaced by `part`."""
         return NormalEquations(
             put(self.cost, frames, part.cost),
             put(self.matrix, frames, part.matrix),
@@ -81,13 +82,13 @@ class NormalEquations:
 
 
 class MarkerChain(Protocol[State]):
-    """Interface of a chain with n degrees of freedom and m markers for the least squares."""
+    """Interface of a chain with n degrees of freedom and m markers that is fitted to markers."""
 
     def places(self, state: State) -> Array:
         """Return the markers (f, m, 3) m."""
 
     def normal(self, state: State, target: Array, weights: Array) -> NormalEquations:
-        """Return the least squares to markers (f, m, 3) m with weights (f, m)."""
+        """Return the normal equations for measured markers (f, m, 3) m with weights (f, m)."""
 
     def moved(self, state: State, step: Array) -> State:
         """Return the state after a step (f, n)."""
@@ -96,7 +97,7 @@ class MarkerChain(Protocol[State]):
         """Return the state of some frames."""
 
     def replaced(self, state: State, frames: Index, part: State) -> State:
-        """Return the state with some frames as in `part`."""
+        """Return the state with some frames replaced by `part`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +106,7 @@ class ChainFit(Generic[State]):
 
     Args:
         state: the fitted state.
-        rms: (f,) m, root mean square distance of the visible markers; NaN without any.
+        rms: (f,) m, root mean square distance of the visible markers; NaN without markers.
         distance: (f, m) m, distance of each marker; NaN for a missing one.
         solved: (f,) whether the last step was below `INVERSE_KINEMATICS.step_tolerance`.
         steps: number of iterations.
@@ -130,10 +131,10 @@ def fit_chain(
         start: initial guess.
     """
     visible = np.isfinite(measured).all(axis=2)
-    target, each = np.nan_to_num(measured), np.where(visible, weights, 0.0)
+    target, frame_weights = np.nan_to_num(measured), np.where(visible, weights, 0.0)
     damping, last = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
     active, steps = np.arange(len(measured)), 0
-    state, residual = start, chain.normal(start, target, each)
+    state, residual = start, chain.normal(start, target, frame_weights)
     while steps < INVERSE_KINEMATICS.max_iterations:
         step = _step(
             residual.of(active), damping[active], last[active] < INVERSE_KINEMATICS.newton_below
@@ -148,8 +149,8 @@ def fit_chain(
         if not len(active):
             break
         trial = chain.chosen(trial, np.flatnonzero(~converged))
-        trial_residual = chain.normal(trial, target[active], each[active])
-        # A frame whose cost would rise keeps its state.
+        trial_residual = chain.normal(trial, target[active], frame_weights[active])
+        # A step that raises the cost of a frame is rejected.
         better = trial_residual.cost <= residual.cost[active] * (1.0 + 1e-12) + 1e-24
         accepted, rows = active[better], np.flatnonzero(better)
         state = chain.replaced(state, accepted, chain.chosen(trial, rows))
@@ -171,20 +172,20 @@ def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -
     """
     matrix, right = equations.matrix, equations.right
     diagonal = np.einsum("fii->fi", matrix)
-    # The floor keeps degrees of freedom that no marker determines at their value.
+    # The floor makes the matrix regular if no marker determines a degree of freedom.
     floor = 1e-9 * diagonal.max(axis=1, keepdims=True, initial=1e-12)
     added = (damping[:, None] * diagonal + floor)[:, :, None] * np.eye(matrix.shape[1])
     step = np.zeros_like(right)
     if equations.curvature is not None and near.any():
-        whole = (matrix + equations.curvature + added)[near]
-        step[near] = np.linalg.solve(whole, right[near][:, :, None])[:, :, 0]
+        hessian = (matrix + equations.curvature + added)[near]
+        step[near] = np.linalg.solve(hessian, right[near][:, :, None])[:, :, 0]
     uphill = np.einsum("fi,fi->f", step, right) <= 0.0
     step[uphill] = np.linalg.solve((matrix + added)[uphill], right[uphill][:, :, None])[:, :, 0]
     return step
 
 
 def put(values: Array, frames: Index, part: Array) -> Array:
-    """Return values with some frames as in `part`."""
+    """Return a copy of `values` with those of some frames replaced by `part`."""
     result = values.copy()
     result[frames] = part
     return result
@@ -209,13 +210,13 @@ class Segment:
     """A body with markers.
 
     Args:
-        name: "shank" and "thigh" are the knee's; others are joined to one of them by a ball joint.
+        name: "shank", "thigh", or the name of a neighbour of one of them.
         labels: (m) labels of its markers.
-        points: (m, 3) m, the markers in its frame.
-        weights: (m,) weights of their squared distances.
-        joined_to: the segment that a ball joint connects it to; empty for shank and thigh.
+        points: (m, 3) m, its markers in its frame.
+        weights: (m,) weights of the markers' squared distances.
+        joined_to: "shank" or "thigh", which a ball joint connects to a neighbour; else empty.
         joint: (3,) m, the ball joint in the frame of `joined_to`.
-        centre: (3,) m, the ball joint in its own frame.
+        centre: (3,) m, the ball joint in the neighbour's frame.
     """
 
     name: str
@@ -235,7 +236,7 @@ class LegState:
         shank: (f, 4, 4) pose_shank_in_world.
         knee: (f, 6) knee coordinates of the thigh; a hinge changes flexion only.
         thigh: (f, 4, 4) pose_thigh_in_world.
-        turns: neighbour -> (f, 3, 3), its rotation in the segment that it is joined to.
+        turns: neighbour -> (f, 3, 3), its rotation in the frame of its `joined_to`.
     """
 
     shank: Array
@@ -253,7 +254,7 @@ class LegChain:
     Args:
         segments: "shank" and "thigh", and their neighbours.
         pose_insert_in_shank: (4, 4), the frame of the knee coordinates.
-        free: whether the knee has six degrees of freedom; else it has flexion only.
+        free: whether the knee has six degrees of freedom; otherwise it is a hinge.
     """
 
     def __init__(
@@ -280,8 +281,8 @@ class LegChain:
         """Return an initial guess from the fits of the single segments.
 
         Args:
-            fitted: segment -> (f, 4, 4), NaN where it could not be fitted.
-            neutral: (6,) knee coordinates that a hinge keeps.
+            fitted: segment -> (f, 4, 4) pose in the world; NaN in frames without a fit.
+            neutral: (6,) constant knee coordinates of a hinge.
         """
         shank = _fill_gaps(fitted["shank"])
         thigh = _fill_gaps(fitted["thigh"])
@@ -295,8 +296,8 @@ class LegChain:
         for ball in self.balls:
             parent = {"shank": shank, "thigh": thigh}.get(ball.joined_to)
             assert parent is not None
-            own = _fill_gaps(fitted[ball.name])[:, :3, :3]
-            state.turns[ball.name] = np.swapaxes(parent[:, :3, :3], 1, 2) @ own
+            rotation = _fill_gaps(fitted[ball.name])[:, :3, :3]
+            state.turns[ball.name] = np.swapaxes(parent[:, :3, :3], 1, 2) @ rotation
         return state
 
     def places(self, state: LegState) -> Array:
@@ -304,7 +305,7 @@ class LegChain:
         return self.markers(state)[0]
 
     def normal(self, state: LegState, target: Array, weights: Array) -> NormalEquations:
-        """Return the least squares to markers (f, m, 3) m with weights (f, m)."""
+        """Return the normal equations for measured markers (f, m, 3) m with weights (f, m)."""
         places, jacobian = self.markers(state)
         frames = len(places)
         off, w = target - places, weights[:, :, None]
@@ -348,10 +349,10 @@ class LegChain:
 
     def moved(self, state: LegState, step: Array) -> LegState:
         """Return the state after a step (f, n)."""
-        shank = _carry(state.shank, step[:, :6])
+        shank = _displaced(state.shank, step[:, :6])
         knee = state.knee.copy()
         if self.free:
-            thigh = _carry(state.thigh, step[:, 6:12])
+            thigh = _displaced(state.thigh, step[:, 6:12])
         else:
             knee[:, FLEXION] += step[:, 6]
             thigh = shank @ self.insert @ knee_pose(knee)
@@ -360,8 +361,8 @@ class LegChain:
             column = self._columns[ball.name]
             world = Rotation.from_rotvec(step[:, column : column + 3]).as_matrix()
             parent = parents[ball.joined_to][:, :3, :3]
-            own = world @ parent @ state.turns[ball.name]
-            turns[ball.name] = np.swapaxes(parent, 1, 2) @ own
+            rotation = world @ parent @ state.turns[ball.name]
+            turns[ball.name] = np.swapaxes(parent, 1, 2) @ rotation
         return LegState(shank, knee, thigh, turns)
 
     def chosen(self, state: LegState, frames: Index) -> LegState:
@@ -370,7 +371,7 @@ class LegChain:
         return LegState(state.shank[frames], state.knee[frames], state.thigh[frames], turns)
 
     def replaced(self, state: LegState, frames: Index, part: LegState) -> LegState:
-        """Return the state with some frames as in `part`."""
+        """Return the state with some frames replaced by `part`."""
         turns = {name: put(turn, frames, part.turns[name]) for name, turn in state.turns.items()}
         return LegState(
             put(state.shank, frames, part.shank),
@@ -380,13 +381,13 @@ class LegChain:
         )
 
 
-def _carry(poses: Array, step: Array) -> Array:
+def _displaced(poses: Array, step: Array) -> Array:
     turn = Rotation.from_rotvec(step[:, 3:]).as_matrix()
     return pose(turn @ poses[:, :3, :3], poses[:, :3, 3] + step[:, :3])
 
 
 def _fill_gaps(poses: Array) -> Array:
-    """Return the poses; a missing one is that of the frame before, or of the first known."""
+    """Return poses (f, 4, 4); a gap has the last pose before it, or else the first known pose."""
     finite = np.flatnonzero(np.isfinite(poses[:, 0, 3]))
     if not len(finite):
         return np.tile(np.eye(4), (len(poses), 1, 1))

@@ -1,4 +1,4 @@
-"""Columns of a file in the laboratory: x forward, y up, z to the subject's right; SI."""
+"""Conversion of a file's columns to the laboratory (x forward, y up, z right) and SI."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def laboratory_rotation(axes: str, path: Path) -> Array:
 
 
 def check_roles(columns: dict[str, str], roles: tuple[str, ...], path: Path, table: str) -> None:
-    """Raise InputError if the scene's `columns` names a role that does not exist."""
+    """Raise an InputError if the scene's `columns` names a role that does not exist."""
     for role in columns:
         if role not in roles:
             raise InputError(
@@ -44,7 +44,7 @@ def angle_scale(table: Table, angle_unit: str | None) -> float:
     """Return radians per unit of angle.
 
     Raises:
-        InputError: the file's header contradicts the scene.
+        InputError: the file's header states another unit than the scene.
     """
     if table.in_degrees is not None and table.in_degrees != (angle_unit == "deg"):
         stated = "degrees" if table.in_degrees else "radians"
@@ -79,5 +79,5 @@ def poses_of_columns(
     try:
         rotation = Rotation.from_euler(sequence, angles * angle_scale(table, angle_unit))
     except ValueError as error:
-        raise InputError(f"sequence '{sequence}' is none ({error})", table.path) from None
+        raise InputError(f"sequence '{sequence}' is not valid ({error})", table.path) from None
     return pose(rotation.as_matrix(), places * table.unit_scale(length_unit, "length_unit"))

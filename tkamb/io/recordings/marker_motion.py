@@ -1,14 +1,13 @@
-"""Knee and shank from skin markers: rigid fits and a chain, side by side.
+"""Motion of knee and shank from skin markers, by separate rigid fits and by a chain.
 
-The same markers are fitted in two ways. Both are computed, and one of them is used:
+The same markers are fitted in two ways. Both fits are computed, and the scene chooses one:
 
-- segments: shank and thigh are fitted rigidly and separately. Their joint centres may differ,
-  and the distance shows the movement of the skin.
+- segments: shank and thigh are fitted rigidly and separately. Each gives a knee centre. The
+  distance between the two shows the movement of the skin.
 - chain: shank, knee, thigh and their neighbours are fitted at once, connected by joints. The
   movement of the skin is distributed over the segments.
 
-The knee centre by the thigh's markers and that by the shank's markers are some distance apart. This
-distance is a lever arm that changes the moments of the knee.
+The distance between the two knee centres is a lever arm that changes the moments of the knee.
 """
 
 from dataclasses import dataclass
@@ -49,8 +48,8 @@ class MarkerMotionSettings:
     """The motion of a leg from markers."""
 
     max_joint_gap: float = 0.1
-    """m: largest distance of a joint from where the markers show it. Chosen: at the hip, skin moves
-    by a third of this; the other foot is farther away."""
+    """m: largest distance between the positions of a joint by the markers of its two segments.
+    Chosen because skin at the hip moves by a third of this, and the other foot is farther away."""
 
 
 MARKER_MOTION = MarkerMotionSettings()
@@ -58,18 +57,18 @@ MARKER_MOTION = MarkerMotionSettings()
 
 @dataclass(frozen=True, eq=False)
 class MarkerKinematics:
-    """Kinematics of a leg from skin markers, as a right leg, SI.
+    """Kinematics of a leg from skin markers, SI. A left leg is mirrored to a right one.
 
     Args:
-        time: (n,) s, the frames that `method` can fit, without a gap.
-        method: the fit that is used.
+        time: (n,) s, times of the frames that `method` can fit, without a gap.
+        method: the fit that the scene chooses.
         tibia: (n, 4, 4) pose_tibia_in_laboratory by this fit.
         coordinates: (n, 6) knee coordinates by this fit.
-        flexion: method -> (n,) rad; NaN where the segments could not be fitted.
+        flexion: method -> (n,) rad; NaN in frames without a fit.
         rms: method -> (n,) m, root mean square distance of the markers of shank and thigh, or of
             all markers of the chain.
-        centre_distance: (n,) m, distance between the knee centres by the shank's and by the
-            thigh's markers, with separate fits.
+        centre_distance: (n,) m, distance between the knee centres by the separate fits of shank
+            and thigh.
         missing: (n,) number of missing markers of shank and thigh.
     """
 
@@ -87,7 +86,7 @@ class MarkerKinematics:
         return np.asarray(np.interp(time, self.time, values))
 
     def shank_motion(self, cutoff_Hz: Cutoff, time: Array, name: str) -> BodyMotion:
-        """Return the shank in the laboratory, filtered, at the frames' times."""
+        """Return the filtered motion of the shank in the laboratory at times (f,) s."""
         filtered, velocity, acceleration = differentiate_poses(
             self.time, self.tibia, cutoff_Hz, time, name
         )
@@ -98,16 +97,16 @@ class MarkerKinematics:
 def load_marker_motion(
     source: MotionTable, side: Side, pose_insert_in_tibia: Array
 ) -> MarkerKinematics:
-    """Return knee and shank of a recording's markers.
+    """Return the kinematics of knee and shank from the markers of a recording.
 
     Args:
         source: the scene's [motion], with markers.
         side: side of the knee; a left leg and its laboratory are mirrored.
-        pose_insert_in_tibia: (4, 4) m, of the patient, mirrored for a left knee.
+        pose_insert_in_tibia: (4, 4) m, pose in the patient's URDF, mirrored for a left knee.
 
     Raises:
         InputError: file, labels or markers cannot be used, the fit is poor or does not converge,
-            or a gap in the interval.
+            or the interval has a gap.
     """
     assert source.markers is not None
     recorded = read_table(source.file, source.format)
@@ -115,23 +114,23 @@ def load_marker_motion(
     segments, measured = leg_segments(source.markers, recorded, source.length_unit, side)
     neutral = neutral_coordinates(source.markers, side)
     chain = LegChain(segments, pose_insert_in_tibia, source.markers.knee == "free")
-    fits, whole = both_fits(chain, segments, measured, neutral, recorded)
-    if not whole.solved.all():
+    fits, chain_fit = both_fits(chain, segments, measured, neutral, recorded)
+    if not chain_fit.solved.all():
         raise InputError(
-            f"the chain of segments does not converge at {time[int(np.argmin(whole.solved))]:.4f} "
-            f"s",
+            "the chain of segments does not converge at "
+            f"{time[int(np.argmin(chain_fit.solved))]:.4f} s",
             recorded.path,
             "check labels and joints in [motion.markers]; two labels may be swapped",
         )
-    blind = np.isnan(whole.rms)[:, None, None]
+    unmarked = np.isnan(chain_fit.rms)[:, None, None]
     readings: dict[Method, tuple[Array, Array]] = {
         "segments": (fits["shank"][0], fits["thigh"][0]),
         "chain": (
-            np.where(blind, np.nan, whole.state.shank),
-            np.where(blind, np.nan, whole.state.thigh),
+            np.where(unmarked, np.nan, chain_fit.state.shank),
+            np.where(unmarked, np.nan, chain_fit.state.thigh),
         ),
     }
-    rms: dict[Method, Array] = {"segments": _joint_rms(fits, measured), "chain": whole.rms}
+    rms: dict[Method, Array] = {"segments": _joint_rms(fits, measured), "chain": chain_fit.rms}
     return _compare_readings(source, recorded, time, readings, rms, chain, measured, neutral)
 
 
@@ -142,7 +141,10 @@ def both_fits(
     neutral: Array,
     recorded: Table,
 ) -> tuple[dict[str, tuple[Array, Array]], ChainFit[LegState]]:
-    """Return segment -> separate fit (poses (n, 4, 4) m, rms (n,) m), and the fit of the chain."""
+    """Return the separate fits and the fit of the chain.
+
+    A separate fit is segment -> (poses (n, 4, 4) m, root mean square distances (n,) m).
+    """
     fits = {s.name: fit_seen(measured[s.name], s.points, s.weights, s.name) for s in segments}
     _check_fits({name: fit[1] for name, fit in fits.items()}, recorded)
     _check_joints(segments, {name: fit[0] for name, fit in fits.items()}, recorded)
@@ -155,7 +157,9 @@ def both_fits(
 def leg_segments(
     markers: MarkersTable, recorded: Table, length_unit: str | None, side: str
 ) -> tuple[list[Segment], dict[str, Array]]:
-    """Return the segments, and segment -> its markers (n, m, 3) m, laboratory, gaps NaN.
+    """Return the segments, and segment -> measured markers (n, m, 3) m, gaps NaN.
+
+    The markers are in the laboratory's axes; those of a left leg are mirrored.
 
     Raises:
         InputError: the recording lacks a marker.
@@ -164,21 +168,21 @@ def leg_segments(
     rotation = laboratory_rotation(markers.laboratory_axes, recorded.path)
     mirror = MIRROR if side == "left" else np.eye(3)
     segments, measured = [], {}
-    for own in markers.segment:
-        labels = tuple(own.markers_mm)
+    for table in markers.segment:
+        labels = tuple(table.markers_mm)
         points = marker_trajectories(recorded, list(labels), scale) @ rotation.T
-        measured[own.name] = points @ mirror
+        measured[table.name] = points @ mirror
         ends = [
             None if end is None else mirror @ (np.array(end) * MILLIMETRE)
-            for end in (own.joint_mm, own.centre_mm)
+            for end in (table.joint_mm, table.centre_mm)
         ]
         segments.append(
             Segment(
-                own.name,
+                table.name,
                 labels,
-                np.array(list(own.markers_mm.values())) * MILLIMETRE @ mirror,
-                np.array([own.weights.get(label, 1.0) for label in labels]),
-                own.joined_to or "",
+                np.array(list(table.markers_mm.values())) * MILLIMETRE @ mirror,
+                np.array([table.weights.get(label, 1.0) for label in labels]),
+                table.joined_to or "",
                 *ends,
             )
         )
@@ -210,16 +214,17 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
 
 
 def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Table) -> None:
-    """Raise where the joint by a segment's markers is far from that by its neighbour's."""
-    for own in segments:
-        if own.joint is None or own.centre is None:
+    """Raise if the markers of two segments give distant positions of their common joint."""
+    for segment in segments:
+        name, neighbour = segment.name, segment.joined_to
+        if segment.joint is None or segment.centre is None:
             continue
-        ends = transform(poses[own.joined_to], own.joint) - transform(poses[own.name], own.centre)
-        apart = np.linalg.norm(ends, axis=1)
-        if np.isfinite(apart).any() and np.nanmedian(apart) > MARKER_MOTION.max_joint_gap:
+        ends = transform(poses[neighbour], segment.joint) - transform(poses[name], segment.centre)
+        distance = np.linalg.norm(ends, axis=1)
+        if np.isfinite(distance).any() and np.nanmedian(distance) > MARKER_MOTION.max_joint_gap:
             raise InputError(
-                f"markers of the {own.name} put its joint with the {own.joined_to} "
-                f"{np.nanmedian(apart) / MILLIMETRE:.0f} mm from where the {own.joined_to}'s do",
+                f"markers of the {name} put its joint with the {neighbour} "
+                f"{np.nanmedian(distance) / MILLIMETRE:.0f} mm from where the {neighbour}'s do",
                 recorded.path,
                 "check the labels in [motion.markers]; left and right may be swapped",
             )
@@ -235,7 +240,10 @@ def _compare_readings(
     measured: dict[str, Array],
     neutral: Array,
 ) -> MarkerKinematics:
-    """Return the result from both fits, (shank, thigh), in the frames of the method in use."""
+    """Return the kinematics in the frames that the chosen method can fit.
+
+    `readings` and `rms` have both methods: poses of shank and thigh, and residuals.
+    """
     assert source.markers is not None
     used = source.markers.method
     knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
@@ -274,9 +282,9 @@ def _knee(insert: Array, femur: Array) -> Array:
 def _run(
     time: Array, missing: np.ndarray, interval: tuple[float, float] | None, recorded: Table
 ) -> slice:
-    """Return the longest run of frames around the interval without a missing frame.
+    """Return the longest range of frames around the interval without a missing frame.
 
-    Without an interval it must be the whole recording.
+    Without an interval, no frame of the recording may be missing.
     """
     start, end = interval or (time[0], time[-1])
     if start < time[0] - 1e-9 or end > time[-1] + 1e-9:

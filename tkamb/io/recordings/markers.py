@@ -18,27 +18,27 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class MarkerFitSettings:
-    """When fitted markers are refused."""
+    """Check of a fit of markers."""
 
     max_median_residual: float = 0.05
-    """m: largest median residual. Chosen: a larger one is due to a wrong marker, unit or set, not
-    to soft tissue."""
+    """m: largest median residual. Chosen because soft tissue causes less; a larger residual is due
+    to a wrong marker or unit."""
 
 
 MARKER_FIT = MarkerFitSettings()
 
 
 def plain_label(label: str) -> str:
-    """Return a label without the subject's prefix, dots, underscores, blanks and case."""
+    """Return a label in lower case, without the subject's prefix and . _ - and blanks."""
     name = label.rpartition(":")[2]
     return "".join(c for c in name if c not in "._- ").lower()
 
 
 def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str]:
-    """Return name -> label in the recording, for each name that is found.
+    """Return name -> label in the recording, for each name with a match.
 
-    An equal label is preferred to a label with the same `plain_label`. A plain label that two
-    markers share (two subjects) matches nothing.
+    A name matches an equal label, or else the only label with the same `plain_label`. There is no
+    match if several labels have the same `plain_label` (two subjects).
     """
     labels = list(labels)
     plain: dict[str, list[str]] = {}
@@ -70,7 +70,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
 
 
 def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
-    """Return the shank's markers and joint centres as measured and in the tibia link.
+    """Return the shank's markers and joint centres, as measured and in the tibia link's frame.
 
     A joint centre comes from a rigid fit of the neighbouring segment's markers.
 
@@ -85,8 +85,8 @@ def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
     reference = list(source.markers_mm.values())
     for joint in source.joint_centre:
         measured = marker_trajectories(recorded, list(joint.markers_mm), scale)
-        own = np.array(list(joint.markers_mm.values())) * MILLIMETRE
-        poses, residual = fit_rigid(measured, own, joint.name)
+        neighbour = np.array(list(joint.markers_mm.values())) * MILLIMETRE
+        poses, residual = fit_rigid(measured, neighbour, joint.name)
         check_fit(residual, f"the markers of joint centre '{joint.name}'", recorded)
         points.append(transform(poses, np.array(joint.centre_mm) * MILLIMETRE)[:, None])
         reference.append(joint.tibia_mm)
@@ -94,7 +94,7 @@ def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
 
 
 def check_fit(residual: Array, what: str, recorded: Table) -> None:
-    """Raise InputError if the median residual shows wrong markers or units."""
+    """Raise an InputError if the median of the residuals (n,), m, is too large."""
     finite = residual[np.isfinite(residual)]
     if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
         raise InputError(
@@ -140,8 +140,8 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
 def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tuple[Array, Array]:
     """Return the weighted rigid fit of the visible markers, frame by frame.
 
-    As `fit_rigid`, with weights and gaps. A frame without three visible markers that span a
-    triangle gives NaN.
+    Unlike `fit_rigid`, it accepts weights and gaps. A frame is NaN unless three visible markers
+    span a triangle.
 
     Args:
         points: (n, m, 3) m, gaps NaN.
@@ -168,10 +168,10 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
     total = np.where(usable, w.sum(axis=1), 1.0)[:, None]
     filled = np.nan_to_num(points)
     mean = np.einsum("nm,nmi->ni", w, filled) / total
-    own = w @ reference / total
-    h = np.einsum("nm,nmi,nmj->nij", w, reference - own[:, None], filled - mean[:, None])
+    centre = w @ reference / total
+    h = np.einsum("nm,nmi,nmj->nij", w, reference - centre[:, None], filled - mean[:, None])
     rotation = _nearest_rotation(h)
-    poses = pose(rotation, mean - np.einsum("nij,nj->ni", rotation, own))
+    poses = pose(rotation, mean - np.einsum("nij,nj->ni", rotation, centre))
     fitted = transform(poses, np.broadcast_to(reference, points.shape))
     square = np.where(visible, np.sum((fitted - filled) ** 2, axis=2), 0.0)
     rms = np.sqrt(square.sum(axis=1) / np.maximum(visible.sum(axis=1), 1))
@@ -207,14 +207,14 @@ def _fit(points: Array, reference: Array) -> tuple[Array, Array]:
 def complete_run(
     points: Array, names: list[str], time: Array, start: float, end: float, table: Table
 ) -> slice:
-    """Return the longest run of frames around [start, end] in which no marker is missing.
+    """Return the longest range of frames around [start, end] in which no marker is missing.
 
     Args:
         points: (n, m, 3), gaps NaN.
-        names: of the m markers, for the message.
+        names: names of the m markers, for the message.
         time: (n,) s.
-        start: s.
-        end: s.
+        start: start of the interval, s.
+        end: end of the interval, s.
         table: the recording, for the message.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Measurements beside the motion: forces of an instrumented implant, envelopes of surface EMG.
+"""Measured forces of an instrumented implant, and envelopes of surface EMG.
 
 An envelope is the signal high-passed, rectified, low-passed and divided by a normalising value.
 Both filters are Butterworth filters of second order that run forwards and backwards. They shift no
@@ -7,8 +7,8 @@ each frequency f by
 
     1 / (1 + r⁴),  r = tan(pi f h) / tan(pi f_c h),
 
-and the high-pass by r⁴ / (1 + r⁴). The signal is mirrored at its ends, so that the envelope there
-is a mean as elsewhere. Values of the envelope below zero are set to zero.
+and the high-pass by r⁴ / (1 + r⁴). The signal is mirrored at its ends, so that the low-pass also
+averages there. Negative values of the envelope are set to zero.
 
 Reference: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., 2009, ch. 10.
 """
@@ -26,7 +26,7 @@ from tkamb.io.recordings.samples import check_overlap
 from tkamb.io.recordings.tables import Table, read_table
 
 FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
-"""Newton per unit of force; lbf: 0.45359237 kg x 9.80665 m/s²."""
+"""Newtons per unit of force; lbf: 0.45359237 kg x 9.80665 m/s²."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ForceSampleSettings:
     """Interpolation between the samples of a measured force."""
 
     max_gap: float = 2.5
-    """Multiple of the median step: a wider gap is not interpolated. Chosen: one lost sample is."""
+    """1: widest gap to interpolate, in median time steps. Chosen because one sample may be lost."""
 
 
 FORCE_SAMPLES = ForceSampleSettings()
@@ -47,7 +47,7 @@ class MeasuredForce:
     Args:
         path: the file.
         time: (n,) s, on the clock of the motion.
-        force: "total", "medial", "lateral", if known -> (n,) N; gaps are NaN.
+        force: "total", "medial" or "lateral", if known -> (n,) N, gaps NaN.
     """
 
     path: Path
@@ -55,13 +55,10 @@ class MeasuredForce:
     force: dict[str, Array]
 
     def at(self, time: Array) -> dict[str, Array]:
-        """Return the forces (f,) N at other times, by linear interpolation.
+        """Return the forces (f,) N at times (f,) s, by linear interpolation.
 
-        They are NaN outside the measurement, beside a gap, and between samples that are farther
+        They are NaN outside the measurement, next to a gap, and between samples that are farther
         apart than `max_gap`.
-
-        Args:
-            time: (f,) s.
         """
         step = np.diff(self.time)
         right = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
@@ -81,7 +78,7 @@ def load_measured_force(source: MeasuredTable, time: Array) -> MeasuredForce:
         time: (f,) s, times of the motion, which must overlap with the measurement.
 
     Raises:
-        InputError: no such file or column, or nothing measured during the motion.
+        InputError: no such file or column, or no measurement during the motion.
     """
     table = read_table(source.file, source.format)
     name = source.columns.get("time", "time")
@@ -104,7 +101,7 @@ def _sum(table: Table, column: str | dict[str, float]) -> Array:
 
 
 def _with_third(force: dict[str, Array]) -> dict[str, Array]:
-    """Return total, medial and lateral where two of them are known: total = medial + lateral."""
+    """Add the third force if two are known, from total = medial + lateral."""
     if set(force) == {"medial", "lateral"}:
         return {"total": force["medial"] + force["lateral"], **force}
     for side, other in (("medial", "lateral"), ("lateral", "medial")):
@@ -115,17 +112,17 @@ def _with_third(force: dict[str, Array]) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class EmgSettings:
-    """How a recorded EMG becomes an envelope."""
+    """Envelopes of a recorded EMG."""
 
     filter_order: int = 2
-    """Order of either Butterworth filter in each direction. Chosen: forward and backward make the
-    usual fourth order."""
+    """Order of each Butterworth filter in one direction. Chosen because forwards and backwards
+    together give the usual fourth order."""
     flat_share: float = 1e-9
-    """Share of the largest value. Chosen: a signal that departs less from its mean holds round-off
-    only."""
+    """1: smallest peak of an envelope, as a share of the signal's largest value. Chosen because a
+    smaller peak is round-off."""
     step_tolerance: float = 0.01
-    """Share of the median time step by which steps between samples may differ from it. Chosen: the
-    jitter of a clock is smaller."""
+    """1: largest deviation of a time step from the median step, as a share of it. Chosen because
+    the jitter of a clock is smaller."""
 
 
 EMG = EmgSettings()
@@ -133,7 +130,7 @@ EMG = EmgSettings()
 
 @dataclass(frozen=True, eq=False)
 class Envelopes:
-    """Normalised envelopes on the motion's clock.
+    """Normalised envelopes of EMG, at times on the motion's clock.
 
     Args:
         path: the file.
@@ -163,7 +160,7 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
         motion: (f,) s, times of the motion, which must overlap with the recording.
 
     Raises:
-        InputError: no such file or channel, nothing measured during the motion, a gap, uneven
+        InputError: no such file or channel, no measurement during the motion, a gap, uneven
             samples, a cut-off above half the rate, too short a recording, or a channel without
             signal.
     """
@@ -186,7 +183,7 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
         if not result.max() > EMG.flat_share * np.abs(signal).max():
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
         values[channel] = result / normalised_by[channel]
-    muscles = {muscle: channel for channel, own in source.channels.items() for muscle in own}
+    muscles = {muscle: channel for channel, names in source.channels.items() for muscle in names}
     return Envelopes(source.file, time + source.offset_s, values, muscles, normalised_by)
 
 
@@ -199,10 +196,11 @@ def envelope(
     both.
 
     Args:
-        signal: (n,) evenly sampled.
+        signal: (n,) evenly spaced samples.
         rate_Hz: sampling rate.
         cutoff_Hz: cut-off of the low-pass after rectifying.
-        high_pass_Hz: cut-off of the high-pass before; "none" only subtracts the mean.
+        high_pass_Hz: cut-off of the high-pass before rectifying; "none": only the mean is
+            subtracted.
 
     Raises:
         InputError: a gap, a cut-off at or above half the rate, or a signal shorter than a
@@ -224,9 +222,9 @@ def envelope(
 
 
 def _low_passed(signal: Array, cutoff: float) -> Array:
-    """Return a signal (n,) low-passed at a cut-off, periods per sample, by its spectrum.
+    """Return a signal (n,) after the low-pass, computed from its spectrum.
 
-    scipy.signal would take 0.3 s to import.
+    `cutoff` is in periods per sample. scipy.signal is not used: its import takes 0.3 s.
     """
     mirrored = np.concatenate([signal, signal[-2:0:-1]])
     ratio = np.tan(np.pi * np.fft.rfftfreq(len(mirrored))) / np.tan(np.pi * cutoff)

@@ -23,16 +23,16 @@ from tkamb.units import LENGTH
 
 @dataclass(frozen=True)
 class MeshUnitSettings:
-    """How the unit of a mesh is recognized, and how many notices are listed."""
+    """Guesses of unit and bottom of a mesh, and the length of the report."""
 
     typical_size: float = 0.08
-    """m: largest extent of a typical component of a knee. Chosen to tell metres, millimetres and
-    inches apart."""
+    """m: assumed length of a mesh of which the unit cannot be guessed. Chosen because it is that of
+    a component of a knee."""
     min_size_share: float = 0.12
-    """Share of the largest mesh; a smaller one is in another unit. Chosen: the parts of a knee
-    differ by less."""
+    """1: smallest area of a flat side in the report, as a share of the mesh's area. Chosen because
+    the bottom of an insert is larger."""
     max_listed: int = 10
-    """Places of a fault that one message lists. Chosen: a message stays short."""
+    """Largest number of bodies in the report. Chosen because a report should be short."""
 
 
 MESH_UNIT = MeshUnitSettings()
@@ -40,7 +40,7 @@ MESH_UNIT = MeshUnitSettings()
 
 @dataclass(frozen=True)
 class Hole:
-    """A loop of open edges: edges, width and centre in file units."""
+    """A loop of open edges: number of edges, width and centre, in file units."""
 
     edges: int
     width: float
@@ -49,7 +49,7 @@ class Hole:
 
 @dataclass(frozen=True)
 class FlatSide:
-    """A large flat side: the mesh axis that it faces, its share of the area, its tilt."""
+    """A large flat side: the mesh axis that it faces, its share of the mesh's area, its tilt."""
 
     faces: str
     area_share: float
@@ -58,7 +58,7 @@ class FlatSide:
 
 @dataclass(frozen=True)
 class Part:
-    """One of the separate bodies: triangles, extents and centre in file units, closed or not."""
+    """A separate body: number of triangles, extents and centre in file units, whether closed."""
 
     triangles: int
     extents: tuple[float, ...]
@@ -66,7 +66,7 @@ class Part:
     closed: bool
 
     def line(self) -> str:
-        """Return its size and place, in file units."""
+        """Return a line with size and centre, in file units."""
         size = " × ".join(f"{extent:.4g}" for extent in self.extents)
         where = ", ".join(f"{value:.4g}" for value in self.centre)
         state = "closed" if self.closed else "open"
@@ -83,17 +83,17 @@ class MeshHealth:
         vertices: number of vertices after equal corners are merged.
         extents: lengths along the mesh's x, y and z.
         components: number of connected parts.
-        bodies: the separate bodies after small defects are repaired, with the largest surface
+        bodies: the separate bodies after repair of small defects, with the largest surface
             first; a void belongs to the body around it.
         watertight: whether the mesh in the file is closed.
-        closed_after_repair: whether it is closed after small defects are repaired.
+        closed_after_repair: whether the mesh is closed after repair of small defects.
         repairs: the repairs that loading would make.
         holes: loops of open edges in the file, widest first.
         remaining_holes: holes that loading would not close.
         forks: number of vertices at which three or more sheets meet in an edge.
-        one_sided: whether there is no consistent winding.
-        units: units in which the size is that of a part of a knee; a guess.
-        flats: the largest flat sides; the first is likely the bottom of an insert; a guess.
+        one_sided: whether no winding of the triangles is consistent.
+        units: guess of the unit: units in which the size is that of a part of a knee.
+        flats: the largest flat sides. The first is probably the bottom of an insert.
     """
 
     file: str
@@ -117,7 +117,7 @@ class MeshHealth:
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Return the report, line by line; guesses are questions."""
+        """Return the lines of the report. Guesses are written as questions."""
         size = " × ".join(f"{extent:.4g}" for extent in self.extents)
         return [
             f"{self.file}",
@@ -125,7 +125,7 @@ class MeshHealth:
             f"{_count_noun(self.components, 'component')}",
             *self._parts(),
             f"  {self._closedness()}",
-            *(f"  would be mended when loaded: {phrase}" for phrase in self.repairs),
+            *(f"  would be repaired when loaded: {phrase}" for phrase in self.repairs),
             *self._defects(),
             f"  extents {size} in file units: {self._unit_question()}",
             *self._axis_questions(),
@@ -134,14 +134,14 @@ class MeshHealth:
     def _parts(self) -> list[str]:
         if len(self.bodies) < 2:
             return []
-        rest = len(self.bodies) - MESH_UNIT.max_listed
+        unlisted = len(self.bodies) - MESH_UNIT.max_listed
         return [
             f"  {len(self.bodies)} separate bodies; `tkamb mesh part FILE N --out F` writes one:",
             *(
                 f"    {n}: {b.line()}"
                 for n, b in enumerate(self.bodies[: MESH_UNIT.max_listed], start=1)
             ),
-            *([f"    and {rest} smaller"] if rest > 0 else []),
+            *([f"    and {unlisted} smaller"] if unlisted > 0 else []),
         ]
 
     def _extent(self, axis: str) -> float:
@@ -197,7 +197,7 @@ class MeshHealth:
 
 
 def check_mesh(path: str | Path) -> MeshHealth:
-    """Return the content and defects of a mesh file. Loading does not use the guesses.
+    """Return content and defects of a mesh file, and guesses of unit and axes.
 
     Raises:
         InputError: no such file, not a mesh, no triangles, or NaN.
@@ -205,7 +205,7 @@ def check_mesh(path: str | Path) -> MeshHealth:
     vertices, faces = read_triangles(path)
     extents, units, scale = _measure(vertices, faces)
     mended = repair(vertices * scale, faces)
-    merged, corners, watertight = _as_it_is(vertices, faces)
+    merged, corners, watertight = _unrepaired(vertices, faces)
     return MeshHealth(
         file=str(path),
         triangles=len(faces),
@@ -227,7 +227,7 @@ def check_mesh(path: str | Path) -> MeshHealth:
 
 
 def mended_mesh(path: str | Path) -> tuple[Repair, float]:
-    """Return a mesh as loading would repair it, in m, and the guessed metres per unit.
+    """Return the repaired mesh, in m, and the guessed metres per unit of the file.
 
     Raises:
         InputError: as for `check_mesh`.
@@ -257,7 +257,7 @@ def _bodies(mended: Repair, scale: float) -> tuple[Part, ...]:
     )
 
 
-def _as_it_is(vertices: Array, faces: Indices) -> tuple[Array, Indices, bool]:
+def _unrepaired(vertices: Array, faces: Indices) -> tuple[Array, Indices, bool]:
     merged = Surface(vertices, faces).mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=12)
     closed = bool(merged.is_watertight and merged.is_winding_consistent)

@@ -1,4 +1,4 @@
-"""Surfaces from mesh files: SI units, anatomical axes, small defects repaired with a notice."""
+"""Surfaces from mesh files, in SI units and anatomical axes, with small defects repaired."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -32,23 +32,22 @@ class MeshFileSettings:
     """Which meshes of components are used."""
 
     min_size: float = 0.034
-    """m: smallest whole component of a knee that is accepted. Chosen: real ones are at least 50 mm
-    wide."""
+    """m: smallest component with two condyles. Chosen because real ones are at least 50 mm wide."""
     rounding_notice: float = 1e-6
-    """m; a mesh whose coordinates are rounded more coarsely gets a notice. Chosen: forces change by
-    about half a per cent."""
+    """m: coarser rounding of coordinates gets a notice. Chosen because forces then change by about
+    0.5 %."""
     rounding_limit: float = 5e-6
-    """m; a mesh whose coordinates are rounded more coarsely is refused. Chosen: 8 µm change forces
+    """m: a mesh with coarser rounding of coordinates is refused. Chosen because 8 µm change forces
     by 4 %."""
     sheet_opening: float = 1.0 / 3.0
-    """Share of a part's length; a wider opening makes the part an open sheet. Chosen: holes of
-    damaged files are smaller."""
+    """1: widest hole of a part, as a share of its length; with a wider hole it is an open sheet.
+    Chosen because holes of damaged files are smaller."""
 
 
 MESH_FILE = MeshFileSettings()
 
 USUAL_SIZE = (0.040, 0.120)
-"""m; range of the lengths of usual components, also of partial knees."""
+"""m; lengths of usual components, including partial knees."""
 
 
 _log = logging.getLogger("tkamb")
@@ -61,8 +60,7 @@ def axes_rotation(axes: str) -> Array:
         axes: the mesh axes that point anterior, superior and to the right, like "-x,+y,-z".
 
     Returns:
-        R with p_anatomical = R p_mesh; its rows are the named axes. Entries are 0 and ±1,
-        so that a permutation changes no digit of a coordinate.
+        R with p_anatomical = R p_mesh. Its entries are 0 and ±1, so that coordinates stay exact.
 
     Raises:
         InputError: not three different axes, or a left-handed system (a mirror image).
@@ -104,18 +102,18 @@ def load_surface(
 
     Args:
         path: the file.
-        unit: its unit of length, "m", "cm", "mm" or "inch".
-        axes: its axes that point anterior, superior and to the right.
+        unit: unit of length of the file, "m", "cm", "mm" or "inch".
+        axes: axes of the file that point anterior, superior and to the right.
         name: name of the part, for messages.
         closed: whether the surface must enclose a volume.
-        size: m, smallest and largest plausible length; a length outside means a wrong unit.
+        size: smallest and largest plausible length, m.
 
     Returns:
-        The surface about the mesh's own origin: x anterior, y superior, z right, m.
+        The surface, m: x anterior, y superior, z right. The origin is that of the mesh.
 
     Raises:
         InputError: no such file, no mesh, no triangles, NaN, an implausible size, not a surface,
-            or not closed although `closed`. Also a part of an implant that is an open sheet or
+            or not closed although `closed`. Also if a part of an implant is an open sheet or
             several separate bodies.
     """
     rotation = axes_rotation(axes)
@@ -153,7 +151,7 @@ def mirrored(surface: Surface) -> Surface:
 
 
 def read_triangles(path: str | Path) -> tuple[Array, Indices]:
-    """Return vertices (n, 3) in file units and faces (k, 3) as the file has them.
+    """Return the vertices (n, 3) in file units and the faces (k, 3) of a mesh file, unrepaired.
 
     Raises:
         InputError: no such file, not a mesh, no triangles, or NaN.
@@ -174,7 +172,7 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
 
 
 def _read_mesh(path: Path) -> tuple[Array, Indices]:
-    """Return vertices and triangles of a mesh file; OBJ and PLY ones may hold polygons."""
+    """Return vertices and triangles of a mesh file. Polygons are cut into triangles."""
     try:
         check_file(path, FILE_LIMITS.mesh_bytes, what="mesh file")
         suffix = path.suffix.lower()
@@ -195,7 +193,7 @@ def _read_mesh(path: Path) -> tuple[Array, Indices]:
 
 def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
     """Return vertices and triangles of a text STL file, or of another format."""
-    import trimesh  # takes 0.25 s, which a usual mesh does not need
+    import trimesh  # takes 0.25 s; most meshes do not need it
 
     mesh = trimesh.load(path, force="mesh", process=False)
     if not isinstance(mesh, trimesh.Trimesh):
@@ -206,8 +204,8 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
 def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> list[str]:
     """Return the units in which the largest extent (file units) is within `size` (m).
 
-    A unit that makes a part of an implant too small is left out if another unit gives a usual size:
-    inches read as centimetres give a knee of 30 mm.
+    A unit that makes a part of an implant too small is left out if another unit gives a usual size.
+    Example: a knee in inches, read as centimetres, is 30 mm wide.
     """
     lengths = {unit: extent * metres for unit, metres in LENGTH.items()}
     fits = [unit for unit, length in lengths.items() if size[0] <= length <= size[1]]
@@ -218,12 +216,12 @@ def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> 
 
 
 def body_size(body: Body, unit: float) -> str:
-    """Return the extents of a body along the mesh's axes, in a unit of `unit` m."""
+    """Return the extents of a body along the mesh's axes, as text. `unit` is metres per unit."""
     return " × ".join(f"{extent / unit:.3g}" for extent in body.extents)
 
 
 def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
-    """Return the number of holes and the widest one, its centre in file axes and units."""
+    """Return a text on the widest hole, its centre in file axes and units, and the other holes."""
     widest, more = holes[0], len(holes) - 1
     where = ", ".join(f"{value / LENGTH[unit]:.4g}" for value in widest.centre)
     text = (
@@ -240,12 +238,12 @@ _CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are
 
 def _opposite(names: list[str]) -> str:
     last = names[2]
-    turned = f"-{last[-1]}" if last[0] != "-" else f"+{last[-1]}"
-    return ",".join([*names[:2], turned])
+    reversed_axis = f"-{last[-1]}" if last[0] != "-" else f"+{last[-1]}"
+    return ",".join([*names[:2], reversed_axis])
 
 
 def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
-    """Return the part without its inner wall, and a wall that cannot be removed, with notices."""
+    """Return the part without its inner wall, or the part and a wall that cannot be removed."""
     wall = find_inner_wall(mended.vertices, mended.faces)
     if wall is None:
         return mended, None
@@ -261,7 +259,7 @@ def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | 
 def _check_part(
     mended: Repair, path: str | Path, name: str, right: Array, wall: InnerWall | None
 ) -> None:
-    """Raise where a part is an open sheet, like a contact surface, or several bodies.
+    """Raise if a part is an open sheet, like a contact surface, or several bodies.
 
     Bodies that touch or overlap at an inner wall count as one.
     """
@@ -278,8 +276,8 @@ def _check_part(
         return
     bodies = separate_bodies(mended.vertices, mended.faces)
     if wall is not None and len(bodies) > 1:
-        own = [body.faces for body in bodies]
-        if touching_groups(mended.vertices, own, mended.faces, wall.faces) == 1:
+        groups = [body.faces for body in bodies]
+        if touching_groups(mended.vertices, groups, mended.faces, wall.faces) == 1:
             return
     if len(bodies) > 1 and not _two_condyles(bodies, right):
         sizes = ", ".join(body_size(body, MILLIMETRE) for body in bodies[:3])
@@ -295,15 +293,15 @@ def _check_part(
 def _two_condyles(bodies: list[Body], right: Array) -> bool:
     """Return whether the bodies are two of similar size, side by side along `right` (3,).
 
-    This is true of the two components of a bicompartmental knee. A tray or an insert lies below
-    its neighbour; parts of both legs are farther apart than their widths.
+    This holds for the two components of a bicompartmental knee. A tray and an insert lie one above
+    the other, and parts of both legs are farther apart than their widths.
     """
     if len(bodies) != 2:
         return False
     widths = [float(np.abs(right) @ body.extents) for body in bodies]
     lengths = sorted(float(body.extents.max()) for body in bodies)
-    apart = abs(float(right @ (bodies[0].centre - bodies[1].centre)))
-    gap = apart - sum(widths) / 2.0
+    distance = abs(float(right @ (bodies[0].centre - bodies[1].centre)))
+    gap = distance - sum(widths) / 2.0
     return -0.1 * min(widths) <= gap <= max(widths) and lengths[0] >= lengths[1] / 2.0
 
 
@@ -317,20 +315,20 @@ def _check_size(
     advice = ", ".join(
         f"'{u}' would make it {extent * LENGTH[u] / MILLIMETRE:.4g} mm" for u in fits
     )
-    why = (
-        f"which no such part of a knee is ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
+    reason = (
+        f"no size of a part of a knee ({size[0] / MILLIMETRE:g} to {size[1] / MILLIMETRE:g} mm)"
     )
     if size[0] <= extent * LENGTH[unit] <= size[1]:
-        why = "smaller than any person's knee"
+        reason = "smaller than any person's knee"
     raise InputError(
-        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {why}",
+        f"{name} is {extent * LENGTH[unit] / MILLIMETRE:.4g} mm long in unit '{unit}', {reason}",
         path,
         f"check the unit: {advice}" if fits else "check the mesh and its unit",
     )
 
 
 def _check_knee_width(surface: Surface, path: str | Path) -> None:
-    """Raise where a component with two condyles is smaller than any person's knee."""
+    """Raise if a component with two condyles is smaller than any person's knee."""
     extents = np.ptp(surface.bounds, axis=0)
     if extents.max() < MESH_FILE.min_size and condyle_split(surface) is not None:
         raise InputError(
@@ -342,14 +340,7 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
 
 
 def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
-    """Warn of or refuse coordinates so far from the origin that the file's digits do not suffice.
-
-    Args:
-        corners: (n, 3), file units.
-        unit: of the file.
-        path: the file.
-        name: of the part.
-    """
+    """Warn or raise if coordinates (n, 3), far from the origin, are rounded too coarsely."""
     rounding = coordinate_rounding(corners) * LENGTH[unit]
     if rounding <= MESH_FILE.rounding_notice:
         return
@@ -366,21 +357,21 @@ def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> N
 
 
 def coordinate_rounding(corners: Array) -> float:
-    """Return the step to which coordinates (n, 3) are rounded, in their units; 0: not seen.
+    """Return the step to which coordinates (n, 3) are rounded, in their unit; 0: none is detected.
 
-    Seen are single precision and text of six or seven digits, axis by axis. Where half of the
-    coordinates are multiples of several such steps they lost nothing: they are round numbers.
+    Single precision and text of six or seven digits are detected, axis by axis. If more than half
+    of the coordinates are multiples of several steps, they are round numbers and have lost nothing.
     """
     return max((_axis_rounding(values) for values in corners.T), default=0.0)
 
 
 def _axis_rounding(values: Array) -> float:
-    """Return the step to which the coordinates (n,) along an axis are rounded; 0: not seen."""
+    """Return the step to which the coordinates (n,) along an axis are rounded; 0: none."""
     largest = float(np.abs(values).max(initial=0.0))
     if largest == 0.0:
         return 0.0
     digits = np.floor(np.log10(largest))
-    long = values[np.abs(values) >= 10.0**digits]  # those of fewer digits are rounded less
+    long = values[np.abs(values) >= 10.0**digits]  # smaller numbers have finer steps
     single = float(np.spacing(np.float32(largest)))
     if (values == values.astype(np.float32)).all():
         return 0.0 if _multiples(values, 4.0 * single).mean() > 0.5 else single
@@ -391,7 +382,7 @@ def _axis_rounding(values: Array) -> float:
 
 
 def _multiples(values: Array, step: float) -> NDArray[np.bool_]:
-    """Say which values (n,) are multiples of a step, but for rounding to double precision."""
+    """Return which values (n,) are multiples of a step, within double precision."""
     number = values / step
     return np.asarray(np.abs(number - np.rint(number)) <= 1e-5)
 

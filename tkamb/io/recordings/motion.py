@@ -1,8 +1,8 @@
-"""The knee's recorded motion: read, turned into knee coordinates, filtered, resampled.
+"""The knee's recorded motion: read, converted to knee coordinates, filtered, resampled.
 
-Recorded angles of any order become the six coordinates of Grood and Suntay through the
-rotation matrix. A left knee is mirrored here: medial-lateral translation changes sign,
-the clinical angles and the patella's sagittal coordinates keep theirs.
+Recorded angles of any sequence are converted to the six coordinates of Grood and Suntay through the
+rotation matrix. A left knee is mirrored here: the medial-lateral translation changes its sign. The
+clinical angles and the patella's sagittal coordinates keep their signs.
 """
 
 from collections.abc import Sequence
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.marker_motion import MarkerKinematics
 
 LIMITS_DEG = {"axial_rotation": (-90, 90), "adduction": (-45, 45), "flexion": (-45, 180)}
-"""deg: beyond these limits, columns, axes or units are wrong. The limits of adduction also exclude
-its singularity."""
+"""deg: limits of the angles; beyond them, columns, axes or units are wrong. The limits of adduction
+also exclude its singularity."""
 FARTHEST_MM = (-200, 200)
-"""mm: limits of the translations. The femoral origin lies within a hand's breadth of the insert,
-and the patella within one of the femoral origin; beyond, units are wrong."""
+"""mm: limits of the translations; beyond them, units are wrong. The femoral origin lies within a
+hand's breadth of the insert, and the patella within a hand's breadth of the femoral origin."""
 
 
 @dataclass(frozen=True)
@@ -53,39 +53,40 @@ class PatellaMotionSettings:
     """Which recorded poses of the patella are plausible."""
 
     max_rotation_deg: int = 180
-    """deg; largest rotation of the patella against the femur, either way. Chosen: half a turn,
-    which no patella reaches."""
+    """deg: largest rotation of the patella against the femur, in either direction. Chosen because
+    no patella turns by half a turn."""
 
 
 PATELLA_MOTION = PatellaMotionSettings()
 
 FASTEST = {"turn": 100.0, "move": 10.0}
-"""rad/s and m/s: five times the speed of the fastest kick, above the noise of a recording."""
+"""rad/s and m/s: largest speeds, five times that of the fastest kick and above the noise of a
+recording."""
 ODD = {"turn": 0.5 * DEGREE, "move": 0.5 * MILLIMETRE}
-"""rad and m: error of fluoroscopy. A sample that is nearer to its neighbours' curve is not odd."""
+"""rad and m: smallest deviation of an odd sample from its neighbours' curve, the error of
+fluoroscopy."""
 
 
 @dataclass(frozen=True, eq=False)
 class KneeMotion:
-    """The knee's motion as a right knee's, SI.
+    """The knee's motion, SI. A left knee is mirrored to a right one.
 
     Args:
         time: (f,) s.
         coordinates: (f, 6) in the order of `KNEE_COORDINATES`, filtered; m and rad.
         velocity: (f, 6) their first derivative.
         acceleration: (f, 6) their second derivative.
-        raw_coordinates: (f, 6) as recorded, at the same times (between samples: quintic
-            interpolation).
-        deviation_translation: (f,) m, between the raw and the filtered femoral origin.
+        raw_coordinates: (f, 6) as recorded, at the same times, by quintic interpolation.
+        deviation_translation: (f,) m, distance between raw and filtered femoral origin.
         deviation_rotation: (f,) rad, angle between raw and filtered orientation.
         patella: (f, 3) patella_ap, patella_si (m), patella_rotation (rad), if recorded.
         patella_velocity: (f, 3) its first derivative.
         patella_acceleration: (f, 3) its second derivative.
-        cycle_percent: (f,) per cent of the cycle, if the motion is one.
-        closed_cycle: whether the cycle's ends agree; it was then filtered as periodic.
+        cycle_percent: (f,) per cent of the cycle, if the motion is a cycle.
+        closed_cycle: whether the cycle's ends agree and it is filtered as periodic.
         unrecorded: coordinates without a column; they are zero.
         odd: samples off their neighbours' curve.
-        markers: kinematics by skin markers, if the motion is from these.
+        markers: kinematics by skin markers, if the motion comes from markers.
     """
 
     time: Array
@@ -121,10 +122,10 @@ def load_motion(
     Args:
         source: the scene's [motion].
         side: side of the knee; a left knee is mirrored.
-        pose_insert_mesh_in_insert: (4, 4) m; the file's axes into the insert frame, whose
-            z points to the subject's right on both sides (not mirrored).
-        pose_femoral_mesh_in_femur: (4, 4) m; likewise for the femur link.
-        released: knee coordinates that will be solved; they need no column.
+        pose_insert_mesh_in_insert: (4, 4) m; z of the insert frame points to the subject's right,
+            also for a left knee (not mirrored).
+        pose_femoral_mesh_in_femur: (4, 4) m; not mirrored.
+        released: names of the released coordinates; they need no column.
         pose_insert_in_tibia: (4, 4) m, needed for markers; mirrored for a left knee.
 
     Raises:
@@ -162,7 +163,7 @@ def load_motion(
 def _from_markers(
     source: MotionTable, side: Side, insert: Array, released: Sequence[str]
 ) -> KneeMotion:
-    """Return the motion with the coordinates that [motion.markers] takes from skin markers."""
+    """Return the motion from skin markers, with the coordinates that [motion.markers] names."""
     from tkamb.io.recordings.marker_motion import load_marker_motion
 
     assert source.markers is not None
@@ -198,11 +199,11 @@ def _find_unrecorded(
     ]
     needed = [role for role in missing if role not in released]
     if needed:
-        more = "" if needed == ["flexion"] else ", or release it: [contact] released"
+        release_hint = "" if needed == ["flexion"] else ", or release it: [contact] released"
         raise InputError(
             f"has no column for {', '.join(needed)} (it has {', '.join(recorded.columns)})",
             recorded.path,
-            f"name it in [motion] columns{more}",
+            f"name it in [motion] columns{release_hint}",
         )
     return tuple(missing)
 
@@ -229,16 +230,16 @@ def _read_coordinates(
 def _check_roles(source: MotionTable, recorded: Table) -> None:
     if source.interpretation == "pose":
         kinds = ("rotation", "translation")
-        own = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
+        roles = tuple(f"{kind}_{k}" for kind in kinds for k in (1, 2, 3))
     else:
-        own = KNEE_COORDINATES
-    check_roles(source.columns, ("time", *own, *PATELLA_COORDINATES), recorded.path, "motion")
+        roles = KNEE_COORDINATES
+    check_roles(source.columns, ("time", *roles, *PATELLA_COORDINATES), recorded.path, "motion")
     for role in source.signs_turned:
-        if role not in own:
+        if role not in roles:
             raise InputError(
                 f"unknown role '{role}' in [motion] signs_turned",
                 recorded.path,
-                f"one of {', '.join(own)}",
+                f"one of {', '.join(roles)}",
             )
 
 
@@ -261,20 +262,17 @@ def _bending_role(recorded: Table, source: MotionTable) -> str:
 
 
 def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
-    """Raise where knee coordinates (n, 6) are impossible for a knee.
+    """Raise if knee coordinates (n, 6) are impossible.
 
-    Args:
-        knee: the coordinates.
-        path: of the file, for messages.
-        bending: role of the column whose sign is that of flexion; None without one.
+    `bending` is the role of the column with the sign of flexion, or None.
     """
     for i, name in enumerate(KNEE_COORDINATES):
         if name in LIMITS_DEG:
             question = "check [motion] columns, sequence, angle_unit and the meshes' axes"
             values, limits, unit = knee[:, i] / DEGREE, LIMITS_DEG[name], "deg"
             low, high = limits
-            turned = name == "flexion" and bending is not None
-            if turned and values.min() < low <= -values.max() and -values.min() <= high:
+            is_flexion = name == "flexion" and bending is not None
+            if is_flexion and values.min() < low <= -values.max() and -values.min() <= high:
                 question = (
                     f'if bending is negative in it, set [motion] signs_turned = ["{bending}"]'
                 )
@@ -285,7 +283,7 @@ def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
 
 
 def _check_patella(patella: Array, path: Path) -> None:
-    """Raise where the patella's coordinates (n, 3) are nowhere near the femoral component."""
+    """Raise if the patella's coordinates (n, 3) are far from the femoral component."""
     turn = (-PATELLA_MOTION.max_rotation_deg, PATELLA_MOTION.max_rotation_deg)
     for name, values, limits, unit, key in (
         ("patella_ap", patella[:, 0] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
@@ -297,14 +295,14 @@ def _check_patella(patella: Array, path: Path) -> None:
 
 
 def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
-    """Return the odd samples of the coordinates (n, 6 or 9); raise for a step that is too fast."""
+    """Return the odd samples of coordinates (n, 6 or 9). Raise if a coordinate changes too fast."""
     odd: list[OddSample] = []
     for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
         moves = name.rsplit("_")[-1] in ("ap", "si", "ml")
         kind, scale, unit = ("move", MILLIMETRE, "mm") if moves else ("turn", DEGREE, "deg")
-        one = (path, name, time, values[:, i])
-        check_steps(*one, FASTEST[kind], scale, unit)
-        odd += odd_samples(*one, ODD[kind], scale, unit)
+        series = (path, name, time, values[:, i])
+        check_steps(*series, FASTEST[kind], scale, unit)
+        odd += odd_samples(*series, ODD[kind], scale, unit)
     return tuple(odd)
 
 

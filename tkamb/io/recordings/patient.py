@@ -1,11 +1,11 @@
-"""The patient's URDF: read, mirrored where left, completed with segment inertias, and checked.
+"""The patient's URDF: read, mirrored for a left knee, completed with segment inertias, and checked.
 
-Links that must exist: `tibia` (shank and foot, its origin at the ankle centre), `femur`,
-`patella`, and `hip`, a frame fixed to the femur at the hip centre. Joints: `ankle` (or the
-tibia as root), the six single-axis knee joints of `tkamb.io.recordings.urdf_check` in their
-order, and the patella's three.
-The origin of `knee_ap` is the insert frame in the tibia. The femur link's frame is the femoral
-component's. Any other link that is fixed to these may hold attachment points.
+Required links: `tibia` (shank and foot, its origin at the ankle centre), `femur`, `patella`, and
+`hip`, a frame fixed to the femur at the hip centre. Required joints: `ankle` (or the tibia as
+root), the six single-axis knee joints of `tkamb.io.recordings.urdf_check` in their order, and the
+three joints of the patella. The origin of `knee_ap` is the insert frame in the tibia. The frame of
+the femur link is the frame of the femoral component. Other links that are fixed to these may hold
+attachment points.
 
 Links without inertia get the segment inertias of de Leva, J Biomech 29:1223 (1996),
 doi:10.1016/0021-9290(95)00178-6, with the shank from the knee to the ankle joint centre.
@@ -41,9 +41,10 @@ class SegmentFractions:
     """Fractions of body mass and of segment length.
 
     Args:
-        mass: of body mass.
-        centre: from the proximal end, of segment length.
-        radii: of gyration about the sagittal (AP), transverse (ML) and longitudinal axis.
+        mass: mass of the segment, share of body mass.
+        centre: distance of its centre of mass from the proximal end, share of segment length.
+        radii: radii of gyration about the sagittal (AP), transverse (ML) and longitudinal axis,
+            shares of segment length.
     """
 
     mass: float
@@ -63,7 +64,7 @@ DE_LEVA: dict[Sex, dict[Segment, SegmentFractions]] = {
         "foot": SegmentFractions(0.0129, 0.0, (0.0, 0.0, 0.0)),
     },
 }
-"""De Leva's fractions. The foot is a point mass at the ankle: it is light and hardly moves."""
+"""De Leva's fractions. The foot is a point mass at the ankle, because it is light and slow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +79,10 @@ class RigidInertia:
 def segment_inertia(
     segment: Segment, sex: Sex, body_mass: float, proximal: Array, distal: Array
 ) -> RigidInertia:
-    """Return the inertia of a segment between two joint centres (3,), in their frame.
+    """Return the inertia of a segment between two joint centres (3,) m, in their frame.
 
-    The longitudinal axis joins the centres; the two other radii of gyration belong to the
-    AP and ML axes nearest to x and z of the frame.
+    The longitudinal axis joins the centres. The AP and ML axes are those nearest to x and z of the
+    frame.
     """
     fractions = DE_LEVA[sex][segment]
     mass = fractions.mass * body_mass
@@ -99,7 +100,7 @@ def segment_inertia(
 
 
 def combined(first: RigidInertia, second: RigidInertia) -> RigidInertia:
-    """Return two bodies joined rigidly (parallel-axis theorem)."""
+    """Return the inertia of two rigidly joined bodies (parallel-axis theorem)."""
     mass = first.mass + second.mass
     centre = (first.mass * first.centre + second.mass * second.centre) / mass
     tensor = np.zeros((3, 3))
@@ -111,30 +112,32 @@ def combined(first: RigidInertia, second: RigidInertia) -> RigidInertia:
 
 @dataclass(frozen=True)
 class PatellaLinkSettings:
-    """The patella of a patient whose URDF does not describe it, and the axes of its links."""
+    """The patella's inertia if the URDF states none, and a check of the axes of the links."""
 
     mass: float = 0.1
-    """kg; mass of the patella at its link's origin unless the URDF says otherwise."""
+    """kg: mass of the patella, at its link's origin, if the URDF states none. An assumption."""
     radius_of_gyration: float = 0.015
-    """m; chosen: about that of a disc 40 mm across and 20 mm thick."""
+    """m: radius of gyration of this mass about any axis. Chosen because it is about that of a disc
+    of 40 mm diameter and 20 mm thickness."""
     max_lateral_share: float = 0.5
-    """Share of a link's length by which its other end may lie beside the link's y axis, which
-    points up. Chosen: a link that leans more is not along its y axis."""
+    """1: largest distance of a link's other end from the link's y axis (up), as a share of the
+    link's length. Chosen because a link with a larger distance is not along its y axis."""
 
 
 PATELLA_LINK = PatellaLinkSettings()
 
 
 THIGH = (0.2, 0.7)
-"""m: accepted distances from the femoral component's flexion axis to the hip centre, from a child
-to a giant."""
+"""m: accepted distances from the origin of the femur link to the hip centre, from a child to a very
+tall adult."""
 
 SHANK = (0.15, 0.65)
-"""m: accepted distances from the ankle centre to the insert's bottom, from a child to a giant."""
+"""m: accepted distances from the ankle centre to the insert's bottom, from a child to a very tall
+adult."""
 
 MOST_TURNED = np.radians(40.0)
-"""rad: largest angle between the insert's axes and the tibia's: slope, torsion and varus of a
-deformed leg."""
+"""rad: largest angle between the insert's axes and the tibia's, due to slope, torsion and varus of
+a deformed leg."""
 
 
 def load_urdf(patient: PatientTable, with_patella: bool) -> str:
@@ -145,7 +148,7 @@ def load_urdf(patient: PatientTable, with_patella: bool) -> str:
         with_patella: whether the patella and its joints are needed.
 
     Raises:
-        InputError: missing file, link or joint, wrong axis, singular inertia.
+        InputError: a missing file, link or joint, a wrong axis, or a singular inertia.
     """
     path = patient.urdf
     robot = _parse(path)
@@ -191,7 +194,8 @@ def _text(values: Array) -> str:
 def _mirror(robot: ElementTree.Element) -> None:
     """Reflect the chain in the sagittal plane (z to -z): a left knee becomes a right one.
 
-    Prismatic axes stay: along z the coordinate changes sign instead, at the motion's input.
+    Prismatic axes are not reflected. Instead, the reader of the motion reverses the sign of the
+    medial-lateral translation.
     """
     for joint in robot.findall("joint"):
         _set_origin(joint, mirrored_pose(_origin(joint)))
@@ -207,22 +211,22 @@ def _mirror(robot: ElementTree.Element) -> None:
 
 
 def _check_places(robot: ElementTree.Element, path: Path) -> None:
-    """Raise unless hip and insert lie where a leg has them, above femur and ankle."""
+    """Raise unless hip and insert lie at plausible distances above the knee and the ankle."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
-    result = (
+    checks = (
         ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),
         ("the origin of knee_ap", "tibia", _origin(joints["knee_ap"])[:3, 3], SHANK),
     )
-    for name, link, place, (low, high) in result:
-        away = float(np.linalg.norm(place))
+    for name, link, position, (low, high) in checks:
+        distance = float(np.linalg.norm(position))
         if (
-            not low <= away <= high
-            or place[1] < 0
-            or np.hypot(*place[[0, 2]]) > PATELLA_LINK.max_lateral_share * away
+            not low <= distance <= high
+            or position[1] < 0
+            or np.hypot(*position[[0, 2]]) > PATELLA_LINK.max_lateral_share * distance
         ):
-            words = ", ".join(f"{value:.4g}" for value in place)
+            words = ", ".join(f"{value:.4g}" for value in position)
             raise InputError(
-                f"{name} is at ({words}) m in '{link}', {away:.4g} m from its origin",
+                f"{name} is at ({words}) m in '{link}', {distance:.4g} m from its origin",
                 path,
                 f"it must lie {low:g} to {high:g} m above it, along y, in metres",
             )
@@ -272,13 +276,13 @@ def _segment(
 def _fixed_pose(robot: ElementTree.Element, link: str, base: str, path: Path) -> Array:
     """Return the pose of `link` in `base`, which must be joined to it by fixed joints."""
     parents = {joint.find("child").get("link"): joint for joint in robot.findall("joint")}  # type: ignore[union-attr]
-    result, place = np.eye(4), link
-    while place != base:
-        joint = parents.get(place)
+    result, name = np.eye(4), link
+    while name != base:
+        joint = parents.get(name)
         if joint is None or joint.get("type") != "fixed":
             raise InputError(f"link '{link}' is not fixed to '{base}'", path, "use fixed joints")
         result = _origin(joint) @ result
-        place = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
+        name = joint.find("parent").get("link")  # type: ignore[union-attr,assignment]
     return result
 
 

@@ -34,15 +34,14 @@ _MOST_HEADER_LINES = 1000
 def read_obj(path: str | Path) -> Polygons:
     """Return the vertices and polygons of an OBJ file, in file units.
 
-    Negative indices count back from the vertices that were read so far, wherever a block of them
-    stands.
+    A negative index counts back from the last vertex before its line.
 
     Raises:
         InputError: no such file.
-        ValueError: a line cannot be understood; the words say which.
+        ValueError: an invalid line, which the message quotes.
     """
     text = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file").decode("latin-1")
-    if "\\" in text:  # a line goes on in the next one
+    if "\\" in text:  # a backslash continues a line
         text = text.replace("\\\r\n", " ").replace("\\\n", " ")
     vertices: list[tuple[float, ...]] = []
     corners: list[int] = []
@@ -70,9 +69,9 @@ def read_obj(path: str | Path) -> Polygons:
 
 @dataclass(frozen=True)
 class _Element:
-    """A kind of element of a PLY file: its name, its number of items and their properties.
+    """A kind of element of a PLY file: its name, the number of items and their properties.
 
-    A property is its name, its type and, for a list, the type of the list's length, else "".
+    A property has a name, a type and, if it is a list, the type of the list's length (else "").
     """
 
     name: str
@@ -85,7 +84,7 @@ def read_ply(path: str | Path) -> Polygons:
 
     Raises:
         InputError: no such file.
-        ValueError: it is no PLY file, or cut short, or holds triangle strips.
+        ValueError: the file is no PLY file, is cut short or holds triangle strips.
     """
     content = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file")
     order, elements, start = _ply_header(content)
@@ -101,7 +100,7 @@ def read_ply(path: str | Path) -> Polygons:
 
 
 def _checked(vertices: object, corners: object, ends: object) -> Polygons:
-    """Return them as arrays.
+    """Return vertices, corners and ends of polygons as arrays.
 
     Raises:
         ValueError: a polygon has a corner that is no vertex.
@@ -114,16 +113,16 @@ def _checked(vertices: object, corners: object, ends: object) -> Polygons:
 
 
 def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
-    """Return the byte order ("" for text), the elements, and where the data begin."""
+    """Return the byte order ("" for text), the elements, and the first byte of the data."""
     if not content.startswith(b"ply"):
         raise ValueError("it does not begin with 'ply'")
-    order, elements, place = None, list[_Element](), 0
+    order, elements, position = None, list[_Element](), 0
     for _ in range(_MOST_HEADER_LINES):
-        end = content.find(b"\n", place)
+        end = content.find(b"\n", position)
         if end < 0:
             break
-        words = content[place:end].decode("latin-1").split()
-        place = end + 1
+        words = content[position:end].decode("latin-1").split()
+        position = end + 1
         if words[:1] == ["format"]:
             order = _ORDERS.get(words[1])
         elif words[:1] == ["element"]:
@@ -139,12 +138,12 @@ def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
         elif words[:1] == ["end_header"]:
             if order is None:
                 raise ValueError("its format is none of ascii, binary_little_endian, _big_endian")
-            return order, elements, place
+            return order, elements, position
     raise ValueError("its header has no end")
 
 
-def _wanted(element: _Element) -> list[int]:
-    """Return which properties of an element are read: x, y and z, or the list of corners."""
+def _columns_to_read(element: _Element) -> list[int]:
+    """Return the indices of the properties to read: x, y and z, or the list of corners."""
     names = [name for name, _, _ in element.properties]
     if element.name == "vertex":
         return [names.index(axis) for axis in "xyz" if axis in names]
@@ -155,26 +154,26 @@ def _wanted(element: _Element) -> list[int]:
 def _ply_text(
     content: bytes, start: int, elements: list[_Element], order: str
 ) -> Iterator[tuple[str, tuple[Array, Index]]]:
-    """Yield the name of each element of a text file, its values and where each one's end."""
+    """Yield the name of each element of a text file, its values, and where each item ends."""
     lines = iter(content[start:].decode("latin-1").splitlines())
     for element in elements:
-        columns, values, ends = _wanted(element), list[float](), list[int]()
+        columns, values, ends = _columns_to_read(element), list[float](), list[int]()
         if element.name == "vertex" and len(columns) < 3:
             raise ValueError("its vertices lack x, y or z")
         for row in range(element.count):
             words = next((w for w in (line.split() for line in lines) if w), None)
             if words is None:
                 raise ValueError(f"it is cut short: {row} of {element.count} of {element.name}")
-            place, own = 0, []
+            position, items = 0, []
             for _, _, length in element.properties:
-                count = int(words[place]) if length else 1
-                place += bool(length)
-                own.append(words[place : place + count])
-                if len(own[-1]) < count:
+                count = int(words[position]) if length else 1
+                position += bool(length)
+                items.append(words[position : position + count])
+                if len(items[-1]) < count:
                     raise ValueError(f"{element.name} {row} is cut short")
-                place += count
+                position += count
             for n in columns:
-                values.extend(float(word) for word in own[n])
+                values.extend(float(word) for word in items[n])
             ends.append(len(values))
         yield element.name, (np.array(values), np.array(ends, np.int64))
 
@@ -182,9 +181,9 @@ def _ply_text(
 def _ply_binary(
     content: bytes, start: int, elements: list[_Element], order: str
 ) -> Iterator[tuple[str, tuple[Array, Index]]]:
-    """Yield the name of each element of a binary file, its values and where each one's end."""
+    """Yield the name of each element of a binary file, its values, and where each item ends."""
     for element in elements:
-        columns, place = _wanted(element), start
+        columns, position = _columns_to_read(element), start
         if element.name == "vertex" and len(columns) < 3:
             raise ValueError("its vertices lack x, y or z")
         rows, start = _equal_rows(content, start, element, order)
@@ -196,28 +195,28 @@ def _ply_binary(
             ends = table.shape[1] * np.arange(1, element.count + 1)
             yield element.name, (table.ravel(), ends)
             continue
-        values, ends_, start = _uneven_rows(content, place, element, order, columns)
+        values, ends_, start = _uneven_rows(content, position, element, order, columns)
         yield element.name, (values, ends_)
 
 
 def _equal_rows(
     content: bytes, start: int, element: _Element, order: str
 ) -> tuple[NDArray | None, int]:
-    """Return an element's rows and where they end, if its lists are as long as in the first row."""
+    """Return an element's rows and where they end; None if its lists differ in length."""
     fields: list[tuple[Any, ...]] = []
-    place = start
+    position = start
     for n, (_, kind, length) in enumerate(element.properties):
         dtype = np.dtype(order + kind)
         shape: tuple[int, ...] = ()
         if length:
             header = np.dtype(order + length)
-            if element.count == 0 or len(content) < place + header.itemsize:
+            if element.count == 0 or len(content) < position + header.itemsize:
                 return None, start
-            shape = (int(np.frombuffer(content, header, 1, place)[0]),)
+            shape = (int(np.frombuffer(content, header, 1, position)[0]),)
             fields.append((f"n{n}", header))
-            place += header.itemsize
+            position += header.itemsize
         fields.append((f"p{n}", dtype, shape))
-        place += dtype.itemsize * int(np.prod(shape))
+        position += dtype.itemsize * int(np.prod(shape))
     row = np.dtype(fields)
     end = start + row.itemsize * element.count
     if len(content) < end:
@@ -232,7 +231,7 @@ def _equal_rows(
 def _uneven_rows(
     content: bytes, start: int, element: _Element, order: str, columns: list[int]
 ) -> tuple[Array, Index, int]:
-    """Return an element's values, where each one's end, and where the rows end, row by row."""
+    """Return an element's values, where each item ends, and where the element ends in the file."""
     kinds = [
         (np.dtype(order + kind), np.dtype(order + length) if length else None)
         for _, kind, length in element.properties
@@ -258,68 +257,68 @@ def _uneven_rows(
 _log = logging.getLogger("tkamb")
 
 _HEADER = 84
-"""Bytes before the first triangle: 80 of anything, and the number of triangles."""
+"""Bytes before the first triangle: 80 bytes of header, and the number of triangles."""
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
 _TEXT_WITHIN = 2000
-"""Bytes at the beginning among which a text STL has its first facet."""
+"""Bytes at the beginning of a text STL that contain its first facet."""
 
 
 def read_binary_stl(path: Path) -> Array | None:
     """Return the corners (3 k, 3) of a binary STL file, in file units; None for a text file.
 
-    80 bytes of anything, the number of triangles, then for each a normal, three corners and two
-    bytes (little-endian). Several solids one after the other are read as one. Bytes after the last
-    triangle are left out, with a notice on the logger "tkamb". A number of triangles of 0 or of the
-    largest integer is ignored, too: programs write it if they do not return to the header.
+    A solid has a header of 80 bytes and the number of triangles. Each triangle has a normal, three
+    corners and two bytes (little-endian). Consecutive solids are read as one. Bytes after the last
+    triangle are ignored, with a notice on the logger "tkamb". If the number is 0 or the largest
+    integer, all triangles are read: some programs never write the number.
 
     Raises:
-        InputError: it is cut short.
+        InputError: the file is cut short.
     """
     content = path.read_bytes()
     if len(content) < _HEADER or _is_text(content):
         return None
-    solids, place = list[Array](), 0
-    while len(content) - place >= _HEADER:
-        rest = len(content) - place - _HEADER
-        count = int.from_bytes(content[place + 80 : place + _HEADER], "little")
-        if place == 0 and count in (0, 2**32 - 1) and rest >= _TRIANGLE.itemsize:
-            count = rest // _TRIANGLE.itemsize
+    solids, position = list[Array](), 0
+    while len(content) - position >= _HEADER:
+        available = len(content) - position - _HEADER
+        count = int.from_bytes(content[position + 80 : position + _HEADER], "little")
+        if position == 0 and count in (0, 2**32 - 1) and available >= _TRIANGLE.itemsize:
+            count = available // _TRIANGLE.itemsize
             _log.warning("%s: does not say how many triangles it has; %d are read", path, count)
-        if count == 0 or count * _TRIANGLE.itemsize > rest:
+        if count == 0 or count * _TRIANGLE.itemsize > available:
             break
-        solids.append(np.frombuffer(content, _TRIANGLE, count, place + _HEADER)["corners"])
-        place += _HEADER + count * _TRIANGLE.itemsize
-        if not _goes_on(content, place):
+        solids.append(np.frombuffer(content, _TRIANGLE, count, position + _HEADER)["corners"])
+        position += _HEADER + count * _TRIANGLE.itemsize
+        if not _another_solid(content, position):
             break
     if not solids:
         _refuse_cut_short(content, path)
         return None
-    if place < len(content):
-        _log.warning("%s: %d bytes after the last triangle left out", path, len(content) - place)
+    if position < len(content):
+        _log.warning("%s: %d bytes after the last triangle left out", path, len(content) - position)
     return np.concatenate(solids).reshape(-1, 3).astype(np.float64)
 
 
 def _is_text(content: bytes) -> bool:
-    """Say whether it is a text STL; binary ones too may begin with the word "solid"."""
+    """Return whether an STL is text. A binary STL may also begin with the word "solid"."""
     begin = content[:_TEXT_WITHIN].lower()
     words = b"facet" in begin or b"endsolid" in begin
     return content.lstrip()[:5].lower() == b"solid" and words and b"\0" not in begin
 
 
-def _goes_on(content: bytes, place: int) -> bool:
-    """Say whether another whole solid of finite corners begins at a place."""
-    rest = len(content) - place - _HEADER
-    if rest < _TRIANGLE.itemsize:
+def _another_solid(content: bytes, position: int) -> bool:
+    """Return whether another complete solid with finite corners begins at a byte."""
+    available = len(content) - position - _HEADER
+    if available < _TRIANGLE.itemsize:
         return False
-    count = int.from_bytes(content[place + 80 : place + _HEADER], "little")
-    if count == 0 or count * _TRIANGLE.itemsize > rest:
+    count = int.from_bytes(content[position + 80 : position + _HEADER], "little")
+    if count == 0 or count * _TRIANGLE.itemsize > available:
         return False
-    corners = np.frombuffer(content, _TRIANGLE, count, place + _HEADER)["corners"]
+    corners = np.frombuffer(content, _TRIANGLE, count, position + _HEADER)["corners"]
     return bool(np.isfinite(corners).all())
 
 
 def _refuse_cut_short(content: bytes, path: Path) -> None:
-    """Refuse a file that announces more triangles than it has, where the others are plausible."""
+    """Raise if a file states more triangles than it has, and those that it has are plausible."""
     count = int.from_bytes(content[80:_HEADER], "little")
     stored = (len(content) - _HEADER) // _TRIANGLE.itemsize
     if not 0 < stored < count:

@@ -1,7 +1,6 @@
-"""Tables of the scene that a reader of files takes: the patient and what was recorded.
+"""Tables of the scene for the patient and the recordings.
 
-Units are in the key names. A reader converts to SI where it uses a value, so that each key is
-declared here and nowhere else.
+Units are in the key names. The code that uses a value converts it to SI.
 """
 
 from pathlib import Path
@@ -27,18 +26,18 @@ Side = Literal["right", "left"]
 
 
 class PatientTable(SceneTable):
-    """The patient. The URDF holds the chain ankle-tibia-femur-patella."""
+    """The patient. The URDF holds the chain of ankle, tibia, femur and patella."""
 
     urdf: Path
     side: Side = Field(description="the knee that is modelled")
-    # From a six-year-old child with a tumour prosthesis to the heaviest patients.
+    # limits: a six-year-old child with a tumour prosthesis, the heaviest patients
     mass_kg: Annotated[Number, within(20, 300, "give it in kilograms")] = Field(
         description="body mass, 20 to 300; forces in BW are relative to it"
     )
     sex: Literal["male", "female"] | None = Field(
-        None, description="only for segments without <inertial>: picks the de Leva table"
+        None, description="selects the de Leva table, for segments without <inertial>"
     )
-    # From the same child to very tall adults.
+    # limits: the same child, very tall adults
     height_mm: Annotated[
         Number | None, within(1000, 2300, "give the standing height in millimetres")
     ] = Field(None, description="body height, 1000 to 2300")
@@ -55,7 +54,7 @@ class PatientTable(SceneTable):
 class MarkerSegmentTable(SceneTable):
     """A segment with skin markers: the shank, the thigh, or a neighbour of one of them."""
 
-    name: str = Field(description="'shank' and 'thigh' are the knee's; others are neighbours")
+    name: str = Field(description="'shank', 'thigh', or the name of a neighbour of one of them")
     markers_mm: dict[str, Vector] = Field(
         min_length=1,
         description="marker -> position in the tibia link (shank), the femur link (thigh) or the "
@@ -73,7 +72,7 @@ class MarkerSegmentTable(SceneTable):
     )
 
     @model_validator(mode="after")
-    def _hangs_somewhere(self) -> Self:
+    def _joint_is_complete(self) -> Self:
         knee = self.name in ("shank", "thigh")
         present = [v is not None for v in (self.joined_to, self.joint_mm, self.centre_mm)]
         if any(present) if knee else not all(present):
@@ -93,25 +92,25 @@ class MarkersTable(SceneTable):
     """The knee's motion and the shank in the laboratory, from skin markers."""
 
     method: Literal["segments", "chain"] = Field(
-        description="'segments': rigid fits of shank and thigh, each by itself; 'chain': all "
-        "segments at once, held together by their joints. Both are computed and compared"
+        description="'segments': separate rigid fits of shank and thigh; 'chain': one fit of all "
+        "segments, connected by their joints. Both are computed and compared"
     )
     knee: Literal["hinge", "free"] = Field(
-        "hinge", description="the chain's knee: flexion alone, or six freedoms"
+        "hinge", description="the chain's knee: flexion alone, or six degrees of freedom"
     )
     coordinates: tuple[Literal["flexion", "adduction", "axial_rotation", "ap", "si", "ml"], ...] = (
         Field(
             ("flexion",),
             min_length=1,
-            description="knee coordinates that are taken from the markers; [contact] releases "
-            "the others",
+            description="knee coordinates that follow from the markers; [contact] releases the "
+            "others",
         )
     )
     neutral_mm: Vector = Field(
-        description="ap, si, ml of the femur link in the insert frame, where a hinge keeps it"
+        description="constant ap, si, ml of the femur link in the insert frame, for a hinge"
     )
     neutral_deg: tuple[float, float] = Field(
-        (0.0, 0.0), description="axial rotation and adduction that a hinge keeps"
+        (0.0, 0.0), description="constant axial rotation and adduction of a hinge"
     )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
@@ -135,8 +134,8 @@ class MotionTable(SceneTable):
 
     `interpretation = "coordinates"`: columns are the six knee coordinates (Grood-Suntay) of
     the femoral component in the insert frame. `"pose"`: columns are a rotation sequence and
-    a translation that place the femoral mesh in the insert mesh's own axes. `"markers"`: skin
-    markers of shank and thigh, see [motion.markers]; they place the shank too.
+    a translation, the pose of the femoral mesh in the insert mesh's axes. `"markers"`: skin
+    markers of shank and thigh, see [motion.markers]. They also give the pose of the shank.
     """
 
     file: Path
@@ -173,19 +172,21 @@ class MotionTable(SceneTable):
             "roles whose columns are multiplied by -1, for a file with the opposite sign convention"
         ),
     )
-    angle_unit: AngleUnit | None = Field(None, description="of the file; markers need none")
+    angle_unit: AngleUnit | None = Field(
+        None, description="unit of angles in the file; not for markers"
+    )
     length_unit: LengthUnit | None = Field(
-        None, description="of the file; .trc and .c3d state their own"
+        None, description="unit of lengths in the file; .trc and .c3d files state it"
     )
     cutoff_Hz: Number | Literal["none"] = Field(
-        description="low-pass cut-off of the differentiation; 'none' trusts the samples"
+        description="cut-off of the low-pass filter; 'none': the samples are not filtered"
     )
     interval_s: tuple[Number, Number] | None = Field(
-        None, description="the part of the recording that is computed; default: all of it"
+        None, description="part of the recording to compute; default: all"
     )
     cycle_s: tuple[Number, Number] | None = Field(
         None,
-        description="the motion's time column is per cent of a cycle, which lies on this interval",
+        description="start and end of the cycle, if the time column of the file is per cent",
     )
     cycle_offset_percent: Number = Field(
         0.0, ge=-100, le=100, description="per cent of the cycle at cycle_s[0]"
@@ -236,7 +237,7 @@ class TibiaTable(SceneTable):
     """The pose of the shank in the laboratory (x forward, y up, z right).
 
     One of: `sagittal` (a forward lean about z over a fixed ankle), `pose` (columns of a
-    file that place the tibia link), `markers` (rigid fit of shank markers).
+    file with the pose of the tibia link), `markers` (rigid fit of shank markers).
     """
 
     kind: Literal["sagittal", "pose", "markers"]
@@ -255,7 +256,8 @@ class TibiaTable(SceneTable):
     )
     angle_unit: AngleUnit = "deg"
     length_unit: LengthUnit | None = Field(
-        None, description="of the file; needed for pose, and for markers unless the file says"
+        None,
+        description="unit of lengths in the file; needed if the file does not state it",
     )
     cutoff_Hz: Number | Literal["none"] | None = Field(
         None, description="low-pass cut-off; default: the motion's"
@@ -298,13 +300,13 @@ class GroundReactionTable(SceneTable):
         default_factory=dict,
         description=(
             "role -> column: time (s), force_1..3 (N, along the file's x, y, z), "
-            "point_1..3 (centre of pressure; the one along the vertical may be missing: the "
-            "plate then is at the laboratory's height 0), moment_1..3 (N·m, free moment at that "
-            "point; those not named and not in the file are zero)"
+            "point_1..3 (centre of pressure; the vertical component may be missing: the "
+            "plate is then at height 0 of the laboratory), moment_1..3 (N·m, free moment at that "
+            "point; missing components are zero)"
         ),
     )
     length_unit: LengthUnit | None = Field(
-        None, description="of the file; a .c3d mostly states its own"
+        None, description="unit of lengths in the file; a .c3d usually states it"
     )
     force_unit: str | None = Field(
         None,
@@ -312,15 +314,15 @@ class GroundReactionTable(SceneTable):
         "unknown one",
     )
     moment_unit: str | None = Field(
-        None, description="of a .c3d: unit of its moment channels (Nm, Nmm, Ncm), likewise"
+        None, description="of a .c3d: unit of its moment channels (Nm, Nmm, Ncm), if needed"
     )
     laboratory_axes: Axes = Field(
         "+x,+y,+z", description="axes of the file that point forward, up and right"
     )
     force: Literal["on the foot", "on the plate"] = Field(
         "on the foot",
-        description="what the file's force acts on. 'on the plate' reverses the signs of force and "
-        "free moment (Newton's third law), but not of the centre of pressure. Axes cannot do this",
+        description="the body that the file's force acts on. 'on the plate' reverses the signs of "
+        "force and free moment (Newton's third law), but not of the centre of pressure",
     )
     applied: Literal["cop", "ankle"] = Field(
         "cop", description="'ankle' applies the force alone at the ankle centre (Sharma 2008)"
@@ -347,7 +349,7 @@ class GroundReactionTable(SceneTable):
 
 
 class MeasuredTable(SceneTable):
-    """Axial knee forces of an instrumented implant: compared with the run, never used in it."""
+    """Axial knee forces of an instrumented implant, only for comparison with the run."""
 
     file: Path
     format: TableFormat | None = Field(None, description=FORMAT)
@@ -356,7 +358,7 @@ class MeasuredTable(SceneTable):
         "lateral at least one, the third follows from the other two; compression is positive; "
         "time is in s, by default the column of that name"
     )
-    unit: Literal["N", "kN", "lbf"] = Field(description="of the forces")
+    unit: Literal["N", "kN", "lbf"] = Field(description="unit of the forces")
     offset_s: Number = Field(
         description="time of [motion] minus time of the file; 0 for a common clock"
     )
@@ -378,7 +380,7 @@ Positive = Annotated[Number, Field(gt=0)]
 class EmgTable(SceneTable):
     """Surface EMG: envelopes that are compared with the activations, or constrain them.
 
-    An envelope is the rectified signal, low-passed without phase shift, over its normalising
+    An envelope is the rectified signal, low-passed without phase shift and divided by a normalising
     value.
     """
 
@@ -427,10 +429,10 @@ class EmgTable(SceneTable):
 
     @property
     def sentence(self) -> str:
-        """How the envelopes are made and what they are used for, in plain words."""
+        """A sentence on the computation and the use of the envelopes."""
         first = "" if self.high_pass_Hz == "none" else f"high-passed at {self.high_pass_Hz:g} Hz, "
-        own = self.normalised_by == "recording"
-        by = "their largest values in that file" if own else "given values"
+        by_recording = self.normalised_by == "recording"
+        by = "their largest values in that file" if by_recording else "given values"
         use = {
             "report": "they are only compared with the activations",
             "target": f"the cost holds {self.weight} (a - e)^2 for each",

@@ -1,8 +1,8 @@
-"""Implausible samples, and samples that do not fit their neighbours, like typing mistakes.
+"""Implausible samples, and odd samples, which do not fit their neighbours, like typing mistakes.
 
-A sample is odd where it lies off the cubic through its two neighbours on either side by more
-than `floor` and by many times more than the samples around it. Noise of any level is not odd:
-the limit is a multiple of the median deviation around it, which one sample hardly changes.
+The deviation of a sample is its distance from the cubic through its two neighbours on either side.
+A sample is odd if its deviation exceeds `floor` and many times the median deviation around it.
+Noise is therefore not odd, because it raises the median. A single sample hardly changes it.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,19 @@ from tkamb.geometry.frames import Array
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """How samples that were not measured are recognized."""
+    """How odd samples are recognized."""
 
     neighbours: int = 12
-    """Samples on either side whose median deviation is the usual one. Chosen: enough for a median,
-    few enough to follow a movement."""
+    """Number of samples on either side for the median deviation. Chosen because they are enough for
+    a median, and few enough to follow a movement."""
     outlier_factor: float = 8.0
-    """Times the usual deviation. Chosen: normal noise reaches it once in 10 million samples."""
+    """1: smallest ratio of an odd sample's deviation to the median. Chosen because normal noise
+    exceeds it once in 10 million samples."""
     max_step: float = 5.0
-    """s: largest step between samples. Chosen: samples farther apart do not record a movement."""
+    """s: largest median step between samples. Chosen because slower samples record no movement."""
     end_factor: float = 4.0
-    """Factor on `outlier_factor` at the ends of a recording. Chosen: a cubic that is extrapolated
-    by one sample has a larger error than one between samples."""
+    """1: factor on `outlier_factor` at the ends of a recording. Chosen because extrapolation of a
+    cubic has larger errors than interpolation."""
 
 
 SAMPLE = SampleSettings()
@@ -63,23 +64,23 @@ def odd_samples(
         what: the quantity, for messages.
         time: (n,) s, rising.
         values: (n,) SI.
-        floor: SI; a sample that is nearer to the curve is not odd.
+        floor: smallest deviation of an odd sample, SI.
         scale: SI per `unit`.
-        unit: unit of the distance in messages.
+        unit: unit of the deviation in messages.
     """
     if len(time) < 6:
         return ()
     away = np.abs(values - neighbours_curve(time, values))
     ends = np.ones(len(time))
     ends[[0, 1, -2, -1]] = SAMPLE.end_factor
-    limit = np.maximum(floor, SAMPLE.outlier_factor * _usual(away / ends)) * ends
-    # An odd sample bends the curve of the four around it by two thirds and a sixth of itself.
+    limit = np.maximum(floor, SAMPLE.outlier_factor * _running_median(away / ends)) * ends
+    # An odd sample also shifts the curves of its four neighbours, by 2/3 and 1/6 of its deviation.
     odd = [k for k in np.flatnonzero(away > limit) if away[k] >= away[max(k - 2, 0) : k + 3].max()]
     return tuple(OddSample(path, what, float(time[k]), float(away[k] / scale), unit) for k in odd)
 
 
 def neighbours_curve(time: Array, values: Array) -> Array:
-    """Return at each sample the cubic (n,) through its four nearest neighbours (two per side)."""
+    """Return, at each sample, the cubic (n,) through its four neighbours (two on either side)."""
     n = len(time)
     first = np.clip(np.arange(n) - 2, 0, n - 5)
     others = first[:, None] + np.arange(5)
@@ -93,8 +94,8 @@ def neighbours_curve(time: Array, values: Array) -> Array:
     return np.asarray((weights * values[others]).sum(axis=1))
 
 
-def _usual(away: Array) -> Array:
-    """Return the running median (n,) of the distances around each sample."""
+def _running_median(away: Array) -> Array:
+    """Return the running median (n,) of the deviations."""
     width = min(2 * SAMPLE.neighbours + 1, len(away))
     windows = np.lib.stride_tricks.sliding_window_view(away, width)
     start = np.clip(np.arange(len(away)) - width // 2, 0, len(windows) - 1)
@@ -102,7 +103,7 @@ def _usual(away: Array) -> Array:
 
 
 def check_spacing(path: Path, time: Array) -> None:
-    """Raise an InputError where samples at times (n,) s are too far apart for a movement."""
+    """Raise an InputError if samples at times (n,) s are too far apart for a movement."""
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if spacing > SAMPLE.max_step:
         raise InputError(
@@ -113,11 +114,11 @@ def check_spacing(path: Path, time: Array) -> None:
 
 
 def check_overlap(path: Path, clock: Array, time: Array, table: str) -> None:
-    """Raise an InputError if nothing was measured during the motion.
+    """Raise an InputError if a measurement and the motion have no common time.
 
     Args:
         path: the file.
-        clock: (n,) s, times of its samples on the motion's clock.
+        clock: (n,) s, times of the file's samples on the motion's clock.
         time: (f,) s, times of the motion.
         table: the scene's table that names the file, like "[measured]".
     """
@@ -133,7 +134,7 @@ def check_overlap(path: Path, clock: Array, time: Array, table: str) -> None:
 def check_steps(
     path: Path, what: str, time: Array, values: Array, fastest: float, scale: float, unit: str
 ) -> None:
-    """Raise an InputError where a quantity (n,) changes faster than `fastest` (SI per second)."""
+    """Raise an InputError if a quantity (n,) changes faster than `fastest` (SI per second)."""
     if len(time) < 2:
         return
     rate = np.abs(np.diff(values)) / np.diff(time)
@@ -141,7 +142,7 @@ def check_steps(
     if rate[k] > fastest:
         raise InputError(
             f"{what} steps from {values[k] / scale:.4g} to {values[k + 1] / scale:.4g} {unit} "
-            f"between {time[k]:g} and {time[k + 1]:g} s, which nobody does",
+            f"between {time[k]:g} and {time[k + 1]:g} s, which is impossible",
             path,
             "check whether a cell is mistyped, and whether the time is in seconds",
         )
@@ -150,7 +151,7 @@ def check_steps(
 def check_range(
     path: Path, what: str, values: Array, limits: tuple[float, float], unit: str, question: str
 ) -> None:
-    """Raise an InputError where values (n,) leave `limits`, all in `unit`.
+    """Raise an InputError if values (n,) are outside `limits`, all in `unit`.
 
     `what` is the part of the body and the quantity, like "knee: flexion".
     """

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Strict
 LengthUnit = Literal["m", "cm", "mm", "inch"]
 AngleUnit = Literal["rad", "deg"]
 Number = Annotated[float, Strict()]
-"""A number; `true` or a number in quotes is refused."""
+"""A number. `true` and a number in quotes are refused."""
 Count = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
@@ -30,7 +30,7 @@ Axes = Annotated[str, AfterValidator(_axes)]
 
 
 def within(low: float, high: float, hint: str) -> Any:
-    """Return the annotation of a number, or of each of a vector's, that must lie in a range."""
+    """Return the annotation of a number, or of a vector, with values from `low` to `high`."""
 
     def checked(value: Any) -> Any:
         for number in value if isinstance(value, tuple) else (value,):
@@ -42,7 +42,7 @@ def within(low: float, high: float, hint: str) -> Any:
 
 
 def zero_or_within(low: float, high: float, hint: str) -> Any:
-    """Return the annotation of a number that is zero or must lie in a range."""
+    """Return the annotation of a number that is zero, or from `low` to `high`."""
 
     def checked(value: float) -> float:
         if value != 0 and not low <= value <= high:
@@ -53,13 +53,14 @@ def zero_or_within(low: float, high: float, hint: str) -> Any:
 
 
 HalfThickness = Annotated[Number, zero_or_within(0.2, 20, "give it in millimetres")]
-"""Of a tendon, off the outline that it wraps; zero is a string."""
+"""mm: distance of a tendon's centre line from the outline that it wraps; zero: a string."""
 Band = Annotated[Number, zero_or_within(0.1, 50, "give it in millimetres")]
-"""Of the sections that a tendon wraps; zero is its own sagittal plane."""
+"""mm: distance up to which a tendon wraps sections beside its sagittal plane; zero: this plane
+only."""
 Point = Annotated[Vector, within(-1000, 1000, "give it in millimetres")]
-"""A bone's length (0.6 m at most) and a frame's origin beside it are less than a metre."""
+"""mm: point on a bone. The limit allows for a bone of 0.6 m and an origin beside it."""
 Offset = Annotated[Vector, within(-600, 600, "give it in millimetres")]
-"""From a mesh's origin, at worst at the bone's other end, to the link's."""
+"""mm: position of a mesh's origin in a link. The limit is the length of a bone."""
 Turn = Annotated[Vector, within(-360, 360, "give it in degrees")]
 
 

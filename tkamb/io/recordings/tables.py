@@ -23,10 +23,9 @@ class TableValueSettings:
     """Which numbers of a table are measurements."""
 
     trc_time_rounding: float = 1e-3
-    """s; rounding of the times of a `.trc`. Chosen: cameras write milliseconds; the header's rate
-    is exact."""
+    """s: largest rounding of the times of a `.trc`. Chosen because cameras write milliseconds."""
     max_value: float = 1e12
-    """Largest number in any unit: a larger one was not measured, and its square may overflow."""
+    """Largest number in any unit. A larger number is refused as no measurement."""
 
 
 TABLE_VALUE = TableValueSettings()
@@ -34,8 +33,8 @@ TABLE_VALUE = TableValueSettings()
 
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
-"""A plain decimal number; Python's float also accepts 1_000 and digits of other scripts."""
-_OF_NUMBERS = "0123456789+-.eE "
+"""A plain decimal number. Python's float would also accept 1_000 and digits of other scripts."""
+_NUMBER_CHARACTERS = "0123456789+-.eE "
 """Characters of plain decimal numbers."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
@@ -51,11 +50,11 @@ class Table:
         path: the file.
         columns: name -> (n,) values. A marker M of `.trc` or `.c3d` has columns M_x, M_y, M_z.
         length_unit: unit of length that the file states (`.trc`, `.c3d`), else None.
-        in_degrees: whether angles are in degrees, if the file states it (`.sto`, `.mot`).
+        in_degrees: whether angles are in degrees; None if the file does not state it.
         equal: names that several columns share; none of these columns is in `columns`.
-        notices: remarks on parts that were not read, or otherwise than the file states.
-        unit_word: the file's own word for its unit of length, understood or not.
-        unit_given: whether the user states the unit of length, because the file does not.
+        notices: remarks on unused parts and on contradictions in the file.
+        unit_word: the file's word for its unit of length, known or not.
+        unit_given: whether the user states the unit of length.
     """
 
     path: Path
@@ -76,7 +75,7 @@ class Table:
         """Return one column.
 
         Raises:
-            InputError: no such column (the message lists similar names), or several of that name.
+            InputError: no such column (the message lists similar names), or several of this name.
         """
         if name in self.equal:
             raise InputError(f"has two columns named '{name}'", self.path, "rename one")
@@ -128,7 +127,7 @@ class Table:
             key: the scene's key, for the message.
 
         Raises:
-            InputError: neither scene nor file states a unit, or they contradict each other.
+            InputError: neither the scene nor the file states a unit, or they state different ones.
         """
         unit = length_unit or self.length_unit
         if unit not in LENGTH:
@@ -163,7 +162,7 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
 
 def with_unit(table: Table, length_unit: str | None) -> Table:
-    """Return a table with the given unit of length.
+    """Return a table with the unit of length that the user states; None: unchanged.
 
     Raises:
         InputError: the file states another unit.
@@ -182,7 +181,7 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text file.
 
-    The encoding is UTF-16 if the file begins with its mark, else UTF-8. A file that is neither is
+    The encoding is UTF-16 if the file begins with its byte order mark, else UTF-8. Other files are
     read as Latin-1, which older programs write.
 
     Raises:
@@ -200,8 +199,8 @@ def read_lines(path: Path) -> list[str]:
 def read_csv(path: Path) -> Table:
     """Read comma-separated values with one header row.
 
-    Empty lines and lines that begin with # are skipped. So are empty cells behind the last named
-    column, because some programs end every line with a comma.
+    Empty lines and lines that begin with # are skipped. Empty cells after the last named column are
+    skipped, too, because some programs end every line with a comma.
     """
     lines = read_lines(path)
     rows = [
@@ -221,11 +220,11 @@ def read_csv(path: Path) -> Table:
         for number, cells in rows[1:]
     ]
     columns, equal = _columns(path, names, body)
-    return Table(path, columns, equal=equal, notices=_of_equal(equal))
+    return Table(path, columns, equal=equal, notices=_equal_notices(equal))
 
 
 def read_storage(path: Path) -> Table:
-    """Read an OpenSim storage file: `key=value` lines to `endheader`, column names, rows."""
+    """Read an OpenSim storage file: `key=value` lines, `endheader`, column names, rows."""
     lines = read_lines(path)
     ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
     if not ends:
@@ -247,13 +246,13 @@ def read_storage(path: Path) -> Table:
         what = f"holds values of the type {header['datatype']}, not single numbers"
         raise InputError(what, path, "export it with DataType=double")
     columns, equal = _columns(path, rows[0][1], rows[1:])
-    notices = (*_of_equal(equal), *_row_notices(header.get("nrows"), len(rows) - 1))
+    notices = (*_equal_notices(equal), *_row_notices(header.get("nrows"), len(rows) - 1))
     degrees = STATED_DEGREES.get(header.get("indegrees", ""))
     return Table(path, columns, in_degrees=degrees, equal=equal, notices=notices)
 
 
 def _row_notices(stated: str | None, rows: int) -> tuple[str, ...]:
-    """Return a remark on a table whose header states another number of rows."""
+    """Return a remark if the header states another number of rows."""
     if stated is None or not stated.isdecimal() or int(stated) == rows:
         return ()
     return (f"has {rows} rows, but its header says {int(stated)}; it may be cut short",)
@@ -312,16 +311,16 @@ def _trc_cells(line: str) -> list[str]:
 
 
 def _filled(cells: list[str]) -> int:
-    """Return the number of cells up to the last that is not empty."""
+    """Return the number of cells without empty cells at the end."""
     return max((k for k, cell in enumerate(cells, 1) if cell), default=0)
 
 
 def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
-    """Return a label per marker, empty where the header has none.
+    """Return a label per marker; "" for a marker without a label.
 
-    The line of labels has a label every three cells. Some programs write blanks in place of tabs;
-    the labels are then taken in order, if there are as many as markers. `usual` is the usual
-    number of cells in a row.
+    The line of labels has a label every three cells. Some programs write blanks in place of tabs.
+    Then the labels are read in order, if there are as many as markers. `usual` is the median number
+    of cells in a row.
     """
     count = max(len(axes.split()) // 3, math.ceil((usual - 2) / 3))
     cells = [cell.strip() for cell in names.split("\t")][2:]
@@ -350,10 +349,9 @@ def _trc_unit(header: dict[str, str], path: Path) -> str | None:
 
 
 def read_c3d_markers(path: Path) -> Table:
-    """Return the markers of a C3D file on the recording's clock, in m.
+    """Return the markers of a C3D file, in m, at the times of the recording.
 
-    If the file's word for the unit is not understood, the numbers are as in the file, without a
-    unit.
+    If the file's word for the unit is unknown, the numbers are as in the file, without a unit.
     """
     from tkamb.io.recordings.c3d import read_c3d
 
@@ -377,9 +375,9 @@ def read_c3d_markers(path: Path) -> Table:
 
 
 def _exact_time(time: Array, frame: Array, rate: str) -> Array:
-    """Return evenly spaced times if they agree with the time column when rounded; else the column.
+    """Return evenly spaced times if the time column is their rounding; else return the column.
 
-    The spacing follows from the rate, Hz; the offset is the best fit to the column.
+    The spacing follows from the rate (Hz). The offset is the best fit to the column.
     """
     try:
         period = 1.0 / float(rate)
@@ -407,12 +405,12 @@ def _columns(
     return result, tuple(sorted(name for name, count in counts.items() if count > 1))
 
 
-def _of_equal(names: tuple[str, ...]) -> tuple[str, ...]:
+def _equal_notices(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"has two columns named '{name}'; neither is used" for name in names)
 
 
 def _row(cells: list[str], path: Path, line: int) -> list[float]:
-    if not "".join(cells).strip(_OF_NUMBERS):
+    if not "".join(cells).strip(_NUMBER_CHARACTERS):
         # Converting the whole row at once is faster. A cell that fails gets its message below.
         with contextlib.suppress(ValueError):
             numbers = [float(cell) for cell in cells]
@@ -441,12 +439,12 @@ def _number(cell: str, path: Path, line: int) -> float:
 
 
 def _why_uneven(cells: list[str], names: list[str]) -> str:
-    """Return a hint on the likely cause of a row that is longer or shorter than the header."""
+    """Return a hint on the probable cause of a row that is longer or shorter than the header."""
     if len(cells) < len(names):
         return "add the missing cell or comma"
-    # A decimal comma cuts every number in two: integers only, and rows about twice as long.
-    whole = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
-    if whole and 4 * len(cells) > 5 * len(names):
+    # Decimal commas cut each number into two integers, so that rows are about twice as long.
+    integers_only = all(re.fullmatch(r"[+-]?[0-9]*", cell.strip()) for cell in cells)
+    if integers_only and 4 * len(cells) > 5 * len(names):
         return "write decimal points, not commas"
     return "give every column a name in the header"
 
@@ -458,4 +456,4 @@ READERS: dict[str, Callable[[Path], Table]] = {
     "trc": read_trc,
     "c3d": read_c3d_markers,
 }
-"""Name of a format, which is its suffix -> reader. A new format is a new row here."""
+"""Name of a format, which is the file's suffix -> reader."""

@@ -35,24 +35,26 @@ class TibiaPoseSettings:
     """Which recorded poses of the tibia are plausible."""
 
     max_lean_deg: float = 150.0
-    """deg; lean of a shank from the vertical, either way. Chosen: a sprinter's shank swings back by
-    110 deg."""
+    """deg: largest lean of a shank from the vertical, in either direction. Chosen because a
+    sprinter's shank swings back by 110 deg."""
     max_distance: float = 100.0
-    """m: distance from the laboratory's origin that is beyond the view of any camera."""
+    """m: largest distance from the laboratory's origin. Chosen because it is beyond the view of any
+    camera."""
     shank_length: float = 0.4
-    """m: distance from the ankle at which the upper end of the shank is compared. Chosen: about the
-    length of an adult's shank."""
+    """m: distance from the ankle of the second point that is checked. Chosen because it is about
+    the length of an adult's shank."""
     window: float = 0.5
-    """s: samples farther from the frames than this do not affect them through the filter. Chosen:
-    several times as long as the filter's response."""
+    """s: time before and after the frames in which samples are checked. Chosen because the filter's
+    response is several times shorter."""
 
 
 TIBIA_POSE = TibiaPoseSettings()
 
 FASTEST_TURN, FASTEST_MOVE = 100.0, 30.0
-"""rad/s and m/s: twice the speed of the shank of the fastest sprinters and kickers."""
+"""rad/s and m/s: largest speeds, twice those of the shank of the fastest sprinters and kickers."""
 ODD_TURN, ODD_MOVE = 0.5 * DEGREE, 3.0 * MILLIMETRE
-"""rad and m: noise of skin markers. A sample that is nearer to its neighbours' curve is not odd."""
+"""rad and m: smallest deviation of an odd sample from its neighbours' curve, the noise of skin
+markers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ class BodyMotion:
             then angular (rad/s): Pinocchio's free flyer.
         acceleration: (f, 6) time derivative of each component of `velocity`.
         residual: (f,) m, root mean square distance of the marker fit before filtering; None
-            if the pose was not fitted.
+            without a marker fit.
         odd: samples around the frames that lie off their neighbours' curve.
     """
 
@@ -81,8 +83,8 @@ class BodyMotion:
 def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
     """Return the tibia's motion at the frames of the knee's motion.
 
-    The whole recording is filtered before it is evaluated at the frames. A recording that is
-    longer than the interval therefore has no end effect inside it.
+    The recording is filtered before it is evaluated at the frames. If it is longer than the
+    interval, the errors of the filter at the ends are outside the interval.
 
     Args:
         source: the scene's [tibia].
@@ -116,7 +118,7 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
 
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
-    """Return the odd samples of the shank's two ends; raise for impossible positions or speeds."""
+    """Return the odd samples of the shank's two ends. Raise for impossible positions or speeds."""
     near = (stamps >= time[0] - TIBIA_POSE.window) & (stamps <= time[-1] + TIBIA_POSE.window)
     ends = {
         "ankle": np.zeros(3),
@@ -132,16 +134,16 @@ def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tup
                 "check [tibia] columns and length_unit",
             )
             check_range(recorded.path, f"shank: {what}", values, limits, "m", question)
-            one = (recorded.path, what, stamps[near], values)
-            check_steps(*one, FASTEST_MOVE, MILLIMETRE, "mm")
-            odd += odd_samples(*one, ODD_MOVE, MILLIMETRE, "mm")
+            series = (recorded.path, what, stamps[near], values)
+            check_steps(*series, FASTEST_MOVE, MILLIMETRE, "mm")
+            odd += odd_samples(*series, ODD_MOVE, MILLIMETRE, "mm")
     return tuple(odd)
 
 
 def _sagittal(
     source: TibiaTable, recorded: Table, time: Array, side: str, cutoff: Cutoff
 ) -> BodyMotion:
-    """Return the lean about the laboratory's z over a fixed ankle."""
+    """Return the motion of a shank that leans about the laboratory's z over a fixed ankle."""
     check_roles(source.columns, ("time", "angle"), recorded.path, "tibia")
     stamps = recorded.time(source.columns.get("time", "time"))
     lean = recorded.complete_column(source.columns.get("angle", "angle"))
@@ -150,9 +152,9 @@ def _sagittal(
     question = "check [tibia] columns and angle_unit: it is the lean from the vertical"
     check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", question)
     check_spacing(recorded.path, stamps)
-    one = (recorded.path, "the shank's lean", stamps, lean)
-    check_steps(*one, FASTEST_TURN, DEGREE, "deg")
-    odd = odd_samples(*one, ODD_TURN, DEGREE, "deg")
+    series = (recorded.path, "the shank's lean", stamps, lean)
+    check_steps(*series, FASTEST_TURN, DEGREE, "deg")
+    odd = odd_samples(*series, ODD_TURN, DEGREE, "deg")
     angle, rate, rate_of_rate = differentiate_coordinates(
         stamps, -lean, cutoff, time, name=str(recorded.path)
     )

@@ -37,12 +37,12 @@ _SEPARATORS = str.maketrans("", "", " .*-·⋅_\x00\t")
 
 @dataclass(frozen=True)
 class GivenUnits:
-    """Units that the user states because the recording lacks them or writes unknown words.
+    """Units that the user states. None: the unit that the recording states.
 
     Args:
-        length: of markers and plates, like mm; None: the recording says.
-        force: of force channels, like N; None: the recording says.
-        moment: of moment channels, like Nmm; None: the recording says.
+        length: unit of markers and plates, like mm.
+        force: unit of force channels, like N.
+        moment: unit of moment channels, like Nmm.
     """
 
     length: str | None = None
@@ -66,9 +66,9 @@ def newtons(word: str) -> float | None:
 
 
 def newton_metres(word: str) -> float | None:
-    """Return newton metres per unit of moment, a force word and a length word; else None.
+    """Return newton metres per unit of moment; None for a word that is not a unit.
 
-    Inches and feet may stand first.
+    A unit of moment is a unit of force, then one of length. Inches and feet may also come first.
     """
     plain = plain_unit(word)
     for first in LENGTH_FIRST:

@@ -1,7 +1,7 @@
 """Checks of a patient's URDF: numbers, one tree, the exact knee chain, physical inertias.
 
-Parsers of URDF silently ignore unknown attributes and fill in missing ones: a misspelt attribute
-becomes zero, a joint without limits another type. Here each of these is an error.
+Parsers of URDF silently ignore unknown attributes and fill in missing ones. A misspelt attribute
+becomes zero, and a joint without limits gets another type. Here these are errors.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -31,7 +31,8 @@ KNEE_JOINTS: dict[str, tuple[str, Axis]] = dict(
         strict=True,
     )
 )
-"""Knee joints of a right knee, tibia to femur; a left one has (0 1 0) and (1 0 0) instead."""
+"""Type and axis of the joints of a right knee, from tibia to femur. The axes of axial rotation and
+adduction of a left knee are (0 1 0) and (1 0 0)."""
 
 PATELLA_JOINTS: dict[str, tuple[str, Axis]] = dict(
     zip(
@@ -42,7 +43,7 @@ PATELLA_JOINTS: dict[str, tuple[str, Axis]] = dict(
 )
 
 CHAINS = (("tibia", KNEE_JOINTS, "femur"), ("femur", PATELLA_JOINTS, "patella"))
-"""Where each chain of joints begins and ends."""
+"""First link, joints and last link of each chain."""
 
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ATTRIBUTES = {
@@ -52,7 +53,7 @@ _ATTRIBUTES = {
     "inertia": dict.fromkeys(_INERTIA, 1),
     "limit": dict.fromkeys(("lower", "upper", "effort", "velocity"), 1),
 }
-"""Element -> attribute -> how many numbers it holds."""
+"""Element -> attribute -> number of values."""
 _CHILDREN = {
     "joint": {"parent", "child", "origin", "axis", "limit", "calibration", "dynamics"}
     | {"safety_controller", "mimic"},
@@ -69,14 +70,14 @@ class UrdfAngleSettings:
     """Which angles of a URDF are in radians."""
 
     max_angle: float = 8.0 * np.pi
-    """rad; a larger number is in degrees. Chosen: four turns, as angles in a URDF are below one."""
+    """rad: a larger number is in degrees. Chosen because angles in a URDF are below one turn."""
 
 
 URDF_ANGLE = UrdfAngleSettings()
 
 
 def check_elements(robot: ElementTree.Element, path: Path) -> None:
-    """Raise an InputError where an element is misspelt, doubled or not numbers."""
+    """Raise an InputError if an element is misspelt, doubled or not numbers."""
     for parent in (*robot.iter("joint"), *robot.iter("link"), *robot.iter("inertial")):
         where = f"{path}: {parent.tag} '{parent.get('name', '')}'"
         counts = Counter(child.tag for child in parent if isinstance(child.tag, str))
@@ -99,13 +100,13 @@ def check_elements(robot: ElementTree.Element, path: Path) -> None:
 
 
 _FARTHEST = 10.0
-"""m; the largest coordinate of a place on a link: four times a tall man's height."""
+"""m: largest coordinate on a link, several times the height of a person."""
 _HEAVIEST = 1000.0
-"""kg and kg·m²; no segment of a human comes near it."""
+"""kg and kg·m²: largest mass and inertia, far above those of a segment of a person."""
 
 
 def _check_attributes(element: ElementTree.Element, where: str) -> None:
-    """Raise where a place, an axis or an inertia is misspelt or not numbers."""
+    """Raise if an origin, an axis or an inertia is misspelt, not numbers or too large."""
     attributes = _ATTRIBUTES[element.tag]
     for key, text in element.attrib.items():
         if key not in attributes:
@@ -115,8 +116,8 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
         if not _finite(text, attributes[key]):
             numbers = "a number" if attributes[key] == 1 else f"{attributes[key]} numbers"
             raise InputError(f'<{element.tag} {key}="{text}"> is not {numbers}', where)
-        place = element.tag == "origin" and key == "xyz"
-        if place and np.abs(numbers_of(element, key)).max() > _FARTHEST:
+        is_position = element.tag == "origin" and key == "xyz"
+        if is_position and np.abs(numbers_of(element, key)).max() > _FARTHEST:
             hint = "give xyz in metres, not in millimetres"
             raise InputError(f'<origin xyz="{text}"> is beyond {_FARTHEST:g} m', where, hint)
         if key in ("value", *_INERTIA) and abs(float(text)) > _HEAVIEST:
@@ -136,13 +137,13 @@ def _finite(text: str, count: int) -> bool:
 
 
 def numbers_of(element: ElementTree.Element | None, key: str, default: str = "0 0 0") -> Array:
-    """Return the numbers of an attribute."""
+    """Return the numbers of an attribute; those of `default` if it is missing."""
     text = default if element is None else element.get(key, default)
     return np.array([float(part) for part in text.split()])
 
 
 def check_links(robot: ElementTree.Element, path: Path, with_patella: bool) -> None:
-    """Raise an InputError unless the links are there that everything is measured from."""
+    """Raise an InputError if a required link is missing."""
     links = [str(link.get("name")) for link in robot.findall("link")]
     for name in ("tibia", "femur", "hip") + (("patella",) if with_patella else ()):
         if name not in links:
@@ -152,7 +153,7 @@ def check_links(robot: ElementTree.Element, path: Path, with_patella: bool) -> N
 
 
 def check_tree(robot: ElementTree.Element, path: Path) -> None:
-    """Raise an InputError unless the joints make one tree of all the links."""
+    """Raise an InputError unless the joints connect all links to one tree."""
     links = [str(link.get("name")) for link in robot.findall("link")]
     parents: dict[str, str] = {}
     for joint in robot.findall("joint"):
@@ -176,10 +177,10 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
             "connect all links by joints to one tree with one root, without a loop",
         )
     for name in links:
-        place, steps = name, 0
-        while place in parents and steps <= len(links):
-            place, steps = parents[place], steps + 1
-        if place != roots[0]:
+        ancestor, steps = name, 0
+        while ancestor in parents and steps <= len(links):
+            ancestor, steps = parents[ancestor], steps + 1
+        if ancestor != roots[0]:
             raise InputError(
                 f"link '{name}' is part of a loop", path, "connect the links to one tree"
             )
@@ -197,16 +198,17 @@ def ends_of(joint: ElementTree.Element) -> tuple[str, str]:
 def check_chain(
     robot: ElementTree.Element, path: Path, side: Literal["right", "left"], with_patella: bool
 ) -> None:
-    """Raise an InputError unless the joints are those of docs/patient.md, exactly.
+    """Raise an InputError unless the joints are exactly those of docs/patient.md.
 
-    Type, axis, limits, order and identity origins of the six knee joints (and the patella's
-    three), links between them without mass, and nothing else that moves.
+    Checked are type, axis, limits, order and identity origins of the six knee joints and of the
+    three joints of the patella. Links between them have no mass. No other joint may move, except
+    the ankle.
 
     Args:
-        robot: a right leg, or a left one mirrored; a tree.
-        path: of the file, for messages.
-        side: as declared, for messages.
-        with_patella: whether the patella is needed; if not, it is checked where it is there.
+        robot: tree of a right leg, or of a mirrored left leg.
+        path: path of the file, for messages.
+        side: declared side of the knee, for messages.
+        with_patella: whether the patella is required; if not, it is checked if present.
     """
     joints = {str(joint.get("name")): joint for joint in robot.findall("joint")}
     for start, chain_joints, end in CHAINS:
@@ -236,14 +238,14 @@ def _check_axes(
     path: Path,
     side: str,
 ) -> None:
-    """Raise unless each joint has its type, its axis and limits."""
+    """Raise unless each joint has the expected type and axis, and does not mimic another."""
     axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in expected}
-    turned = [
+    flipped = [
         name
         for name, (kind, axis) in expected.items()
         if kind == "revolute" and np.allclose(axes[name], -np.array(axis), atol=1e-9)
     ]
-    if {"knee_axial_rotation", "knee_adduction"} <= set(turned) and len(turned) == 2:
+    if {"knee_axial_rotation", "knee_adduction"} <= set(flipped) and len(flipped) == 2:
         other = "left" if side == "right" else "right"
         raise InputError(
             f"its axes of knee_axial_rotation and knee_adduction are those of a {other} knee",
@@ -265,7 +267,7 @@ def _check_axes(
 
 
 def _check_limit(joint: ElementTree.Element, path: Path) -> None:
-    """Raise unless a joint states all its limits, in order; they bound nothing here."""
+    """Raise unless a joint states all its limits, lower below upper. tkamb does not use them."""
     limit, name = joint.find("limit"), joint.get("name")
     if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
         hint = "give lower, upper, effort and velocity"
@@ -282,15 +284,15 @@ def _check_order(
     between: tuple[str, str],
     path: Path,
 ) -> None:
-    """Raise unless the joints follow each other, at one place and without mass between them."""
+    """Raise unless the joints form a chain at one point, without mass between them."""
     masses = {str(link.get("name")): link.find("inertial/mass") for link in robot.findall("link")}
     order = f"the order is {between[0]}, {', '.join(names)}, {between[1]}"
-    place = between[0]
+    link = between[0]
     for name in names:
         parent, child = ends_of(joints[name])
-        if parent != place:
-            raise InputError(f"joint '{name}' has parent '{parent}', not '{place}'", path, order)
-        place = child
+        if parent != link:
+            raise InputError(f"joint '{name}' has parent '{parent}', not '{link}'", path, order)
+        link = child
         origin = joints[name].find("origin")
         numbers = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
         if name != names[0] and numbers.any():
@@ -301,12 +303,18 @@ def _check_order(
         if name != names[-1] and mass is not None and numbers_of(mass, "value", "0").any():
             hint = "links inside the chain have none: put it on tibia or femur"
             raise InputError(f"link '{child}' has a mass", path, hint)
-    if place != between[1]:
-        raise InputError(f"joint '{names[-1]}' leads to '{place}'", path, order)
+    if link != between[1]:
+        raise InputError(f"joint '{names[-1]}' leads to '{link}'", path, order)
 
 
 def check_inertia(link: ElementTree.Element, path: Path, needed: bool) -> None:
-    """Raise an InputError unless the mass is positive and the tensor is that of a real body."""
+    """Raise an InputError unless mass and inertia tensor are those of a real body.
+
+    Args:
+        link: the link.
+        path: path of the file, for messages.
+        needed: whether the link must have a mass; otherwise zero is accepted.
+    """
     inertial = link.find("inertial")
     if inertial is None:
         return

@@ -1,7 +1,7 @@
 """Triangles from VTK's XML PolyData (.vtp): text, base64 or raw, in place or appended.
 
-The format: VTK User's Guide, "VTK XML file formats". Arrays are preceded by their length in
-bytes, or, compressed by zlib, by the number and sizes of their blocks.
+Format: VTK User's Guide, "VTK XML file formats". The header of an array is its length in bytes. If
+the array is compressed by zlib, its header is the number and sizes of its blocks.
 """
 
 import base64
@@ -36,40 +36,40 @@ _RAW = re.compile(rb"<AppendedData[^>]*encoding=[\"']raw[\"'][^>]*>\s*_")
 def read_vtp(path: str | Path) -> tuple[Array, Indices]:
     """Return the points (n, 3) and triangles (k, 3) of a .vtp file, in file units.
 
-    Polygons of more than three corners are cut into triangles; vertices, lines and data are not
+    Polygons of more than three corners are cut into triangles. Vertices, lines and data are not
     read.
 
     Raises:
-        InputError: no such file, not PolyData, cut short, strips, or another encoding.
+        InputError: no such file, not PolyData, cut short, triangle strips, or another encoding.
     """
-    return _read(path, lambda found: found.triangles())
+    return _read(path, lambda data: data.triangles())
 
 
 def read_vtp_values(path: str | Path, name: str) -> Array:
-    """Return the data (n,) of that name at the points of a .vtp file.
+    """Return the values (n,) of a point data array of a .vtp file.
 
     Raises:
-        InputError: as `read_vtp`, or no such data.
+        InputError: as `read_vtp`, or there is no array of this name.
     """
-    return _read(path, lambda found: found.values(name))
+    return _read(path, lambda data: data.values(name))
 
 
-def _read(path: str | Path, what: "Callable[[_PolyData], Read]") -> Read:
+def _read(path: str | Path, select: "Callable[[_PolyData], Read]") -> Read:
     content = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file")
     try:
-        return what(_PolyData(content, path))
-    except (ValueError, KeyError, OverflowError, zlib.error) as error:  # base64's is a ValueError
+        return select(_PolyData(content, path))
+    except (ValueError, KeyError, OverflowError, zlib.error) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"cannot be read as VTK PolyData ({reason})", path, _AGAIN) from None
 
 
 class _PolyData:
-    """The pieces of a file, and where its arrays are."""
+    """A parsed PolyData file."""
 
     def __init__(self, content: bytes, path: str | Path) -> None:
         self._appended = b""
         self._raw = False
-        if raw := _RAW.search(content):  # bytes that no XML parser takes
+        if raw := _RAW.search(content):  # raw bytes are not XML
             self._raw, self._appended = True, content[raw.end() :]
             content = content[: raw.end() - 1] + b"</AppendedData></VTKFile>"
         self._root = parse_xml(content, path, what="mesh file")
@@ -106,7 +106,7 @@ class _PolyData:
         return np.concatenate(points), np.concatenate(faces)
 
     def values(self, name: str) -> Array:
-        """Return one array of the points' data of all pieces."""
+        """Return one array of point data, of all pieces."""
         result = []
         for piece in self._root.iter("Piece"):
             named = {array.get("Name"): array for array in piece.iterfind("PointData/DataArray")}
@@ -150,37 +150,37 @@ class _PolyData:
         """Return the bytes of an array after its header."""
         size = self._header.itemsize
         if not self._compressed:
-            header, rest = self._taken(source, size, raw)
-            return self._taken_joined(source, header, rest, raw)
-        header, _ = self._taken(source, size, raw)
+            header, remaining = self._decoded(source, size, raw)
+            return self._uncompressed(source, header, remaining, raw)
+        header, _ = self._decoded(source, size, raw)
         count = int(np.frombuffer(header, self._header)[0])
-        header, rest = self._taken(source, (3 + count) * size, raw)
-        _, whole, last, *sizes = (int(n) for n in np.frombuffer(header, self._header))
+        header, remaining = self._decoded(source, (3 + count) * size, raw)
+        _, block_size, last_size, *sizes = (int(n) for n in np.frombuffer(header, self._header))
         if count == 0:
             return b""
-        if whole * (count - 1) + (last or whole) > FILE_LIMITS.mesh_bytes:
+        if block_size * (count - 1) + (last_size or block_size) > FILE_LIMITS.mesh_bytes:
             raise ValueError("a block unpacks to more bytes than it states")
-        packed, _ = self._taken(rest, sum(sizes), raw)
+        packed, _ = self._decoded(remaining, sum(sizes), raw)
         blocks, start = [], 0
         for number, length in enumerate(sizes):
-            most = last if last and number == count - 1 else whole
-            block = zlib.decompressobj().decompress(packed[start : start + length], most)
-            if len(block) != most:
+            expected = last_size if last_size and number == count - 1 else block_size
+            block = zlib.decompressobj().decompress(packed[start : start + length], expected)
+            if len(block) != expected:
                 raise ValueError("a compressed block is cut short")
             blocks.append(block)
             start += length
         return b"".join(blocks)
 
-    def _taken_joined(self, source: bytes, header: bytes, rest: bytes, raw: bool) -> bytes:
-        """Return an uncompressed array: in base64 its header may be encoded with it or apart."""
+    def _uncompressed(self, source: bytes, header: bytes, remaining: bytes, raw: bool) -> bytes:
+        """Return an uncompressed array. Base64 encodes its header jointly or separately."""
         size, length = len(header), int(np.frombuffer(header, self._header)[0])
         coded = source[: 4 * -(-size // 3)]
         if raw or (size % 3 and coded.endswith(b"=")):
-            return self._taken(rest, length, raw)[0]
-        return self._taken(source, size + length, raw)[0][size:]
+            return self._decoded(remaining, length, raw)[0]
+        return self._decoded(source, size + length, raw)[0][size:]
 
-    def _taken(self, source: bytes, count: int, raw: bool) -> tuple[bytes, bytes]:
-        """Return the first `count` bytes of a raw or base64 text, and what comes after."""
+    def _decoded(self, source: bytes, count: int, raw: bool) -> tuple[bytes, bytes]:
+        """Return the first `count` bytes of a raw or base64 text, and the remaining text."""
         length = count if raw else 4 * -(-count // 3)
         piece = source[:length]
         packed = piece if raw else base64.b64decode(piece, validate=True)
