@@ -57,7 +57,7 @@ KINDS = ["sphere", "torus", "shipped", "dm", "jw"]
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("yaw", [20, 45, 90, -33, -64, 125])
 def test_condyles_that_lie_askew_are_refused(kind, yaw):
-    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+    with pytest.raises(InputError, match="medial and lateral cannot be distinguished"):
         condyle_split(turned(femoral(kind), yaw))
 
 
@@ -132,10 +132,10 @@ def test_press_refuses_exchanged_axes_on_the_command_line(capsys):
 
 def test_press_and_run_refuse_them_in_python(tmp_path):
     meshes = MODEL / "femoral_component.stl", MODEL / "insert.stl"
-    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+    with pytest.raises(InputError, match="medial and lateral cannot be distinguished"):
         press_meshes(*meshes, 1000.0, axes=AXES, contact="foundation")
     scene = write_scene(tmp_path, implant__femoral__axes=AXES)
-    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+    with pytest.raises(InputError, match="medial and lateral cannot be distinguished"):
         simulate(scene, frames=slice(0, 1))
 
 
