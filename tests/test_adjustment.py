@@ -210,7 +210,6 @@ SWEEP = np.arange(-0.7, 0.75, 0.1) * 1e-3
 def test_the_split_does_not_depend_on_the_recorded_height(
     query: ClosestPointQuery, angle_deg: float
 ) -> None:
-    """The split has no step, not even at 0.5 mm."""
     shares = [medial_share(pressed(query, angle_deg, h, 1500.0)[0]) for h in SWEEP]
     assert shares == pytest.approx([0.5] * len(shares), abs=0.01)
 

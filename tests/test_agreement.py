@@ -40,7 +40,6 @@ def shipped(tmp_path_factory):
 
 
 def test_split_sensitivities_by_tangent_and_by_presses_agree_on_the_shipped_knee(tmp_path):
-    """They agree within the roughness of the facets."""
     case = load_case(load_scene(write_scene(tmp_path)))
     side = contact_side(case, mechanics_of(case))
     for k in (10, 60, 95):

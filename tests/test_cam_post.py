@@ -182,7 +182,6 @@ def test_work_of_the_cam_is_the_energy_of_the_foundation():
 
 
 def test_lattice_and_finite_elements_agree_on_the_post():
-    """Force, area and peak at one pose, with the nonlinear material."""
     lattice, fe = (
         cylinder_on_post(model, CURVED, 1.0, 30e-3).at(pressed_in(0.15e-3, 30e-3))
         for model in ("lattice", "fe")

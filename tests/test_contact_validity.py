@@ -99,7 +99,7 @@ LIP, SHEET = box_insert(4e-3, 5e-3, 12e-3), box_insert(14e-3, 1e-3, 14e-3)
 
 @pytest.mark.parametrize(("name", "insert"), [("lattice-linear", LIP), ("lattice", SHEET)])
 def test_a_peak_above_100_megapascal_is_flagged(name, insert):
-    """A sphere presses on a lip 4 mm wide and on a sheet of 1 mm."""
+    """A sphere on a lip 4 mm wide and on a sheet of 1 mm."""
     sphere = condyles(offset=0.0, subdivisions=4)
     result, state = pressed(name, sphere, insert, 2500.0, size=1.0)
     assert result.status is ContactStatus.OK

@@ -329,7 +329,7 @@ def test_a_failed_guess_or_one_with_other_map_points_is_not_used():
 
 
 def test_columns_missed_by_the_neighbourhood_are_found_by_the_final_evaluation(monkeypatch):
-    """With a wrong bound the search misses columns; the evaluation of all columns detects this."""
+    """With a wrong bound the search misses columns."""
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))

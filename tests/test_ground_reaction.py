@@ -119,7 +119,6 @@ def test_laboratory_axes_and_left_foot(tmp_path):
 
 
 def test_a_force_too_large_for_a_foot_is_refused_with_its_column_and_row(tmp_path):
-    """Also after a rotation of the laboratory's axes."""
     force, point, moment = step(STAMPS)
     force[1200, 0] = -3e4
     file = write(tmp_path / "g.csv", force, point, moment)

@@ -96,7 +96,6 @@ def test_curvature_error_shrinks_with_the_patch():
 
 
 def test_an_ellipsoid_in_a_dish():
-    """The relative curvature is the difference of the curvatures in each direction."""
     stretch = np.sqrt([1.2, 1.0, 1.6])
     femoral = graded_sphere(20e-3, stretch=stretch)
     insert = dished_insert(lambda x, z: 9e-3 + x**2 / (2 * 60e-3) + z**2 / (2 * 90e-3))

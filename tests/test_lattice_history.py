@@ -127,7 +127,6 @@ def test_area_above_a_level_is_exact_in_the_mean(level):
 
 
 def test_area_above_a_level_is_continuous():
-    """The area has no step when the pressure of a node passes the level."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 1.0]])
     triangles = np.array([[0, 1, 2], [1, 2, 3]])
     pressure = np.array([1.0, 2.0, 3.0, 4.0])

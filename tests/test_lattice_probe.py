@@ -97,9 +97,7 @@ def residual(state, result, start):
 
 
 def test_at_near_poses_the_residual_is_measured_in_the_region_alone(usual, monkeypatch):
-    """The steps are those of a search. At far poses or under a larger force the whole solid is
-    measured.
-    """
+    """At far poses or under a larger force the whole solid is measured."""
     model, state, pose = usual
     measured, forces = [], type(state.problem.solid).forces
     monkeypatch.setattr(

@@ -128,7 +128,7 @@ def test_the_contact_carries_the_force_of_the_equations_of_motion(bend):
 
 
 def test_the_patella_is_in_equilibrium_under_three_forces(bend):
-    """Quadriceps, ligament and patellofemoral force form a triangle, because the bend is slow."""
+    """The bend is slow, so that inertia is small."""
     q, pl = bend["quadriceps_N"], bend["patellar_ligament_N"]
     pf = np.hypot(bend["patellofemoral_N"], bend["patellofemoral_tangential_N"])
     for k in range(3, 11):

@@ -82,7 +82,6 @@ def test_a_damaged_subdivision_is_not_undone():
 
 
 def test_curved_patches_do_not_change_with_subdivision():
-    """Heights and normals at the same points, after one and two subdivisions."""
     surface = ball(3)
     faces = np.flatnonzero(surface.face_normals[:, 1] > 0.8)
     generator = np.random.default_rng(1)

@@ -135,7 +135,6 @@ def test_the_two_shares_of_fronts_are_independent(seed):
 
 
 def test_a_balanced_tree_is_divided_in_two_halves():
-    """Two subtrees under one root, each with two leaves."""
     parents = np.array([2, 2, 6, 5, 5, 6, -1])
     starts, empty = np.arange(8) * 10, np.zeros(0, np.int64)
     factor = CholeskyFactor(

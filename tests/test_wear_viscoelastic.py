@@ -177,7 +177,6 @@ def test_a_bonded_block_under_a_flat_plate_relaxes_by_the_series(flat):
 
 
 def elastic(made, place, share=1.0, load=None):
-    """Return the elastic contact with a share of the modulus."""
     model, pair = made
     softer = replace(pair.material, young_modulus=share * pair.material.young_modulus)
     state = model.prepare(replace(pair, material=softer))
@@ -241,7 +240,6 @@ def test_slow_motion_is_on_the_relaxed_lattice_and_fast_motion_on_the_fresh_one(
 
 
 def test_the_height_of_the_pose_is_only_an_initial_guess(ball):
-    """The height begins the search, above the block or in it, and does not change the result."""
     result = []
     for height in (1e-3, 0.0, -0.5e-3):
         block = ViscoelasticLattice(*ball, PAIR_SERIES)

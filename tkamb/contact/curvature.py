@@ -22,11 +22,11 @@ class CurvatureSettings:
     """m: the contact point has converged when an iteration moves it by less. Chosen because it is
     far below the size of a triangle."""
     max_distance: float = 3.0
-    """1: largest distance of the contact point from first touch, over the radius of a patch. Chosen
-    because the quadrics do not describe the surfaces farther away."""
+    """1: largest distance of the contact point from first touch, over the radius of a patch.
+    Farther away the quadrics do not describe the surfaces."""
     least_cover: float = 0.6
-    """1: smallest share of a patch that both meshes must cover. Chosen because with a smaller share
-    the quadric is an extrapolation."""
+    """1: smallest share of a patch that both meshes must cover. With a smaller share the quadric
+    is an extrapolation."""
 
 
 CURVATURE = CurvatureSettings()
@@ -157,12 +157,7 @@ def _slope(quadric: Array, place: Array) -> Array:
 
 
 def _nearest_place(difference: Array, radius: float) -> Array | None:
-    """Return the place (2,), m, of the smallest gap, at most a radius away; None without a minimum.
-
-    Args:
-        difference: (6,) quadric of the gap.
-        radius: m, radius of the disc.
-    """
+    """Return the place (2,), m, of a quadric's minimum, at most a radius away; None without one."""
     values, vectors = np.linalg.eigh(_hessian(difference))
     # Not convex in all directions: the bodies conform, and no nearest point exists.
     if values[0] <= 0:

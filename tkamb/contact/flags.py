@@ -3,8 +3,8 @@
 A map contains the pressure at its points only. If contact is a few points wide, the highest
 pressure lies between them, and the sum over the points is not the integral over the contact.
 
-The rounding of a real edge is finer than the spacing of a map, and a real edge wears and chips. The
-flag of a contact at the edge states the place of the peak.
+A map does not resolve the rounding of a real edge, which also wears and chips. The flag of a
+contact at the edge states the place of the peak.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,9 +26,8 @@ class NarrowContactSettings:
 
     least_inner_points: int = 5
     """Smallest number of inner points: map points with contact all around. With this number the
-    error of the peak is at most 8 %: the contact of a sphere then has about 17 points, that of a
-    cylinder three rows of points. Without inner points the peak of a lattice is 5 to 96 % too low
-    (docs/lattice.md)."""
+    error of the peak is at most 8 %: a sphere then touches about 17 points, a cylinder three rows
+    of points. Without inner points the peak of a lattice is 5 to 96 % too low (docs/lattice.md)."""
 
 
 NARROW_CONTACT = NarrowContactSettings()
@@ -122,7 +121,7 @@ class ArticularEdge:
             insert: insert, insert frame.
             settings: definition of the edge.
         """
-        from scipy.ndimage import distance_transform_edt  # a report needs the words alone
+        from scipy.ndimage import distance_transform_edt  # slow import, not needed for a report
 
         low, high = insert.bounds[:, [0, 2]]
         # Two rows of margin on each side, so that the outside is one connected region.
@@ -152,7 +151,7 @@ class ArticularEdge:
 
 def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
     """Return the connected parts of a mask (a, b) that contain a cell outside the insert."""
-    from scipy.ndimage import label  # a report needs the words alone
+    from scipy.ndimage import label  # slow import, not needed for a report
 
     part, _ = label(flat, structure=np.ones((3, 3)))
     touching = np.unique(part[outside])

@@ -128,7 +128,7 @@ class PreparedContact:
 
     Args:
         pair: the two bodies.
-        surface: points of all pressure maps that are computed with this state.
+        surface: points of all pressure maps of this state.
     """
 
     pair: ContactPair

@@ -25,12 +25,12 @@ class PressSettings:
     load_tolerance: float = 1e-6
     """1: relative difference of reaction and load below which the search has converged."""
     coarse_tolerance: float = 1e-3
-    """1: relative difference above which the press has not converged. It is larger than
-    `load_tolerance`, because a reaction may jump where map points come into contact one by one."""
+    """1: relative difference above which the press has not converged. It exceeds `load_tolerance`,
+    because a reaction may jump where map points come into contact."""
     first_approach: float = 5e-5
     """m: initial guess of the approach if the caller gives none."""
     max_approach: float = 0.02
-    """m: largest approach of a search. Chosen because inserts are thinner."""
+    """m: largest approach of a search. Chosen because no insert carries a load beyond it."""
     least_bracket: float = 1e-16
     """m: width of the bracket at which the search ends. Chosen: the rounding of an approach of
     1 mm."""
@@ -112,8 +112,7 @@ def press_by_search(
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
 
-    Rotation, x and z of `pose` do not change; its y is not used. The reaction is minus the y
-    component of the force on the insert.
+    Rotation, x and z of `pose` do not change; its y is not used.
 
     Args:
         model: any contact model.
@@ -121,8 +120,8 @@ def press_by_search(
         load: superior-inferior force, N.
         pose: (4, 4) pose_femoral_in_insert.
         guess: earlier result or warm start; its approach is the initial guess of the search.
-        reaction: function that returns the reaction (N) at an approach (m) faster than `evaluate`;
-            inf if the approach is out of range.
+        reaction: function that returns the reaction (N), minus the y component of the force on the
+            insert, at an approach (m), faster than `evaluate`; inf if out of range.
 
     Returns:
         The contact at the approach that carries the load. It is OUT_OF_RANGE, with NaN, if the load
@@ -194,7 +193,7 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
     """Find the approach at which a rising reaction equals the load.
 
     The trial approach grows from `start` until the load is bracketed. False position (Illinois)
-    then narrows the bracket. It uses the square root of the reaction.
+    then narrows the bracket.
 
     Args:
         reaction: function that returns the reaction (N) at an approach (m): 0 at 0, inf if the
@@ -231,8 +230,8 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
             if math.isnan(high)
             else _between(low, low_value, high, high_value)
         )
-    # The bracket encloses the load only if the reaction at its upper end is finite. Otherwise the
-    # model goes out of range before the load is reached.
+    # If the reaction at the bracket's upper end is not finite, the model goes out of range before
+    # the load is reached.
     reached = best[0] <= PRESS.load_tolerance or math.isfinite(high_value)
     return LoadSearch(best[1] if reached else math.nan, count, best[0], deepest)
 

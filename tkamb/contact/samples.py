@@ -22,8 +22,8 @@ class MapPointSettings:
     """The map points on the articular surface."""
 
     rim_rays: int = 8
-    """Number of rays along each edge of a map cell at the rim. The rays measure the share of the
-    cell that the insert covers."""
+    """Number of rays along each edge of a map cell at the rim, which measure the cell's covered
+    share."""
     least_normal_y: float = 0.1
     """1: smallest superior component of a normal by which a covered area is divided; a slope of 84
     deg. Chosen because it prevents a division by zero."""
@@ -114,10 +114,10 @@ def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -
     """Return the gap (n,), m, along the insert's normals; negative for a penetration.
 
     A ray starts half-way through the insert and runs outward along the normal. Its first crossing
-    with the femoral component gives the gap. The gap is inf if there is no crossing, and -inf if
-    the ray starts inside the femoral component. On a steep rim the ray starts under the dish, where
-    the femoral component may be without touching the rim. A penetration of such a ray counts only
-    if the surface point lies inside the femoral component, too.
+    with the femoral component gives the gap. The gap is inf without a crossing, and -inf if the ray
+    starts inside the femoral component. On a steep rim the ray starts under the dish, where the
+    femoral component may be. A penetration counts there only if the surface point lies inside the
+    femoral component, too.
     """
     return _gaps(samples, femoral, inverse(pose))[0]
 
@@ -142,8 +142,8 @@ def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array
     gap, face = _first_entry(femoral, origins, normals)
     # Rays start inside the insert, so that they meet a penetrating femur from outside.
     gap -= below
-    # On a steep wall a column starts beside its point, in the plan view, and may start in the
-    # femur. If the point itself is outside the femur, the gap above the point counts.
+    # On a steep wall a column may start inside the femur, beside its point. If the point is outside
+    # the femur, the gap above the point counts.
     steep = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < MAP_POINT.side_start_normal_y))
     if len(steep):
         rim = origins[steep] + below[steep, None] * normals[steep]
@@ -228,8 +228,8 @@ def _cells(
     nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
     mean_covered = np.isfinite(_first(caster, mean)[0])[:, None]
     xz, share = centres.copy(), all_hit.ravel().astype(float)
-    # The point of a partly covered cell is the centroid of its covered part. If the insert does not
-    # cover the centroid, it is the place of the nearest ray that meets the insert.
+    # The point of a partly covered cell is the centroid of its covered part, or the nearest ray
+    # that meets the insert if the centroid is not covered.
     xz[rim], share[rim] = np.where(mean_covered, mean, nearest), count / MAP_POINT.rim_rays**2
     cell = np.flatnonzero(share > 0)
     if not cell.size:

@@ -88,9 +88,7 @@ class HeightBound:
         return planes
 
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
-        """Yield numbers (m,) of rectangles, and row (m,) and column (m,) of a cell under each.
-
-        The results together contain every cell under every rectangle.
+        """Yield all cells under all rectangles: numbers of rectangles, rows and columns, (m,) each.
 
         Args:
             low: (n, 2) m, smallest x and z of the rectangles.
@@ -130,8 +128,8 @@ class ClosestPointSettings:
     """Number of times that the triangles around the deepest point are divided into four. Larger:
     slower, but a finer position of the point."""
     kept_candidates: int = 8
-    """Number of deepest vertices or triangles that the search of the deepest point continues with.
-    Chosen because the deepest point is among them."""
+    """Number of vertices or triangles with which the search of the deepest point continues. Chosen
+    because the deepest point is among them."""
     batch_size: int = 64
     """Number of vertices whose depth is computed together, and largest number of intersecting
     triangles that are examined."""
@@ -356,8 +354,7 @@ class _CloseRegion:
     ) -> tuple[Array, Array]:
         """Return the centre (3,), m, and the mean unit normal (3,) of the close region.
 
-        The centre lies on the other body, and the normal is that of the other body. Both are given
-        in the other body's frame.
+        Both belong to the other body and are given in its frame.
 
         Args:
             other: nearest points of the other body.
@@ -433,9 +430,7 @@ def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[In
 
 @compiled_as_written
 def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
-    """Return the samples near a place with about the normal of the sample nearest to the place.
-
-    The normals differ by less than 60 deg.
+    """Return the samples near a place with a normal within 60 deg of the nearest sample's normal.
 
     Args:
         samples: (n, 3) m.

@@ -16,15 +16,14 @@ STEEP = 1e-9
 """1: ratio of a triangle's area in the plan view to its area below which the triangle is a wall and
 is skipped. The edges of a wall are edges of its neighbours."""
 FACING = 0.2
-"""1: smallest vertical component of a mean normal. The plane of a smaller one bounds no heights."""
+"""1: smallest vertical component of a mean normal with which its plane is used as a bound."""
 ROUNDING = 1e-12
 """m: rounding error of a plane's height."""
 MOST_WAITING = 256
 """Largest number of pairs of boxes on the stack: two for each level of both trees."""
 MOST_CORNERS = 9
-"""Largest number of corners of a triangle cut by another triangle: six, and more by rounding. A cut
-that crosses c of n sides leaves at most n + c / 2 corners, and c is even. This gives 4, 6 and 9
-after the three cuts."""
+"""Largest number of corners of a triangle cut by another triangle: six, and up to nine by
+rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +127,8 @@ def _bound(
 ) -> float:
     """Return a lower bound (m) of the clearance of the triangles in two boxes.
 
-    It is the larger of two bounds: the clearance of the boxes, and the clearance of their planes
-    over the rectangle that both boxes cover. It is inf if the boxes do not overlap in the plan
-    view.
+    It is the larger of the boxes' clearance and of their planes' clearance over the rectangle that
+    both boxes cover. It is inf if the boxes do not overlap in the plan view.
 
     Args:
         upper: (6,) m, box of the upper body, in the lower body's frame.

@@ -282,13 +282,7 @@ def sharp_edges(surface: Surface, sharp: float = SHARP_EDGE) -> Mask:
 
 
 def _sums(index: Index, rows: Array, count: int = 0) -> Array:
-    """Return the sum of the rows (m, n) for each index; at least `count` sums.
-
-    Args:
-        index: (m,) index of each row.
-        rows: (m, n) rows.
-        count: smallest number of sums.
-    """
+    """Return the sum (n,) of the rows (m, n) of each index (m,); at least `count` sums."""
     return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
 
 

@@ -17,9 +17,8 @@ exactly is moved by an infinitesimal distance to +z, and by a much smaller one t
 simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). The result
 is correct for all points that do not lie on the surface.
 
-The sum may also be taken over the triangles below the point, with the opposite sign. In a closed
-surface both sums are equal. If a ray leaves through a small hole of the mesh, they differ; the
-larger sum is the result.
+In a closed surface the sum over the triangles below the point, with the opposite sign, is equal. If
+a ray leaves through a small hole of the mesh, the larger sum is the result.
 """
 
 from dataclasses import dataclass
