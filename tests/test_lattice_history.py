@@ -19,7 +19,7 @@ from tkamb.io.scene.case import load_case
 
 FRAMES, FAR = (12, 36, 84), 60
 LOADS = {11: 700.0, 12: 750.0, 35: 1400.0, 36: 1450.0, 60: 2000.0, 83: 2150.0, 84: 2200.0}
-"""N."""
+"""Frame -> load, N."""
 
 
 @lru_cache
@@ -47,9 +47,9 @@ def columns(state, result):
     """Return the columns of a results table for a contact."""
     medial = medial_points(result.points, result.pose, state.pair.split)
     row = {"approach": result.approach, "lowest gap": result.gap[result.pressure == 0].min()}
-    for side, own in (("medial", medial), ("lateral", ~medial)):
+    for side, under_side in (("medial", medial), ("lateral", ~medial)):
         condyle = getattr(result, side)
-        carried = np.where(own, result.pressure, 0.0)
+        carried = np.where(under_side, result.pressure, 0.0)
         row |= {
             f"{side} force": condyle.force,
             f"{side} area": condyle.area,

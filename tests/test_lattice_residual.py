@@ -38,19 +38,19 @@ def test_the_reported_residual_equals_an_independent_measurement(name, load, mon
     bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), material("polyethylene"))
     state, solutions = model.prepare(bodies), []
 
-    def kept(*given):
+    def storing_solve(*given):
         solutions.append(solve(*given))
         return solutions[-1]
 
-    monkeypatch.setattr(lattice_model, "solve", kept)
+    monkeypatch.setattr(lattice_model, "solve", storing_solve)
     _, before = model.press_from(state, 1.5 * load, POSE)
     for start in (None, before):
         result = model.press(state, load, POSE, start)
-        actual, settings = solutions[-1], LatticeSolverSettings()
-        pushed = actual.forces.force @ actual.planes.normals[:, 1]
-        assert result.status is ContactStatus.OK and actual.residual.within(settings)
-        assert abs(-pushed / load - 1) < 1e-9 and (actual.forces.force >= 0).all()
-        assert difference(state, actual, result) < 1e-6
+        solution, settings = solutions[-1], LatticeSolverSettings()
+        pushed = solution.forces.force @ solution.planes.normals[:, 1]
+        assert result.status is ContactStatus.OK and solution.residual.within(settings)
+        assert abs(-pushed / load - 1) < 1e-9 and (solution.forces.force >= 0).all()
+        assert difference(state, solution, result) < 1e-6
 
 
 def check(cases):
