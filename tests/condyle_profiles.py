@@ -1,8 +1,7 @@
-"""Sagittal profile of a femoral condyle, as a curve that goes on past 90 deg of flexion.
+"""Sagittal profile of a femoral condyle, as a curve that continues beyond 90 deg of flexion.
 
-Seen from below, the posterior condyle is no height field in deep flexion. Its sagittal section
-is a curve all the same: the profile runs from the anterior to the posterior end of what a
-plate under the femur can touch between -20 and 160 deg of flexion.
+The profile is the part of a sagittal section that a horizontal plate under the femur touches
+between -20 and 160 deg of flexion. It runs from anterior to posterior.
 """
 
 from dataclasses import dataclass
@@ -18,11 +17,11 @@ from tkamb.geometry.surface import Surface
 from tkamb.units import DEGREE, MILLIMETRE
 
 LEAST_FLEXION, MOST_FLEXION = -20.0 * DEGREE, 160.0 * DEGREE
-"""rad; a plate touches the profile somewhere within its ends between these."""
+"""rad: flexion at which a plate touches the anterior and the posterior end of a profile."""
 SPACING = 5e-4
-"""m between the points of a profile."""
+"""m: spacing of the points of a profile."""
 WELD = 1e-8
-"""m; ends of cuts nearer than this are one point."""
+"""m: distance below which two ends of a section's segments are one point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +30,8 @@ class CondyleProfile:
 
     Args:
         z: m, plane of the section.
-        arc: (m,) m, from the point that is lowest in extension, positive backwards.
-        points: (m, 2) x and y, m, even in arc length.
+        arc: (m,) m, arc length from the lowest point in extension, positive to posterior.
+        points: (m, 2) m, x and y at equal steps of the arc length.
     """
 
     z: float
@@ -40,7 +39,7 @@ class CondyleProfile:
     points: Array
 
     def at(self, arc: Array) -> Array:
-        """Return the points (n, 2) m at arc lengths (n,) m; a cubic spline."""
+        """Return the points (n, 2), m, at arc lengths (n,), m, on a cubic spline."""
         return np.asarray(CubicSpline(self.arc, self.points)(arc))
 
     def locate(self, points: Array) -> Array:
@@ -54,18 +53,18 @@ class CondyleProfile:
         return np.asarray(self.arc[nearest] + within * np.diff(self.arc)[nearest])
 
     def lowest(self, flexion: Array) -> Array:
-        """Return the arc lengths (n,) m of the points that are lowest at flexion (n,) rad.
+        """Return the arc lengths (n,), m, of the lowest points at flexions (n,), rad.
 
-        The femur is turned about z only. A parabola through the three lowest points of the
-        profile places the minimum between them.
+        The femur is rotated about z. The lowest point is the minimum of a parabola through the
+        three lowest points of the profile.
         """
         flexion = np.atleast_1d(np.asarray(flexion, float))
         height = np.sin(flexion)[:, None] * self.points[:, 0]
         height = height + np.cos(flexion)[:, None] * self.points[:, 1]
         least = np.clip(height.argmin(axis=1), 1, len(self.arc) - 2)
         row = np.arange(len(least))
-        before, here, after = (height[row, least + d] for d in (-1, 0, 1))
-        bend = before - 2.0 * here + after
+        before, middle, after = (height[row, least + d] for d in (-1, 0, 1))
+        bend = before - 2.0 * middle + after
         offset = np.divide(before - after, 2.0 * bend, out=np.zeros_like(bend), where=bend > 0)
         spacing = self.arc[1] - self.arc[0]
         return np.asarray(self.arc[least] + np.clip(offset, -1.0, 1.0) * spacing)
@@ -75,8 +74,7 @@ def condyle_profile(femoral: Surface, z: float) -> CondyleProfile:
     """Return the profile of a femoral component (femoral frame) in the plane at z (m).
 
     Raises:
-        InputError: the plane misses the component, or cuts it into pieces none of which runs
-            from its anterior to its posterior end.
+        InputError: the plane does not meet the component.
     """
     loop = _longest_chain(sagittal_section(femoral, z), femoral.name, z)
     ends = [_support(loop, angle) for angle in (LEAST_FLEXION, 60.0 * DEGREE, MOST_FLEXION)]
@@ -87,11 +85,11 @@ def condyle_profile(femoral: Surface, z: float) -> CondyleProfile:
 
 
 def _even(run: Array) -> tuple[Array, Array]:
-    """Return arc lengths and points, even on the cubic spline through a chain (thinned)."""
+    """Return arc lengths and points at equal steps on a cubic spline through a chain."""
     arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(run, axis=0), axis=1)))
     even = np.linspace(0.0, arc[-1], max(int(arc[-1] / SPACING), 8) + 1)
-    kept = np.unique(np.searchsorted(arc, even).clip(max=len(arc) - 1))
-    points = CubicSpline(arc[kept], run[kept])(even)
+    chosen = np.unique(np.searchsorted(arc, even).clip(max=len(arc) - 1))
+    points = CubicSpline(arc[chosen], run[chosen])(even)
     arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     even = np.linspace(0.0, arc[-1], len(arc))
     return even, CubicSpline(arc, points)(even)
@@ -130,21 +128,24 @@ def _longest_chain(segments: Array, name: str, z: float) -> Array:
         neighbours.setdefault(a, []).append(b)
         neighbours.setdefault(b, []).append(a)
     chains: list[Array] = []
-    left = set(neighbours)
-    while left:
-        chain = _walk(neighbours, left)
+    remaining = set(neighbours)
+    while remaining:
+        chain = _next_chain(neighbours, remaining)
         chains.append(ends[first[chain]])
     return max(chains, key=lambda c: float(np.linalg.norm(np.diff(c, axis=0), axis=1).sum()))
 
 
-def _walk(neighbours: dict[int, list[int]], left: set[int]) -> NDArray[np.int64]:
-    """Return one chain of points, from an open end if it has one; take its points off `left`."""
-    start = min((p for p in left if len(neighbours[p]) == 1), default=min(left))
+def _next_chain(neighbours: dict[int, list[int]], remaining: set[int]) -> NDArray[np.int64]:
+    """Return one chain of points, and remove them from `remaining`.
+
+    The chain begins at an open end if there is one.
+    """
+    start = min((p for p in remaining if len(neighbours[p]) == 1), default=min(remaining))
     chain = [start]
-    left.discard(start)
+    remaining.discard(start)
     while True:
-        onward = [p for p in neighbours[chain[-1]] if p in left]
-        if not onward:
+        following = [p for p in neighbours[chain[-1]] if p in remaining]
+        if not following:
             return np.array(chain)
-        chain.append(onward[0])
-        left.discard(onward[0])
+        chain.append(following[0])
+        remaining.discard(following[0])

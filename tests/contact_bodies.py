@@ -1,4 +1,4 @@
-"""Femoral components and inserts of known curvature, in metres, insert axes."""
+"""Femoral components and inserts with known curvature, m, in the axes of the insert frame."""
 
 import numpy as np
 
@@ -8,10 +8,11 @@ SECTORS = 96
 
 
 def graded_sphere(radius, centre=(0.0, 0.0, 0.0), stretch=(1.0, 1.0, 1.0)):
-    """Return a sphere whose rings are 0.15 deg apart near its lower pole.
+    """Return a sphere with rings 0.15 deg apart near the lower pole.
 
-    `stretch` scales x, y, z before it is moved: the lower pole of the ellipsoid has radii of
-    curvature radius * stretch_x² / stretch_y along x and likewise along z.
+    `stretch` scales x, y and z to an ellipsoid before the move to `centre`. At the lower pole the
+    radius of curvature along x is radius * stretch_x² / stretch_y; along z stretch_z replaces
+    stretch_x.
     """
     polar = np.radians(np.concatenate([np.arange(0.15, 20, 0.15), np.linspace(20, 180, 60)[:-1]]))
     around = np.arange(SECTORS) * 2 * np.pi / SECTORS
@@ -24,15 +25,15 @@ def graded_sphere(radius, centre=(0.0, 0.0, 0.0), stretch=(1.0, 1.0, 1.0)):
         axis=-1,
     ).reshape(-1, 3)
     vertices = radius * np.concatenate([[[0, -1, 0]], ring, [[0, 1, 0]]])
-    here = np.arange(SECTORS)
-    there = (here + 1) % SECTORS
-    faces = [np.stack([np.zeros(SECTORS, int), 1 + here, 1 + there], axis=1)]
+    start = np.arange(SECTORS)
+    end = (start + 1) % SECTORS
+    faces = [np.stack([np.zeros(SECTORS, int), 1 + start, 1 + end], axis=1)]
     for row in range(len(polar) - 1):
         a, b = 1 + row * SECTORS, 1 + (row + 1) * SECTORS
-        faces.append(np.stack([a + here, b + here, b + there], axis=1))
-        faces.append(np.stack([a + here, b + there, a + there], axis=1))
+        faces.append(np.stack([a + start, b + start, b + end], axis=1))
+        faces.append(np.stack([a + start, b + end, a + end], axis=1))
     last = 1 + (len(polar) - 1) * SECTORS
-    faces.append(np.stack([last + here, np.full(SECTORS, len(vertices) - 1), last + there], 1))
+    faces.append(np.stack([last + start, np.full(SECTORS, len(vertices) - 1), last + end], 1))
     surface = Surface(
         vertices * np.asarray(stretch) + np.asarray(centre), np.concatenate(faces), "sphere"
     )
@@ -51,7 +52,7 @@ def joined(*surfaces):
 
 
 def dished_insert(height, half_x=15e-3, half_z=15e-3, spacing=0.5e-3):
-    """Return a closed insert on y = 0 whose upper surface is y = height(x, z), vectorised."""
+    """Return a closed insert on y = 0 with the upper surface y = height(x, z) (arrays, m)."""
     x = np.linspace(-half_x, half_x, round(2 * half_x / spacing) + 1)
     z = np.linspace(-half_z, half_z, round(2 * half_z / spacing) + 1)
     grid_x, grid_z = (grid.ravel() for grid in np.meshgrid(x, z, indexing="ij"))
@@ -74,5 +75,5 @@ def dished_insert(height, half_x=15e-3, half_z=15e-3, spacing=0.5e-3):
 
 
 def flat_insert(height, half_x=15e-3, half_z=15e-3):
-    """Return a box on y = 0."""
+    """Return a box of that height on y = 0."""
     return dished_insert(lambda x, z: height + 0 * x, half_x, half_z, spacing=2 * half_x)

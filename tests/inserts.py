@@ -1,4 +1,4 @@
-"""Inserts for lattice tests: synthetic ones with holes, posts and rims, and the real ones."""
+"""Inserts for lattice tests: synthetic inserts with holes, posts and rims, and real inserts."""
 
 from pathlib import Path
 
@@ -13,9 +13,13 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def raised(x, z, height, solid):
-    """A closed block over the squares of a grid that are solid; bottom in y = 0.
+    """Return a closed block over the solid squares of a grid; its bottom lies in y = 0.
 
-    x (a,), z (b,) in m; height (a, b) m at the grid's points; solid (a-1, b-1).
+    Args:
+        x: (a,) m, coordinates of the grid's points.
+        z: (b,) m, coordinates of the grid's points.
+        height: (a, b) m, y of the top at the grid's points.
+        solid: (a - 1, b - 1) whether a square belongs to the block.
     """
     a, b = len(x), len(z)
     grid = np.arange(a * b).reshape(a, b)
@@ -26,8 +30,8 @@ def raised(x, z, height, solid):
     top = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
     faces = [top, top[:, ::-1] + a * b]
     directed = np.concatenate([corners[:, [i, (i + 1) % 4]] for i in range(4)])
-    both = {tuple(edge) for edge in directed.tolist()}
-    rim = np.array([edge for edge in directed.tolist() if (edge[1], edge[0]) not in both])
+    edges = {tuple(edge) for edge in directed.tolist()}
+    rim = np.array([edge for edge in directed.tolist() if (edge[1], edge[0]) not in edges])
     s, e = rim.T
     faces += [np.column_stack([e, s, s + a * b]), np.column_stack([e, s + a * b, e + a * b])]
     faces = np.concatenate(faces)
@@ -37,7 +41,7 @@ def raised(x, z, height, solid):
 
 
 def dished(size=(0.04, 0.06), lip=0.012, dish=0.006, spacing=5e-4, radius=0.035):
-    """A block with two spherical dishes, and its exact top as a function of x and z."""
+    """Return a block with two spherical dishes, and its exact top as a function of x and z."""
 
     def top(x, z):
         floor = dish + radius - np.sqrt(radius**2 - x**2 - (np.abs(z) - size[1] / 4) ** 2)
@@ -49,7 +53,7 @@ def dished(size=(0.04, 0.06), lip=0.012, dish=0.006, spacing=5e-4, radius=0.035)
 
 
 def real_insert(name):
-    """The insert of subject dm or jw in the insert frame, or a skip."""
+    """Return the insert of DM or JW in the insert frame; skip the test without the data."""
     path = DATA / name / "geometry" / "tibial_insert.stl"
     if not path.is_file():
         pytest.skip("subject data absent (shared/data): meshes of DM and JW are not shipped")
@@ -58,13 +62,13 @@ def real_insert(name):
 
 
 def shipped_insert():
-    """The insert of the shipped deep knee bend, in the insert frame."""
+    """Return the insert of the shipped deep knee bend, in the insert frame."""
     path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "insert.stl"
     surface = load_surface(path, "mm", name="shipped insert", closed=True)
     return surface.moved(insert_placement(surface))
 
 
 def volume(surface):
-    """Enclosed volume, m³."""
+    """Return the enclosed volume, m³."""
     a, b, c = np.moveaxis(surface.triangles, 1, 0)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)

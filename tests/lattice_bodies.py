@@ -8,19 +8,19 @@ from tkamb.geometry.surface import Surface
 
 
 def box_insert(width, height, depth):
-    """Return a box standing on y = 0 (m)."""
+    """Return a box on y = 0 (sizes in m)."""
     box = trimesh.creation.box((width, height, depth))
     box.apply_translation((0, height / 2, 0))
     return Surface(np.array(box.vertices), np.array(box.faces, np.int64), "box")
 
 
 def plate(width, depth):
-    """Return a rigid plate whose underside is y = 0 (m)."""
+    """Return a rigid plate with its underside in y = 0 (sizes in m)."""
     return box_insert(width, 5e-3, depth)
 
 
 def sphere_cap(radius, reach=6e-3, step=1e-4, sectors=96):
-    """Return the lower cap of a sphere centred at the origin, finely triangulated (m)."""
+    """Return the lower cap of a sphere about the origin, finely triangulated (sizes in m)."""
     count = int(reach / step)
     r = np.arange(1, count + 1)[:, None] * step
     angle = np.arange(sectors) * 2 * np.pi / sectors
@@ -39,7 +39,7 @@ def sphere_cap(radius, reach=6e-3, step=1e-4, sectors=96):
 
 
 def dished_insert(width=24e-3, depth=40e-3, height=9e-3, radius=30e-3, cells=48):
-    """Return a closed insert with two dishes under condyles at z = ±depth/4 (m)."""
+    """Return a closed insert with two dishes at z = ±depth/4 (sizes in m)."""
     x = np.linspace(-width / 2, width / 2, cells + 1)
     z = np.linspace(-depth / 2, depth / 2, 2 * cells + 1)
     gx, gz = np.meshgrid(x, z, indexing="ij")
@@ -53,9 +53,12 @@ def dished_insert(width=24e-3, depth=40e-3, height=9e-3, radius=30e-3, cells=48)
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     shift = gx.size
     rim = np.concatenate([number[:, 0], number[-1, 1:], number[-2::-1, -1], number[0, -2:0:-1]])
-    nxt = np.roll(rim, -1)
+    following = np.roll(rim, -1)
     walls = np.concatenate(
-        [np.stack([rim, nxt + shift, rim + shift], 1), np.stack([rim, nxt, nxt + shift], 1)]
+        [
+            np.stack([rim, following + shift, rim + shift], 1),
+            np.stack([rim, following, following + shift], 1),
+        ]
     )
     mesh = trimesh.Trimesh(
         np.concatenate([upper, lower]), np.concatenate([faces, faces[:, ::-1] + shift, walls])
@@ -65,11 +68,11 @@ def dished_insert(width=24e-3, depth=40e-3, height=9e-3, radius=30e-3, cells=48)
 
 
 def condyles(radius=20e-3, offset=10e-3, subdivisions=5):
-    """Return two spheres as a femoral component (m)."""
+    """Return two spheres as a femoral component (sizes in m)."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     parts = [ball.copy().apply_translation((0, 0, side * offset)) for side in (-1, 1)]
-    both = trimesh.util.concatenate(parts)
-    return Surface(np.array(both.vertices), np.array(both.faces, np.int64), "condyles")
+    spheres = trimesh.util.concatenate(parts)
+    return Surface(np.array(spheres.vertices), np.array(spheres.faces, np.int64), "condyles")
 
 
 def pair(femoral, insert, material, bearing="fixed"):
@@ -78,7 +81,7 @@ def pair(femoral, insert, material, bearing="fixed"):
 
 
 def above(x=0.0, z=0.0, y=1.0, rotation=None):
-    """Return a pose (4, 4)."""
+    """Return a pose (4, 4) from a translation (m) and a rotation (3, 3)."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     if rotation is not None:

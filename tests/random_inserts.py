@@ -20,16 +20,17 @@ from tkamb.geometry.surface import Surface
 
 KINDS = ("ridge", "post", "step", "notch", "hole", "void", "dish")
 EVEN_SIZES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
-"""mm: with them, lines and cells of the grid lie exactly under the walls of a design."""
+"""mm: cell sizes with which grid lines lie exactly under the walls of a design."""
 TWIST = np.array([[0, 0], [0, 1], [1, 1], [1, 0]])
 
 
 def voxel_surface(lines: tuple[Array, Array, Array], solid: Mask, name: str = "insert") -> Surface:
-    """Return the closed skin of the solid cells of an uneven grid.
+    """Return the closed surface of the solid cells of an uneven grid.
 
     Args:
-        lines: increasing coordinates (m) of the planes across x, y and z.
-        solid: (nx - 1, ny - 1, nz - 1), which cells are filled.
+        lines: increasing coordinates (m) of the planes normal to x, y and z.
+        solid: (nx - 1, ny - 1, nz - 1) whether a cell is solid.
+        name: name of the surface.
     """
     shape = tuple(len(line) for line in lines)
     number = np.arange(np.prod(shape)).reshape(shape)
@@ -39,8 +40,8 @@ def voxel_surface(lines: tuple[Array, Array, Array], solid: Mask, name: str = "i
         u, v = (axis + 1) % 3, (axis + 2) % 3
         before = np.moveaxis(full, axis, 0)[:-1]
         after = np.moveaxis(full, axis, 0)[1:]
-        for here, there, outward in ((before, after, 1), (after, before, -1)):
-            face = np.argwhere(np.moveaxis(here & ~there, 0, axis))
+        for inner, outer, outward in ((before, after, 1), (after, before, -1)):
+            face = np.argwhere(np.moveaxis(inner & ~outer, 0, axis))
             face -= np.where(np.arange(3) == axis, 0, 1)
             ring = np.zeros((4, 3), np.int64)
             ring[:, u], ring[:, v] = TWIST[:, 1], TWIST[:, 0]
@@ -55,13 +56,13 @@ def voxel_surface(lines: tuple[Array, Array, Array], solid: Mask, name: str = "i
 
 @dataclass(frozen=True, eq=False)
 class RandomInsert:
-    """An insert, in a mesh's own pose, and what it is made of.
+    """An insert in an arbitrary pose, and its features.
 
     Args:
-        surface: closed, m.
-        kinds: its features.
-        size: m, cells of its lattice.
-        symmetric: it is its own mirror image across z = 0.
+        surface: closed surface, m.
+        kinds: kinds of the features.
+        size: m, edge of the lattice's cells.
+        symmetric: whether the insert is symmetric about z = 0.
     """
 
     surface: Surface
@@ -71,12 +72,12 @@ class RandomInsert:
 
 
 def random_insert(seed: int, symmetric: bool | None = None) -> RandomInsert:
-    """Return the random insert of that number; the same for the same seed."""
+    """Return the random insert of a seed."""
     random = np.random.default_rng(seed)
     symmetric = bool(random.random() < 0.3) if symmetric is None else symmetric
     length, width = random.uniform(35, 60), random.uniform(55, 85)
     height = random.uniform(6, 14)
-    if random.random() < 0.5:  # CAD's round numbers, which lie on planes of the grid
+    if random.random() < 0.5:  # round numbers as in CAD, on planes of the grid
         length, width, height = np.round(length), np.round(width), np.round(height)
     kinds = tuple(random.choice(KINDS, size=random.integers(1, 4), replace=False))
     features = [_feature(random, kind, length, width, height) for kind in kinds]
@@ -95,7 +96,7 @@ def random_insert(seed: int, symmetric: bool | None = None) -> RandomInsert:
 
 
 def _on_ties(box, plan, size):
-    """Return the box with its walls on planes of a grid's nodes, or half-way between them."""
+    """Return the box with walls moved to planes of a grid's nodes, or half-way between them."""
     moved = list(box)
     for axis, extent in zip((0, 2), plan, strict=True):
         half = extent / round(extent / size) / 2
@@ -105,7 +106,7 @@ def _on_ties(box, plan, size):
 
 
 def _interval(random, low, high, least, most):
-    """Return a random interval within [low, high], half of them on round numbers."""
+    """Return a random interval within [low, high]; half of the intervals are round numbers."""
     size = random.uniform(least, min(most, high - low))
     start = random.uniform(low, high - size)
     if random.random() < 0.5:
@@ -114,7 +115,7 @@ def _interval(random, low, high, least, most):
 
 
 def _feature(random, kind, length, width, height):
-    """Return a kind and its box: x, y and z from and to, mm."""
+    """Return a kind and the box of the feature: lower and upper x, y and z, mm."""
     x, z = (-length / 2, length / 2), (-width / 2, width / 2)
     inner_x, inner_z = (x[0] + 4, x[1] - 4), (z[0] + 4, z[1] - 4)
     if kind == "ridge":  # along x or along z, up to the outline
@@ -133,7 +134,7 @@ def _feature(random, kind, length, width, height):
     box = _interval(random, *inner_x, 4, 14), (0, height), _interval(random, *inner_z, 4, 14)
     if kind == "void":
         return kind, (box[0], (0.3 * height, 0.7 * height), box[2])
-    return kind, box  # a hole, or for a dish a place that is not used
+    return kind, box  # a hole; for a dish the box is not used
 
 
 def _filled(features, size):
@@ -165,17 +166,17 @@ def _filled(features, size):
 
 
 def _refined(planes, step):
-    """Return the planes with even ones between them, at most `step` apart."""
+    """Return the planes and evenly spaced planes between them, at most `step` apart."""
     parts = [np.linspace(a, b, int(np.ceil((b - a) / step)) + 1)[:-1] for a, b in pairwise(planes)]
     return np.concatenate([*parts, planes[-1:]])
 
 
 def _shaped(random, surface, height, dished, symmetric, upright):
-    """Return the block dished, its walls slanted, turned, tilted and moved, each perhaps."""
+    """Return the block with dishes if `dished`, with random slants of walls in a random pose."""
     points = surface.vertices.copy()
     half = np.abs(points[:, [0, 2]]).max(axis=0)
     share = points[:, 1] / height
-    if dished:  # two dishes, deeper towards the middle of either side
+    if dished:  # two dishes, deepest in the middle of each side
         u, v = points[:, 0] / half[0], (np.abs(points[:, 2]) - half[1] / 2) / (half[1] / 2)
         points[:, 1] *= 1.0 - 0.3 * np.maximum(1 - u**2, 0) * np.maximum(1 - v**2, 0)
     if upright:
@@ -199,15 +200,15 @@ def _shaped(random, surface, height, dished, symmetric, upright):
 
 
 def in_insert_frame(design: RandomInsert) -> Surface:
-    """Return the design as a run reads it: mended and placed on its flat bottom."""
-    mended = repair(design.surface.vertices, design.surface.faces)
-    assert not mended.holes and not len(mended.forks) and not mended.one_sided
-    surface = Surface(mended.vertices, mended.faces, "insert", merged=True)
+    """Return the design as in a run: repaired, and in the insert frame."""
+    repaired = repair(design.surface.vertices, design.surface.faces)
+    assert not repaired.holes and not len(repaired.forks) and not repaired.one_sided
+    surface = Surface(repaired.vertices, repaired.faces, "insert", merged=True)
     return surface.moved(insert_placement(surface))
 
 
 def lattice_error(design: RandomInsert) -> float:
-    """Return by how much the volume of a run's lattice differs from the mesh's, as a share.
+    """Return the relative difference between the volumes of a run's lattice and of the mesh.
 
     Raises:
         InputError: the lattice is refused.
@@ -218,10 +219,7 @@ def lattice_error(design: RandomInsert) -> float:
 
 
 def share_of_load(design: RandomInsert, contact: str = "lattice-linear") -> float | None:
-    """Return the share of 1000 N that the medial one of two condyles carries.
-
-    None where they would not both stand on the insert's main plane.
-    """
+    """Return the medial condyle's share of 1000 N on two condyles; None if the press fails."""
     insert = in_insert_frame(design)
     width = np.ptp(insert.bounds[:, 2])
     balls = []
@@ -229,10 +227,10 @@ def share_of_load(design: RandomInsert, contact: str = "lattice-linear") -> floa
         ball = trimesh.creation.icosphere(4, 0.022)
         ball.apply_translation([0.0, 0.05, side * width / 4])
         balls.append(ball)
-    both = trimesh.util.concatenate(balls)
-    vertices = np.asarray(both.vertices)
+    spheres = trimesh.util.concatenate(balls)
+    vertices = np.asarray(spheres.vertices)
     vertices[:, 2] = np.where(vertices[:, 2] < 0, vertices[:, 2], np.abs(vertices[:, 2]))
-    femoral = Surface(vertices, np.asarray(both.faces, np.int64), "femoral", merged=True)
+    femoral = Surface(vertices, np.asarray(spheres.faces, np.int64), "femoral", merged=True)
     pair = ContactPair(femoral, insert, material("polyethylene"))
     model = contact_model(contact, max(1e3 * design.size, 1.5), cache=False)
     result = model.press(model.prepare(pair), 1000.0, np.eye(4))

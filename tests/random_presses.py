@@ -1,4 +1,7 @@
-"""Compare random presses of the lattice from random initial guesses with solutions to 1e-6."""
+"""Compare random presses of the lattice, from random initial guesses, with precise solutions.
+
+The precise solutions have a tolerance of 1e-6.
+"""
 
 import numpy as np
 
@@ -14,27 +17,27 @@ STARTS = ("cold", "warm", "heavier", "wrong pose")
 
 
 def prepared(mm, tolerance=1e-3):
-    """Return the lattice of a cell size, and its state on two condyles over a dished insert."""
+    """Return the lattice with a cell size (mm), and its state for condyles on a dished insert."""
     bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), material("polyethylene"))
     model = contact_model("lattice", mm, tolerance=tolerance)
     return model, model.prepare(bodies)
 
 
 def pose_of(rng):
-    """Return a random pose within some millimetres and degrees."""
+    """Return a random pose near the neutral one."""
     x, z = rng.uniform([-2e-3, -1e-3], [2e-3, 1e-3])
     turned = np.radians(rng.uniform([-0.5, -3.0, -5.0], [0.5, 3.0, 5.0]))
     return knee_pose([x, 0.0, z, *turned])
 
 
-def presses(model, state, wanted, exact, rng, cases):
+def presses(model, state, reference, reference_state, rng, cases):
     """Yield load, start, status and errors of random presses between 1 N and 24 kN.
 
     Args:
         model: lattice with the tolerance under test.
-        state: the state that `model` prepared.
-        wanted: lattice with a tolerance of 1e-6, for the reference solutions.
-        exact: the state that `wanted` prepared.
+        state: state that `model` prepared.
+        reference: lattice with a tolerance of 1e-6.
+        reference_state: state that `reference` prepared.
         rng: random generator of numpy.
         cases: number of presses.
     """
@@ -50,19 +53,20 @@ def presses(model, state, wanted, exact, rng, cases):
             _, start = model.press_from(state, min(4 * load, 24e3), pose)
         elif kind == "wrong pose":
             start = last
-        found, last = model.press_from(state, load, pose, start)
-        best = wanted.press(exact, load, pose, last)
-        case = {"load_N": round(load, 1), "start": kind, "status": found.status.value}
-        case |= {"passes": found.iterations, "residual": found.residual}
-        if best.status is not ContactStatus.OK:
-            yield case | {"errors": [np.nan] * 3, "reference": best.status.value}
+        result, last = model.press_from(state, load, pose, start)
+        precise = reference.press(reference_state, load, pose, last)
+        case = {"load_N": round(load, 1), "start": kind, "status": result.status.value}
+        case |= {"passes": result.iterations, "residual": result.residual}
+        if precise.status is not ContactStatus.OK:
+            yield case | {"errors": [np.nan] * 3, "reference": precise.status.value}
             continue
         areas = [
-            sum(c.area for c in (one.medial, one.lateral) if c is not None) for one in (found, best)
+            sum(c.area for c in (contact.medial, contact.lateral) if c is not None)
+            for contact in (result, precise)
         ]
         errors = (
-            abs(found.approach / best.approach - 1),
-            abs(found.pressure.max() / best.pressure.max() - 1),
+            abs(result.approach / precise.approach - 1),
+            abs(result.pressure.max() / precise.pressure.max() - 1),
             abs(areas[0] / areas[1] - 1),
         )
         yield case | {"errors": [float(f"{error:.3g}") for error in errors]}

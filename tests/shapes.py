@@ -17,7 +17,7 @@ def block(
     spacing: float = 1e-3,
     name: str = "insert",
 ) -> Surface:
-    """A closed block on y = 0 whose top is height(x, z), centred on x = z = 0."""
+    """Return a closed block on y = 0 with the top y = height(x, z), centred on x = z = 0."""
     nx, nz = round(size_x / spacing) + 1, round(size_z / spacing) + 1
     x, z = np.meshgrid(
         np.linspace(-size_x / 2, size_x / 2, nx),
@@ -41,17 +41,17 @@ def block(
 
 
 def plate(thickness: float = 0.01, spacing: float = 2e-3) -> Surface:
-    """A flat block."""
+    """Return a flat block."""
     return block(lambda x, z: np.full_like(x, thickness), spacing=spacing)
 
 
 def trough(radius: float, depth: float = 0.006, spacing: float = 1e-3) -> Surface:
-    """A block with a cylindrical trough along z, `depth` above the bottom at x = 0."""
+    """Return a block with a cylindrical trough along z; its lowest line is at y = `depth`."""
     return block(lambda x, z: depth + radius - np.sqrt(radius**2 - x**2), 0.03, 0.04, spacing)
 
 
 def two_dishes(radius: float = 0.05, apart: float = 0.044, depth: float = 0.006) -> Surface:
-    """A block with two spherical dishes, centres `apart` along z."""
+    """Return a block with two spherical dishes, with centres `apart` (m) along z."""
 
     def height(x: np.ndarray, z: np.ndarray) -> np.ndarray:
         out = np.abs(z) - apart / 2
@@ -61,26 +61,26 @@ def two_dishes(radius: float = 0.05, apart: float = 0.044, depth: float = 0.006)
 
 
 def sphere(radius: float, subdivisions: int = 4, centre: tuple = (0.0, 0.0, 0.0)) -> Surface:
-    """A sphere of triangles whose corners lie on it."""
+    """Return a triangulated sphere; its vertices lie on the exact sphere."""
     ball = trimesh.creation.icosphere(subdivisions, radius)
     return Surface(np.asarray(ball.vertices) + centre, np.asarray(ball.faces), "sphere")
 
 
 def joined(*parts: Surface) -> Surface:
-    """Several bodies as one surface (they may overlap)."""
+    """Return several bodies, which may overlap, as one surface."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
     return Surface(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
 def torus_condyle(sagittal: float, frontal: float, z: float) -> Surface:
-    """A ring in the sagittal plane: outer radius `sagittal`, `frontal` across; axis along z."""
+    """Return a torus about the z axis: outer radius `sagittal`, radius of the tube `frontal`."""
     ring = trimesh.creation.torus(sagittal - frontal, frontal, 64, 32)
     return Surface(np.add(ring.vertices, [0.0, 0.0, z]), np.asarray(ring.faces), "torus")
 
 
 def bicondylar(kind: str = "sphere", apart: float = 0.044) -> Surface:
-    """Two condyles joined by a bridge in front and above (x > 0)."""
+    """Return two condyles and a bridge between them, in front and above (x > 0)."""
     bridge = trimesh.creation.box((0.008, 0.02, apart))
     anterior = Surface(np.add(bridge.vertices, [0.02, 0.015, 0.0]), np.asarray(bridge.faces))
     if kind == "sphere":
@@ -91,10 +91,10 @@ def bicondylar(kind: str = "sphere", apart: float = 0.044) -> Surface:
 
 
 def nearest_on_triangles(triangles, points):
-    """Return for each point (n, 3) the nearest one (n, 3) of its own triangle (n, 3, 3).
+    """Return the point (n, 3) of each triangle (n, 3, 3) that is nearest to its point (n, 3).
 
-    The foot on the triangle's plane where that lies inside, else the nearest of the feet on
-    the three edges. Free of absolute tolerances, so right for triangles of any size.
+    It is the projection onto the triangle's plane if it lies inside the triangle, else the nearest
+    projection onto an edge. Without absolute tolerances it is correct for triangles of any size.
     """
     weights = _plane_weights(triangles, points)
     feet = np.einsum("ij,ijk->ik", weights, triangles)
@@ -111,7 +111,7 @@ def nearest_on_triangles(triangles, points):
 
 
 def _plane_weights(triangles, points):
-    """Return barycentric coordinates (n, 3) of the feet on the planes; NaN without area."""
+    """Return barycentric coordinates (n, 3) of projections onto the planes; NaN without area."""
     a = triangles[:, 0]
     u, v, w = triangles[:, 1] - a, triangles[:, 2] - a, points - a
     uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)

@@ -1,7 +1,7 @@
 """Lines on a surface: U and V splines with their normals, and arc lengths.
 
-U lines join the points of a grid at constant z, V lines those at constant x; both are piecewise
-cubic splines y(x) and y(z). Their tangents (1, y_x, 0) and (0, y_z, 1) span the tangent plane.
+A U line connects the points of a grid with the same z by a cubic spline y(x), a V line those with
+the same x by y(z). The tangents (1, y_x, 0) and (0, y_z, 1) span the tangent plane.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from tkamb.geometry.surface import Surface
 Index = NDArray[np.int64]
 
 STEP = 5e-4
-"""m between the samples of an arc."""
+"""m: spacing of the samples of an arc."""
 LEAST_SAMPLES = 9
-"""Samples of the shortest arc."""
+"""Smallest number of samples of an arc."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +42,9 @@ class UVLines:
 
     @property
     def mean_line_normals(self) -> Array:
-        """Sharma's (2008) normals (n, 3): mean of the lines' own normals, for comparison only.
+        """Normals (n, 3) of Sharma (2008): the mean of the normals of the U and the V line.
 
-        On a slope that one line does not see it errs by half the slope.
+        On a slope along one of the lines the error is half the slope.
         """
         zero, one = np.zeros(len(self.points)), np.ones(len(self.points))
         of_u = _unit(np.column_stack([-self.slope_x, one, zero]))
@@ -53,14 +53,12 @@ class UVLines:
 
 
 def draw_uv_lines(points: Array, i: Index, k: Index) -> UVLines:
-    """Return the U and V lines through points of a grid.
-
-    A line is interrupted where the grid lacks a point.
+    """Return the U and V lines through points of a grid; a missing point interrupts a line.
 
     Args:
         points: (n, 3) m, at most one per column of the grid.
-        i: (n,) place along x in the grid.
-        k: (n,) place along z in the grid.
+        i: (n,) index of the column along x.
+        k: (n,) index of the column along z.
     """
     return UVLines(
         points,
@@ -70,17 +68,17 @@ def draw_uv_lines(points: Array, i: Index, k: Index) -> UVLines:
 
 
 def arc_lengths(surface: Surface, start: Array, end: Array, side: float = 1.0) -> Array:
-    """Return lengths (n,) m along the surface from start to end, in vertical planes.
+    """Return lengths (n,), m, along the surface from start to end, in vertical planes.
 
-    The surface is cut by the plane along y through both points: rays along y at even steps of
-    0.5 mm, a cubic spline through their hits, and the integral of sqrt(1 + (dy/ds)²). The
-    surface must be a height field between the points; NaN where it is not there.
+    Rays along y at steps of 0.5 mm meet the surface, which must be a height field. A cubic spline
+    connects the crossings, and sqrt(1 + (dy/ds)²) is integrated along it. The length is NaN if a
+    ray does not meet the surface.
 
     Args:
-        surface: any frame whose y is vertical.
+        surface: surface in a frame with a vertical y axis.
         start: (n, 3) m; only x and z are used.
         end: (n, 3) m; only x and z are used.
-        side: 1 for the surface seen from above (an insert), -1 from below (a femur).
+        side: 1 for the upper surface (an insert), -1 for the lower one (a femur).
     """
     start, end = (np.atleast_2d(np.asarray(p, float)) for p in (start, end))
     across = np.linalg.norm((end - start)[:, [0, 2]], axis=1)
@@ -114,7 +112,7 @@ def _gauss_points(knots: Array) -> tuple[Array, Array]:
 
 
 def _slopes(place: Array, height: Array, along: Index, line: Index) -> Array:
-    """Return the slope of the spline at every point; runs of one point have none."""
+    """Return the slope of the spline at every point; NaN for a point alone on its line."""
     order = np.lexsort((along, line))
     gap = (np.diff(line[order]) != 0) | (np.diff(along[order]) != 1)
     slope = np.full(len(place), np.nan)

@@ -1,4 +1,4 @@
-"""Estimates that contradict each other are flagged; the split's sensitivity to adduction."""
+"""Contradictory estimates of the split are flagged; sensitivity of the split to adduction."""
 
 from functools import cache
 from pathlib import Path
@@ -39,8 +39,7 @@ def shipped(tmp_path_factory):
     return simulate(write_scene(tmp_path_factory.mktemp("shipped"), **COARSE), frames=FRAMES)
 
 
-def test_the_tangent_and_a_turned_press_tell_the_same_of_the_shipped_knee(tmp_path):
-    """Within the roughness of its facets."""
+def test_split_sensitivities_by_tangent_and_by_presses_agree_on_the_shipped_knee(tmp_path):
     case = load_case(load_scene(write_scene(tmp_path)))
     side = contact_side(case, mechanics_of(case))
     for k in (10, 60, 95):
@@ -51,10 +50,9 @@ def test_the_tangent_and_a_turned_press_tell_the_same_of_the_shipped_knee(tmp_pa
 
 
 @pytest.mark.parametrize("name", ["foundation-linear", "lattice-linear"])
-def test_two_spheres_share_by_their_stiffness(name):
-    """A layer carries F = c d^2 under a sphere: dF/dd = 2F/d, half the width apart per radian.
-
-    An elastic body carries F = c d^(3/2) (Hertz).
+def test_split_sensitivity_of_two_spheres_has_its_closed_form(name):
+    """A layer carries F = c d^2 under a sphere, an elastic body F = c d^(3/2) (Hertz). The
+    sensitivity is dF/dd times half the distance of the spheres.
     """
     power, load = {"foundation-linear": (2.0, 1000.0), "lattice-linear": (1.5, 1000.0)}[name]
     pair = flat_joint()
@@ -65,8 +63,8 @@ def test_two_spheres_share_by_their_stiffness(name):
     assert split_sensitivity(Probe(model, state), result) == pytest.approx(expected, rel=0.1)
 
 
-def test_the_tangent_of_a_layer_under_two_spheres():
-    """A ring of columns that enters makes the tangent jump: by less, the finer they are."""
+def test_split_tangent_of_a_layer_under_two_spheres_has_its_closed_form():
+    """The tangent jumps when columns come into contact, by less with finer columns."""
     model, load = contact_model("foundation-linear", 0.25), 1000.0
     state = model.prepare(flat_joint())
     result = model.press(state, load, knee_pose(np.zeros(6)))
@@ -74,8 +72,8 @@ def test_the_tangent_of_a_layer_under_two_spheres():
     assert split_tangent(model.probe(state), result) == pytest.approx(expected, rel=0.02)
 
 
-def test_a_probe_sees_in_a_result_what_it_finds_at_its_pose():
-    """To the bit, also where the search for it had looked at columns about another pose."""
+def test_a_probe_of_a_result_equals_a_probe_at_its_pose():
+    """To the bit, also after an evaluation at another pose."""
     model = contact_model("foundation", 1.0)
     state = model.prepare(flat_joint())
     result = model.press(state, 1000.0, knee_pose(np.zeros(6)))
@@ -83,14 +81,14 @@ def test_a_probe_sees_in_a_result_what_it_finds_at_its_pose():
     away[:3, 3] += [5e-3, 2e-3, 0.0]
     probe = model.probe(state)
     probe.at(away)
-    seen, found = probe.seen(result), model.probe(state).at(result.pose)
-    assert set(seen.condyles) == set(found.condyles) == {"medial", "lateral"}
-    for side, condyle in seen.condyles.items():
-        assert np.array_equal(condyle.wrench, found.condyles[side].wrench)
-        assert np.array_equal(condyle.stiffness, found.condyles[side].stiffness)
+    from_result, at_pose = probe.seen(result), model.probe(state).at(result.pose)
+    assert set(from_result.condyles) == set(at_pose.condyles) == {"medial", "lateral"}
+    for side, condyle in from_result.condyles.items():
+        assert np.array_equal(condyle.wrench, at_pose.condyles[side].wrench)
+        assert np.array_equal(condyle.stiffness, at_pose.condyles[side].stiffness)
 
 
-def test_a_probe_looks_at_the_whole_bed_where_a_result_failed():
+def test_a_probe_of_a_failed_result_evaluates_all_columns():
     model = contact_model("foundation", 1.0)
     state = model.prepare(flat_joint())
     pose = model.press(state, 1000.0, knee_pose(np.zeros(6))).pose
@@ -98,8 +96,8 @@ def test_a_probe_looks_at_the_whole_bed_where_a_result_failed():
     assert set(model.probe(state).seen(failed).condyles) == {"medial", "lateral"}
 
 
-def test_sensitivity_is_the_slope_of_presses_farther_apart(tmp_path):
-    """Of the run's own column: 0.05 deg to either side, at the load of the equations."""
+def test_sensitivity_is_the_difference_quotient_of_presses(tmp_path):
+    """Presses at ±0.05 deg of adduction, with the load of the equations of motion."""
     case = load_case(load_scene(write_scene(tmp_path)))
     side = contact_side(case, mechanics_of(case))
     body, contact = side.frame(60)
@@ -111,10 +109,10 @@ def test_sensitivity_is_the_slope_of_presses_farther_apart(tmp_path):
         medial.append(side.model.press(side.state, load, knee_pose(place)).medial.force)
     slope = np.diff(medial)[0] / np.radians(0.1)
     assert contact.sensitivity == pytest.approx(slope, rel=0.03)
-    assert slope > 0  # varus loads the medial condyle
+    assert slope > 0  # a varus rotation loads the medial condyle
 
 
-def test_the_shipped_knee_agrees_with_itself_and_says_what_half_a_degree_does(shipped):
+def test_the_shipped_knee_has_no_contradiction_and_states_the_effect_of_half_a_degree(shipped):
     # At this coarse spacing the contact is too narrow for its columns; nothing else is flagged.
     parts = {part for status in shipped.status for part in status.split("; ")}
     assert all(part == "ok" or TOO_NARROW in part or "take finer" in part for part in parts)
@@ -128,7 +126,7 @@ def test_the_shipped_knee_agrees_with_itself_and_says_what_half_a_degree_does(sh
     assert card.detail.startswith("by equilibrium")
 
 
-def test_with_adduction_released_nothing_hangs_on_the_recorded_one(tmp_path):
+def test_released_adduction_has_no_sensitivity(tmp_path):
     path = write_scene(tmp_path, contact__released=["adduction"], **COARSE)
     results = simulate(path, frames=slice(60, 61))
     assert np.isnan(results["medial_force_per_adduction_N_per_deg"]).all()
@@ -136,7 +134,7 @@ def test_with_adduction_released_nothing_hangs_on_the_recorded_one(tmp_path):
     assert "0.5 deg" not in share_card(results).detail
 
 
-def test_an_insert_turned_back_to_front_is_flagged(tmp_path):
+def test_an_insert_with_reversed_axes_is_flagged(tmp_path):
     path = write_scene(tmp_path, implant__insert__axes="-x,+y,-z", **COARSE)
     results = simulate(path, frames=FRAMES)
     for status in results.status:
@@ -170,7 +168,7 @@ def dm_side():
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
 @pytest.mark.parametrize("k", [27, 28, 29, 30, 31, 69, 86, 90, 94])
-def test_subject_dms_contradicting_frames_are_flagged(k):
+def test_contradictory_frames_of_dm_are_flagged(k):
     case, side = dm_side()
     words = contradictions(case, *side.frame(k))
     assert any("by deformation contradicts" in word for word in words)

@@ -1,4 +1,4 @@
-"""Contact at the edge of the insert's articular surface is flagged, and said beside the peak."""
+"""Contact at the edge of the insert's articular surface is flagged."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ HALF = 15 * MM
 
 
 def filleted(fillet=3 * MM, height=9 * MM):
-    """A plateau whose top turns down over a fillet to its walls on all sides."""
+    """Return an insert with a flat top and a fillet along its outline."""
 
     def top(x, z):
         beyond = np.maximum(np.maximum(np.abs(x), np.abs(z)) - (HALF - fillet), 0.0)
@@ -27,7 +27,7 @@ def filleted(fillet=3 * MM, height=9 * MM):
 
 
 def with_eminence():
-    """A flat insert with a steep ridge along x in its middle."""
+    """Return a flat insert with a steep ridge along x in the middle."""
     return dished_insert(
         lambda x, z: 8 * MM + np.clip(8 * MM - 3 * np.abs(z), 0.0, 6 * MM), half_z=30 * MM
     )
@@ -36,23 +36,25 @@ def with_eminence():
 def flags(insert, x, z, model="foundation-linear", radius=20 * MM, load=150.0):
     chosen = contact_model(model, 1.0, **({"cache": False} if model.startswith("lat") else {}))
     pair = ContactPair(graded_sphere(radius), insert, LINEAR)
-    found = chosen.press(chosen.prepare(pair), load, pose(np.eye(3), [x, 0, z]))
-    return [flag for flag in found.flags if "edge of the insert" in flag]
+    result = chosen.press(chosen.prepare(pair), load, pose(np.eye(3), [x, 0, z]))
+    return [flag for flag in result.flags if "edge of the insert" in flag]
 
 
 @pytest.mark.parametrize("model", ["foundation-linear", "lattice-linear", "hertz"])
-def test_the_distance_of_contact_from_the_edge_decides(model):
+def test_contact_near_the_edge_is_flagged(model):
     insert = flat_insert(8 * MM)
     assert flags(insert, 0, 0, model) == []
     assert flags(insert, 6 * MM, 0, model) == []
-    load = 20.0 if model == "hertz" else 150.0  # an ellipse must not leave the insert
+    load = (
+        20.0 if model == "hertz" else 150.0
+    )  # with a larger load the ellipse would leave the insert
     for x, z in ((13.2 * MM, 0), (-13.2 * MM, 0), (0, 13.2 * MM), (3 * MM, -13.2 * MM)):
         (flag,) = flags(insert, x, z, model, load=load)
         assert "its peak pressure lies there" in flag
 
 
-def test_the_fillet_of_a_rim_is_beyond_the_edge():
-    """The articular surface ends where the fillet turns down by 50 deg, 0.7 mm inside the wall."""
+def test_the_edge_is_where_the_fillet_is_steep():
+    """The articular surface ends at a slope of 50 deg on the fillet, 0.7 mm inside the wall."""
     edge = ArticularEdge.of(filleted())
     at = np.array([[x * MM, 9 * MM, 0.0] for x in (0, 8, 12, 13.5, 14.2, 14.9)])
     ends = HALF - 3 * MM * (1 - np.sin(EDGE.steepest))
@@ -63,28 +65,28 @@ def test_the_fillet_of_a_rim_is_beyond_the_edge():
     assert not flags(filleted(), 7 * MM, 0)
 
 
-def test_the_flank_of_an_eminence_is_no_edge():
+def test_the_flank_of_an_eminence_is_not_an_edge():
     edge = ArticularEdge.of(with_eminence())
     away = edge.distance(np.array([[0, 0, 0], [0, 0, 3 * MM], [0, 0, 8 * MM]]))
-    assert (away > 10 * MM).all()  # where the ridge meets the outline, 4 mm of it are a rim
+    assert (away > 10 * MM).all()  # the ends of the ridge at the outline belong to the rim
     assert not flags(with_eminence(), 0, 6 * MM, radius=8 * MM)
 
 
 def test_each_condyle_has_its_own_flag():
-    both = joined(*(graded_sphere(20 * MM, (0, 0, z * MM)) for z in (-22, 22)))
+    condyles = joined(*(graded_sphere(20 * MM, (0, 0, z * MM)) for z in (-22, 22)))
     insert = flat_insert(8 * MM, half_x=15 * MM, half_z=34 * MM)
     model = LinearFoundation(1 * MM)
-    state = model.prepare(ContactPair(both, insert, LINEAR))
+    state = model.prepare(ContactPair(condyles, insert, LINEAR))
     for shift, side in ((-9.5 * MM, "medial"), (9.5 * MM, "lateral")):
-        found = model.press(state, 400.0, pose(np.eye(3), [0, 0, shift]))
-        (flag,) = [flag for flag in found.flags if "edge of the insert" in flag]
+        result = model.press(state, 400.0, pose(np.eye(3), [0, 0, shift]))
+        (flag,) = [flag for flag in result.flags if "edge of the insert" in flag]
         assert flag.startswith(f"the {side} contact")
     level = model.press(state, 400.0, np.eye(4))
     assert not [flag for flag in level.flags if "edge of the insert" in flag]
 
 
 @pytest.mark.parametrize("shift", [0.0, 7.0])
-def test_the_distance_of_the_peak_is_told(shift):
-    """A wide, flat contact reaches the edge while its peak stays inside."""
+def test_the_flag_states_the_distance_of_the_peak(shift):
+    """A wide, flat contact reaches the edge with its peak inside."""
     (flag,) = flags(flat_insert(8 * MM), (8 + shift) * MM, 0, radius=60 * MM, load=4000.0)
     assert ("lies there" in flag) == (shift > 0)

@@ -1,4 +1,4 @@
-"""Cam and post: a second pair of surfaces beside the condyles, in a turned frame."""
+"""Cam and post: a second contact pair besides the condyles, in a turned frame."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +56,7 @@ def parts(insert):
 
 
 def place(flexion_deg, ap_mm=-6.5, rotation_deg=0.0, adduction_deg=0.0, ml_mm=0.0):
-    """Return a pose in which the condyles about touch the dishes."""
+    """Return a pose in which the condyles nearly touch the dishes."""
     lengths = np.array([ap_mm, 29.6, ml_mm]) * MILLIMETRE
     return knee_pose([*lengths, *np.radians([rotation_deg, adduction_deg, flexion_deg])])
 
@@ -78,7 +78,7 @@ def cylinder(radius, length):
 
 
 def cylinder_on_post(model, law=LINEAR, size_mm=1.0, radius=RADIUS):
-    """Return a cylinder behind a rectangular post, whose posterior face is x = 0."""
+    """Return a cylinder behind a rectangular post with its posterior face in x = 0."""
     box = trimesh.creation.box((DEPTH, TALL, LENGTH))
     middle = np.array([DEPTH / 2, TALL / 2, 0.0])
     post = Surface(np.asarray(box.vertices) + middle, np.asarray(box.faces, np.int64), "post")
@@ -114,12 +114,11 @@ def test_the_post_is_divided_from_the_dishes_and_both_stay_closed(insert, parts)
     ("model", "size_mm", "tolerance"),
     [("foundation", 1.0, 1e-9), pytest.param("lattice", 2.0, 5e-3, marks=pytest.mark.slow)],
 )
-def test_condyles_alone_are_as_without_the_division(
+def test_the_division_does_not_change_the_contact_of_the_condyles(
     femoral, insert, parts, model, size_mm, tolerance
 ):
-    """If the cam is far from the post, both pairs together carry the same load as the whole insert.
-
-    The lattice's grid divides a box of another height, so that its cells are others.
+    """The cam is far from the post. The lattice's cells change, because the height of the box
+    changes.
     """
     dishes, post = parts
     chosen, pose = contact_model(model, size_mm), place(40.0, -5.4, 3.0)
@@ -136,8 +135,8 @@ def test_condyles_alone_are_as_without_the_division(
     assert change.max() < tolerance * -wrenches[0][1]
 
 
-def test_engagement_is_where_a_circle_meets_a_line(femoral, parts):
-    """Cylinder and plane touch where its axis lies a radius away: n . (c - p) = r."""
+def test_the_cam_engages_where_a_circle_touches_a_line(femoral, parts):
+    """Cylinder and plane touch if the distance of the axis is a radius: n . (c - p) = r."""
     cam, posts = DESIGN.femoral.cam, DESIGN.insert.post
     slope = posts.height / posts.draft
     normal = np.array([-slope, 1.0]) / np.hypot(slope, 1.0)
@@ -153,36 +152,36 @@ def test_engagement_is_where_a_circle_meets_a_line(femoral, parts):
         return normal @ (centre - foot) - cam.radius
 
     pair = CamPost(contact_model("foundation"), femoral, parts[1], 0.0, LINEAR)
-    found = brentq(lambda flexion: pair.at(place(flexion, ap(flexion))).gap, 60.0, 100.0, xtol=1e-4)
-    assert found == pytest.approx(brentq(distance, 60.0, 100.0), abs=0.01)
-    assert (pair.at(place(found - 0.1, ap(found - 0.1))).force == 0).all()
-    assert pair.at(place(found + 1.0, ap(found + 1.0))).force[0] > 1.0
+    result = brentq(
+        lambda flexion: pair.at(place(flexion, ap(flexion))).gap, 60.0, 100.0, xtol=1e-4
+    )
+    assert result == pytest.approx(brentq(distance, 60.0, 100.0), abs=0.01)
+    assert (pair.at(place(result - 0.1, ap(result - 0.1))).force == 0).all()
+    assert pair.at(place(result + 1.0, ap(result + 1.0))).force[0] > 1.0
 
 
-def test_a_cylinder_on_the_foundation_is_the_bonded_layers_closed_form():
+def test_a_cylinder_on_the_foundation_has_its_closed_form():
     """p = M d/h under a parabola: F = 4 M w delta a/(3 h), a = sqrt(2 R delta), peak M delta/h."""
     overlap = 0.3e-3
-    found = cylinder_on_post("foundation-linear", size_mm=0.5).at(pressed_in(overlap))
+    result = cylinder_on_post("foundation-linear", size_mm=0.5).at(pressed_in(overlap))
     half, stiff = np.sqrt(2 * RADIUS * overlap), LINEAR.confined_modulus / DEPTH
-    assert found.force[0] == pytest.approx(4 / 3 * stiff * overlap * half * LENGTH, rel=0.02)
-    assert found.peak_pressure == pytest.approx(stiff * overlap, rel=0.01)
-    assert found.area == pytest.approx(2 * half * LENGTH, rel=0.05)
-    assert found.gap == pytest.approx(-overlap, abs=1e-6)
-    assert found.centre == pytest.approx([0.0, TALL / 2, 0.0], abs=1e-5)
-    assert np.abs(found.force[1:]).max() < 1e-3 * found.force[0]
+    assert result.force[0] == pytest.approx(4 / 3 * stiff * overlap * half * LENGTH, rel=0.02)
+    assert result.peak_pressure == pytest.approx(stiff * overlap, rel=0.01)
+    assert result.area == pytest.approx(2 * half * LENGTH, rel=0.05)
+    assert result.gap == pytest.approx(-overlap, abs=1e-6)
+    assert result.centre == pytest.approx([0.0, TALL / 2, 0.0], abs=1e-5)
+    assert np.abs(result.force[1:]).max() < 1e-3 * result.force[0]
 
 
 def test_work_of_the_cam_is_the_energy_of_the_foundation():
-    """The work of the force equals the energy of the linear springs."""
     pair, steps = cylinder_on_post("foundation-linear"), np.linspace(0.0, 0.4e-3, 17)
     work = np.trapezoid([pair.at(pressed_in(d)).force[0] for d in steps], steps)
     last = pair.model.evaluate(pair.state, pair.in_turned @ pressed_in(steps[-1]))
-    held = 0.5 * last.pressure @ (last.area * np.maximum(-last.gap, 0.0))
-    assert work == pytest.approx(held, rel=2e-3)
+    stored = 0.5 * last.pressure @ (last.area * np.maximum(-last.gap, 0.0))
+    assert work == pytest.approx(stored, rel=2e-3)
 
 
 def test_lattice_and_finite_elements_agree_on_the_post():
-    """Nonlinear; force, area and peak of the same pose."""
     lattice, fe = (
         cylinder_on_post(model, CURVED, 1.0, 30e-3).at(pressed_in(0.15e-3, 30e-3))
         for model in ("lattice", "fe")
@@ -194,20 +193,22 @@ def test_lattice_and_finite_elements_agree_on_the_post():
 
 @pytest.mark.slow
 def test_a_cylinder_on_a_deep_post_is_hertzs_line_contact():
-    """Half-width b = 2 sqrt(F R/(pi E*)), peak 2 F/(pi b), F per length as found (Johnson 1985)."""
-    found = cylinder_on_post("lattice-linear", LINEAR, 0.75, 30e-3).at(pressed_in(0.1e-3, 30e-3))
-    per_length, strain = found.force[0] / LENGTH, 1.0 - LINEAR.poisson_ratio**2
+    """Half-width b = 2 sqrt(F R/(pi E*)) and peak 2 F/(pi b), with the force per length F (Johnson
+    1985).
+    """
+    result = cylinder_on_post("lattice-linear", LINEAR, 0.75, 30e-3).at(pressed_in(0.1e-3, 30e-3))
+    per_length, strain = result.force[0] / LENGTH, 1.0 - LINEAR.poisson_ratio**2
     half = 2.0 * np.sqrt(per_length * 30e-3 * strain / (np.pi * LINEAR.young_modulus))
-    assert found.area == pytest.approx(2.0 * half * LENGTH, rel=0.05)
-    assert found.peak_pressure == pytest.approx(2.0 * per_length / (np.pi * half), rel=0.05)
+    assert result.area == pytest.approx(2.0 * half * LENGTH, rel=0.05)
+    assert result.peak_pressure == pytest.approx(2.0 * per_length / (np.pi * half), rel=0.05)
 
 
-def test_stiffness_is_the_change_of_the_wrench(femoral, parts):
+def test_stiffness_is_the_derivative_of_the_wrench(femoral, parts):
     """Central differences of the wrench about the insert's origin, in all six directions."""
     pair = CamPost(contact_model("foundation"), femoral, parts[1], 0.0, CURVED)
     probe, pose, step = pair.probe(), place(95.0, -6.2, 2.0, 0.5), 2e-7
-    seen = probe.at(pose).post
-    assert seen.force > 500
+    load = probe.at(pose).post
+    assert load.force > 500
     for i in range(6):
         wrenches = []
         for sign in (1, -1):
@@ -218,8 +219,8 @@ def test_stiffness_is_the_change_of_the_wrench(femoral, parts):
             wrenches.append(probe.at(moved @ pose).post.wrench)
         size = 2 * step / (1.0 if i < 3 else 0.03)
         slope = (wrenches[0] - wrenches[1]) / size
-        assert seen.stiffness[:, i] == pytest.approx(slope, abs=2e-3 * np.abs(slope).max())
-    assert seen.wrench == pytest.approx(np.append(pair.at(pose).force, seen.wrench[3:]), rel=1e-9)
+        assert load.stiffness[:, i] == pytest.approx(slope, abs=2e-3 * np.abs(slope).max())
+    assert load.wrench == pytest.approx(np.append(pair.at(pose).force, load.wrench[3:]), rel=1e-9)
 
 
 def test_power_is_the_same_in_both_frames():
@@ -227,15 +228,19 @@ def test_power_is_the_same_in_both_frames():
     pose = knee_pose(rng.normal(size=6))
     point, force, shift, spin = rng.normal(size=(4, 3))
     velocity = shift + np.cross(spin, point)
-    there = twist_matrix(pose) @ np.concatenate([shift, spin])
+    turned_twist = twist_matrix(pose) @ np.concatenate([shift, spin])
     moved = rotate(pose, point[None])[0] + pose[:3, 3]
-    assert there[:3] + np.cross(there[3:], moved) == pytest.approx(pose[:3, :3] @ velocity)
+    assert turned_twist[:3] + np.cross(turned_twist[3:], moved) == pytest.approx(
+        pose[:3, :3] @ velocity
+    )
     assert force @ velocity == pytest.approx((pose[:3, :3] @ force) @ (pose[:3, :3] @ velocity))
 
 
 @pytest.fixture(scope="module")
 def knee(tmp_path_factory):
-    """Return a function that makes the contact side of the shipped bend with such an implant."""
+    """Return a function from released coordinates to the contact side of the shipped bend with a
+    cam.
+    """
     folder = tmp_path_factory.mktemp("bend")
     DESIGN.write_meshes(folder / "ps")
     changes = {
@@ -259,7 +264,9 @@ def knee(tmp_path_factory):
 
 @pytest.mark.parametrize(("released", "frame"), [((), 58), (("ap", "adduction"), 80)])
 def test_condyles_and_post_together_balance_the_shank(knee, released, frame):
-    """The sum of ground, weight and inertia, ligaments, condyles, post and residuals is zero."""
+    """The wrenches of ground, weight, inertia, ligaments, condyles, post and residuals add up to
+    zero.
+    """
     side = knee(*released)
     body, contact = side.frame(frame)
     geometry, values, friction = body.geometry, body.loads.values, side.mechanics.friction
@@ -275,9 +282,9 @@ def test_condyles_and_post_together_balance_the_shank(knee, released, frame):
         push = -values[f"{name}_normal"] * condyle.direction(friction)
         total = total + wrench_of(condyle.point, push)
     at = np.mean([condyle.point for condyle in geometry.condyles.values()], axis=0)
-    kept = np.array([values["residual_ap"], 0.0, values["residual_ml"]])
+    remaining = np.array([values["residual_ap"], 0.0, values["residual_ml"]])
     moment = np.array([0.0, values["residual_axial"], values["residual_flexion"]])
-    total = total + wrench_of(at, kept) + np.append(np.zeros(3), moment)
+    total = total + wrench_of(at, remaining) + np.append(np.zeros(3), moment)
     assert total == pytest.approx(np.zeros(6), abs=1e-6)
     if not released:
         pressed = -contact.result.wrench_on_insert[1]
@@ -288,7 +295,7 @@ def test_condyles_and_post_together_balance_the_shank(knee, released, frame):
     assert contact.result.lateral.force == pytest.approx(values["lateral_normal"], rel=2e-3)
 
 
-def test_without_friction_the_equations_get_the_pairs_own_wrench(knee):
+def test_without_friction_the_equations_get_the_wrench_of_the_pair(knee):
     side = knee()
     load = side.post.at(place(95.0, -6.2, 2.0)).load
     smooth = replace(side.mechanics.instant(58), friction=0.0)
@@ -296,7 +303,7 @@ def test_without_friction_the_equations_get_the_pairs_own_wrench(knee):
     assert total_wrench([push], np.zeros(3)) == pytest.approx(load.wrench, abs=1e-9)
 
 
-def test_a_recorded_overlap_is_asked_about_and_a_deep_one_fails(knee):
+def test_a_recorded_overlap_is_flagged_and_a_deep_one_fails(knee):
     contact = knee().frame(59)[1]
     assert contact.post.gap < -0.5e-3
     assert any("release ap" in flag for flag in contact.post.flags)
@@ -312,12 +319,12 @@ def test_an_insert_without_a_post_is_refused(tmp_path, capsys):
     out = tmp_path / "out"
     scene = write_scene(tmp_path / "knee", contact__post=True)
     assert main(["run", str(scene), "--out", str(out)]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert said == ["tkamb: [contact] post: the insert has no post; leave the key out"]
+    message = capsys.readouterr().err.strip().splitlines()
+    assert message == ["tkamb: [contact] post: the insert has no post; leave the key out"]
     assert not out.exists()
 
 
-def test_what_has_no_cam_or_no_line_contact_is_refused(femoral, parts):
+def test_a_femur_without_cam_and_a_model_without_line_contact_are_refused(femoral, parts):
     with pytest.raises(InputError, match="has no line contact"):
         CamPost(contact_model("hertz"), femoral, parts[1], 0.0, CURVED)
     bare = surface(DESIGN.femoral.mesh(), "femoral component")
@@ -328,18 +335,17 @@ def test_what_has_no_cam_or_no_line_contact_is_refused(femoral, parts):
 
 
 @pytest.mark.slow
-def test_a_left_knee_gives_the_right_knees_numbers(tmp_path):
-    """Files that are reflected in the sagittal plane give the same columns."""
+def test_a_mirrored_left_knee_gives_the_columns_of_the_right_knee(tmp_path):
     overrides = {"contact.post": True, "contact.released": ["ap", "adduction"]}
-    found = []
+    result = []
     for scene in (write_scene(tmp_path / "right"), write_mirrored_patient(tmp_path / "left")):
         DESIGN.write_meshes(tmp_path / "ps")
         for mesh, name in ((CAM_MESH, "femoral_component.stl"), (INSERT_MESH, "insert.stl")):
             if scene.parent.name == "left":
                 mirror_mesh(tmp_path / "ps" / mesh)
             (tmp_path / "ps" / mesh).replace(scene.parent / name)
-        found.append(simulate(load_scene(scene, overrides), frames=slice(70, 81, 10)))
-    right, left = found
+        result.append(simulate(load_scene(scene, overrides), frames=slice(70, 81, 10)))
+    right, left = result
     assert right["post_force_ap_N"].min() > 100
     for name in right.columns:
         if name != "status" and not name.endswith("_seconds"):

@@ -1,4 +1,4 @@
-"""Condyles, closest and lowest points: closed forms, brute force, and subject DM's gaps."""
+"""Condyles, closest and lowest points, against closed forms, brute force and DM's gaps."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -42,7 +42,7 @@ def part(subject, name):
 
 
 def test_nearest_points_of_triangles_of_any_size_or_shape():
-    """Against dense samples; slivers and points without area among them."""
+    """Against dense samples; some triangles are slivers or have no area."""
     rng = np.random.default_rng(0)
     triangles = rng.normal(size=(200, 3, 3))
     triangles[:40, 2] = triangles[:40, 1] + 1e-4 * rng.normal(size=(40, 3))
@@ -56,37 +56,37 @@ def test_nearest_points_of_triangles_of_any_size_or_shape():
     for scale in (1.0, 1e-3, 1e-5):
         distance = np.empty(len(points))
         for k, (corners, point) in enumerate(zip(triangles * scale, points * scale, strict=True)):
-            found = NearestPoints(Surface(corners, np.arange(3)[None])).at(point)
-            distance[k] = found.distance[0] / scale
-            assert np.linalg.norm(found.points[0] - point) / scale == pytest.approx(distance[k])
+            result = NearestPoints(Surface(corners, np.arange(3)[None])).at(point)
+            distance[k] = result.distance[0] / scale
+            assert np.linalg.norm(result.points[0] - point) / scale == pytest.approx(distance[k])
         assert (distance <= sampled_distance + 1e-9).all()
         assert np.allclose(distance, sampled_distance, atol=6e-3)
 
 
-def test_nearest_points_miss_nothing():
+def test_nearest_points_equal_a_brute_force_search():
     insert = two_dishes()
     rng = np.random.default_rng(1)
     points = rng.uniform([-0.02, -0.002, -0.04], [0.02, 0.03, 0.04], (150, 3))
-    found = NearestPoints(insert).at(points)
-    for point, distance in zip(points, found.distance, strict=True):
+    result = NearestPoints(insert).at(points)
+    for point, distance in zip(points, result.distance, strict=True):
         all_feet = nearest_on_triangles(insert.triangles, np.tile(point, (len(insert.faces), 1)))
         assert distance == pytest.approx(np.linalg.norm(all_feet - point, axis=1).min(), abs=1e-15)
 
 
-def test_nearest_points_within_reach_are_those_of_all():
+def test_nearest_points_within_reach_equal_those_without_a_limit():
     insert = two_dishes()
     rng = np.random.default_rng(2)
     points = rng.uniform([-0.02, -0.002, -0.04], [0.02, 0.03, 0.04], (400, 3))
     every = insert.nearest.at(points)
-    near, found = insert.nearest.within(points, 2e-3)
+    near, result = insert.nearest.within(points, 2e-3)
     assert np.array_equal(near, np.flatnonzero(every.distance <= 2e-3)) and 20 < len(near) < 380
-    assert np.array_equal(found.distance, every.distance[near])
-    assert np.array_equal(found.faces, every.faces[near])
+    assert np.array_equal(result.distance, every.distance[near])
+    assert np.array_equal(result.faces, every.faces[near])
     back = insert.nearest.at(points[::-1])  # another way through the tree
     assert np.array_equal(back.faces[::-1], every.faces)
 
 
-def test_samples_carry_the_area():
+def test_samples_have_the_area_of_the_surface():
     insert = two_dishes()
     samples, owner, areas = sampled(insert, 5e-4)
     assert areas.sum() == pytest.approx(insert.mesh.area)
@@ -132,24 +132,24 @@ def test_one_condyle_is_not_split(shape):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_sphere_over_a_plane_on_both_sides_of_touch(turned):
-    """Gap, points and normal; a face of the ball may be lowest (its sagitta is 10 µm)."""
+    """Gap, points and normal. A face of the sphere may be lowest, with a sagitta of 10 µm."""
     ball, top = sphere(RADIUS, 5), 0.01
     turn = Rotation.from_rotvec([0.3, 0.2, -0.5]) if turned else None
     query = ClosestPointQuery(ball, plate(top), None)
     for gap in STEPS:
         at = lifted(top + RADIUS + gap, 0.003, 0.002, turn)
         lowest = transform(at, ball.vertices)[:, 1].min() - top
-        found = query.at(at)
-        assert found.lateral is None
-        assert found.medial.gap == pytest.approx(lowest, abs=1e-9)
-        assert found.medial.point_on_femoral[1] == pytest.approx(top + lowest, abs=1e-9)
-        assert found.medial.point_on_insert[1] == pytest.approx(top, abs=1e-9)
-        assert found.medial.centre == pytest.approx([0.003, top, 0.002], abs=2e-4)
-        assert np.allclose(found.medial.normal, [0, 1, 0], atol=1e-9)
+        result = query.at(at)
+        assert result.lateral is None
+        assert result.medial.gap == pytest.approx(lowest, abs=1e-9)
+        assert result.medial.point_on_femoral[1] == pytest.approx(top + lowest, abs=1e-9)
+        assert result.medial.point_on_insert[1] == pytest.approx(top, abs=1e-9)
+        assert result.medial.centre == pytest.approx([0.003, top, 0.002], abs=2e-4)
+        assert np.allclose(result.medial.normal, [0, 1, 0], atol=1e-9)
 
 
 def test_sphere_in_a_trough_on_both_sides_of_touch():
-    """Trough of radius 30 mm, ball of 20 mm off its middle: gap = 30 − 20 − distance."""
+    """Trough of radius 30 mm, sphere of 20 mm: gap = 30 - 20 - distance of the axes."""
     outer, depth = 0.03, 0.006
     query = ClosestPointQuery(sphere(RADIUS, 5), trough(outer, depth, 5e-4), None)
     axis = np.array([0.0, depth + outer, 0.0])
@@ -157,10 +157,10 @@ def test_sphere_in_a_trough_on_both_sides_of_touch():
         for angle in (0.0, 0.2):
             towards = np.array([np.sin(angle), -np.cos(angle), 0.0])
             centre = axis + (outer - RADIUS - gap) * towards
-            found = query.at(lifted(centre[1], centre[0])).medial
-            assert found.gap == pytest.approx(gap, abs=1.2e-5)
-            assert found.centre == pytest.approx(axis + outer * towards, abs=4e-4)
-            assert found.normal @ -towards > np.cos(np.radians(0.7))
+            result = query.at(lifted(centre[1], centre[0])).medial
+            assert result.gap == pytest.approx(gap, abs=1.2e-5)
+            assert result.centre == pytest.approx(axis + outer * towards, abs=4e-4)
+            assert result.normal @ -towards > np.cos(np.radians(0.7))
 
 
 def test_the_gap_is_continuous_through_touch_with_slope_one():
@@ -173,8 +173,8 @@ def test_the_gap_is_continuous_through_touch_with_slope_one():
     assert np.allclose(gaps, steps, atol=5e-8)
 
 
-def test_a_coarse_face_cut_by_a_ridge_has_no_vertex_inside():
-    """Only a face of the femoral part reaches into the insert."""
+def test_an_overlap_without_a_femoral_vertex_inside_is_found():
+    """Only the inside of a femoral face lies in the insert."""
     made = trimesh.creation.box((0.06, 0.01, 0.06))
     slab = Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64))
     ball = sphere(0.01, 4)
@@ -182,8 +182,8 @@ def test_a_coarse_face_cut_by_a_ridge_has_no_vertex_inside():
     ball = ball.moved(lifted(0.005))
     query = ClosestPointQuery(slab, ball, None)
     for depth in (1e-3, 1e-4, 1e-5):
-        found = query.at(lifted(0.015 - depth + 0.005)).medial
-        assert found.gap == pytest.approx(-depth, rel=0.02, abs=1e-6)
+        result = query.at(lifted(0.015 - depth + 0.005)).medial
+        assert result.gap == pytest.approx(-depth, rel=0.02, abs=1e-6)
 
 
 def test_each_condyle_has_its_own_gap():
@@ -200,8 +200,8 @@ def test_each_condyle_has_its_own_gap():
     assert varus.lateral.gap - varus.medial.gap == pytest.approx(expected, rel=0.03)
 
 
-def test_the_ceiling_spares_only_points_outside_the_insert(monkeypatch):
-    """From 1 mm apart to 2 mm inside, turned: the gaps are those with every vertex asked."""
+def test_the_height_bound_does_not_change_gaps(monkeypatch):
+    """From 1 mm apart to 2 mm inside the gaps equal those of a search over all vertices."""
     femoral, insert = bicondylar(), two_dishes()
     bounded, all_asked = (ClosestPointQuery(femoral, insert, 0.0) for _ in range(2))
     monkeypatch.setattr(
@@ -211,24 +211,24 @@ def test_the_ceiling_spares_only_points_outside_the_insert(monkeypatch):
     for height in (0.029, 0.028, 0.0279, 0.026):
         at = knee_pose([*rng.uniform(-4e-3, 4e-3, 3), *rng.uniform(-0.05, 0.05, 2), 0.7])
         at[1, 3] = height
-        found, expected = bounded.at(at), all_asked.at(at)
+        result, expected = bounded.at(at), all_asked.at(at)
         for side in ("medial", "lateral"):
-            one, other = vars(getattr(found, side)), vars(getattr(expected, side))
-            assert all(np.array_equal(one[key], other[key]) for key in other)
+            bounded_gap, full_gap = vars(getattr(result, side)), vars(getattr(expected, side))
+            assert all(np.array_equal(bounded_gap[key], full_gap[key]) for key in full_gap)
 
 
-def test_moving_both_bodies_in_the_plane_changes_nothing():
+def test_a_move_in_the_plane_does_not_change_the_gap():
     ball, insert = sphere(RADIUS, 4), plate()
     for height in (0.0301, 0.0295):
-        here = ClosestPointQuery(ball, insert, None).at(lifted(height)).medial
+        before = ClosestPointQuery(ball, insert, None).at(lifted(height)).medial
         shift = np.array([0.002, 0.0, -0.003])
         moved = ball.moved(lifted(0.01, 0.02, -0.01, Rotation.from_rotvec([0.1, 0.2, 0.3])))
         back = inverse(lifted(0.01, 0.02, -0.01, Rotation.from_rotvec([0.1, 0.2, 0.3])))
-        there = (
+        after = (
             ClosestPointQuery(moved, insert, None).at(lifted(height, *shift[[0, 2]]) @ back).medial
         )
-        assert there.gap == pytest.approx(here.gap, abs=1e-12)
-        assert np.allclose(there.centre, here.centre + shift, atol=2e-4)
+        assert after.gap == pytest.approx(before.gap, abs=1e-12)
+        assert np.allclose(after.centre, before.centre + shift, atol=2e-4)
 
 
 # lowest points
@@ -265,11 +265,10 @@ def test_real_femurs_split_near_the_middle(subject):
 
 @needs_data
 def test_gaps_of_subject_dm_over_the_gait_cycle():
-    """The data notes' table, 5 % steps, within 0.05 mm.
+    """The gaps are those of the data's table within 0.05 mm, at steps of 5 %.
 
-    All 21 frames of both condyles agree. On the lateral dish the largest difference is
-    0.023 mm; on the medial side, in stance, the deepest point lies on the flank of the
-    eminence, where depth changes quickly along the surface, and differences reach 0.042 mm.
+    The largest difference is 0.023 mm on the lateral dish. On the medial side it is 0.042 mm in
+    stance, where the deepest point lies on the flank of the eminence.
     """
     insert, femoral = part("dm", "tibial_insert"), part("dm", "femoral_component")
     placement = insert_placement(insert)
@@ -279,18 +278,18 @@ def test_gaps_of_subject_dm_over_the_gait_cycle():
     turns = Rotation.from_euler("XYZ", rows[:, 4:7]).as_matrix()
     poses = placement @ axes @ pose(turns, rows[:, 1:4]) @ inverse(axes)
     gaps = [query.at(at) for at in poses]
-    for text, found in (
+    for text, result in (
         (MEDIAL_MM, [g.medial.gap for g in gaps]),
         (LATERAL_MM, [g.lateral.gap for g in gaps]),
     ):
         table = np.array(text.split(), float)
-        assert (np.abs(1e3 * np.array(found) - table) < 0.05).sum() >= 19
+        assert (np.abs(1e3 * np.array(result) - table) < 0.05).sum() >= 19
 
 
 @needs_data
 @pytest.mark.parametrize("subject", ["dm", "jw"])
 def test_real_implants_through_touch_and_flexion(subject):
-    """The gap is continuous through touch; the contact's centre moves without jumps."""
+    """The gap is continuous through touch, and the centre moves without jumps."""
     insert = part(subject, "tibial_insert")
     insert = insert.moved(insert_placement(insert))
     femoral = part(subject, "femoral_component")

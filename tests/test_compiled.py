@@ -1,4 +1,4 @@
-"""Compiled loops: what is kept of them, and where nothing can be."""
+"""Compiled loops: their cache, and the work without one."""
 
 import ast
 import subprocess
@@ -23,22 +23,22 @@ print(doubled(2.0) + tripled(1.0))
 """No file holds these functions, so that numba finds no folder for them."""
 
 
-def test_without_a_folder_to_keep_them_in_they_are_compiled_and_it_is_said_once():
-    done = subprocess.run(
+def test_without_a_cache_folder_functions_are_compiled_with_one_warning():
+    process = subprocess.run(
         [sys.executable, "-c", NOWHERE], capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == "7.0"
-    assert done.stderr.count("NUMBA_CACHE_DIR") == 1
+    assert process.stdout.strip() == "7.0"
+    assert process.stderr.count("NUMBA_CACHE_DIR") == 1
 
 
 def test_compiled_functions_use_nothing_of_other_files():
-    """Kept code is renewed when its own file changes, not when one that it calls does."""
+    """The cache detects changes of a function's own file only."""
     kernels, foreign = 0, []
     for path in Path(tkamb.__file__).parent.rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
-        own = [node for node in imports if (node.module or "").startswith("tkamb")]
-        names = {name.asname or name.name for node in own for name in node.names}
+        of_tkamb = [node for node in imports if (node.module or "").startswith("tkamb")]
+        names = {name.asname or name.name for node in of_tkamb for name in node.names}
         for function in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
             marks = {mark.id for mark in function.decorator_list if isinstance(mark, ast.Name)}
             if marks & {"compiled", "compiled_as_written"}:

@@ -1,4 +1,4 @@
-"""Medial and lateral: told where the condyles lie side by side along z, refused where not."""
+"""Medial and lateral condyles: components that lie askew are refused."""
 
 import json
 from functools import cache
@@ -57,7 +57,7 @@ KINDS = ["sphere", "torus", "shipped", "dm", "jw"]
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("yaw", [20, 45, 90, -33, -64, 125])
 def test_condyles_that_lie_askew_are_refused(kind, yaw):
-    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+    with pytest.raises(InputError, match="medial and lateral cannot be distinguished"):
         condyle_split(turned(femoral(kind), yaw))
 
 
@@ -65,14 +65,13 @@ def test_condyles_that_lie_askew_are_refused(kind, yaw):
 @pytest.mark.parametrize("yaw", [4, -9])
 def test_condyles_that_lie_side_by_side_are_split(kind, yaw):
     whole = femoral(kind)
-    # the notch of a real component lies behind the origin, so that its middle moves to the side
+    # The notch of a real component lies behind the origin, so a yaw moves its middle sideways.
     assert condyle_split(turned(whole, yaw)) == pytest.approx(condyle_split(whole), abs=6 * MM)
     assert np.degrees(condyle_yaw(turned(whole, yaw))[0]) == pytest.approx(yaw, abs=3.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_mirrored_component_is_split_as_its_mirror_image(kind):
-    """A left part in the axes of a right one: the plane is mirrored, the sides are exchanged."""
+def test_the_split_of_a_mirrored_component_is_mirrored(kind):
     shift = np.eye(4)
     shift[2, 3] = 4 * MM
     shifted = femoral(kind).moved(shift)
@@ -92,24 +91,24 @@ def one_condyle(kind):
         return Surface(np.minimum(ball.vertices * [1.4, 1, 0.4], [1, 4 * MM, 1]), ball.faces, kind)
     whole = femoral("shipped")
     sign = 1.0 if kind == "lateral half" else -1.0
-    kept = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
-    return Surface(whole.vertices, whole.faces[kept], kind)
+    remaining = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
+    return Surface(whole.vertices, whole.faces[remaining], kind)
 
 
 @pytest.mark.parametrize("yaw", [0, 20, 45, 75, 90, -30, -60])
 @pytest.mark.parametrize(
     "kind", ["sphere", "cylinder", "runner", "cap", "lateral half", "medial half"]
 )
-def test_a_single_condyle_may_lie_in_any_way(kind, yaw):
+def test_a_single_condyle_is_not_split_at_any_yaw(kind, yaw):
     assert condyle_split(turned(one_condyle(kind), yaw)) is None
 
 
 @pytest.mark.parametrize("subject", ["dm", "jw"])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_half_of_a_real_component_may_lie_in_any_way(subject, sign):
+def test_half_of_a_real_component_is_not_split_at_any_yaw(subject, sign):
     whole = femoral(subject)
-    kept = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
-    half = Surface(whole.vertices, whole.faces[kept], "half")
+    remaining = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
+    half = Surface(whole.vertices, whole.faces[remaining], "half")
     for yaw in (-75, -30, 0, 75):
         assert condyle_split(turned(half, yaw)) is None
 
@@ -122,29 +121,29 @@ def test_press_refuses_exchanged_axes_on_the_command_line(capsys):
     for contact in ("foundation", "lattice"):
         pressing = ["press", *meshes, f"--axes={AXES}", "--load", "1000", "--contact", contact]
         assert main([*pressing, "--no-cache"] if contact == "lattice" else pressing) == 2
-        said = capsys.readouterr().err
+        message = capsys.readouterr().err
         assert (
-            "deg from the medial-lateral axis" in said
-            and "axes" in said
-            and "Traceback" not in said
+            "deg from the medial-lateral axis" in message
+            and "axes" in message
+            and "Traceback" not in message
         )
 
 
-def test_press_and_run_refuse_them_in_python(tmp_path):
+def test_press_and_run_refuse_exchanged_axes_in_python(tmp_path):
     meshes = MODEL / "femoral_component.stl", MODEL / "insert.stl"
-    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+    with pytest.raises(InputError, match="medial and lateral cannot be distinguished"):
         press_meshes(*meshes, 1000.0, axes=AXES, contact="foundation")
     scene = write_scene(tmp_path, implant__femoral__axes=AXES)
-    with pytest.raises(InputError, match="medial and lateral cannot be told"):
+    with pytest.raises(InputError, match="medial and lateral cannot be distinguished"):
         simulate(scene, frames=slice(0, 1))
 
 
-def test_press_in_the_right_axes_loads_both(capsys):
+def test_a_press_with_correct_axes_loads_both_condyles(capsys):
     meshes = [str(MODEL / "femoral_component.stl"), str(MODEL / "insert.stl")]
     assert main(["press", *meshes, "--load", "1000", "--contact", "foundation", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["medial"]["force_N"] == pytest.approx(500, rel=0.1)
-    assert found["lateral"]["force_N"] == pytest.approx(500, rel=0.1)
+    result = json.loads(capsys.readouterr().out)
+    assert result["medial"]["force_N"] == pytest.approx(500, rel=0.1)
+    assert result["lateral"]["force_N"] == pytest.approx(500, rel=0.1)
 
 
 LINEAR = material("polyethylene-linear")
@@ -156,7 +155,7 @@ def flags_of(femoral, insert, load=500.0):
 
 
 def test_one_condyle_on_two_separate_patches_is_flagged():
-    """A flat-bottomed part with one valley, on an insert with two ridges 24 mm apart."""
+    """A flat bar with one valley lies on two ridges 24 mm apart."""
     ridges = dished_insert(
         lambda x, z: 8 * MM - np.minimum((np.abs(x) - 12 * MM) ** 2 / 40e-3, 3 * MM),
         20 * MM,
@@ -172,7 +171,7 @@ def test_one_condyle_on_one_patch_is_not_flagged():
 
 @pytest.mark.parametrize("kind", ["shipped", "dm", "jw"])
 def test_the_shape_shows_the_flexion(kind):
-    """Whatever the pose: flexion within 10 deg, tilt, and where the front points."""
+    """Flexion within 10 deg, tilt, and direction of the front, at several poses."""
     body = femoral(kind)
     for flexion in (-30.0, 0.0, 90.0, 150.0):
         for turn in (0.0, 20.0, 170.0):
@@ -187,5 +186,5 @@ SPHERES_APART = joined(*(sphere(0.005, 3, (0.0, 0.0, z)) for z in (-0.03, 0.03))
 
 
 @pytest.mark.parametrize("shape", [sphere(0.02), bicondylar(), SPHERES_APART])
-def test_a_part_that_is_no_shell_shows_no_flexion(shape):
+def test_a_body_that_is_not_a_shell_has_no_orientation(shape):
     assert orientation(shape, np.eye(4)) is None

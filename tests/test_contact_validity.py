@@ -1,4 +1,4 @@
-"""Bodies pressed through each other are out of range; pressures beyond any law are flagged."""
+"""Bodies pressed through each other are out of range; too large pressures are flagged."""
 
 import numpy as np
 import pytest
@@ -20,21 +20,21 @@ POLYETHYLENE = material("polyethylene")
 
 
 def pressed(name, femoral, insert, load, pose=None, size=2.0):
-    """Return the result of a press and what was prepared."""
+    """Return the result of a press, and the prepared state."""
     model = contact_model(name, size)
     state = model.prepare(ContactPair(femoral, insert, POLYETHYLENE))
     return model.press(state, load, above() if pose is None else pose), state
 
 
 def spiked(surface, height, where):
-    """Return the surface with the vertex nearest to a place moved along y, m."""
+    """Return the surface with the vertex nearest to a place moved by `height` (m) along y."""
     vertices = surface.vertices.copy()
     vertices[np.linalg.norm(vertices - where, axis=1).argmin(), 1] += height
     return Surface(vertices, surface.faces, surface.name)
 
 
-def holds_nothing(result):
-    """Say whether a result is out of range without a number, and says why."""
+def is_out_of_range(result):
+    """Return whether a result is OUT_OF_RANGE, without numbers and with a reason."""
     unknown = [result.approach, *result.pressure, *result.wrench_on_insert]
     return (
         result.status is ContactStatus.OUT_OF_RANGE
@@ -46,9 +46,8 @@ def holds_nothing(result):
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_dish_without_a_bottom_is_out_of_range(name):
-    """10 µm are left under each condyle: 0.18 to 0.27 mm went into them, unflagged.
-
-    A lattice of such cells lacks that part of the insert and is refused.
+    """The insert is 10 µm thick under each condyle. A lattice of such cells lacks this part and is
+    refused.
     """
     dish = dished_insert(height=2.01e-3, cells=24)
     if name in ("lattice", "lattice-linear", "fe"):
@@ -56,20 +55,20 @@ def test_a_dish_without_a_bottom_is_out_of_range(name):
             pressed(name, FEMORAL, dish, 1000.0, size=1.5)
         return
     result, _ = pressed(name, FEMORAL, dish, 1000.0, size=1.5)
-    assert holds_nothing(result)
+    assert is_out_of_range(result)
     assert "thick" in " ".join(result.flags)
 
 
 @pytest.mark.parametrize("name", FEW)
 @pytest.mark.parametrize("body", ["femoral", "insert"])
 def test_a_spike_longer_than_the_insert_is_thick_is_out_of_range(name, body):
-    """28 mm, of either mesh."""
+    """The spike has 28 mm, on either mesh."""
     femoral, insert = FEMORAL, dished_insert(cells=24)
     if body == "femoral":
         femoral = spiked(femoral, -28e-3, [0, -20e-3, 10e-3])
     else:
         insert = spiked(insert, 28e-3, [3e-3, 7e-3, 10e-3])
-    assert holds_nothing(pressed(name, femoral, insert, 1500.0, size=3.0)[0])
+    assert is_out_of_range(pressed(name, femoral, insert, 1500.0, size=3.0)[0])
 
 
 @pytest.mark.parametrize(
@@ -80,7 +79,7 @@ def test_a_spike_longer_than_the_insert_is_thick_is_out_of_range(name, body):
     ],
 )
 def test_a_shorter_spike_is_flagged(length, pose, words):
-    """On a node, and between nodes, which see little of it; the approach counts from its tip."""
+    """The spike is on a node or between nodes; the approach counts from its tip."""
     femoral = spiked(FEMORAL, -length, [0, -20e-3, 10e-3])
     result, _ = pressed("lattice-linear", femoral, dished_insert(cells=24), 1500.0, pose)
     assert result.status is ContactStatus.OK
@@ -89,7 +88,7 @@ def test_a_shorter_spike_is_flagged(length, pose, words):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_sound_press_has_no_such_words(name):
+def test_a_valid_press_has_no_such_flags(name):
     result, _ = pressed(name, FEMORAL, dished_insert(cells=24), 1000.0, size=3.0)
     assert result.status is ContactStatus.OK
     assert not any(word in " ".join(result.flags) for word in ("spike", "thick:", "100 MPa"))
@@ -100,9 +99,9 @@ LIP, SHEET = box_insert(4e-3, 5e-3, 12e-3), box_insert(14e-3, 1e-3, 14e-3)
 
 @pytest.mark.parametrize(("name", "insert"), [("lattice-linear", LIP), ("lattice", SHEET)])
 def test_a_peak_above_100_megapascal_is_flagged(name, insert):
-    """A ball on a lip 4 mm wide and on a sheet of 1 mm; `press` and its JSON say it."""
-    one = condyles(offset=0.0, subdivisions=4)
-    result, state = pressed(name, one, insert, 2500.0, size=1.0)
+    """A sphere on a lip 4 mm wide and on a sheet of 1 mm."""
+    sphere = condyles(offset=0.0, subdivisions=4)
+    result, state = pressed(name, sphere, insert, 2500.0, size=1.0)
     assert result.status is ContactStatus.OK
     assert result.medial.peak_pressure > 100e6
     words = "peak above 100 MPa: polyethylene's law is not known there; check whether"
@@ -115,7 +114,7 @@ def test_a_peak_above_100_megapascal_is_flagged(name, insert):
     assert any(words in flag for flag in report.as_dict()["flags"])
 
 
-def test_thickness_is_that_of_the_column_and_near_a_rim_of_its_neighbours():
+def test_thickness_near_a_rim_is_the_largest_one_nearby():
     dish = dished_insert(height=4e-3, cells=24)
     whole = ContactPair(FEMORAL, dish, POLYETHYLENE)
     places = np.array([[0, 2e-3, 10e-3], [12e-3, 4e-3, 20e-3]])

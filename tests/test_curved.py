@@ -1,4 +1,4 @@
-"""Curved patches over triangles: smooth surfaces to second order, flats and edges kept."""
+"""Curved patches over triangles: exact to second order, with unchanged flats and sharp edges."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def ball(subdivisions):
 
 
 def sheet(x, z, height):
-    """A triangulated height field over x (a,) and z (b,), m."""
+    """Return a triangulated height field over x (a,) and z (b,), m."""
     gx, gz = np.meshgrid(x, z, indexing="ij")
     number = np.arange(gx.size).reshape(gx.shape)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
@@ -28,13 +28,13 @@ def sheet(x, z, height):
 
 
 def scattered(surface, faces, seed=2):
-    """A random point on each of some triangles, and its barycentric coordinates."""
+    """Return a random point on each of some triangles, and its barycentric coordinates."""
     weights = np.random.default_rng(seed).dirichlet([1, 1, 1], len(faces))
     return np.einsum("ij,ijk->ik", weights, surface.triangles[faces]), weights
 
 
 def test_a_faceted_sphere_becomes_round():
-    """Within 5 % of a facet's sagitta, at every size."""
+    """Within 5 % of a facet's sagitta, for three facet sizes."""
     for subdivisions in (3, 4, 5):
         surface = ball(subdivisions)
         faces = np.flatnonzero(surface.face_normals[:, 1] > 0.9)
@@ -53,11 +53,11 @@ def test_neighbouring_patches_meet():
     ends = surface.vertices[surface.mesh.face_adjacency_edges]
     points = 0.3 * ends[:, 0] + 0.7 * ends[:, 1]
     upper = surface.face_normals[across[:, 0], 1] > 0.7
-    one, other = (
+    first, second = (
         patches.shift(faces, surface.barycentric(points, faces), UP)[0][upper] for faces in across.T
     )
-    assert one.min() > 5e-6
-    np.testing.assert_allclose(one, other, rtol=2e-3)
+    assert first.min() > 5e-6
+    np.testing.assert_allclose(first, second, rtol=2e-3)
 
 
 def test_a_box_keeps_its_faces():
@@ -69,7 +69,7 @@ def test_a_box_keeps_its_faces():
 
 
 def test_a_flat_that_meets_a_fillet_stays_flat():
-    """Corner normals lean where the fillet begins; the mean of both turns would swell it."""
+    """Corner normals are tilted at the start of the fillet; the flat must not bulge."""
     radius, x = 3e-3, np.concatenate([np.linspace(-6e-3, 0, 7), np.linspace(0.5e-3, 2.5e-3, 5)])
 
     def height(gx, _):
@@ -90,8 +90,8 @@ def test_a_flat_that_meets_a_fillet_stays_flat():
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.7])
-def test_a_saddle_is_followed_both_ways(slope):
-    """Exact on a quadratic height field, whichever way it bends and leans."""
+def test_a_saddle_is_approximated_closely(slope):
+    """A quadratic height field, level and inclined."""
     x = np.linspace(-5e-3, 5e-3, 11)
 
     def height(gx, gz):

@@ -1,4 +1,4 @@
-"""Subject DM: the scene loads, and its records say what a walking subject's should."""
+"""Subject DM: the scene loads, and its recordings are those of a walking subject."""
 
 import re
 from functools import cache
@@ -58,7 +58,7 @@ def test_motion_is_a_closed_gait_cycle():
     assert np.abs(np.rad2deg(motion.raw_coordinates[:, 4])).max() < 3
 
 
-def test_frames_that_the_filter_moves_are_in_swing_or_at_the_seam():
+def test_frames_changed_by_the_filter_are_in_swing_or_at_the_seam():
     motion = case().motion
     rough = (motion.deviation_translation > 5e-4) | (motion.deviation_rotation > np.deg2rad(0.5))
     assert 0 < rough.sum() < 20
@@ -67,15 +67,15 @@ def test_frames_that_the_filter_moves_are_in_swing_or_at_the_seam():
 
 def test_condylar_gaps_of_the_recorded_poses():
     query = ClosestPointQuery(case().femoral, case().insert, case().split)
-    found = [query.at(pose) for pose in knee_pose(case().motion.raw_coordinates[::5])]
+    result = [query.at(pose) for pose in knee_pose(case().motion.raw_coordinates[::5])]
     for side, stated in (("medial", MEDIAL_MM), ("lateral", LATERAL_MM)):
-        gaps = np.array([getattr(gap, side).gap for gap in found]) * 1e3
+        gaps = np.array([getattr(gap, side).gap for gap in result]) * 1e3
         expected = np.array([float(value) for value in stated.split()])
         assert (np.abs(gaps - expected) <= 0.05).sum() >= 19
 
 
-def test_the_mirrored_reading_closes_the_gaps_as_well_and_half_of_it_does_not():
-    """Spread of medial less lateral gap in swing, mm: geometry alone cannot tell the two."""
+def test_gaps_cannot_distinguish_the_mirrored_convention():
+    """Spread of the medial less the lateral gap in swing, mm."""
     roles = ("rotation_1", "rotation_2", "translation_3")
     mirrored = load_scene(SCENE.with_name("mirrored.toml"))
     assert mirrored.motion.signs_turned == roles
@@ -89,13 +89,13 @@ def test_the_mirrored_reading_closes_the_gaps_as_well_and_half_of_it_does_not():
     for turned in ((), roles[:1], roles[1:2], roles):
         table = mirrored.motion.model_copy(update={"signs_turned": turned})
         motion = load_motion(table, "right", placed @ turn, turn)
-        found = [query.at(place) for place in knee_pose(motion.raw_coordinates[62:101:3])]
-        spread[turned] = 1e3 * np.std([gap.medial.gap - gap.lateral.gap for gap in found])
+        result = [query.at(place) for place in knee_pose(motion.raw_coordinates[62:101:3])]
+        spread[turned] = 1e3 * np.std([gap.medial.gap - gap.lateral.gap for gap in result])
     assert spread[roles] == pytest.approx(spread[()], abs=0.05)
     assert min(spread[roles[:1]], spread[roles[1:2]]) > 1.5 * spread[()]
 
 
-def test_shank_stands_upright_and_rolls_forward():
+def test_the_shank_rolls_forward_in_stance():
     tibia = case().tibia
     assert np.median(tibia.residual) < 0.010
     assert tibia.residual.max() < 0.015
@@ -103,8 +103,8 @@ def test_shank_stands_upright_and_rolls_forward():
     assert up[STANCE, 1].min() > np.cos(np.deg2rad(30))
     assert right[:, 2].min() > 0.95
     lean = np.rad2deg(np.arctan2(up[:, 0], up[:, 1]))
-    assert -25 < lean[0] < -10  # heel strike: the shank leans back
-    assert (np.diff(lean[:60]) > 0).all()  # and rolls forward over the foot
+    assert -25 < lean[0] < -10  # at heel strike the shank leans back
+    assert (np.diff(lean[:60]) > 0).all()  # then it rolls forward over the foot
     assert 0.09 < tibia.pose[STANCE, 1, 3].min() < 0.13  # ankle height, m
 
 
@@ -115,7 +115,7 @@ def test_belt_carries_the_foot_backward():
 
 
 def test_marker_set_has_only_two_shank_markers():
-    """The reason for the joint centres: the third is a gap throughout."""
+    """The third marker is missing throughout, so joint centres are needed."""
     recorded = read_table(case().scene.tibia.file)
     assert np.isnan(recorded.column("R_Shank_Superior_x")).all()
     for name in case().scene.tibia.markers_mm:
@@ -156,7 +156,7 @@ def test_centre_of_pressure_lies_between_heel_and_toe_markers():
 
 
 def test_stride_is_the_most_representative_one():
-    """Of all strides, least distance to the mean in ground reaction and shank lean together."""
+    """Its distance to the mean of ground reaction and shank lean is the smallest of all strides."""
     scene = case().scene
     plate = read_table(scene.ground_reaction.file)
     vertical = plate.column("ground_force_2_vy")
@@ -192,7 +192,7 @@ def _joints_with_mass():
     return [(k, name) for k, name in enumerate(model.names) if model.inertias[k].mass > 0]
 
 
-def test_ligament_law_is_opensims():
+def test_ligament_law_is_that_of_opensim():
     """Blankevoort1991Ligament: k e²/(2 e_t) below the transition strain e_t = 0.06, else linear."""
     strain = np.linspace(-0.02, 0.12, 141)
     toe, line = 0.5 * strain**2 / 0.06, strain - 0.5 * 0.06
@@ -201,7 +201,7 @@ def test_ligament_law_is_opensims():
 
 
 def test_ligaments_are_near_their_slack_length_in_stance():
-    """Nothing is torn or hangs loose while the foot is loaded; MCL and LCL straddle slack."""
+    """No ligament is torn or very slack while the foot is loaded."""
     chain, motion = case().chain, case().motion
     femur = knee_pose(motion.coordinates)
     tibia_r = inverse(chain.insert_in_tibia) @ chain.link_in("tibia_r", "tibia")
@@ -233,8 +233,8 @@ def test_hip_is_above_the_knee():
     assert hip[1] > 0.41
 
 
-def test_a_shank_marker_that_stands_elsewhere_is_asked_about():
-    """The scene's own fit leaves 8 mm; a marker moved by 87 mm more than skin ever does."""
+def test_a_misplaced_shank_marker_is_asked_about():
+    """The residual of the fit is 8 mm; a misplaced marker moves by 87 mm, more than skin."""
     assert not list(marker_questions(case()))
     scene = load_scene(SCENE)
     places = scene.tibia.markers_mm

@@ -1,4 +1,4 @@
-"""Finite elements on the lattice's grid: the yardstick against its own theory and the lattice."""
+"""Finite elements on the lattice's grid, against beam theory and the lattice."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tkamb.geometry.frames import knee_pose
 
 @pytest.mark.parametrize("nu", [0.3, 0.49, 0.4999])
 def test_beam_in_bending_does_not_lock_with_the_bulk_modulus(nu):
-    """Tip load on a slender beam: deflection within 10 % of theory at any Poisson's ratio."""
+    """The deflection of a slender beam under a tip load is within 10 % of theory."""
     counts, edges = (20, 4, 2), np.array([1.0, 0.5, 0.5]) * 1e-3
     nodes, index, cells, _ = block(counts, edges)
     solid = BbarHexahedra(nodes, cells, edges, Material("m", 1e9, nu))
@@ -35,18 +35,18 @@ def test_beam_in_bending_does_not_lock_with_the_bulk_modulus(nu):
 def test_lattice_and_finite_elements_agree_on_two_condyles(law):
     """2 mm cells, 1500 N: approach within 4 %, peak within 6 %, condyle forces within 1 %."""
     bodies = pair(condyles(subdivisions=5), dished_insert(), material(law))
-    found = []
+    result = []
     for name in ("lattice", "fe"):
         model = contact_model(name, 2.0)
-        found.append(model.press(model.prepare(bodies), 1500.0, knee_pose(np.zeros(6))))
-    lattice, fe = found
+        result.append(model.press(model.prepare(bodies), 1500.0, knee_pose(np.zeros(6))))
+    lattice, fe = result
     assert lattice.approach == pytest.approx(fe.approach, rel=0.04)
     assert lattice.pressure.max() == pytest.approx(fe.pressure.max(), rel=0.06)
     assert lattice.medial.force == pytest.approx(fe.medial.force, rel=0.01)
 
 
 @pytest.mark.slow
-def test_lattice_and_finite_elements_meet_as_the_cells_shrink():
+def test_lattice_and_finite_elements_converge_to_each_other():
     """The difference in approach falls with the cell size."""
     bodies = pair(condyles(subdivisions=6), dished_insert(cells=72), material("polyethylene"))
     apart = []

@@ -1,4 +1,4 @@
-"""The filter's response, exactness, convergence, ends; and rigid-body rates."""
+"""The filter's response, exactness, convergence and behaviour at the ends; rigid-body rates."""
 
 import numpy as np
 import pinocchio as pin
@@ -77,7 +77,7 @@ def test_noise_is_reduced_and_the_acceleration_usable():
     assert np.std((filtered - truth)[inner]) < 0.01 * omega**2
 
 
-def test_ends_fade_within_a_period_and_beat_a_padded_butterworth():
+def test_end_effects_fade_within_a_period_and_are_below_those_of_a_padded_butterworth():
     t, omega = np.linspace(0, 3, 721), 2 * np.pi
     sections = butter(3, CUTOFF, fs=240, output="sos")
     ours, padded = [], []
@@ -138,7 +138,7 @@ def test_rates_of_poses_agree_with_finite_differences_of_pinocchio():
 
 
 def test_free_flyer_accelerates_as_pinocchio_integrates():
-    """Integrating velocity and acceleration of one frame reaches the next pose."""
+    """Integration of velocity and acceleration of one frame gives the next pose."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
     dt = 1e-3
@@ -186,7 +186,7 @@ def test_unusable_samples(time, value, cutoff, message):
     assert "gait.csv" in str(caught.value)
 
 
-def test_frames_too_few_for_the_cutoff_are_named_with_how_many_would_do():
+def test_too_few_frames_for_the_cutoff_are_refused_with_the_number_needed():
     time = np.linspace(0.0, 2.0, 26)
     check_frames(time, 6.0, 26)
     differentiate_coordinates(time, np.zeros(26), 6.0)  # the number that the message gives does
@@ -195,15 +195,15 @@ def test_frames_too_few_for_the_cutoff_are_named_with_how_many_would_do():
     check_frames(np.linspace(0.0, 2.0, 25), "none", 25)
 
 
-def test_never_outside_the_record():
+def test_curves_are_refused_outside_the_recording():
     t = np.linspace(0, 2, 50)
     with pytest.raises(InputError, match=r"covers 0 to 2 s, but 2\.1 s is needed"):
         differentiate_coordinates(t, np.zeros(50), 6.0, at=np.array([1.0, 2.1]))
 
 
 @pytest.mark.parametrize("cutoff", np.arange(1.0, 12.5, 0.5))
-def test_no_cutoff_falls_off_the_last_knot(cutoff):
-    """The last knot is the last sample to within rounding only (4 s at 25 Hz and 10 Hz)."""
+def test_no_cutoff_loses_the_last_knot(cutoff):
+    """The last knot equals the last sample to rounding (4 s at 25 Hz and 10 Hz)."""
     time = np.linspace(0.0, 4.0, 101)
     x, _, _ = differentiate_coordinates(time, np.column_stack([time, time**2]), cutoff)
     np.testing.assert_allclose(x[:, 0], time, atol=1e-9)

@@ -13,7 +13,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 def vertex_clearance(femoral, insert, at):
-    """Return the smallest clearance at any vertex of either body, every one of them tried."""
+    """Return the smallest clearance at any vertex of either body, by brute force."""
     moved = Surface(transform(at, femoral.vertices), femoral.faces)
     above = moved.vertices + UP * (0.1 - moved.vertices[:, 1:2])
     down = 0.1 - insert.rays.first(above, -UP)[0]
@@ -36,8 +36,8 @@ def bodies():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_no_vertex_is_lower_and_edges_only_a_little(seed):
-    """Edges may touch before vertices do, by less than the sagitta of the facets."""
+def test_first_touch_is_just_below_the_clearance_of_the_vertices(seed):
+    """Edges may touch before vertices, by less than the sagitta of the facets."""
     rng = np.random.default_rng(seed)
     femoral, insert = bodies()
     scale = np.array([6e-3, 20e-3, 3e-3, 0.2, 0.05, 1.5])
@@ -50,19 +50,19 @@ def test_no_vertex_is_lower_and_edges_only_a_little(seed):
     assert FirstTouch(femoral, insert).travel(at) == pytest.approx(travel, abs=1e-12)
 
 
-def test_two_spheres_touch_where_they_must():
+def test_two_spheres_touch_on_the_line_of_their_centres():
     femoral = joined(graded_sphere(20e-3, (0, 0, -12e-3)), graded_sphere(20e-3, (0, 0, 12e-3)))
     touch = FirstTouch(femoral, flat_insert(10e-3, half_z=28e-3), 0.0)
     tilt = np.radians(1.0)
     medial, lateral = touch.at(knee_pose([1e-3, 40e-3, 0, 0, tilt, 0]))
-    for found, side in ((medial, -1), (lateral, 1)):
+    for result, side in ((medial, -1), (lateral, 1)):
         height = 40e-3 - 20e-3 - 10e-3 + side * 12e-3 * np.sin(tilt)
-        assert found.travel == pytest.approx(height, abs=5e-6)
-        assert found.point == pytest.approx([1e-3, 10e-3, side * 12e-3], abs=0.4e-3)
+        assert result.travel == pytest.approx(height, abs=5e-6)
+        assert result.point == pytest.approx([1e-3, 10e-3, side * 12e-3], abs=0.4e-3)
     assert medial.travel < lateral.travel
 
 
-def test_a_condyle_beside_the_insert_is_none():
+def test_a_condyle_beside_the_insert_has_no_touch():
     femoral = joined(graded_sphere(20e-3, (0, 0, -60e-3)), graded_sphere(20e-3, (0, 0, 5e-3)))
     medial, lateral = FirstTouch(femoral, flat_insert(10e-3), -30e-3).at(np.eye(4))
     assert medial is None
@@ -71,7 +71,7 @@ def test_a_condyle_beside_the_insert_is_none():
     assert np.isnan(FirstTouch(femoral, flat_insert(10e-3)).travel(away))
 
 
-def test_travel_moves_with_the_pose_and_not_with_the_femoral_frame():
+def test_travel_depends_on_the_pose_and_not_on_the_femoral_frame():
     femoral, insert = bodies()
     at = knee_pose([1e-3, 5e-3, 0.5e-3, 0.05, 0.01, 0.7])
     first = FirstTouch(femoral, insert).travel(at)
@@ -82,7 +82,7 @@ def test_travel_moves_with_the_pose_and_not_with_the_femoral_frame():
     assert other.travel(at @ np.linalg.inv(frame)) == pytest.approx(first, abs=1e-12)
 
 
-def test_the_ceiling_is_above_the_surface_everywhere():
+def test_the_height_bound_is_above_the_surface_everywhere():
     _, insert = bodies()
     points = insert.triangles.mean(axis=1)
     above = HeightBound(insert).over(points) - points[:, 1]
@@ -90,18 +90,18 @@ def test_the_ceiling_is_above_the_surface_everywhere():
     assert np.median(above[insert.face_normals[:, 1] > 0.5]) < 0.2e-3
 
 
-def test_triangles_that_cross_touch_where_their_edges_do():
-    """A roof's ridge across a ridge: no vertex of either lies over the other's edge."""
+def test_crossing_edges_touch_where_no_vertex_lies():
+    """The ridges of two roofs cross; no vertex lies over the other roof's ridge."""
     ridge = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -0.5, 1], [0, -0.5, -1]]) * 1e-2
     below = Surface(ridge, np.array([[0, 2, 1], [0, 1, 3]]), "ridge")
     above = Surface(ridge[:, [2, 1, 0]] * [1, -1, 1], np.array([[0, 1, 2], [0, 3, 1]]), "roof")
     at = pose(np.eye(3), [1e-3, 4e-3, 2e-3])
-    found = FirstTouch(above, below).either(at)
-    assert found.travel == pytest.approx(4e-3, abs=1e-15)
-    assert found.point == pytest.approx([1e-3, 0, 0], abs=1e-15)
+    result = FirstTouch(above, below).either(at)
+    assert result.travel == pytest.approx(4e-3, abs=1e-15)
+    assert result.point == pytest.approx([1e-3, 0, 0], abs=1e-15)
 
 
-def test_supports_and_boxes_hold_their_triangles():
+def test_supports_and_boxes_bound_their_triangles():
     femoral, _ = bodies()
     tree = femoral.tree
     count = len(tree.boxes) // 2

@@ -1,4 +1,4 @@
-"""The insert's flat bottom and the insert frame on it."""
+"""The insert's flat bottom, and the insert frame that it defines."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def box(x, y, z, centre=(0.0, 0.0, 0.0)):
     return Surface(np.asarray(made.vertices) + centre, np.asarray(made.faces, np.int64), "box")
 
 
-def test_the_frame_stands_on_the_bottom():
+def test_the_origin_of_the_insert_frame_is_the_middle_of_the_bottom():
     insert = two_dishes()
     placement = insert_placement(insert.moved(pose(np.eye(3), [0.01, -0.3, 0.02])))
     assert np.allclose(placement, pose(np.eye(3), [-0.01, 0.3, -0.02]), atol=1e-15)
@@ -45,12 +45,12 @@ def test_the_frame_stands_on_the_bottom():
 )
 def test_a_tilt_is_turned_level_by_the_smallest_rotation(x_deg, z_deg):
     insert = two_dishes()
-    there = tilted(insert, x_deg, z_deg)
-    placed = transform(insert_placement(there), there.vertices)
+    tilted_insert = tilted(insert, x_deg, z_deg)
+    placed = transform(insert_placement(tilted_insert), tilted_insert.vertices)
     assert np.allclose(placed, insert.vertices, atol=1e-12)
 
 
-def test_a_tilt_beyond_the_limit_is_no_tilt():
+def test_a_tilt_beyond_the_limit_is_refused():
     with pytest.raises(InputError, match="tilted by 40 deg"):
         insert_placement(tilted(two_dishes(), 40, 0))
 
@@ -65,7 +65,7 @@ def test_permuted_axes_give_the_same_digits(axes):
     assert np.array_equal(insert_placement(back), insert_placement(insert))
 
 
-def test_the_wrong_axes_are_refused_with_the_mesh_axis_named():
+def test_wrong_axes_are_refused_with_the_name_of_the_mesh_axis():
     rotation = axes_rotation("+y,+z,+x")
     wrong = Surface(two_dishes().vertices @ rotation.T, two_dishes().faces, "insert")
     with pytest.raises(InputError, match=r"faces -y of the mesh.*-z is inferior") as caught:
@@ -73,7 +73,7 @@ def test_the_wrong_axes_are_refused_with_the_mesh_axis_named():
     assert "superior is +y" in str(caught.value)
 
 
-def test_jitter_and_fine_triangles_do_not_hide_it():
+def test_the_bottom_is_found_with_noise_and_fine_triangles():
     insert = two_dishes()
     rng = np.random.default_rng(3)
     noisy = Surface(insert.vertices + rng.normal(0, 1e-5, insert.vertices.shape), insert.faces)
@@ -84,31 +84,31 @@ def test_jitter_and_fine_triangles_do_not_hide_it():
     assert np.allclose(placement, np.eye(4), atol=3e-5)
 
 
-def test_axes_decide_between_equal_sides_of_a_block():
+def test_the_axes_decide_between_equal_sides_of_a_block():
     assert np.allclose(insert_placement(plate()), np.eye(4), atol=1e-12)
     cube = insert_placement(box(0.03, 0.03, 0.03))
     assert np.allclose(cube[:3, 3], [0, 0.015, 0], atol=1e-12)
 
 
-def test_a_larger_side_wall_is_told(caplog):
+def test_a_larger_side_wall_gives_a_notice(caplog):
     placement = insert_placement(box(0.02, 0.03, 0.02))
     assert placement[1, 3] == pytest.approx(0.015)
     assert "another is larger" in caplog.text
 
 
-def test_two_bottoms_are_both_named():
+def test_two_possible_bottoms_are_refused_with_their_places():
     two = joined(box(0.03, 0.01, 0.03), box(0.03, 0.01, 0.03, (0.031, 0.002, 0.0)))
     with pytest.raises(InputError, match="two flats that could be its bottom") as caught:
         insert_placement(two)
     assert str(caught.value).count("900 mm²") == 2
 
 
-def test_a_clearly_larger_bottom_wins_over_a_stepped_one():
+def test_the_clearly_larger_of_two_levels_is_the_bottom():
     two = joined(box(0.03, 0.01, 0.03), box(0.02, 0.008, 0.03, (0.026, 0.001, 0.0)))
     assert find_flat_bottom(two).area == pytest.approx(9e-4)
 
 
-def test_no_flat_on_a_ball():
+def test_a_sphere_has_no_flat_bottom():
     ball = trimesh.creation.icosphere(4, 0.03)
     flats = find_flats(Surface(np.asarray(ball.vertices), np.asarray(ball.faces)))
     assert all(flat.area < 0.02 * ball.area for flat in flats)
@@ -126,8 +126,8 @@ def test_real_inserts(subject):
     flat = find_flat_bottom(insert)
     assert 2.0e-3 < flat.area < 2.4e-3
     for x_deg, z_deg in [(10, 0), (-10, 0), (0, 10), (0, -10)]:
-        there = tilted(insert, x_deg, z_deg)
-        again = transform(insert_placement(there), there.vertices)
+        tilted_insert = tilted(insert, x_deg, z_deg)
+        again = transform(insert_placement(tilted_insert), tilted_insert.vertices)
         assert np.allclose(again, placed.vertices, atol=1e-8)
     rng = np.random.default_rng(0)
     noisy = Surface(insert.vertices + rng.normal(0, 1e-5, insert.vertices.shape), insert.faces)

@@ -1,4 +1,4 @@
-"""A recording of flexion alone: the other coordinates are found, or the scene is refused."""
+"""Recordings of flexion alone: equilibrium gives the other coordinates, or the scene is refused."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ ROLES = {"time": "time_s", "flexion": "flexion_deg"} | {
 
 
 def scene_of(folder, columns, released):
-    """The shipped scene with a motion file of some of its columns."""
+    """Return the shipped scene with a motion file of some of its columns."""
     table = read_table(BEND / "motion.csv", "csv")
     file = folder / "motion.csv"
     values = np.stack([table.columns[name] for name in columns], axis=1)
@@ -36,7 +36,7 @@ def scene_of(folder, columns, released):
     return scene.model_copy(update={"motion": scene.motion.model_copy(update={"columns": named})})
 
 
-def test_flexion_alone_finds_the_state_of_the_whole_recording(tmp_path):
+def test_flexion_alone_gives_the_equilibrium_of_the_whole_recording(tmp_path):
     alone = load_case(scene_of(tmp_path, list(ROLES.values()), ALL))
     whole = load_case(load_scene(BEND / "scene.toml", {"contact.released": ALL} | COARSE))
     assert set(alone.motion.unrecorded) == {*ALL, "si"}
@@ -50,7 +50,7 @@ def test_flexion_alone_finds_the_state_of_the_whole_recording(tmp_path):
         assert np.degrees(apart[3:]).max() < 0.3, k
 
 
-def test_the_first_guess_sits_on_the_insert(tmp_path):
+def test_the_initial_guess_touches_the_insert(tmp_path):
     case = load_case(scene_of(tmp_path, list(ROLES.values()), ALL))
     lowest = LowestPoints(case.femoral, case.split)
     touch = FirstTouch(case.femoral, case.insert)
@@ -68,6 +68,8 @@ def test_the_first_guess_sits_on_the_insert(tmp_path):
         (["time_s", "adduction_deg"], ALL, "flexion"),
     ],
 )
-def test_what_is_neither_recorded_nor_released_is_refused(tmp_path, columns, released, missing):
+def test_a_coordinate_that_is_neither_recorded_nor_released_is_refused(
+    tmp_path, columns, released, missing
+):
     with pytest.raises(InputError, match=missing):
         load_case(scene_of(tmp_path, columns, released))

@@ -1,4 +1,4 @@
-"""Elastic foundation, the bed it stands on and the press, against closed forms."""
+"""Elastic foundation, its columns and the press, against closed forms."""
 
 from pathlib import Path
 
@@ -46,8 +46,8 @@ def cap(depth):
     return np.pi * depth**2 * (RADIUS - depth / 3)
 
 
-def test_a_sphere_presses_with_its_cap_volume():
-    """Force = M/h times the cap's volume; doubling the depth gives 3.9 to 4.0 times it."""
+def test_the_force_of_a_sphere_is_proportional_to_the_volume_of_its_cap():
+    """Force = M/h times the cap's volume. Twice the depth gives 3.9 to 4.0 times the force."""
     model = LinearFoundation(0.5e-3)
     state = model.prepare(sphere_on_block())
     depths = np.array([0.1e-3, 0.2e-3, 0.4e-3, 0.8e-3])
@@ -59,7 +59,7 @@ def test_a_sphere_presses_with_its_cap_volume():
 
 
 def test_the_force_converges_with_second_order():
-    """RMS over positions of the grid under the sphere, 2 to 0.5 mm."""
+    """Root mean square error over positions of the grid under the sphere, 2 to 0.5 mm."""
     errors = []
     shifts = np.linspace(0, 1, 7)[:-1]
     for resolution in (2e-3, 1e-3, 0.5e-3):
@@ -77,7 +77,7 @@ def test_the_force_converges_with_second_order():
 
 
 def test_a_flat_punch_gives_uniform_pressure_on_the_whole_top():
-    """Tributary areas add up to the top, rim included, when the grid does not fit it."""
+    """Tributary areas add up to the area of the top, also if the cells do not fit."""
     insert = flat_insert(8e-3, half_x=10.3e-3, half_z=13.7e-3)
     punch = flat_insert(5e-3, half_x=20e-3, half_z=20e-3)
     model = LinearFoundation(1e-3)
@@ -90,7 +90,7 @@ def test_a_flat_punch_gives_uniform_pressure_on_the_whole_top():
     assert np.allclose(result.medial.centre_of_pressure, [0, 8e-3, 0], atol=1e-9)
 
 
-def test_the_bed_lies_on_the_mesh_with_true_areas_normals_and_thickness():
+def test_map_points_lie_on_the_mesh_with_exact_areas_normals_and_thickness():
     radius = 25e-3
     insert = dished_insert(lambda x, z: 32e-3 - np.sqrt(radius**2 - x**2 - z**2))
     bed = sample_surface(insert, 1e-3)
@@ -113,7 +113,7 @@ def test_the_bed_lies_on_the_mesh_with_true_areas_normals_and_thickness():
     assert (facing[:, 1] > 0).all()
 
 
-def test_the_bed_shows_a_post():
+def test_map_points_include_a_post():
     insert = dished_insert(lambda x, z: np.where(np.hypot(x, z) < 4e-3, 20e-3, 8e-3))
     bed = sample_surface(insert, 1e-3)
     on_post = np.hypot(bed.points[:, 0], bed.points[:, 2]) < 3.4e-3
@@ -142,16 +142,16 @@ def test_pressure_laws():
     assert np.allclose(pressure[2:], M / 561.5e6 * secant * true_strain)
 
 
-def test_rotated_past_a_right_angle_nothing_changes():
-    """The femoral mesh in a frame turned by 130 deg of flexion, pose turned back."""
+def test_the_force_does_not_depend_on_the_femoral_frame():
+    """The mesh is given in a frame turned by 130 deg of flexion, and the pose is turned back."""
     pair = sphere_on_block()
     turned = knee_pose([2e-3, 1e-3, 0, 0, 0, np.radians(130)])
     other = ContactPair(pair.femoral.moved(turned), pair.insert, pair.material)
     model = LinearFoundation(1e-3)
-    here = model.press(model.prepare(pair), 800.0, lowered(0))
-    there = model.press(model.prepare(other), 800.0, lowered(0) @ inverse(turned))
-    assert there.approach == pytest.approx(here.approach, rel=1e-9)
-    assert np.allclose(there.pressure, here.pressure, rtol=1e-6, atol=1.0)
+    expected = model.press(model.prepare(pair), 800.0, lowered(0))
+    result = model.press(model.prepare(other), 800.0, lowered(0) @ inverse(turned))
+    assert result.approach == pytest.approx(expected.approach, rel=1e-9)
+    assert np.allclose(result.pressure, expected.pressure, rtol=1e-6, atol=1.0)
 
 
 def two_spheres(gap=24e-3):
@@ -161,7 +161,7 @@ def two_spheres(gap=24e-3):
     )
 
 
-def test_two_condyles_share_evenly_and_by_their_depths():
+def test_two_condyles_share_the_load_by_their_penetrations():
     model = LinearFoundation(1e-3)
     state = model.prepare(ContactPair(two_spheres(), flat_insert(HEIGHT, half_z=28e-3), LINEAR))
     level = model.press(state, 1500.0, np.eye(4))
@@ -187,7 +187,7 @@ def test_varus_loads_the_medial_condyle():
 
 
 @pytest.mark.parametrize("load", [1e-6, 1.0, 300.0, 3000.0])
-def test_the_load_is_reached_at_any_size(load):
+def test_loads_of_any_size_are_reached(load):
     model = ElasticFoundation(0.5e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     result = model.press(state, load, lowered(0, x=0.13e-3))
@@ -213,7 +213,7 @@ def test_an_impossible_load_is_an_input_error(load):
         model.press(model.prepare(sphere_on_block()), load, lowered(0))
 
 
-def test_out_of_range_is_nan_and_says_why():
+def test_out_of_range_is_nan_with_a_reason():
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     deep = model.evaluate(state, lowered(6e-3))
@@ -228,8 +228,10 @@ def test_out_of_range_is_nan_and_says_why():
     assert beside.medial is None
 
 
-def test_a_rim_column_that_starts_under_the_dish_lets_the_femur_in_there():
-    """Half-way along a steep chamfer's normal lies under the flat top, in the ball."""
+def test_a_rim_column_that_starts_in_the_femur_under_the_dish_is_no_penetration():
+    """Half-way through the insert, the normal of a steep chamfer lies under the flat top, in the
+    sphere.
+    """
     radius, depth = 6e-3, 3e-3
     outline = [(-15, 0), (15.5, 0), (15, 8), (14, 10), (-15, 10)]  # z, y in mm
     corners = [(x, y, z) for x in (-15, 15) for z, y in outline]
@@ -247,8 +249,10 @@ def test_a_rim_column_that_starts_under_the_dish_lets_the_femur_in_there():
     assert reaction(model, state, at) == pytest.approx(M / HEIGHT * volume, rel=8e-3)
 
 
-def test_an_edge_that_is_run_over_is_not_called_half_the_thickness():
-    """A slope of 45 deg ends in a crest, 31 mm high and less than 1 thick along its normal."""
+def test_the_femur_over_an_edge_has_its_own_message():
+    """A slope of 45 deg ends in a crest that is 31 mm high and less than 1 mm thick along the
+    normal.
+    """
     outline = [(-15, 0), (15, 0), (15, 32), (-15, 2)]  # z, y in mm
     corners = [(x, y, z) for x in (-15, 15) for z, y in outline]
     hull = trimesh.convex.convex_hull(np.array(corners) * 1e-3)
@@ -265,7 +269,7 @@ def test_an_edge_that_is_run_over_is_not_called_half_the_thickness():
 
 
 @pytest.mark.parametrize("share", [0.5, 0.999, 1.05, 3.0])
-def test_where_the_range_ends_the_near_columns_say_what_the_whole_bed_does(share, monkeypatch):
+def test_near_columns_go_out_of_range_like_all_columns(share, monkeypatch):
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     most = -model.evaluate(state, lowered(0.4999 * HEIGHT)).wrench_on_insert[1]
@@ -276,19 +280,23 @@ def test_where_the_range_ends_the_near_columns_say_what_the_whole_bed_does(share
         return evaluate(self, *arguments)
 
     monkeypatch.setattr(ElasticFoundation, "evaluate", counted)
-    found = model.press(state, share * most, lowered(0))
+    result = model.press(state, share * most, lowered(0))
     few = len(looked)
     whole = press_by_search(model, state, share * most, lowered(0))
-    assert found.status is whole.status
-    assert (found.status is ContactStatus.OK) == (share < 1.0)
-    assert found.flags == whole.flags
-    np.testing.assert_allclose(found.approach, whole.approach, rtol=1e-6)
-    assert few <= 2 < len(looked) - few  # the bed at the end, and once where the range ends
+    assert result.status is whole.status
+    assert (result.status is ContactStatus.OK) == (share < 1.0)
+    assert result.flags == whole.flags
+    np.testing.assert_allclose(result.approach, whole.approach, rtol=1e-6)
+    assert (
+        few <= 2 < len(looked) - few
+    )  # all columns are evaluated at the end, and once at the end of the range
 
 
 @pytest.mark.parametrize("aside", [0.0, 1.0e-3, 3.0e-3, 12.0e-3])
-def test_a_guess_spares_the_bed_and_changes_nothing(aside, monkeypatch):
-    """Near by, 1.5 mm the most, the guess says which columns count; from afar the bed does."""
+def test_a_guess_saves_evaluations_and_does_not_change_the_result(aside, monkeypatch):
+    """From a neighbouring pose the guess selects the columns; from a far pose all columns are
+    evaluated.
+    """
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))
@@ -300,15 +308,15 @@ def test_a_guess_spares_the_bed_and_changes_nothing(aside, monkeypatch):
         return gaps_and_facets(samples, *arguments)
 
     monkeypatch.setattr(contact_samples, "gaps_and_facets", counted)
-    found = model.press(state, 1500.0, lowered(0), before)
-    assert found.status is ContactStatus.OK
-    assert found.residual <= PRESS.load_tolerance
-    np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
+    result = model.press(state, 1500.0, lowered(0), before)
+    assert result.status is ContactStatus.OK
+    assert result.residual <= PRESS.load_tolerance
+    np.testing.assert_allclose(result.approach, alone.approach, rtol=1e-6)
     nearer_than = contact_samples.FARTHEST / contact_samples.OBLIQUE
     assert (looked[0] < len(state.points)) == (aside < nearer_than)
 
 
-def test_a_guess_that_failed_or_stands_on_another_bed_is_not_looked_at():
+def test_a_failed_guess_or_one_with_other_map_points_is_not_used():
     model = ElasticFoundation(1e-3)
     bodies = sphere_on_block(material("polyethylene"))
     state, coarse = model.prepare(bodies), ElasticFoundation(2e-3).prepare(bodies)
@@ -316,22 +324,22 @@ def test_a_guess_that_failed_or_stands_on_another_bed_is_not_looked_at():
     failed = model.evaluate(state, lowered(0.9 * HEIGHT))
     assert failed.status is ContactStatus.OUT_OF_RANGE
     for guess in (failed, model.press(coarse, 1500.0, lowered(0))):
-        found = model.press(state, 1500.0, lowered(0), guess)
-        np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
+        result = model.press(state, 1500.0, lowered(0), guess)
+        np.testing.assert_allclose(result.approach, alone.approach, rtol=1e-6)
 
 
-def test_columns_that_the_neighbourhood_left_out_are_found_by_the_whole_bed(monkeypatch):
-    """With the bound broken the search misses columns; the bed at its end tells."""
+def test_columns_missed_by_the_neighbourhood_are_found_by_the_final_evaluation(monkeypatch):
+    """With a wrong bound the search misses columns."""
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))
     before = model.press(state, 1500.0, lowered(0, x=-12e-3))
     monkeypatch.setattr(contact_samples, "OBLIQUE", 0.0)
-    found = model.press(state, 1500.0, lowered(0), before)
-    np.testing.assert_allclose(found.approach, alone.approach, rtol=1e-6)
+    result = model.press(state, 1500.0, lowered(0), before)
+    np.testing.assert_allclose(result.approach, alone.approach, rtol=1e-6)
 
 
-def test_a_probe_far_from_where_it_looked_looks_anew():
+def test_a_probe_at_a_far_pose_evaluates_other_columns():
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block())
     probe, depth = model.probe(state), 0.2e-3
@@ -340,19 +348,19 @@ def test_a_probe_far_from_where_it_looked_looks_anew():
         np.testing.assert_allclose(probe.at(lowered(depth, x=x)).wrench, expected, 1e-9, 1e-12)
 
 
-def test_what_a_probe_sees_of_a_result_is_what_it_finds_there():
+def test_a_probe_of_a_result_is_the_probe_at_its_pose():
     model = ElasticFoundation(1e-3)
     state = model.prepare(ContactPair(two_spheres(), flat_insert(HEIGHT, half_z=28e-3), LINEAR))
     result = model.press(state, 1500.0, np.eye(4))
-    seen, found = model.probe(state).seen(result), model.probe(state).at(result.pose)
-    assert set(seen.condyles) == set(found.condyles) == {"medial", "lateral"}
-    for side, condyle in seen.condyles.items():
-        np.testing.assert_allclose(condyle.wrench, found.condyles[side].wrench, rtol=1e-12)
-        np.testing.assert_allclose(condyle.stiffness, found.condyles[side].stiffness, rtol=1e-9)
+    from_result, at_pose = model.probe(state).seen(result), model.probe(state).at(result.pose)
+    assert set(from_result.condyles) == set(at_pose.condyles) == {"medial", "lateral"}
+    for side, condyle in from_result.condyles.items():
+        np.testing.assert_allclose(condyle.wrench, at_pose.condyles[side].wrench, rtol=1e-12)
+        np.testing.assert_allclose(condyle.stiffness, at_pose.condyles[side].stiffness, rtol=1e-9)
 
 
 def test_first_touch_of_crossed_cylinders_is_found_on_their_edges():
-    """Two prisms touch edge on edge, where neither has a vertex."""
+    """Two prisms touch on their edges, where no vertex lies."""
     ridge = dished_insert(lambda x, z: 10e-3 - 0.5 * np.abs(x), spacing=15e-3)
     roof = dished_insert(lambda x, z: 10e-3 - 0.5 * np.abs(z), spacing=15e-3)
     flipped = Surface(roof.vertices * [1, -1, 1], roof.faces[:, ::-1].copy(), "roof")
@@ -370,7 +378,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the data folder shared/data is not here")
 def test_a_real_implant_is_loaded_on_both_dishes():
-    """JW's components aligned, 1500 N: even split, centres in the dishes."""
+    """The aligned components of JW, 1500 N: even split, centres of pressure in the dishes."""
     from tkamb.run.press import press_meshes
 
     folder = DATA / "jw" / "geometry"
@@ -381,9 +389,9 @@ def test_a_real_implant_is_loaded_on_both_dishes():
         units="m",
         axes="-x,+y,-z",
     )
-    found = report.as_dict()
+    result = report.as_dict()
     for name, side in (("medial", -1), ("lateral", 1)):
-        condyle = found[name]
+        condyle = result[name]
         assert condyle["force_N"] == pytest.approx(750, rel=0.03)
         assert side * condyle["cop_mm"][2] == pytest.approx(22, abs=1.5)
         assert abs(condyle["cop_mm"][0]) < 6
@@ -393,7 +401,7 @@ def test_a_real_implant_is_loaded_on_both_dishes():
 
 @pytest.mark.parametrize("law", ["linear", "nonlinear"])
 @pytest.mark.parametrize("name", ["polyethylene", "polyethylene-linear"])
-def test_the_slope_is_that_of_the_pressure(law, name):
+def test_layer_slope_is_the_derivative_of_the_pressure(law, name):
     chosen, strain, step = material(name), np.array([1e-3, 0.02, 0.1, 0.3]), 1e-6
     ends = [layer_pressure(law, chosen, strain + side * step) for side in (-1, 1)]
     slope = (ends[1] - ends[0]) / (2 * step)
@@ -402,14 +410,14 @@ def test_the_slope_is_that_of_the_pressure(law, name):
 
 @pytest.mark.parametrize("power", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("start", [1e-7, 1e-4, 5e-3])
-def test_the_search_for_a_load_says_how_near_it_came(power, start):
-    """Reactions c d^p: the approach in closed form, and the difference that is left there."""
+def test_the_search_for_a_load_returns_its_residual(power, start):
+    """Reactions c d^p, with the approach in closed form."""
 
     def reaction(approach):
         return 1e9 * approach**power
 
-    found = search_load(reaction, 800.0, start)
-    assert found.approach == pytest.approx((800.0 / 1e9) ** (1 / power), rel=1e-6)
-    assert found.residual == pytest.approx(abs(reaction(found.approach) / 800.0 - 1.0), abs=1e-15)
-    assert found.residual <= PRESS.load_tolerance
-    assert found.deepest >= found.approach
+    result = search_load(reaction, 800.0, start)
+    assert result.approach == pytest.approx((800.0 / 1e9) ** (1 / power), rel=1e-6)
+    assert result.residual == pytest.approx(abs(reaction(result.approach) / 800.0 - 1.0), abs=1e-15)
+    assert result.residual <= PRESS.load_tolerance
+    assert result.deepest >= result.approach

@@ -1,4 +1,4 @@
-"""The bed's columns: walls and voids within the insert, and contact narrower than the columns."""
+"""Columns of the foundation: walls and voids in the insert, and contact narrower than a column."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ OFFSETS = [(0, 0), (0.5, 0.5), (0.5, 0), (0.25, 0.25), (0.13, 0.37)]
 
 
 def box(low, high, turn_out=True):
-    """Return a box (mm) between y = low and high, 30 x 30; inside out where it is a void."""
+    """Return a box of 30 x 30 mm between y = low and high (mm); inside out for a void."""
     made = (
         trimesh.creation.box((30, high - low, 30))
         if turn_out
@@ -48,7 +48,7 @@ INSERTS = {
 
 
 @pytest.mark.parametrize("name", INSERTS)
-def test_a_column_ends_where_it_leaves_the_insert_for_good(name):
+def test_a_column_ends_where_it_finally_leaves_the_insert(name):
     bed = sample_surface(INSERTS[name], 1 * MM)
     assert bed.thickness == pytest.approx(10 * MM)
     if "layers" in name:
@@ -57,8 +57,8 @@ def test_a_column_ends_where_it_leaves_the_insert_for_good(name):
 
 @pytest.mark.parametrize("name", INSERTS)
 @pytest.mark.parametrize("model", [LinearFoundation, ElasticFoundation])
-def test_pressure_is_that_of_the_whole_insert(name, model):
-    found, whole = (
+def test_walls_and_voids_do_not_change_the_pressure(name, model):
+    result, whole = (
         model(1 * MM).press(
             model(1 * MM).prepare(ContactPair(graded_sphere(30 * MM), insert, LINEAR)),
             800.0,
@@ -66,8 +66,8 @@ def test_pressure_is_that_of_the_whole_insert(name, model):
         )
         for insert in (INSERTS[name], WHOLE)
     )
-    assert found.medial.peak_pressure == pytest.approx(whole.medial.peak_pressure, rel=1e-6)
-    assert found.approach == pytest.approx(whole.approach, rel=1e-6)
+    assert result.medial.peak_pressure == pytest.approx(whole.medial.peak_pressure, rel=1e-6)
+    assert result.approach == pytest.approx(whole.approach, rel=1e-6)
 
 
 def narrow(result):
@@ -75,7 +75,7 @@ def narrow(result):
 
 
 @pytest.mark.parametrize("size", [1.0, 2.0])
-def test_a_ball_s_peak_is_right_or_flagged(size):
+def test_the_peak_of_a_sphere_is_correct_or_flagged(size):
     """Radius 22 mm on 10 mm, 1 to 5000 N: force = M/h times the volume of the cap."""
     radius, height = 22 * MM, 10 * MM
     model = LinearFoundation(size * MM)
@@ -87,8 +87,8 @@ def test_a_ball_s_peak_is_right_or_flagged(size):
         force = M / height * np.pi * depths**2 * (radius - depths / 3)
         exact = M / height * np.interp(load, force, depths)
         for x, z in np.array(OFFSETS) * size * MM:
-            found = model.press(state, load, pose(np.eye(3), [x, 0, z]))
-            off.append((narrow(found), found.medial.peak_pressure / exact - 1))
+            result = model.press(state, load, pose(np.eye(3), [x, 0, z]))
+            off.append((narrow(result), result.medial.peak_pressure / exact - 1))
     flagged, error = (np.array(column) for column in zip(*off, strict=True))
     assert np.abs(error[~flagged]).max() < 0.08
     assert error[flagged].min() < -0.5
@@ -96,7 +96,7 @@ def test_a_ball_s_peak_is_right_or_flagged(size):
 
 
 @pytest.mark.parametrize("degrees", [20.0, 30.0, 45.0])
-def test_the_edge_of_a_tilted_brick_is_right_or_flagged(degrees):
+def test_the_peak_of_a_tilted_block_is_correct_or_flagged(degrees):
     """A wedge of 90 deg presses a strip: force = M/h times its cross-section times its length."""
     brick = trimesh.creation.box((30, 30, 30))
     turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [1, 0, 0])
@@ -104,8 +104,8 @@ def test_the_edge_of_a_tilted_brick_is_right_or_flagged(degrees):
     femoral = Surface(np.asarray(brick.vertices) * MM, np.asarray(brick.faces, np.int64), "brick")
     model = LinearFoundation(1 * MM)
     insert = flat_insert(12 * MM, half_x=20 * MM, half_z=30 * MM)
-    found = model.press(model.prepare(ContactPair(femoral, insert, LINEAR)), 1000.0, np.eye(4))
+    result = model.press(model.prepare(ContactPair(femoral, insert, LINEAR)), 1000.0, np.eye(4))
     steep = 1 / np.tan(np.radians(degrees)) + np.tan(np.radians(degrees))
     depth = np.sqrt(1000.0 * 12 * MM / M / 30 / MM * 2 / steep)
     exact = M * depth / (12 * MM)
-    assert narrow(found) or found.medial.peak_pressure == pytest.approx(exact, rel=0.08)
+    assert narrow(result) or result.medial.peak_pressure == pytest.approx(exact, rel=0.08)

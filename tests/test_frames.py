@@ -1,4 +1,4 @@
-"""Knee coordinates: signs of the field, round trip, and the twist by finite differences."""
+"""Knee coordinates: signs, inverse transformation, and the twist by finite differences."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,8 +15,10 @@ from tkamb.geometry.frames import (
 from tkamb.units import DEGREE
 
 
-def test_signs_are_those_of_the_field():
-    """Flexion swings the femur's shaft back; varus opens laterally; external turns it out."""
+def test_signs_are_those_of_grood_and_suntay():
+    """Flexion turns the femur's shaft backwards, varus opens laterally, external rotation turns it
+    out.
+    """
     shaft, anterior = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
     lateral_condyle = np.array([0.0, 0.0, 0.02])
     turn = 5 * DEGREE
@@ -25,16 +27,16 @@ def test_signs_are_those_of_the_field():
     assert transform(knee_pose([0, 0, 0, turn, 0, 0]), anterior)[2] > 0.08
 
 
-def test_round_trip_to_160_degrees():
+def test_coordinates_of_a_pose_are_recovered_to_160_degrees():
     rng = np.random.default_rng(1)
     low = np.array([-0.02, 0, -0.01, -0.4, -0.2, -0.1])
     high = np.array([0.02, 0.05, 0.01, 0.4, 0.2, 160 * DEGREE])
-    wanted = rng.uniform(low, high, (500, 6))
-    found = np.array([knee_coordinates(knee_pose(c)) for c in wanted])
-    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    expected = rng.uniform(low, high, (500, 6))
+    result = np.array([knee_coordinates(knee_pose(c)) for c in expected])
+    np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
-def test_any_other_angle_order_goes_through_the_matrix():
+def test_other_angle_orders_are_converted_by_the_rotation_matrix():
     angles = np.array([0.3, -0.4, 1.1])
     given = pose(Rotation.from_euler("XYZ", angles).as_matrix(), np.zeros(3))
     again = knee_pose(knee_coordinates(given))
@@ -56,7 +58,7 @@ def test_twist_is_the_derivative_of_the_pose():
 
 
 def test_inverse_and_mirror():
-    there = knee_pose([0.01, 0.03, 0.002, 0.1, 0.05, 1.0])
-    np.testing.assert_allclose(there @ inverse(there), np.eye(4), atol=1e-15)
-    c = knee_coordinates(mirrored_pose(there))
+    femoral_pose = knee_pose([0.01, 0.03, 0.002, 0.1, 0.05, 1.0])
+    np.testing.assert_allclose(femoral_pose @ inverse(femoral_pose), np.eye(4), atol=1e-15)
+    c = knee_coordinates(mirrored_pose(femoral_pose))
     np.testing.assert_allclose(c, [0.01, 0.03, -0.002, -0.1, -0.05, 1.0], atol=1e-15)

@@ -1,4 +1,4 @@
-"""Force plate: axes, centre of pressure, swing, left foot, and an unchanged wrench."""
+"""Ground reaction: axes, centre of pressure, swing, left foot, and the unchanged wrench."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ NAMES = ["time", *(f"{what}_{k}" for what in ("force", "point", "moment") for k 
 
 
 def step(t):
-    """Force, centre of pressure and vertical free moment (n, 3) of one step from 0.4 to 1.4 s."""
+    """Return force, centre of pressure and vertical free moment (n, 3) of a step, 0.4 to 1.4 s."""
     on = np.clip((t - 0.4) / 1.0, 0, 1)
     load = np.sin(np.pi * on) ** 2
     force = np.stack([-60 * np.sin(2 * np.pi * on) * load, 700 * load, 30 * load], axis=1)
@@ -50,15 +50,15 @@ def test_loaded_foot_is_reproduced(tmp_path):
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_an_infinite_cell_is_refused_before_anything_is_computed(tmp_path, which):
+def test_an_infinite_cell_is_refused(tmp_path, which):
     measured = [values.copy() for values in step(STAMPS)]
     measured[which][7, 0] = np.inf
     with pytest.raises(InputError, match="line 9 holds 'inf', which is not finite"):
         load_ground_reaction(plate(write(tmp_path / "g.csv", *measured)), AT, "right")
 
 
-def test_garbage_of_the_unloaded_plate_does_no_harm(tmp_path):
-    """Points of the swing phase mean nothing: wild, zero or missing, the result is the same."""
+def test_centres_of_pressure_of_an_unloaded_plate_have_no_influence(tmp_path):
+    """Points of the swing phase may be wild, zero or missing."""
     force, point, moment = step(STAMPS)
     swing = force[:, 1] < 20
     results = []
@@ -75,22 +75,22 @@ def test_garbage_of_the_unloaded_plate_does_no_harm(tmp_path):
     assert (results[0].point <= high + 1e-3).all()
 
 
-def test_wrench_is_filtered_about_a_fixed_point_only(tmp_path):
-    """Where the plate's origin lies changes no force, moment, nor centre of pressure."""
+def test_the_wrench_is_filtered_about_a_fixed_point(tmp_path):
+    """The origin of the plate has no influence on force, moment and centre of pressure."""
     force, point, moment = step(STAMPS)
     shift = np.array([5.0, 0.0, -3.0])
-    here, there = (
+    unshifted, shifted = (
         load_ground_reaction(
             plate(write(tmp_path / "g.csv", force, point + s, moment), cutoff_Hz=5.0), AT, "right"
         )
         for s in (0.0, shift)
     )
-    np.testing.assert_allclose(there.force, here.force, atol=1e-9)
-    np.testing.assert_allclose(there.point - shift, here.point, atol=1e-9)
-    np.testing.assert_allclose(there.moment, here.moment, atol=1e-9)
+    np.testing.assert_allclose(shifted.force, unshifted.force, atol=1e-9)
+    np.testing.assert_allclose(shifted.point - shift, unshifted.point, atol=1e-9)
+    np.testing.assert_allclose(shifted.moment, unshifted.moment, atol=1e-9)
 
 
-def test_unloaded_point_is_convention_the_wrench_is_not(tmp_path):
+def test_the_point_of_an_unloaded_plate_does_not_change_the_wrench(tmp_path):
     file = write(tmp_path / "g.csv", *step(STAMPS))
     low, high = (
         load_ground_reaction(plate(file, unloaded_N=n, cutoff_Hz=5.0), AT, "right")
@@ -118,8 +118,7 @@ def test_laboratory_axes_and_left_foot(tmp_path):
         np.testing.assert_allclose(other.moment, right.moment, atol=1e-10)
 
 
-def test_a_force_beyond_any_foot_is_told_by_its_column_and_row(tmp_path):
-    """Also where the laboratory's axes turn it to another direction."""
+def test_a_force_too_large_for_a_foot_is_refused_with_its_column_and_row(tmp_path):
     force, point, moment = step(STAMPS)
     force[1200, 0] = -3e4
     file = write(tmp_path / "g.csv", force, point, moment)
@@ -128,7 +127,7 @@ def test_a_force_beyond_any_foot_is_told_by_its_column_and_row(tmp_path):
 
 
 def test_force_on_the_plate_is_the_opposite_of_that_on_the_foot(tmp_path):
-    """Newton's third law: three signs of the force and the moment's turn, the point stays."""
+    """Newton's third law: force and free moment change their signs, the point does not."""
     force, point, moment = step(STAMPS)
     foot = write(tmp_path / "foot.csv", force, point, moment)
     on_foot = load_ground_reaction(plate(foot), AT, "left")
@@ -151,9 +150,9 @@ def test_millimetres_and_absent_free_moment(tmp_path):
     lines = [",".join(NAMES[:7]), *(",".join(f"{v:.15g}" for v in row) for row in rows)]
     file = tmp_path / "mm.csv"
     file.write_text("\n".join(lines), encoding="utf-8")
-    found = load_ground_reaction(plate(file, length_unit="mm"), AT, "right")
-    np.testing.assert_allclose(found.point, metres.point, atol=1e-12)
-    np.testing.assert_allclose(found.moment, metres.moment, atol=1e-9)
+    result = load_ground_reaction(plate(file, length_unit="mm"), AT, "right")
+    np.testing.assert_allclose(result.point, metres.point, atol=1e-12)
+    np.testing.assert_allclose(result.moment, metres.moment, atol=1e-9)
 
 
 def test_plate_that_is_never_loaded(tmp_path):
@@ -190,20 +189,20 @@ def test_refusals(tmp_path):
         load_ground_reaction(plate(file), AT + 1, "right")
 
 
-def test_a_plate_need_not_say_its_own_height(tmp_path):
-    """Its surface then is the laboratory's height 0; a missing horizontal column is refused."""
+def test_the_height_of_a_plate_may_be_missing(tmp_path):
+    """The plate is then at the height 0; a missing horizontal column is refused."""
     force, point, moment = step(STAMPS)
     point[:, 1] = 0.0
     given = write(tmp_path / "given.csv", force, point, moment)
     rows = [line.split(",") for line in given.read_text(encoding="utf-8").splitlines()]
-    wanted = load_ground_reaction(plate(given), AT, "right")
+    expected = load_ground_reaction(plate(given), AT, "right")
     for role, file in (("point_2", "height.csv"), ("point_3", "side.csv")):
-        kept = [k for k, name in enumerate(rows[0]) if name != role]
-        text = "\n".join(",".join(row[k] for k in kept) for row in rows)
+        remaining = [k for k, name in enumerate(rows[0]) if name != role]
+        text = "\n".join(",".join(row[k] for k in remaining) for row in rows)
         (tmp_path / file).write_text(text, encoding="utf-8")
-    found = load_ground_reaction(plate(tmp_path / "height.csv"), AT, "right")
-    np.testing.assert_array_equal(found.point, wanted.point)
-    np.testing.assert_array_equal(found.moment, wanted.moment)
-    assert found.level_assumed and not wanted.level_assumed
+    result = load_ground_reaction(plate(tmp_path / "height.csv"), AT, "right")
+    np.testing.assert_array_equal(result.point, expected.point)
+    np.testing.assert_array_equal(result.moment, expected.moment)
+    assert result.level_assumed and not expected.level_assumed
     with pytest.raises(InputError, match="has no column 'point_3'"):
         load_ground_reaction(plate(tmp_path / "side.csv"), AT, "right")

@@ -1,4 +1,4 @@
-"""Hertz contact against closed forms and the half-space's own integral equation."""
+"""Hertz contact against closed forms and the integral equation of the half-space."""
 
 import numpy as np
 import pytest
@@ -18,10 +18,10 @@ RADIUS, HEIGHT = 30e-3, 10e-3
 
 
 def displacement(patch, u, v):
-    """Return the half-space's displacement at (u, v) inside the patch, m.
+    """Return the half-space's displacement (m) at (u, v) inside the patch.
 
-    Boussinesq: 1/(pi E*) times the integral of p / r, in polar coordinates about the point,
-    where the semi-ellipsoid integrates in closed form along each chord.
+    Boussinesq: 1/(pi E*) times the integral of p/r, in polar coordinates about the point. The
+    integral of the semi-ellipsoid along a chord has a closed form.
     """
     a, b = patch.long_axis, patch.short_axis
 
@@ -36,19 +36,19 @@ def displacement(patch, u, v):
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.0001, 2.0, 17.0, 900.0])
-def test_the_ellipse_fills_the_gap_exactly(ratio):
-    """delta - A u² - B v² = displacement at any point of the patch."""
+def test_the_ellipse_satisfies_the_contact_condition(ratio):
+    """delta - A u² - B v² equals the displacement at every point of the patch."""
     flat, approach = 10.0, 0.1e-3
     patch = contact_ellipse(flat, ratio * flat, approach, PLANE)
     for x, y in ((0, 0), (0.5, 0), (0, 0.7), (0.6, -0.6)):
         u, v = x * patch.long_axis, y * patch.short_axis
-        wanted = approach - flat * u**2 - ratio * flat * v**2
-        assert displacement(patch, u, v) == pytest.approx(wanted, rel=1e-7)
+        expected = approach - flat * u**2 - ratio * flat * v**2
+        assert displacement(patch, u, v) == pytest.approx(expected, rel=1e-7)
     volume = 2 / 3 * np.pi * patch.long_axis * patch.short_axis * patch.peak_pressure
     assert patch.force == pytest.approx(volume)
 
 
-def test_a_circle_is_the_textbook_case():
+def test_a_circular_patch_is_that_of_a_sphere():
     patch = contact_ellipse(1 / (2 * RADIUS), 1 / (2 * RADIUS), 1e-4, PLANE)
     assert patch.force == pytest.approx(4 / 3 * PLANE * RADIUS**0.5 * 1e-4**1.5)
     assert patch.long_axis == pytest.approx(np.sqrt(RADIUS * 1e-4))
@@ -63,7 +63,7 @@ def lowered(depth, top=HEIGHT, radius=RADIUS):
 
 
 def test_a_sphere_on_a_block():
-    """Force within 1 % of Hertz; doubling the depth gives 2.83 times it within 1 %."""
+    """Force within 1 % of Hertz; twice the depth gives 2.83 times the force within 1 %."""
     model = Hertz()
     state = model.prepare(ContactPair(graded_sphere(RADIUS), flat_insert(HEIGHT), LINEAR))
     depths = np.array([0.05e-3, 0.1e-3, 0.2e-3, 0.4e-3])
@@ -82,7 +82,7 @@ def test_a_sphere_on_a_block():
 
 
 def test_curvature_error_shrinks_with_the_patch():
-    """The quartic term makes the fitted curvature too large by (r/R)²/4."""
+    """The relative error of the fitted curvature is (r/R)²/4, from the quartic term."""
     model = Hertz()
     state = model.prepare(ContactPair(graded_sphere(RADIUS), flat_insert(HEIGHT), LINEAR))
     radii = np.array([2e-3, 4e-3, 8e-3])
@@ -96,7 +96,6 @@ def test_curvature_error_shrinks_with_the_patch():
 
 
 def test_an_ellipsoid_in_a_dish():
-    """Relative curvature is the difference of the two in each direction."""
     stretch = np.sqrt([1.2, 1.0, 1.6])
     femoral = graded_sphere(20e-3, stretch=stretch)
     insert = dished_insert(lambda x, z: 9e-3 + x**2 / (2 * 60e-3) + z**2 / (2 * 90e-3))
@@ -114,7 +113,7 @@ def test_an_ellipsoid_in_a_dish():
     assert result.medial.peak_pressure == pytest.approx(exact.peak_pressure, rel=0.015)
 
 
-def test_the_map_carries_the_vertical_force_exactly_and_converges_to_the_peak():
+def test_the_map_has_the_exact_vertical_force_and_converges_to_the_peak():
     pair = ContactPair(graded_sphere(RADIUS), flat_insert(HEIGHT), LINEAR)
     missing = []
     for resolution in (2e-3, 1e-3, 0.5e-3):
@@ -161,7 +160,7 @@ def two_spheres():
 
 
 def test_two_condyles_approach_together():
-    """Varus of 0.1 deg puts the medial sphere deeper by 24 mm sin(0.1 deg)."""
+    """A varus of 0.1 deg lowers the medial sphere by 24 mm sin(0.1 deg)."""
     model = Hertz()
     state = model.prepare(ContactPair(two_spheres(), flat_insert(HEIGHT, half_z=28e-3), LINEAR))
     level = model.press(state, 1500.0, np.eye(4))
@@ -183,8 +182,8 @@ def test_one_condyle_may_lift_off():
     assert result.lateral.force == pytest.approx(200, rel=1e-6)
 
 
-def test_a_tilted_block_pushes_along_its_normal():
-    """A flat top inclined by 10 deg: force along the normal, load along y."""
+def test_the_force_on_a_tilted_block_is_along_its_normal():
+    """A flat top is inclined by 10 deg; the load is along y."""
     slope = np.tan(np.radians(10))
     insert = dished_insert(lambda x, z: 12e-3 + slope * x, spacing=30e-3)
     model = Hertz()
@@ -198,8 +197,8 @@ def test_a_tilted_block_pushes_along_its_normal():
     assert result.approach * np.cos(np.radians(10)) == pytest.approx(depth, rel=0.02)
 
 
-def test_cells_of_a_slope_carry_their_mean_of_the_semi_ellipsoid():
-    """At 25 deg and cells of half the patch; shares of the load against a quadrature in x and z."""
+def test_cells_on_a_slope_have_the_mean_of_the_semi_ellipsoid():
+    """At 25 deg, with cells of half the patch, against a quadrature in x and z."""
     slope, size = np.tan(np.radians(25)), 2e-3
     insert = dished_insert(lambda x, z: 20e-3 + slope * x, spacing=30e-3)
     model = Hertz(size)
@@ -215,8 +214,8 @@ def test_cells_of_a_slope_carry_their_mean_of_the_semi_ellipsoid():
     assert shares == pytest.approx(height / height.sum(), abs=2e-3)
 
 
-def test_facets_average_out():
-    """Noise of 2 µm on the insert's vertices, 0.5 mm apart, moves the force by under 5 %."""
+def test_noise_of_the_mesh_averages_out():
+    """Noise of 2 µm at vertices 0.5 mm apart changes the force by less than 5 %."""
     clean = dished_insert(lambda x, z: HEIGHT + (x**2 + z**2) / (2 * 60e-3))
     noise = np.random.default_rng(3).normal(0, 2e-6, len(clean.vertices))
     top = clean.vertices[:, 1] > 0

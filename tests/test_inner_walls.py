@@ -1,4 +1,4 @@
-"""Inserts of several bodies that touch or overlap, and hollow ones: as one solid part."""
+"""Inserts of several touching or overlapping bodies, and hollow inserts, act as one body."""
 
 import logging
 
@@ -22,7 +22,7 @@ LENGTH, WIDTH, HEIGHT = 0.050, 0.076, 0.010
 
 
 def block(x, y, z, counts=(2, 1, 2)):
-    """A closed block between x, y and z (m), its sides divided evenly."""
+    """Return a closed block between x, y and z (m), with evenly divided sides."""
     lines = tuple(
         np.linspace(*limits, count + 1) for limits, count in zip((x, y, z), counts, strict=True)
     )
@@ -56,16 +56,16 @@ PRESENT = {
 
 
 def read(tmp_path, bodies):
-    """The bodies in one STL file, as a run reads them."""
-    both = joined_surfaces(*bodies)
+    """Return the bodies of one STL file, read as in a run."""
+    bodies_of_file = joined_surfaces(*bodies)
     path = tmp_path / "insert.stl"
-    trimesh.Trimesh(1e3 * both.vertices, both.faces, process=False).export(path)
+    trimesh.Trimesh(1e3 * bodies_of_file.vertices, bodies_of_file.faces, process=False).export(path)
     surface = load_surface(path, "mm", name="insert", closed=True)
     return surface.moved(insert_placement(surface))
 
 
 def peak(insert, contact):
-    """The peak pressure under a ball of 22 mm at 500 N, Pa."""
+    """Return the peak pressure (Pa) under a sphere of 22 mm at 500 N."""
     ball = trimesh.creation.icosphere(4, 0.022)
     femoral = Surface(np.asarray(ball.vertices), np.asarray(ball.faces, np.int64), "femoral")
     pair = ContactPair(femoral, insert, material("polyethylene"))
@@ -75,16 +75,16 @@ def peak(insert, contact):
 
 @pytest.fixture(scope="module")
 def right(tmp_path_factory):
-    """The peak pressures of the solid block."""
+    """Return the peak pressures of the solid block."""
     insert = read(tmp_path_factory.mktemp("solid"), [SOLID])
     return {contact: peak(insert, contact) for contact in ("foundation", "lattice-linear")}
 
 
 @pytest.mark.parametrize("name", TOUCHING)
-def test_a_wall_between_touching_bodies_is_taken_out(name, tmp_path, right, caplog):
+def test_a_wall_between_touching_bodies_is_removed(name, tmp_path, right, caplog):
     with caplog.at_level(logging.WARNING, "tkamb"):
         insert = read(tmp_path, TOUCHING[name])
-    if name != "meshed alike":  # whose two sides vanish as triangles back to back
+    if name != "meshed alike":  # both sides of this wall are removed as opposite duplicates
         assert "inner wall" in caplog.text
     assert insert.mesh.is_watertight
     assert insert.volume == pytest.approx(SOLID.volume, rel=1e-6)
@@ -101,8 +101,8 @@ def test_overlapping_bodies_are_one_in_the_lattice(name, tmp_path, right, caplog
     assert peak(insert, "lattice-linear") == pytest.approx(right["lattice-linear"], rel=1e-3)
 
 
-def test_a_block_that_stands_on_a_part_of_a_plate_is_one_with_it(tmp_path):
-    """Its underside covers triangles of the plate in part: the wall stays and is not counted."""
+def test_a_block_on_a_part_of_a_plate_is_joined_to_it(tmp_path):
+    """The block covers parts of the plate's triangles, so the wall stays; it does not count."""
     ridge = block((-LENGTH / 2, LENGTH / 2), (HEIGHT, 0.015), (-0.0067, 0.0067), (5, 1, 2))
     insert = read(tmp_path, [SOLID, ridge])
     lattice = whole_lattice(insert, 1.5e-3)
@@ -111,7 +111,7 @@ def test_a_block_that_stands_on_a_part_of_a_plate_is_one_with_it(tmp_path):
 
 
 @pytest.mark.parametrize("size", [1.5e-3, 2e-3])
-def test_a_void_stays_empty(size, tmp_path):
+def test_a_void_contains_no_material(size, tmp_path):
     void = inside_out(block((-0.012, 0.012), (0.002, 0.007), (-0.02, 0.02)))
     insert = read(tmp_path, [SOLID, void])
     lattice = whole_lattice(insert, size)
@@ -123,12 +123,12 @@ def test_a_void_stays_empty(size, tmp_path):
     )
 
 
-def test_a_body_within_the_other_may_be_a_void_and_is_refused(tmp_path):
+def test_a_body_within_another_one_is_refused(tmp_path):
     within = block((-0.01, 0.01), (0.002, 0.006), (-0.01, 0.01))
     with pytest.raises(InputError, match="2 separate bodies"):
         read(tmp_path, [SOLID, within])
 
 
-def test_bodies_a_tenth_of_a_millimetre_apart_are_two(tmp_path):
+def test_bodies_a_tenth_of_a_millimetre_apart_are_separate(tmp_path):
     with pytest.raises(InputError, match="2 separate bodies"):
         read(tmp_path, [slab(0, 0.004), slab(0.0041, HEIGHT)])

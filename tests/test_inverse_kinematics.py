@@ -1,4 +1,4 @@
-"""Inverse kinematics: Jacobians by finite differences, exact markers, gaps, noise."""
+"""Inverse kinematics: Jacobians by finite differences, exact markers, missing markers, noise."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def start(chain: LegChain, measured: np.ndarray) -> LegState:
 
 
 @pytest.mark.parametrize("free", [False, True], ids=["hinge", "six freedoms"])
-def test_the_jacobian_is_that_of_the_markers(free):
+def test_the_jacobian_is_the_derivative_of_the_markers(free):
     chain = LegChain(segments(), INSERT, free)
     state = random_state(chain)
     _, jacobian = chain.markers(state)
@@ -75,7 +75,7 @@ def test_the_jacobian_is_that_of_the_markers(free):
 
 
 @pytest.mark.parametrize("free", [False, True], ids=["hinge", "six freedoms"])
-def test_exact_markers_give_the_pose_back(free):
+def test_exact_markers_give_the_exact_pose(free):
     chain = LegChain(segments(), INSERT, free)
     truth = random_state(chain)
     measured, _ = chain.markers(truth)
@@ -83,25 +83,25 @@ def test_exact_markers_give_the_pose_back(free):
     fit = fit_chain(chain, measured, weights, start(chain, measured))
     assert fit.solved.all() and fit.rms.max() < 1e-9
     np.testing.assert_allclose(fit.state.shank, truth.shank, atol=1e-9)
-    found = knee_coordinates(np.linalg.inv(fit.state.shank @ INSERT) @ fit.state.thigh)
-    np.testing.assert_allclose(found, truth.knee, atol=1e-9)
+    result = knee_coordinates(np.linalg.inv(fit.state.shank @ INSERT) @ fit.state.thigh)
+    np.testing.assert_allclose(result, truth.knee, atol=1e-9)
 
 
-def test_the_chain_bridges_markers_that_are_missing():
+def test_poses_are_found_with_missing_markers():
     chain = LegChain(segments(), INSERT, False)
     truth = random_state(chain)
     measured, _ = chain.markers(truth)
-    seen = measured.copy()
-    seen[:, 0] = np.nan  # a shank marker throughout: two are left
-    seen[2, 4:6] = np.nan  # two of the thigh in one frame: pelvis and knee hold it
+    incomplete = measured.copy()
+    incomplete[:, 0] = np.nan  # a shank marker is missing throughout
+    incomplete[2, 4:6] = np.nan  # two thigh markers are missing in one frame
     weights = np.concatenate([s.weights for s in chain.segments.values()])
-    fit = fit_chain(chain, seen, weights, start(chain, measured))
+    fit = fit_chain(chain, incomplete, weights, start(chain, measured))
     assert fit.solved.all()
     np.testing.assert_allclose(fit.state.thigh, truth.thigh, atol=1e-8)
     assert np.isnan(fit.distance[:, 0]).all()
 
 
-def test_at_the_solution_no_freedom_lowers_the_weighted_distance():
+def test_the_solution_is_a_minimum_of_the_weighted_distance():
     chain = LegChain(segments(), INSERT, False)
     measured, _ = chain.markers(random_state(chain))
     measured = measured + np.random.default_rng(3).normal(0.0, 0.01, measured.shape)
@@ -116,7 +116,7 @@ def test_at_the_solution_no_freedom_lowers_the_weighted_distance():
     assert close.distance[:, 4].max() < 0.01 * fit.distance[:, 4].min()
 
 
-def test_flexion_goes_past_any_bound():
+def test_flexion_has_no_bound():
     chain = LegChain(segments(), INSERT, False)
     state = random_state(chain)
     state.knee[:, FLEXION] = np.linspace(-0.5, 2.9, FRAMES)
@@ -128,18 +128,18 @@ def test_flexion_goes_past_any_bound():
     np.testing.assert_allclose(fit.state.knee[:, FLEXION], truth.knee[:, FLEXION], atol=1e-9)
 
 
-def test_a_rigid_fit_needs_three_markers_and_takes_those_it_sees():
+def test_a_rigid_fit_needs_three_visible_markers():
     reference = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.15]])
     turn = Rotation.from_rotvec([0.3, -0.5, 1.2]).as_matrix()
-    there = np.tile(transform(pose(turn, [1.0, 2.0, 3.0]), reference), (3, 1, 1))
-    there[1, 0] = np.nan
-    there[2, :2] = np.nan
-    poses, rms = fit_seen(there, reference, np.ones(4), "x")
+    markers = np.tile(transform(pose(turn, [1.0, 2.0, 3.0]), reference), (3, 1, 1))
+    markers[1, 0] = np.nan
+    markers[2, :2] = np.nan
+    poses, rms = fit_seen(markers, reference, np.ones(4), "x")
     np.testing.assert_allclose(
         poses[:2], np.tile(pose(turn, [1.0, 2.0, 3.0]), (2, 1, 1)), atol=1e-12
     )
     assert np.isnan(poses[2]).all() and np.isnan(rms[2])
-    whole, _ = fit_rigid(there[:1], reference)
+    whole, _ = fit_rigid(markers[:1], reference)
     np.testing.assert_allclose(poses[:1], whole, atol=1e-14)
     with pytest.raises(InputError, match="no orientation"):
-        fit_seen(there[:, :2], reference[:2], np.ones(2), "x")
+        fit_seen(markers[:, :2], reference[:2], np.ones(2), "x")

@@ -1,4 +1,4 @@
-"""Small contacts: their area between the nodes, and a word where they are narrow."""
+"""Small contacts on the lattice: their area between the nodes, and the flag of narrow ones."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ OFFSETS = [(0, 0), (0.5, 0.5), (0.5, 0), (0.25, 0.25), (0.13, 0.37), (0.4, 0.1)]
 
 
 def sheet(size, half=12):
-    """Return points of a level square grid, its triangles and their areas."""
+    """Return nodes of a level square grid, its triangles and their areas."""
     ticks = size * np.arange(-half, half + 1)
     x, z = (g.ravel() for g in np.meshgrid(ticks, ticks, indexing="ij"))
     number = np.arange(x.size).reshape(2 * half + 1, -1)
@@ -32,7 +32,7 @@ def sheet(size, half=12):
 
 
 def hertz(r):
-    """Return pressure and gap of a rigid sphere on a half-space, contact radius A."""
+    """Return pressure and gap at the radius r of a rigid sphere, with the contact radius A."""
     modulus = LINEAR.young_modulus / (1 - LINEAR.poisson_ratio**2)
     p0 = 2 * A * modulus / (np.pi * RADIUS)
     out = np.maximum(r, A)
@@ -47,7 +47,7 @@ def covered(size, offset):
     return covered_areas(points, triangles, area, *hertz(r), LINEAR).sum() / (np.pi * A**2) - 1
 
 
-def test_exact_nodal_values_give_the_circle():
+def test_exact_nodal_values_give_the_area_of_the_circle():
     """Left are the polygon in place of the circle, and the edge's law at a finite distance."""
     sizes = np.array([1e-3, 0.5e-3, 0.25e-3, 0.125e-3])
     errors = np.array([[covered(size, offset) for offset in OFFSETS] for size in sizes])
@@ -59,27 +59,27 @@ def test_exact_nodal_values_give_the_circle():
 
 @pytest.mark.parametrize(("size", "worst"), [(1.0, 0.06), (2.0, 0.08)])
 @pytest.mark.parametrize("nu", [0.3, 0.45, 0.4999])
-def test_a_pressed_sphere_has_its_area(size, worst, nu):
-    """500 N; nodes in contact with their tributary areas give 20 and 40 % too much."""
+def test_the_contact_area_of_a_sphere_is_accurate(size, worst, nu):
+    """500 N. The sum of tributary areas would be 20 and 40 % too large."""
     body = replace(LINEAR, poisson_ratio=nu)
     model = contact_model("lattice-linear", size)
     state = model.prepare(pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), body))
     a, *_ = sphere_on_layer(RADIUS, 8e-3, 500.0, body.young_modulus, nu)
-    found = [model.press(state, 500.0, above(*(np.array(o) * size * 1e-3))) for o in OFFSETS]
-    area = np.array([f.medial.area for f in found]) / (np.pi * a**2)
-    whole = np.array([f.area[f.pressure > 0].sum() for f in found]) / (np.pi * a**2)
+    result = [model.press(state, 500.0, above(*(np.array(o) * size * 1e-3))) for o in OFFSETS]
+    area = np.array([f.medial.area for f in result]) / (np.pi * a**2)
+    whole = np.array([f.area[f.pressure > 0].sum() for f in result]) / (np.pi * a**2)
     assert abs(area.mean() - 1) < worst
     assert area.std() < 0.06
     assert whole.mean() > 1.15
-    assert found[0].medial.mean_pressure == pytest.approx(
-        found[0].medial.force / found[0].medial.area
+    assert result[0].medial.mean_pressure == pytest.approx(
+        result[0].medial.force / result[0].medial.area
     )
 
 
 @pytest.mark.parametrize("name", ["lattice", "lattice-linear", "fe"])
 @pytest.mark.parametrize("load", [1e-3, 1.0, 50.0])
 def test_the_mean_pressure_is_never_above_the_peak(name, load):
-    """Contact smaller than a cell: the nodes cannot tell its area."""
+    """The contact is smaller than a cell, so that its area cannot be resolved."""
     model = contact_model(name, 2.0)
     state = model.prepare(
         pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), material("polyethylene"))
@@ -89,15 +89,15 @@ def test_the_mean_pressure_is_never_above_the_peak(name, load):
         assert 0 < condyle.mean_pressure <= condyle.peak_pressure * (1 + 1e-12)
 
 
-def test_a_flat_with_sharp_edges_ends_half_way():
-    """A punch of 8 x 8 mm, edges between the nodes; its gap beyond is a step."""
+def test_the_contact_of_a_sharp_punch_ends_half_way_between_nodes():
+    """A punch of 8 x 8 mm with edges between the nodes; the gap jumps at the edge."""
     model = contact_model("lattice-linear", 1.0)
     state = model.prepare(pair(plate(8e-3, 8e-3), box_insert(16e-3, 6e-3, 16e-3), LINEAR))
-    found = model.press(state, 500.0, above(0.5e-3, 0.5e-3))
-    assert found.medial.area == pytest.approx(64e-6, rel=0.02)
+    result = model.press(state, 500.0, above(0.5e-3, 0.5e-3))
+    assert result.medial.area == pytest.approx(64e-6, rel=0.02)
 
 
-def test_contact_up_to_the_rim_of_the_insert_is_whole():
+def test_contact_up_to_the_rim_has_the_whole_area():
     model = contact_model("lattice-linear", 1.0)
     state = model.prepare(pair(plate(20e-3, 20e-3), box_insert(12e-3, 3e-3, 12e-3), LINEAR))
     assert model.press(state, 1000.0, above()).medial.area == pytest.approx(144e-6, rel=1e-9)
@@ -109,23 +109,23 @@ def narrow(found):
 
 @pytest.mark.parametrize("name", ["lattice-linear", "fe"])
 @pytest.mark.parametrize("size", [1.0, 2.0])
-def test_a_narrow_contact_is_flagged_and_any_other_has_its_peak(name, size):
+def test_a_contact_is_flagged_as_narrow_or_has_an_accurate_peak(name, size):
     model = contact_model(name, size)
     state = model.prepare(pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), LINEAR))
     off = []
     for load in (1.0, 50.0, 200.0, 300.0, 500.0, 3000.0):
         *_, exact = sphere_on_layer(RADIUS, 8e-3, load, LINEAR.young_modulus, LINEAR.poisson_ratio)
         for x, z in np.array(OFFSETS) * size * 1e-3:
-            found = model.press(state, load, above(x, z))
-            off.append((narrow(found), found.medial.peak_pressure / exact[0] - 1))
+            result = model.press(state, load, above(x, z))
+            off.append((narrow(result), result.medial.peak_pressure / exact[0] - 1))
     flagged, error = (np.array(column) for column in zip(*off, strict=True))
     assert np.abs(error[~flagged]).max() < 0.08
     assert error[flagged].max() < 0.05
     assert error[flagged].min() < -0.8
 
 
-def test_a_line_of_contact_is_flagged_however_long_it_is():
-    """A cylinder along x: one or two rows of nodes hold any number of nodes."""
+def test_a_line_contact_is_flagged_at_any_length():
+    """A cylinder along x touches one or two rows of nodes."""
     body = trimesh.creation.cylinder(radius=8e-3, height=40e-3, sections=720)
     body.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
     cylinder = Surface(np.array(body.vertices), np.array(body.faces, np.int64), "cylinder")
@@ -133,8 +133,8 @@ def test_a_line_of_contact_is_flagged_however_long_it_is():
     coarse, fine = (contact_model("lattice-linear", size) for size in (1.0, 0.5))
     state, exact = (model.prepare(pair(cylinder, insert, LINEAR)) for model in (coarse, fine))
     for load, z in ((150.0, 0.0), (150.0, 0.5e-3), (1500.0, 0.0), (3000.0, 0.5e-3)):
-        found = coarse.press(state, load, above(0, z))
+        result = coarse.press(state, load, above(0, z))
         peak = np.mean([fine.press(exact, load, above(0, y)).pressure.max() for y in (0, 0.25e-3)])
-        assert (found.pressure > 0).sum() >= 16
-        assert narrow(found) == (load < 1000)
-        assert narrow(found) or found.pressure.max() == pytest.approx(peak, rel=0.1)
+        assert (result.pressure > 0).sum() >= 16
+        assert narrow(result) == (load < 1000)
+        assert narrow(result) or result.pressure.max() == pytest.approx(peak, rel=0.1)

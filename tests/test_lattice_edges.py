@@ -1,4 +1,4 @@
-"""A peak at an edge that the cells do not resolve is flagged, one on a condyle's curve is not."""
+"""A peak at an edge that the cells do not resolve is flagged; a peak on a smooth surface is not."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ MODELS = ("lattice-linear", "fe")
 
 
 def punch(radius=6e-3, fillet=0.5e-3):
-    """A round flat punch with a rounded edge, its flat on y = 0."""
+    """Return a round flat punch with a rounded edge; its flat lies in y = 0."""
     angle = np.linspace(0.0, np.pi / 2, 20)
     rim = radius - fillet + fillet * np.sin(angle), fillet - fillet * np.cos(angle)
     flat = np.stack([np.linspace(0.0, radius - fillet, 12)[:-1], np.zeros(11)], axis=1)
@@ -31,7 +31,7 @@ def pressed(model, femoral, size_mm):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_punch_is_flagged_at_every_size_and_its_peak_rises(model):
+def test_a_punch_is_flagged_at_every_cell_size_and_its_peak_rises(model):
     coarse, middle, fine = (pressed(model, punch(), size) for size in (1.5, 1.0, 0.8))
     for result in (coarse, middle, fine):
         peak = result.points[np.argmax(result.pressure)]

@@ -1,6 +1,6 @@
-"""Extremes of the lattice: the reference Newton within 1 %, or a status that says why not.
+"""Extreme presses of the lattice agree with a reference Newton's method within 1 %, or fail.
 
-The lattice may give up only where full Newton's method on the same grid gives up too.
+The lattice may fail only where the full Newton's method on the same grid fails, too.
 """
 
 from functools import lru_cache
@@ -71,7 +71,7 @@ def prepared(shape, nu=None):
 
 
 def by_newton(state, load, pose, size):
-    """Return the reference's result, None where it has none."""
+    """Return the result of the reference Newton's method; None if it fails."""
     model = contact_model("lattice", size, newton=True, tolerance=5e-4)
     try:
         result = model.press(state, load, pose)
@@ -81,7 +81,7 @@ def by_newton(state, load, pose, size):
 
 
 def compare(state, pose, size, load):
-    """Return the quick result after checking it against Newton's."""
+    """Return the lattice's result after a comparison with the reference Newton's method."""
     quick = contact_model("lattice", size).press(state, load, pose)
     exact = by_newton(state, load, pose, size)
     if quick.status is not ContactStatus.OK:
@@ -112,13 +112,13 @@ def test_extreme_ratios(nu, load):
 
 
 @pytest.mark.parametrize("shape", [shape for shape in SHAPES if shape != "fine"])
-def test_a_kilonewton_is_no_extreme(shape):
-    """All but the block of 6 mm, whose strain passes -1, answer."""
+def test_presses_of_one_kilonewton_converge(shape):
+    """All shapes converge but the block of 6 mm, with a strain below -1."""
     state, pose, size = prepared(shape)
     assert contact_model("lattice", size).press(state, 1e3, pose).status is ContactStatus.OK
 
 
-def test_an_insert_pressed_to_nothing_gives_no_number():
+def test_a_completely_compressed_insert_gives_no_numbers():
     state, pose, size = prepared("two millimetres")
     result = contact_model("lattice", size).press(state, 1e4, pose)
     assert result.status is ContactStatus.OUT_OF_RANGE
@@ -127,7 +127,7 @@ def test_an_insert_pressed_to_nothing_gives_no_number():
     assert np.isnan(result.pressure).all()
 
 
-def test_insert_with_a_post_is_pressed_beside_it():
+def test_an_insert_with_a_post_is_pressed_beside_the_post():
     state, pose, size = prepared("post")
     result = contact_model("lattice", size).press(state, 1e3, pose)
     loaded = result.points[result.pressure > 0]

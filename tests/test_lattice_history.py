@@ -1,4 +1,4 @@
-"""The lattice's answer depends on pose and load alone, not on where the solution began."""
+"""Results of the lattice depend on pose and load, and not on the initial guess."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -19,12 +19,12 @@ from tkamb.io.scene.case import load_case
 
 FRAMES, FAR = (12, 36, 84), 60
 LOADS = {11: 700.0, 12: 750.0, 35: 1400.0, 36: 1450.0, 60: 2000.0, 83: 2150.0, 84: 2200.0}
-"""N."""
+"""Frame -> load, N."""
 
 
 @lru_cache
 def shipped():
-    """Return the shipped knee's bodies and its poses."""
+    """Return the bodies and the poses of the shipped knee."""
     case = load_case(load_scene(MODEL / "scene.toml"))
     bodies = ContactPair(case.femoral, case.insert, material("polyethylene"))
     return bodies, [knee_pose(place) for place in case.motion.coordinates]
@@ -32,25 +32,25 @@ def shipped():
 
 @lru_cache
 def prepared(name):
-    """Return a model of 2 mm cells, prepared for the shipped knee."""
+    """Return a model with cells of 2 mm, prepared for the shipped knee."""
     model = contact_model(name, 2.0)
     return model, model.prepare(shipped()[0])
 
 
 def too_deep(state, result, factor):
-    """Return an answer that is no start, whose approach is too large by a factor."""
+    """Return a failed result with an approach that is too large by a factor, as a guess."""
     pose = state.pair.pose_at_approach(result.pose, factor * result.approach)
     return replace(result, pose=pose)
 
 
 def columns(state, result):
-    """Return what a results table says of a contact."""
+    """Return the columns of a results table for a contact."""
     medial = medial_points(result.points, result.pose, state.pair.split)
-    found = {"approach": result.approach, "lowest gap": result.gap[result.pressure == 0].min()}
-    for side, own in (("medial", medial), ("lateral", ~medial)):
+    row = {"approach": result.approach, "lowest gap": result.gap[result.pressure == 0].min()}
+    for side, under_side in (("medial", medial), ("lateral", ~medial)):
         condyle = getattr(result, side)
-        carried = np.where(own, result.pressure, 0.0)
-        found |= {
+        carried = np.where(under_side, result.pressure, 0.0)
+        row |= {
             f"{side} force": condyle.force,
             f"{side} area": condyle.area,
             f"{side} mean pressure": condyle.mean_pressure,
@@ -59,30 +59,30 @@ def columns(state, result):
             f"{side} centre x": condyle.centre_of_pressure[0] + 1.0,
             f"{side} centre z": condyle.centre_of_pressure[2] + 1.0,
         }
-    return found
+    return row
 
 
 @pytest.mark.parametrize("name", ["lattice", "lattice-linear", "fe"])
 @pytest.mark.parametrize("frame", FRAMES)
-def test_answers_do_not_depend_on_the_guess(name, frame):
-    """Cold, from the frame before, from a far frame, and from a frame that was read back.
+def test_results_do_not_depend_on_the_guess(name, frame):
+    """Without a guess, and with guesses from the last frame, a far frame, and a stored frame.
 
-    Centres of pressure within 5 µm, all else within 0.5 %.
+    Centres of pressure agree within 5 µm, other values within 0.5 %.
     """
     (model, state), (_, poses) = prepared(name), shipped()
     cold = model.press(state, LOADS[frame], poses[frame])
-    wanted = columns(state, cold)
+    expected = columns(state, cold)
     before, start = model.press_from(state, LOADS[frame - 1], poses[frame - 1])
     far, far_start = model.press_from(state, LOADS[FAR], poses[FAR])
     for guess in (start, far_start, before, WarmStart.after(before), too_deep(state, far, 3.0)):
-        found = columns(state, model.press(state, LOADS[frame], poses[frame], guess))
-        for key, value in found.items():
+        result = columns(state, model.press(state, LOADS[frame], poses[frame], guess))
+        for key, value in result.items():
             near = {"abs": 5e-6} if "centre" in key else {"rel": 5e-3, "abs": 2e-7}
-            assert value == pytest.approx(wanted[key], **near), key
+            assert value == pytest.approx(expected[key], **near), key
 
 
 def test_the_gap_beside_the_contact_is_that_of_the_deformed_insert():
-    """Seen with few candidates and with all of them: the same nodes, the same gap."""
+    """The gaps with few candidates and with all candidates agree."""
     (model, state), (_, poses) = prepared("lattice-linear"), shipped()
     few = model.press(state, 2000.0, poses[84])
     many = model.press(state, 2000.0, poses[84], too_deep(state, few, 20.0))
@@ -101,23 +101,23 @@ def grid(size):
 
 
 def share_above(level, size, along, across):
-    """Return the area above a level of Hertz's pressure about a place, over the circle's."""
+    """Return the area above a level of Hertz's pressure, as a share of the circle."""
     x, z, triangles = grid(size)
     pressure = np.sqrt(np.maximum(1.0 - (x - along) ** 2 - (z - across) ** 2, 0.0))
     return area_above(np.stack([x, 0 * x, z], axis=1), triangles, pressure, level) / np.pi
 
 
 @pytest.mark.parametrize("level", [0.3, 0.6, 0.9])
-def test_area_above_a_level_is_that_of_the_pressure(level):
-    """Hertz: 1 - (level / p0)² of the circle, to 3 % at a fifth of its radius."""
+def test_area_above_a_level_is_that_of_hertz(level):
+    """1 - (level / p0)² of the circle, within 3 % for cells of a fifth of the radius."""
     for size in (0.2, 0.1, 0.05):
-        found = share_above(level, size, 0.07, 0.03)
-        assert found == pytest.approx(1 - level**2, abs=0.7 * size**2 + 1e-3)
+        result = share_above(level, size, 0.07, 0.03)
+        assert result == pytest.approx(1 - level**2, abs=0.7 * size**2 + 1e-3)
 
 
 @pytest.mark.parametrize("level", [0.7, 0.9])
 def test_area_above_a_level_is_exact_in_the_mean(level):
-    """Hertz's p² is quadratic: over all places of the grid nothing is left, 0.3 % unmended."""
+    """The mean error over all positions of the grid vanishes, because Hertz's p² is quadratic."""
     shifts = np.arange(8) / 8 * 0.1
     missed = [
         share_above(level, 0.1, along, across) - (1 - level**2)
@@ -126,8 +126,7 @@ def test_area_above_a_level_is_exact_in_the_mean(level):
     assert np.mean(missed) == pytest.approx(0.0, abs=2e-5)
 
 
-def test_area_above_a_level_grows_steadily():
-    """A pressure that passes the level at one node changes nothing by a step."""
+def test_area_above_a_level_is_continuous():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 1.0]])
     triangles = np.array([[0, 1, 2], [1, 2, 3]])
     pressure = np.array([1.0, 2.0, 3.0, 4.0])

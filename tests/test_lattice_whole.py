@@ -1,4 +1,4 @@
-"""Every run's lattice is the whole insert: random designs, ties, pieces, and what is refused."""
+"""The lattice of every run contains the whole insert: random designs, steps, pieces, refusals."""
 
 import logging
 
@@ -29,14 +29,14 @@ LOAD = 1000.0
 
 
 def on_lines(x, y, z, solid):
-    """A closed skin of boxes, in mm; solid(x, y, z) says which middles are filled."""
+    """Return the closed surface of boxes (mm); solid(x, y, z) selects boxes by their centres."""
     lines = [np.unique(np.asarray(line, float)) for line in (x, y, z)]
     middle = np.meshgrid(*[(line[1:] + line[:-1]) / 2 for line in lines], indexing="ij")
     return voxel_surface(tuple(1e-3 * line for line in lines), solid(*middle))
 
 
 def ridge(edges=(-6.5, 6.5)):
-    """A plate 50 x 76 x 8 with a ridge 6 high along x."""
+    """Return a plate of 50 x 76 x 8 mm with a ridge 6 mm high along x."""
     z = np.concatenate([np.arange(-38, 39), edges])
     return on_lines(
         np.arange(-25, 26),
@@ -47,7 +47,7 @@ def ridge(edges=(-6.5, 6.5)):
 
 
 def plates(gap=16.0, second_floor=0.0):
-    """Two plates 50 x 8 x 30 side by side, the second one from another height."""
+    """Return two plates of 50 x 8 x 30 mm side by side, the second one at another height."""
     z = (gap / 2, gap / 2 + 30)
     first = on_lines(
         np.arange(-25, 26), [0, 8], np.linspace(-z[1], -z[0], 31), lambda x, y, z: y < 9
@@ -58,14 +58,14 @@ def plates(gap=16.0, second_floor=0.0):
 
 
 def loads(insert, contact, size=2.0, bearing="fixed"):
-    """The force of the medial and of the lateral condyle, balls of radius 22 at z = ±22 mm."""
+    """Return the forces of the medial and lateral condyle, spheres of 22 mm at z = ±22 mm."""
     balls = []
     for side in (-0.022, 0.022):
         ball = trimesh.creation.icosphere(4, 0.022)
         ball.apply_translation([0.0, 0.05, side])
         balls.append(ball)
-    both = trimesh.util.concatenate(balls)
-    femoral = Surface(np.asarray(both.vertices), np.asarray(both.faces, np.int64), "femoral")
+    spheres = trimesh.util.concatenate(balls)
+    femoral = Surface(np.asarray(spheres.vertices), np.asarray(spheres.faces, np.int64), "femoral")
     pair = ContactPair(femoral, insert, material("polyethylene-linear"), bearing)
     model = contact_model(contact, size)
     result = model.press(model.prepare(pair), LOAD, np.eye(4))
@@ -73,7 +73,7 @@ def loads(insert, contact, size=2.0, bearing="fixed"):
 
 
 def test_random_inserts_keep_their_volume_or_are_refused():
-    """A sample; scripts/measure_random_inserts has 2,000."""
+    """A sample; scripts/measure_random_inserts has 2,000 inserts."""
     errors, refused = [], []
     for seed in range(15):
         try:
@@ -91,8 +91,8 @@ def test_symmetric_inserts_share_the_load_evenly(seed):
 
 
 @pytest.mark.parametrize("contact", ["lattice-linear", "fe", "lattice-source"])
-def test_a_ridge_whose_walls_lie_over_cell_centres_loses_nothing(contact):
-    """At 1 mm the centres of 28,950 cells lie exactly under a step: half the plate was lost."""
+def test_a_ridge_with_walls_over_cell_centres_is_complete(contact):
+    """At 1 mm the centres of 28,950 cells lie exactly under a step."""
     insert = ridge()
     lattice = build_grid(insert, 1e-3)
     assert cell_volumes(lattice.nodes[lattice.cells]).sum() == pytest.approx(
@@ -105,7 +105,7 @@ def test_a_ridge_whose_walls_lie_over_cell_centres_loses_nothing(contact):
 
 @pytest.mark.parametrize("edges", [(-6.5, 6.5), (-6.25, 5.0), (-7.0, 6.5), (-20.0, -3.5)])
 @pytest.mark.parametrize("size", [1.0, 1.5, 2.0, 2.5])
-def test_steps_on_ties_of_any_grid_lose_nothing(edges, size):
+def test_steps_on_ties_of_any_grid_are_complete(edges, size):
     insert = ridge(edges)
     lattice = build_grid(insert, 1e-3 * size)
     assert cell_volumes(lattice.nodes[lattice.cells]).sum() == pytest.approx(
@@ -115,7 +115,7 @@ def test_steps_on_ties_of_any_grid_lose_nothing(edges, size):
 
 @pytest.mark.parametrize("bearing", ["fixed", "mobile"])
 @pytest.mark.parametrize("contact", ["lattice", "lattice-linear", "fe"])
-def test_two_plates_both_carry(contact, bearing):
+def test_two_plates_carry_the_load_together(contact, bearing):
     medial, lateral = loads(plates(), contact, 2.0, bearing)
     assert medial == pytest.approx(LOAD / 2, rel=0.005)
     assert lateral == pytest.approx(LOAD / 2, rel=0.005)
@@ -131,7 +131,7 @@ def test_plates_any_distance_apart_are_two_pieces(gap):
     )
 
 
-def test_a_piece_that_stands_on_nothing_is_refused_by_its_place():
+def test_a_piece_without_support_is_refused_with_its_place():
     with pytest.raises(
         InputError, match=r"less volume than the mesh.*it lacks a part of"
     ) as caught:
@@ -139,7 +139,7 @@ def test_a_piece_that_stands_on_nothing_is_refused_by_its_place():
     assert "mm at (0.0, 5.6, 23.1) mm" in str(caught.value)
 
 
-def test_smaller_cells_are_taken_where_wanted_ones_lose_too_much(caplog):
+def test_smaller_cells_are_used_if_the_chosen_ones_lose_too_much_volume(caplog):
     insert = real_insert("jw")
     coarse = build_grid(insert, 2e-3)
     with caplog.at_level(logging.WARNING, "tkamb"):
@@ -150,12 +150,12 @@ def test_smaller_cells_are_taken_where_wanted_ones_lose_too_much(caplog):
     assert any("instead of 2 mm" in words for words in lattice.notices)
 
 
-def test_a_sound_lattice_is_the_grid_itself():
+def test_a_valid_lattice_is_the_unchanged_grid():
     insert, _ = dished()
     np.testing.assert_array_equal(whole_lattice(insert, 2e-3).nodes, build_grid(insert, 2e-3).nodes)
 
 
-def test_the_outer_skin_encloses_the_cells_and_what_lacks_is_found():
+def test_the_outer_surface_encloses_the_cells_and_missing_cells_are_found():
     insert, _ = dished()
     lattice = build_grid(insert, 2e-3)
     skin = outer_skin(lattice.nodes, lattice.cells)
@@ -168,19 +168,19 @@ def test_the_outer_skin_encloses_the_cells_and_what_lacks_is_found():
 
 @pytest.mark.parametrize("seed", [0, 6, 9, 12])
 def test_the_winding_number_agrees_with_the_intervals_of_lines(seed):
-    """On lines through vertices, edges and walls too: midpoints of intervals are inside."""
+    """Also on lines through vertices, edges and walls: midpoints of intervals are inside."""
     surface = in_insert_frame(random_insert(seed))
     x, z = (np.unique(surface.vertices[:, a])[:: len(surface.vertices) // 12] for a in (0, 2))
-    found = inside_intervals(surface, 1, z, x)
-    assert found.mended == 0
-    middle = np.column_stack([x[found.second], (found.lower + found.upper) / 2, z[found.first]])
-    near_wall = found.upper - found.lower < 1e-6
+    result = inside_intervals(surface, 1, z, x)
+    assert result.mended == 0
+    middle = np.column_stack([x[result.second], (result.lower + result.upper) / 2, z[result.first]])
+    near_wall = result.upper - result.lower < 1e-6
     steps = [(x, 0.0, z) for x in (-1e-7, 1e-7) for z in (-1e-7, 1e-7)]
     inner = [surface.winding.inside(middle + step) for step in steps]
     assert (np.any(inner, axis=0) | near_wall).all()
-    apart = found.first[1:] == found.first[:-1]
-    apart &= found.second[1:] == found.second[:-1]
+    apart = result.first[1:] == result.first[:-1]
+    apart &= result.second[1:] == result.second[:-1]
     gap = np.column_stack(
-        [x[found.second[1:]], (found.lower[1:] + found.upper[:-1]) / 2, z[found.first[1:]]]
+        [x[result.second[1:]], (result.lower[1:] + result.upper[:-1]) / 2, z[result.first[1:]]]
     )[apart]
     assert not surface.winding.inside(gap).any()

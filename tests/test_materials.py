@@ -18,8 +18,8 @@ def test_ramberg_osgood_is_inverted_to_rounding():
     assert np.allclose(ratio * (1 + power), STRAIN, rtol=5e-15, atol=0)
 
 
-def test_polyethylene_yields_where_published():
-    """At sigma0 = 8.4194 MPa the strain is sigma0/E times 1 + alpha."""
+def test_polyethylene_yields_at_the_published_stress():
+    """At sigma0 = 8.4194 MPa the strain is (1 + alpha) sigma0/E."""
     strain = 8.4194 / 561.5 * 1.0389
     assert material("polyethylene").stress(strain) == pytest.approx(8.4194e6, rel=1e-12)
 
@@ -46,7 +46,7 @@ def test_tangent_is_the_derivative(make):
     assert np.allclose(chosen.tangent(strain), slope, rtol=1e-5)
 
 
-def test_table_is_met_monotone_and_goes_on_straight():
+def test_a_table_is_interpolated_monotonically_and_continued_straight():
     chosen = tabulated()
     assert np.allclose(chosen.stress([0.01, 0.03, 0.06, -0.03]) / 1e6, [5, 11, 14, -11])
     assert (np.diff(chosen.stress(np.linspace(-0.2, 0.2, 999))) > 0).all()

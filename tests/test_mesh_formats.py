@@ -1,4 +1,4 @@
-"""Mesh files as the world writes them: polygons, textures, trailing bytes, units, far origins."""
+"""Variants of mesh files: polygons, textures, trailing bytes, units, far origins."""
 
 import logging
 import struct
@@ -35,7 +35,7 @@ OUTLINES = {"notch": NOTCHED, "star": STAR, "comb": COMB}
 
 
 def prism(outline, height=9.0):
-    """Vertices (2 n, 3) and polygons of a part with a flat top, one polygon for each face."""
+    """Return vertices (2 n, 3) and polygons of a prism; each face is one polygon."""
     n = len(outline)
     vertices = [(x, y, z) for y in (0.0, height) for x, z in outline]
     faces = [list(range(n)), list(range(2 * n - 1, n - 1, -1))]
@@ -118,7 +118,7 @@ def test_concave_polygons_keep_their_shape(writer, outline, tmp_path):
     assert check_mesh(path).watertight
 
 
-def test_a_polygon_with_a_hole_joined_by_a_slit():
+def test_a_polygon_with_a_hole_and_a_slit_keeps_its_area():
     points = np.array([(x, 0.0, z) for x, z in WITH_HOLE])
     faces = triangulated(points, np.arange(len(points)), np.array([len(points)]))
     a, b, c = np.moveaxis(points[faces], 1, 0)
@@ -137,7 +137,7 @@ def test_convex_polygons_stay_fans_and_crossed_ones_are_refused(tmp_path):
         read_triangles(write_obj(tmp_path / "crossed.obj", crossed, [range(4)]))
 
 
-def test_negative_indices_count_back_wherever_a_block_stands(tmp_path):
+def test_negative_indices_count_back_from_their_line(tmp_path):
     points, faces = prism(NOTCHED)
     text, count = "", len(points)
     for shift in (0.0, 60.0):
@@ -155,7 +155,7 @@ def test_negative_indices_count_back_wherever_a_block_stands(tmp_path):
 @pytest.mark.parametrize(
     "line", ["f 1 2 99", "f 0 1 2", "f -1 -2 -99", "f 1 2 x", "v 1 2", "v a b c"]
 )
-def test_a_bad_line_of_an_obj_file_is_refused_in_a_line(line, tmp_path):
+def test_a_bad_line_of_an_obj_file_is_refused_in_one_line(line, tmp_path):
     path = write_obj(tmp_path / "bad.obj", *prism(NOTCHED))
     path.write_text(path.read_text("utf-8") + line + "\n", encoding="utf-8")
     with pytest.raises(InputError, match="cannot be read as a mesh") as caught:
@@ -164,7 +164,7 @@ def test_a_bad_line_of_an_obj_file_is_refused_in_a_line(line, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["texture", "coordinates", "materials"])
-def test_what_a_missing_texture_is_for_is_not_looked_for(kind, tmp_path, capsys):
+def test_a_missing_texture_has_no_influence(kind, tmp_path, capsys):
     points, faces = prism(NOTCHED)
     if kind == "materials":
         path = write_obj(tmp_path / "part.obj", points, faces, texture="mtllib none.mtl\nusemtl a")
@@ -174,13 +174,13 @@ def test_what_a_missing_texture_is_for_is_not_looked_for(kind, tmp_path, capsys)
             more, tail = "property list uchar float texcoord\nproperty uchar red\n", " 2 0.5 0.5 9"
         path = write_ply(tmp_path / "part.ply", points, faces, extra, more, tail)
     assert main(["mesh", "check", str(path)]) == 0
-    told = capsys.readouterr()
-    assert "watertight" in told.out
-    assert "Traceback" not in told.err
+    message = capsys.readouterr()
+    assert "watertight" in message.out
+    assert "Traceback" not in message.err
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary"])
-def test_a_ply_file_cut_short_is_refused(form, tmp_path):
+def test_a_truncated_ply_file_is_refused(form, tmp_path):
     write = write_ply if form == "ascii" else write_binary_ply
     path = write(tmp_path / "part.ply", *prism(NOTCHED))
     data = path.read_bytes()
@@ -195,7 +195,7 @@ def stl(surface, scale=1e3):
 
 
 @pytest.mark.parametrize("tail", [b"\0" * 37, b"\0", b"attributes " * 40, b"\xff" * 500])
-def test_bytes_after_the_last_triangle_are_left_out_with_a_notice(tail, tmp_path, caplog):
+def test_bytes_after_the_last_triangle_are_ignored_with_a_notice(tail, tmp_path, caplog):
     (path := tmp_path / "part.stl").write_bytes(stl(plate()) + tail)
     with caplog.at_level(logging.WARNING, "tkamb"):
         surface = load_surface(path, "mm", name="insert", closed=True)
@@ -204,7 +204,7 @@ def test_bytes_after_the_last_triangle_are_left_out_with_a_notice(tail, tmp_path
 
 
 @pytest.mark.parametrize("count", [0, 2**32 - 1])
-def test_an_stl_that_does_not_say_how_many_triangles_it_has(count, tmp_path, caplog):
+def test_an_stl_with_a_wrong_number_of_triangles_is_read(count, tmp_path, caplog):
     data = bytearray(stl(plate()))
     data[80:84] = count.to_bytes(4, "little")
     (path := tmp_path / "part.stl").write_bytes(bytes(data))
@@ -226,19 +226,19 @@ def test_a_binary_stl_may_begin_with_the_word_solid(header, tmp_path):
     assert len(read_triangles(path)[1]) == len(plate().faces)
 
 
-def test_a_binary_stl_cut_short_says_how_much_is_there(tmp_path):
+def test_a_truncated_binary_stl_is_refused_with_its_number_of_triangles(tmp_path):
     (path := tmp_path / "part.stl").write_bytes(stl(plate())[:-120])
     with pytest.raises(InputError, match=r"cut short: \d+ of \d+ triangles"):
         read_triangles(path)
 
 
 def knee():
-    """Two condyles, 70 mm wide."""
+    """Return two condyles, 70 mm wide."""
     return two_dishes()
 
 
 @pytest.mark.parametrize("width", [0.052, 0.070, 0.085])
-def test_inches_are_suggested_and_a_knee_too_small_for_any_person_is_refused(width):
+def test_inches_are_suggested_and_a_too_small_knee_is_refused(width):
     inches, millimetres = width / 0.0254, width * 1e3
     assert plausible_units(inches) == ["inch"]
     assert plausible_units(millimetres) == ["mm"]
@@ -255,7 +255,7 @@ def test_a_mesh_in_inches_is_read_as_such(tmp_path):
             load_surface(path, unit, name="insert", closed=True)
 
 
-def test_two_condyles_29_mm_wide_are_no_knee(tmp_path):
+def test_two_condyles_29_mm_wide_are_refused(tmp_path):
     balls = []
     for z in (-9.0, 9.0):
         ball = trimesh.creation.icosphere(3, 5.5)
@@ -283,8 +283,8 @@ def test_coordinates_rounded_far_from_the_origin_are_refused(suffix, axis, tmp_p
         load_surface(path, "mm", name="femoral component")
 
 
-def test_coordinates_that_lose_nothing_far_away_are_read(tmp_path, caplog):
-    """Double precision; and round numbers, which single precision holds."""
+def test_far_coordinates_with_full_precision_are_read(tmp_path, caplog):
+    """In double precision, or as round numbers that single precision represents exactly."""
     points, faces = prism(STAR)
     path = write_obj(tmp_path / "part.obj", points + np.array([1e5, 0, 0]), faces)
     assert load_surface(path, "mm", name="insert", closed=True).volume == pytest.approx(
@@ -303,6 +303,6 @@ def test_coordinates_that_lose_nothing_far_away_are_read(tmp_path, caplog):
 
 
 def test_two_parts_of_one_obj_file_are_joined(tmp_path):
-    both = joined(plate(), plate())
-    path = write_obj(tmp_path / "two.obj", both.vertices * 1e3, both.faces.tolist())
-    assert len(read_triangles(path)[1]) == len(both.faces)
+    parts = joined(plate(), plate())
+    path = write_obj(tmp_path / "two.obj", parts.vertices * 1e3, parts.faces.tolist())
+    assert len(read_triangles(path)[1]) == len(parts.faces)

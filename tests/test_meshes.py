@@ -1,4 +1,4 @@
-"""Mesh files into surfaces: axes, units, repairs with a notice, refusals in one line."""
+"""Mesh files as surfaces: axes, units, repairs with a notice, refusals in one line."""
 
 import logging
 from pathlib import Path
@@ -55,12 +55,12 @@ def test_axes_name_the_rows_of_a_rotation():
 
 
 @pytest.mark.parametrize("axes", ["+x,+y", "+x,+x,+z", "+x,+y,+w", "x y z", "++x,+y,+z"])
-def test_axes_that_are_no_axes(axes):
+def test_invalid_axes_are_refused(axes):
     with pytest.raises(InputError, match="three different axes"):
         axes_rotation(axes)
 
 
-def test_left_handed_axes_are_refused_with_a_right_handed_way_out():
+def test_left_handed_axes_are_refused_with_a_right_handed_suggestion():
     with pytest.raises(InputError, match="left-handed") as caught:
         axes_rotation("-x,+y,+z")
     assert np.linalg.det(axes_rotation(str(caught.value).split("'")[3])) == 1
@@ -68,7 +68,7 @@ def test_left_handed_axes_are_refused_with_a_right_handed_way_out():
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
 @pytest.mark.parametrize(("unit", "scale"), [("mm", 1e3), ("cm", 1e2), ("m", 1.0)])
-def test_loads_into_metres(tmp_path, suffix, unit, scale, caplog):
+def test_meshes_are_read_in_metres(tmp_path, suffix, unit, scale, caplog):
     ball = sphere(0.02, 3)
     path = save(tmp_path / f"ball.{suffix}", ball, scale)
     surface = load_surface(path, unit, name="ball", closed=True)
@@ -83,13 +83,13 @@ def test_axes_turn_the_mesh(tmp_path):
     turn = axes_rotation("-z,+x,-y")
     turned = Surface(insert.vertices @ turn, insert.faces)
     path = save(tmp_path / "turned.ply", turned)
-    there = load_surface(path, "mm", "-z,+x,-y", name="insert")
+    expected = load_surface(path, "mm", "-z,+x,-y", name="insert")
     straight = load_surface(save(tmp_path / "straight.ply", insert), "mm", name="insert")
-    assert np.array_equal(there.vertices, straight.vertices)
-    assert np.array_equal(there.faces, straight.faces)
+    assert np.array_equal(expected.vertices, straight.vertices)
+    assert np.array_equal(expected.faces, straight.faces)
 
 
-def test_mirrored_twice_is_the_same_and_stays_outward():
+def test_a_surface_mirrored_twice_is_unchanged_and_outward():
     ball = sphere(0.02, 2, (0.0, 0.01, 0.03))
     once = mirrored(ball)
     assert once.vertices[:, 2].mean() == pytest.approx(-0.03)
@@ -97,19 +97,19 @@ def test_mirrored_twice_is_the_same_and_stays_outward():
     assert np.array_equal(mirrored(once).vertices, ball.vertices)
 
 
-def test_wrong_unit_names_the_right_one(tmp_path):
+def test_a_wrong_unit_is_refused_with_the_correct_one(tmp_path):
     path = save(tmp_path / "plate.stl", plate())
     message = refused("no size of a part", path, "m")
     assert "'mm' would make it 60 mm" in message
 
 
-def test_a_whole_bone_is_longer_than_an_implant(tmp_path):
+def test_a_whole_bone_may_be_longer_than_an_implant(tmp_path):
     path = save(tmp_path / "bone.stl", sphere(0.2, 3))
     refused("400 mm", path, "mm")
     assert load_surface(path, "mm", name="bone", size=BONE_SIZE).bounds[1, 0] == pytest.approx(0.2)
 
 
-def test_bad_files(tmp_path):
+def test_unreadable_files_are_refused(tmp_path):
     refused("no such mesh file", tmp_path / "none.stl", "mm")
     text = tmp_path / "text.stl"
     text.write_text("not a mesh at all\n")
@@ -120,19 +120,19 @@ def test_bad_files(tmp_path):
     refused("unknown unit 'foot'", save(tmp_path / "plate.stl", plate()), "foot")
 
 
-def test_a_coordinate_that_is_not_a_number(tmp_path):
+def test_a_coordinate_that_is_not_a_number_is_refused(tmp_path):
     bad = plate()
     bad.vertices[3, 1] = np.nan
     refused("not a number", save(tmp_path / "bad.stl", bad), "mm")
 
 
-def test_three_sheets_on_an_edge_are_no_surface(tmp_path):
+def test_three_sheets_on_one_edge_are_refused(tmp_path):
     vertices = np.array([[0, 0, 0], [50, 0, 0], [20, 30, 0], [20, -30, 5], [20, 0, 30.0]])
     fan = Surface(vertices, np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [0, 2, 4]]))
     assert "(" in refused("three or more sheets", save(tmp_path / "fan.ply", fan, 1.0), "mm")
 
 
-def test_a_one_sided_strip_is_no_surface(tmp_path):
+def test_a_one_sided_strip_is_refused(tmp_path):
     n = 40
     angle = np.linspace(0, 2 * np.pi, n, endpoint=False)
     radial = np.stack([np.cos(angle), np.zeros(n), np.sin(angle)], axis=1)
@@ -181,8 +181,8 @@ def test_each_repair_restores_the_body_with_one_notice(tmp_path, caplog):
     doubled=st.integers(0, 10),
     split=st.booleans(),
 )
-def test_any_mixture_of_small_defects_is_mended(seed, lost, flipped, doubled, split):
-    """Lost, flipped and doubled triangles, merged or not: the closed body comes back."""
+def test_any_mixture_of_small_defects_is_repaired(seed, lost, flipped, doubled, split):
+    """Missing, flipped and duplicate triangles, with merged or separate vertices."""
     rng = np.random.default_rng(seed)
     ball = sphere(0.02, 3)
     faces = np.delete(ball.faces, rng.choice(len(ball.faces), lost, replace=False), axis=0)
@@ -202,7 +202,7 @@ def test_any_mixture_of_small_defects_is_mended(seed, lost, flipped, doubled, sp
         assert surface.mesh.volume == pytest.approx(ball.mesh.volume, rel=5e-3)
 
 
-def test_loose_vertices_are_dropped_with_a_notice(tmp_path, caplog):
+def test_unreferenced_vertices_are_removed_with_a_notice(tmp_path, caplog):
     insert = two_dishes()
     more = Surface(np.concatenate([insert.vertices, [[0.0, 0.5, 0.0]]]), insert.faces)
     mended = load_surface(save(tmp_path / "loose.ply", more), "mm", name="insert", closed=True)
@@ -210,7 +210,7 @@ def test_loose_vertices_are_dropped_with_a_notice(tmp_path, caplog):
     assert mended.bounds[1, 1] < 0.02
 
 
-def test_a_fold_without_thickness_is_taken_out():
+def test_a_fold_without_thickness_is_removed():
     ball = sphere(0.02, 2)
     tip = ball.vertices[ball.faces[0]].mean(axis=0) * 1.2
     a, b, n = *ball.faces[0][:2], len(ball.vertices)
@@ -241,7 +241,7 @@ def test_a_void_inside_stays_a_void():
     assert volume == pytest.approx(shell.mesh.volume - void.mesh.volume)
 
 
-def test_a_wide_hole_is_refused_where_it_must_be_closed(tmp_path, caplog):
+def test_a_wide_hole_is_refused_in_a_closed_surface(tmp_path, caplog):
     insert = two_dishes()
     middle = insert.triangles.mean(axis=1)
     hole = np.flatnonzero(np.linalg.norm(middle - [0.0, 0.007, 0.022], axis=1) < 0.004)
@@ -263,7 +263,7 @@ def test_touching_holes_are_two_loops():
     assert loops[0].width == pytest.approx(5e-3 / np.sqrt(2))
 
 
-def test_check_asks_and_applies_nothing(tmp_path):
+def test_check_reports_and_changes_nothing(tmp_path):
     path = save(tmp_path / "insert.stl", two_dishes())
     health = check_mesh(path)
     assert health.watertight
@@ -290,7 +290,7 @@ def test_check_lists_defects(tmp_path):
     assert any("small hole" in phrase for phrase in health.repairs)
 
 
-def test_what_has_no_area_is_not_said_to_be_closed(tmp_path):
+def test_a_mesh_without_area_is_not_reported_as_closed(tmp_path):
     line = trimesh.Trimesh([[0, 0, 0], [60, 0, 0]], [[0, 0, 1]] * 4, process=False)
     path = tmp_path / "line.stl"
     line.export(path)
@@ -299,7 +299,7 @@ def test_what_has_no_area_is_not_said_to_be_closed(tmp_path):
     assert "4 degenerate faces removed" in health.repairs
 
 
-def test_several_bodies_are_named_refused_and_taken_apart(tmp_path, capsys):
+def test_several_bodies_are_refused_and_can_be_separated(tmp_path, capsys):
     insert, tray = two_dishes(), sphere(0.015, 3, (0.0, -0.03, 0.0))
     void = sphere(0.002, 1, (0.0, 0.003, 0.0))
     void = Surface(void.vertices, void.faces[:, ::-1])
@@ -323,7 +323,7 @@ def test_several_bodies_are_named_refused_and_taken_apart(tmp_path, capsys):
     assert alone.mesh.volume == pytest.approx(expected, rel=1e-6)
 
 
-def test_parts_that_cannot_be_written(tmp_path, capsys):
+def test_bodies_that_cannot_be_written_are_refused(tmp_path, capsys):
     path = save(tmp_path / "insert.ply", two_dishes())
     for number, out in (("2", "new.stl"), ("0", "new.stl"), ("1", "new.txt"), ("1", "insert.ply")):
         assert main(["mesh", "part", str(path), number, "--out", str(tmp_path / out)]) == 2
@@ -331,7 +331,7 @@ def test_parts_that_cannot_be_written(tmp_path, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ["insert.ply"]
 
 
-def test_two_condyles_side_by_side_are_one_part_and_a_pair_from_two_legs_is_not(tmp_path):
+def test_two_condyles_are_one_component_and_a_pair_of_two_legs_is_refused(tmp_path):
     def pair(apart, radius=0.02):
         medial, lateral = (0.0, 0.0, -apart / 2), (0.0, 0.0, apart / 2)
         return save(
@@ -392,7 +392,7 @@ def test_real_inserts_with_lost_triangles_and_jitter(tmp_path, subject, caplog):
     assert rough.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-3)
 
 
-def test_a_binary_stl_is_read_as_trimesh_reads_it(tmp_path):
+def test_a_binary_stl_is_read_like_by_trimesh(tmp_path):
     path = save(tmp_path / "ball.stl", sphere(0.02))
     theirs = trimesh.load(path, force="mesh", process=False)
     vertices, faces = read_triangles(path)
@@ -401,7 +401,7 @@ def test_a_binary_stl_is_read_as_trimesh_reads_it(tmp_path):
 
 
 @pytest.mark.parametrize("hashed", [True, False])
-def test_points_at_one_place_are_found_whatever_their_hash(monkeypatch, hashed):
+def test_equal_points_are_grouped_with_any_hash(monkeypatch, hashed):
     if not hashed:
         monkeypatch.setattr(topology, "_ODD", np.zeros(3, np.uint64))
     points = np.array([[0.0, 1, 2], [3, 4, 5], [-0.0, 1, 2], [3, 4, 5.5], [3, 4, 5]])
@@ -410,7 +410,7 @@ def test_points_at_one_place_are_found_whatever_their_hash(monkeypatch, hashed):
     assert place.tolist() == [0, 1, 0, 2, 1]
 
 
-def test_edges_are_those_of_trimesh_and_say_whether_a_surface_is_closed():
+def test_edges_and_closedness_agree_with_trimesh():
     ball = sphere(0.02)
     edge, count = topology.edge_use(ball.faces)
     edges = np.empty((len(count), 2), np.int64)
@@ -424,17 +424,19 @@ def test_edges_are_those_of_trimesh_and_say_whether_a_surface_is_closed():
 
 
 @pytest.mark.parametrize("surface", [plate(), sphere(0.02), two_dishes()])
-def test_corner_normals_are_the_means_over_what_turns_little(surface):
-    """By the definition, triangle by triangle at a vertex."""
+def test_corner_normals_are_means_over_neighbours_within_the_crease_angle(surface):
+    """Against the definition, for each triangle at a vertex."""
     weights, crease = corner_angles(surface), np.deg2rad(40.0)
-    found = corner_normals(surface, crease, weights)
+    result = corner_normals(surface, crease, weights)
     for face in range(0, len(surface.faces), 97):
         for corner, vertex in enumerate(surface.corner_vertices[face]):
             around, at = np.nonzero(surface.corner_vertices == vertex)
             normals = surface.face_normals[around]
             near = normals @ surface.face_normals[face] >= np.cos(crease)
             mean = weights[around, at][near] @ normals[near]
-            np.testing.assert_allclose(found[face, corner], mean / np.linalg.norm(mean), atol=1e-12)
+            np.testing.assert_allclose(
+                result[face, corner], mean / np.linalg.norm(mean), atol=1e-12
+            )
 
 
 def test_the_longest_edge_of_every_triangle():

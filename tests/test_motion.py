@@ -16,7 +16,7 @@ EYE = np.eye(4)
 
 
 def bend(time=TIME):
-    """A smooth bend (n, 6): ap, si, ml (m), axial rotation, adduction, flexion (rad)."""
+    """Return a smooth bend (n, 6): ap, si, ml (m), axial rotation, adduction, flexion (rad)."""
     phase = 0.5 - 0.5 * np.cos(2 * np.pi * time / 3)
     return np.stack(
         [
@@ -99,18 +99,17 @@ def test_any_angle_order_and_mesh_axes_give_the_same_knee(tmp_path, sequence):
     np.testing.assert_allclose(motion.coordinates, bend(), atol=1e-13)
 
 
-def test_left_knee_is_mirrored_to_the_same_arrays(tmp_path):
-    """The mirror image of a right knee's record, declared left, is that right knee."""
+def test_a_left_knee_gives_the_arrays_of_its_mirror_image(tmp_path):
     left = bend() * [1, 1, -1, 1, 1, 1]
     right_file = write(tmp_path / "r.csv", coordinate_columns(bend()))
     left_file = write(tmp_path / "l.csv", coordinate_columns(left))
     poses = write(tmp_path / "p.csv", pose_columns(mirrored_pose(knee_pose(bend())), "XYZ"))
     right = load_motion(coordinates_table(right_file), "right", EYE, EYE)
     for table in (coordinates_table(left_file), pose_table(poses)):
-        found = load_motion(table, "left", EYE, EYE)
+        result = load_motion(table, "left", EYE, EYE)
         for name, scale in (("coordinates", 1), ("velocity", 1), ("acceleration", 100)):
             np.testing.assert_allclose(
-                getattr(found, name), getattr(right, name), atol=1e-12 * scale
+                getattr(result, name), getattr(right, name), atol=1e-12 * scale
             )
 
 
@@ -129,7 +128,7 @@ def test_patella_is_read_and_stays_sagittal_on_both_sides(tmp_path):
         np.testing.assert_allclose(motion.patella_acceleration[:, 1], -2e-3, atol=1e-8)
 
 
-def test_deviation_is_what_the_filter_changed(tmp_path):
+def test_deviation_is_the_change_by_the_filter(tmp_path):
     rough = bend()
     rough[50, 0] += 2e-3
     rough[30, 3] += np.deg2rad(2)
@@ -157,7 +156,7 @@ def cycle(percent):
 
 
 @pytest.mark.parametrize("offset", [0.0, 30.0, -12.5])
-def test_closed_cycle_is_laid_on_time_and_filtered_as_periodic(tmp_path, offset):
+def test_a_closed_cycle_gets_times_and_a_periodic_filter(tmp_path, offset):
     percent = np.linspace(0, 100, 101)
     file = write(tmp_path / "m.csv", coordinate_columns(cycle(percent), percent))
     table = coordinates_table(
@@ -186,7 +185,7 @@ def test_cycle_without_frames_keeps_the_recorded_samples(tmp_path):
         np.testing.assert_allclose(motion.raw_coordinates, cycle(motion.cycle_percent), atol=1e-9)
 
 
-def test_open_cycle_is_not_closed_and_takes_no_offset(tmp_path):
+def test_an_open_cycle_is_not_closed_and_accepts_no_offset(tmp_path):
     percent = np.linspace(0, 100, 101)
     drifting = cycle(percent) + percent[:, None] * [0, 0, 0, 0, 0, 0.005]
     file = write(tmp_path / "m.csv", coordinate_columns(drifting, percent))
@@ -218,7 +217,7 @@ def test_refusals(tmp_path):
     refused(tmp_path, "cycle_s does not rise", cycle_s=(1.0, 1.0))
 
 
-def test_header_that_contradicts_the_scene(tmp_path):
+def test_a_header_that_contradicts_the_scene_is_refused(tmp_path):
     columns = coordinate_columns(bend())
     rows = np.stack(list(columns.values()), axis=1)
     lines = ["inDegrees=yes", "endheader", "\t".join(columns)]

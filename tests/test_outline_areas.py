@@ -1,7 +1,7 @@
-"""Pressure at the outline of a map: the force of a node over the area that belongs to it.
+"""Pressure at the outline of a map: the force of a node over its tributary area.
 
-A bearing that slides without friction under a flat plate is in uniform uniaxial stress: the
-pressure is force over area at every node, at corners and along any outline.
+A bearing that slides without friction under a flat plate is in uniform uniaxial stress. The
+pressure is therefore force over area at every node, also at corners and along any outline.
 """
 
 from itertools import product
@@ -61,12 +61,12 @@ AT_TWO_SIZES = ("disc", "D", "turned square", "turned rectangle", "hexagon", "bo
 
 
 def extruded(outline, height=8.0, bottom=0.0):
-    """Return a plate of a convex outline, standing on y = bottom (mm)."""
+    """Return a plate with a convex outline; its underside is at y = bottom (mm)."""
     n = len(outline)
     low, high = (np.insert(outline, 1, y, axis=1) for y in (bottom, bottom + height))
     fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
-    here, after = np.arange(n), np.roll(np.arange(n), -1)
-    walls = [np.stack([here, here + n, after], 1), np.stack([after, here + n, after + n], 1)]
+    start, after = np.arange(n), np.roll(np.arange(n), -1)
+    walls = [np.stack([start, start + n, after], 1), np.stack([after, start + n, after + n], 1)]
     faces = np.concatenate([fan, fan[:, ::-1] + n, *walls])
     return Surface(np.concatenate([low, high]) * MM, faces, "plate")
 
@@ -81,31 +81,31 @@ def pressures(outline, cover, name, size):
     assert insert.mesh.volume > 0
     pair = ContactPair(cover, insert, LINEAR, "mobile")
     model = contact_model(name, size, **({} if name == "foundation-linear" else {"cache": False}))
-    found = model.press(model.prepare(pair), 1500.0, np.eye(4))
-    return found, 1500.0 / (area_of(outline) * MM**2)
+    result = model.press(model.prepare(pair), 1500.0, np.eye(4))
+    return result, 1500.0 / (area_of(outline) * MM**2)
 
 
 @pytest.mark.parametrize(
     ("shape", "size"),
     [*product(AT_TWO_SIZES, (1.0, 2.0)), *product(sorted(OUTLINES.keys() - AT_TWO_SIZES), (1.5,))],
 )
-def test_a_sliding_plate_has_one_pressure_up_to_its_outline(shape, size, cover):
-    found, exact = pressures(OUTLINES[shape], cover, "lattice-linear", size)
-    assert found.medial.area == pytest.approx(area_of(OUTLINES[shape]) * MM**2, rel=0.012)
-    assert found.pressure == pytest.approx(exact, rel=0.012)
-    assert np.ptp(found.pressure) < 2e-3 * exact
+def test_a_sliding_plate_has_a_uniform_pressure(shape, size, cover):
+    result, exact = pressures(OUTLINES[shape], cover, "lattice-linear", size)
+    assert result.medial.area == pytest.approx(area_of(OUTLINES[shape]) * MM**2, rel=0.012)
+    assert result.pressure == pytest.approx(exact, rel=0.012)
+    assert np.ptp(result.pressure) < 2e-3 * exact
 
 
 @pytest.mark.parametrize("name", ["lattice", "fe", "foundation-linear"])
 @pytest.mark.parametrize("shape", ["disc", "D", "turned rectangle"])
-def test_every_model_has_it(shape, name, cover):
-    found, exact = pressures(OUTLINES[shape], cover, name, 2.0)
-    assert found.pressure == pytest.approx(exact, rel=0.02)
+def test_every_model_has_a_uniform_pressure(shape, name, cover):
+    result, exact = pressures(OUTLINES[shape], cover, name, 2.0)
+    assert result.pressure == pytest.approx(exact, rel=0.02)
 
 
 @pytest.mark.parametrize(("half", "size"), [(9.0, 1.0), (9.0, 1.5), (10.0, 1.5)])
 def test_all_layers_of_an_upright_plate_have_one_outline(half, size):
-    """Nodes half a cell from a wall: rounding decided, and differently in each layer."""
+    """Nodes lie half a cell from a wall, where rounding must decide alike in each layer."""
     lattice = build_grid(extruded(turned(rectangle(half, half), 45.0)), size * MM)
     layer = lattice.index[lattice.cells[:, 0], 1]
     columns = [
@@ -116,13 +116,13 @@ def test_all_layers_of_an_upright_plate_have_one_outline(half, size):
 
 
 @pytest.mark.parametrize("name", ["lattice-linear", "fe"])
-def test_four_equal_forces_at_the_corners_of_one_face_are_one_pressure(name, cover):
-    found, exact = pressures(rectangle(1, 1), cover, name, 2.0)
-    assert found.pressure == pytest.approx(exact, rel=0.02)
+def test_equal_forces_at_the_corners_of_a_face_give_one_pressure(name, cover):
+    result, exact = pressures(rectangle(1, 1), cover, name, 2.0)
+    assert result.pressure == pytest.approx(exact, rel=0.02)
 
 
-def test_the_area_of_a_node_is_the_consistent_one():
-    """A square gives each corner a quarter; a face drawn out to a triangle, by integration."""
+def test_the_area_of_a_node_is_the_consistent_tributary_area():
+    """A square gives each corner a quarter. For a distorted face it is an integral."""
     points = np.array([[0, 0, 0], [0, 0, 2], [2, 0, 2], [2, 0, 0]], float)
     assert consistent_areas(points, np.array([[0, 1, 2, 3]])) == pytest.approx(1.0)
     drawn = points.copy()
@@ -132,7 +132,7 @@ def test_the_area_of_a_node_is_the_consistent_one():
     assert areas == pytest.approx([2 / 3, 1 / 2, 1 / 3, 1 / 2])
 
 
-def test_every_upper_face_of_a_plate_s_cells_can_be_touched():
+def test_every_upper_face_of_a_plate_is_a_contact_face():
     lattice = build_grid(extruded(OUTLINES["disc"]), 2 * MM)
     upper = lattice.cells[:, [2, 3, 7, 6]]
     upper = upper[(lattice.nodes[upper][..., 1] > 8 * MM - 1e-6).all(axis=1)]

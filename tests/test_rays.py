@@ -1,4 +1,4 @@
-"""Rays: exact distances, no leaks, every crossing once."""
+"""Rays: exact distances, no gaps between triangles, every crossing once."""
 
 import pickle
 
@@ -16,7 +16,7 @@ DOWN = (0.0, -1.0, 0.0)
 
 
 def brute(surface, origins, direction):
-    """First crossings of vertical-like rays in float64, every triangle asked."""
+    """Return the first crossings of nearly vertical rays, from all triangles."""
     a, b, c = np.moveaxis(surface.triangles, 1, 0)
     e1, e2, d = b - a, c - a, np.asarray(direction, float)
     p = np.cross(d, e2)
@@ -33,7 +33,7 @@ def brute(surface, origins, direction):
     return best
 
 
-def test_where_in_its_triangle_a_ray_crosses():
+def test_barycentric_coordinates_of_crossings_are_exact():
     """Through faces, edges and vertices; NaN beside the sphere."""
     surface = sphere(0.02, 3, (0.0, 0.0, 0.0))
     upper = surface.vertices[surface.vertices[:, 1] > 5e-3]
@@ -77,7 +77,7 @@ def test_hits_lie_in_the_plane_of_their_triangle():
     assert np.abs(off).max() < 1e-15
 
 
-def test_no_leaks_on_a_grid_aligned_with_vertices_and_edges():
+def test_rays_through_vertices_and_edges_meet_the_surface():
     surface, top = dished()
     x, z = np.linspace(-0.02, 0.02, 161), np.linspace(-0.03, 0.03, 241)
     xx, zz = (v.ravel() for v in np.meshgrid(x, z, indexing="ij"))
@@ -88,7 +88,7 @@ def test_no_leaks_on_a_grid_aligned_with_vertices_and_edges():
     np.testing.assert_allclose(0.1 - distance[on_vertex.ravel()], top(xx, zz)[on_vertex.ravel()])
 
 
-def test_all_reports_every_crossing_once_and_sorted():
+def test_all_crossings_appear_once_and_sorted():
     surface, _ = dished()
     x, z = np.linspace(-0.0199, 0.0199, 80), np.linspace(-0.0299, 0.0299, 120)
     xx, zz = (v.ravel() for v in np.meshgrid(x, z, indexing="ij"))
@@ -127,20 +127,20 @@ def test_origin_inside_and_on_the_surface():
 
 
 def test_intervals_on_a_grid_are_exact_and_closed():
-    """Lines through vertices, edges and along walls: even crossings, heights to rounding."""
+    """Lines through vertices, edges and along walls have even numbers of crossings."""
     x, z = np.linspace(-0.02, 0.02, 81), np.linspace(-0.03, 0.03, 121)
     height = 0.01 + 0.002 * np.sin(200 * x)[:, None] * np.cos(150 * z)
     solid = np.ones((80, 120), bool)
     solid[30:50, 40:60] = False
     surface = raised(x, z, height, solid)
-    found = inside_intervals(surface, 1, z, x)
-    assert found.mended == 0
-    i, k = found.second, found.first
+    result = inside_intervals(surface, 1, z, x)
+    assert result.mended == 0
+    i, k = result.second, result.first
     hole = (i > 30) & (i < 50) & (k > 40) & (k < 60)
     assert not hole.any()
     assert len(i) == 81 * 121 - 19 * 19
-    np.testing.assert_allclose(found.lower, 0.0, atol=1e-18)
-    np.testing.assert_allclose(found.upper, height[i, k], atol=1e-17)
+    np.testing.assert_allclose(result.lower, 0.0, atol=1e-18)
+    np.testing.assert_allclose(result.upper, height[i, k], atol=1e-17)
 
 
 @settings(max_examples=15, deadline=None)
@@ -154,19 +154,18 @@ def test_intervals_agree_with_rays_on_random_grids(seed):
     low, high = surface.bounds
     axis = int(rng.integers(3))
     lines = [np.sort(rng.uniform(low[(axis + s) % 3], high[(axis + s) % 3], 20)) for s in (1, 2)]
-    found = inside_intervals(surface, axis, *lines)
+    result = inside_intervals(surface, axis, *lines)
     a, b = (v.ravel() for v in np.meshgrid(*lines, indexing="ij"))
     origins = np.empty((400, 3))
     origins[:, axis] = low[axis] - 0.01
     origins[:, (axis + 1) % 3], origins[:, (axis + 2) % 3] = a, b
     ray, distance, _ = surface.rays.all(origins, np.eye(3)[axis])
-    np.testing.assert_array_equal(ray[::2], found.first * 20 + found.second)
-    np.testing.assert_allclose(low[axis] - 0.01 + distance[::2], found.lower, atol=1e-12)
-    np.testing.assert_allclose(low[axis] - 0.01 + distance[1::2], found.upper, atol=1e-12)
+    np.testing.assert_array_equal(ray[::2], result.first * 20 + result.second)
+    np.testing.assert_allclose(low[axis] - 0.01 + distance[::2], result.lower, atol=1e-12)
+    np.testing.assert_allclose(low[axis] - 0.01 + distance[1::2], result.upper, atol=1e-12)
 
 
-def test_a_surface_builds_its_rays_and_normals_once_and_keeps_them_to_itself():
-    """What is derived stays with the surface; only the triangles go to another process."""
+def test_a_surface_computes_rays_and_normals_once_and_does_not_pickle_them():
     ball = sphere(0.02, 3, (0.0, 0.0, 0.0))
     assert ball.rays is ball.rays and ball.nearest is ball.nearest
     assert ball.corner_normals is ball.corner_normals

@@ -1,4 +1,4 @@
-"""Corner normals keep rims sharp and smooth parts smooth."""
+"""Corner normals: sharp at edges, smooth elsewhere."""
 
 import numpy as np
 import pytest
@@ -23,8 +23,8 @@ def test_rim_of_a_cylinder_does_not_tilt_the_wall() -> None:
     assert normals[~wall] == pytest.approx(flat, abs=1e-12)
 
 
-def test_far_nearer_to_a_sphere_than_the_facets() -> None:
-    """At the corners: below a tenth of the facets' error, and falling with the edge length."""
+def test_corner_normals_of_a_sphere_are_more_accurate_than_facet_normals() -> None:
+    """Their error is below a tenth of the facets' error, and falls with the edge length."""
     errors = []
     for level in (3, 4, 5):
         part = surface(trimesh.creation.icosphere(level, 1.0))

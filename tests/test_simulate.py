@@ -1,4 +1,4 @@
-"""The pipeline on the shipped knee bend: what the numbers must obey, whoever made them."""
+"""The pipeline on the shipped knee bend: physical conditions on its results."""
 
 import time
 from dataclasses import replace
@@ -42,7 +42,7 @@ def test_every_frame_has_numbers(bend):
         assert np.isfinite(bend[name]).all(), name
 
 
-def test_a_case_is_run_as_it_was_read(bend):
+def test_a_run_does_not_change_its_case(bend):
     case = load_case(load_scene(fast_scene()))
     again = simulate(case, frames=EVERY_TENTH)
     for name in set(bend.columns) - CLOCKS:
@@ -51,22 +51,22 @@ def test_a_case_is_run_as_it_was_read(bend):
         simulate(case, resolution_mm=2.0)
 
 
-def test_the_maps_say_of_what_they_are(bend):
-    told = bend.maps.attributes
-    assert told["model"] == "foundation" and told["frame"].startswith("insert: x anterior")
-    assert told["version"] == tkamb.__version__ and told["units"].startswith("SI")
-    assert told["scene_sha256"] == bend.summary["scene_sha256"]
+def test_the_maps_contain_their_description(bend):
+    message = bend.maps.attributes
+    assert message["model"] == "foundation" and message["frame"].startswith("insert: x anterior")
+    assert message["version"] == tkamb.__version__ and message["units"].startswith("SI")
+    assert message["scene_sha256"] == bend.summary["scene_sha256"]
 
 
-def test_the_parts_of_the_time_are_parts_of_the_whole(timed_bend):
+def test_times_of_parts_add_up_to_less_than_the_whole(timed_bend):
     results, seconds = timed_bend
     parts = np.stack([results[name] for name in sorted(CLOCKS)])
     assert (parts > 0.0).all()
     assert parts.sum() < seconds
 
 
-def test_a_part_of_the_motion_has_the_answers_of_the_whole(bend, monkeypatch):
-    """It takes the patella and the slip of its own frames alone; slip is counted from frame 0."""
+def test_a_part_of_the_motion_has_the_results_of_the_whole(bend, monkeypatch):
+    """Patella and slip are computed for these frames alone; slip is counted from frame 0."""
     places, lows = [], []
     monkeypatch.setattr(PatellofemoralContact, "at", seen(places, PatellofemoralContact.at))
     monkeypatch.setattr(LowestPoints, "at", seen(lows, LowestPoints.at))
@@ -77,7 +77,9 @@ def test_a_part_of_the_motion_has_the_answers_of_the_whole(bend, monkeypatch):
         if name == "status":
             assert values == bend.status[4:6]
         elif name not in CLOCKS and name != "iterations":
-            close = 1e-5 if name in CONTACT_COLUMNS else 1e-12  # another guess for the contact
+            close = (
+                1e-5 if name in CONTACT_COLUMNS else 1e-12
+            )  # the contact has another initial guess
             np.testing.assert_allclose(values, bend[name][4:6], rtol=close, err_msg=name)
 
 
@@ -91,10 +93,10 @@ def seen(arguments, method):
     return asked
 
 
-def test_forces_go_the_way_of_the_source(bend):
-    """Rising with flexion, PL/Q from 1 down, PF/Q up to about 1; the README's numbers.
+def test_forces_have_the_trends_of_sharma(bend):
+    """They rise with flexion, PL/Q falls from 1, PF/Q rises to about 1, as in the README.
 
-    Sharma's (2008) PL/Q ends at 0.45, its PF/Q begins at 0.2: the README says that ours do not.
+    In Sharma (2008) PL/Q ends at 0.45 and PF/Q begins at 0.2; the README states this difference.
     """
     force, quadriceps = bend["force_total_BW"], bend["quadriceps_N"]
     assert (np.diff(force[:-1]) > 0).all()
@@ -114,19 +116,19 @@ def test_contact_force_is_mostly_superior_inferior(bend):
     assert (bend["force_si_N"] / bend["force_total_N"] > 0.99).all()
 
 
-def test_residuals_are_small_against_it(bend):
+def test_residuals_are_small_against_the_contact_force(bend):
     residual = np.hypot(bend["residual_ap_N"], bend["residual_ml_N"])
     assert (residual / bend["force_si_N"] < 0.12).all()
 
 
-def test_the_deformed_insert_carries_the_load_that_balance_asks_for(bend):
-    """Both condyles' nodal forces add up to the superior-inferior force of the body."""
+def test_the_contact_carries_the_force_of_the_equations_of_motion(bend):
+    """The nodal forces add up to the superior-inferior force of the equations of motion."""
     carried = -bend.maps.nodal_force_N[:, :, 1].sum(axis=1)
     np.testing.assert_allclose(carried, bend["force_si_N"], rtol=1e-5)
 
 
-def test_patella_balances_as_three_forces(bend):
-    """Light and slow: quadriceps, ligament and patellofemoral force close a triangle."""
+def test_the_patella_is_in_equilibrium_under_three_forces(bend):
+    """The bend is slow, so that inertia is small."""
     q, pl = bend["quadriceps_N"], bend["patellar_ligament_N"]
     pf = np.hypot(bend["patellofemoral_N"], bend["patellofemoral_tangential_N"])
     for k in range(3, 11):
@@ -159,7 +161,7 @@ def test_a_left_knee_gives_the_right_knees_numbers(tmp_path, bend):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * scale, err_msg=name)
 
 
-def test_body_weight_scales_everything_but_geometry(tmp_path):
+def test_body_mass_scales_forces_and_not_geometry(tmp_path):
     scene = load_scene(fast_scene())
     assert scene.patient.mass_kg == 75.0
     results = simulate(write_scene(tmp_path, patient__mass_kg=150.0), frames=slice(50, 51))
@@ -174,17 +176,17 @@ def test_frames_outside_the_motion_are_refused(frames):
         simulate(fast_scene(), frames=frames)
 
 
-def test_the_refusal_of_frames_says_which_there_are():
+def test_refused_frames_are_refused_with_the_available_range():
     with pytest.raises(InputError, match="it has frames 0 to 100; 0:101 are all of them"):
         simulate(fast_scene(), frames=slice(0, 3000, 10))
 
 
-def test_a_folder_in_the_place_of_its_scene_is_refused_with_the_scene():
+def test_a_folder_instead_of_a_scene_is_refused_with_the_name_of_its_scene():
     with pytest.raises(InputError, match=r"is a folder, not a file; give .*scene\.toml"):
         simulate(MODEL)
 
 
-def test_a_frame_whose_contact_is_out_of_range_fails_and_says_so(monkeypatch):
+def test_a_frame_with_contact_out_of_range_fails_with_its_reason(monkeypatch):
     press = ElasticFoundation.press
 
     def losing(self, *arguments):
@@ -215,7 +217,7 @@ def test_values_of_the_scene_are_changed_by_keyword_or_mapping(bend):
         ({"patient": {"mass_kg": 80.0}, "overrides": {"patient.mass_kg": 70.0}}, "given twice"),
     ],
 )
-def test_an_override_that_is_none_is_refused(changes, message):
+def test_an_invalid_override_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
         simulate(fast_scene(), frames=range(1), **changes)
 

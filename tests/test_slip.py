@@ -1,4 +1,4 @@
-"""A cylinder that rolls, slides and spins on a plate and in a trough: arcs in closed form."""
+"""A cylinder that rolls, slides and spins on a plate and in a trough: closed forms of the arcs."""
 
 from pathlib import Path
 
@@ -29,8 +29,8 @@ FRAMES = 61
 FLEXION = np.deg2rad(np.linspace(0.0, 60.0, FRAMES))
 
 
-def test_arcs_of_a_turned_femur_are_their_part_in_the_insert_s_sagittal_plane() -> None:
-    """A sphere flexed in steps of 20 deg, axially turned by 40 deg all the while: R dθ cos 40°."""
+def test_arcs_of_a_turned_femur_are_their_projection_onto_the_sagittal_plane() -> None:
+    """A sphere with 40 deg of axial rotation is flexed in steps of 20 deg: R dθ cos 40°."""
     coordinates = np.zeros((5, 6))
     coordinates[:, 1], coordinates[:, 3] = RADIUS, np.deg2rad(40.0)
     coordinates[:, 5] = np.deg2rad(20.0) * np.arange(5)
@@ -48,7 +48,7 @@ def cylinder() -> Surface:
 
 
 def bed(trough: bool) -> Surface:
-    """A block 60 x 80 mm; its top is flat at 12 mm or a trough of 50 mm radius."""
+    """Return a block of 60 x 80 mm; its top is flat at 12 mm or a trough of 50 mm radius."""
     x, z = np.linspace(-0.03, 0.03, 241), np.array([-0.04, 0.0, 0.04])
     top = DEPTH + (TROUGH - np.sqrt(TROUGH**2 - x**2) if trough else 0.0 * x)
     rings = [
@@ -110,9 +110,8 @@ def test_sliding_on_a_plate_is_all_slip(roller: Surface) -> None:
         assert side.slip[-1] == pytest.approx(-0.02 * FLEXION[-1], rel=1e-3)
 
 
-def test_axial_rotation_is_taken_out(roller: Surface) -> None:
-    """A rotation of 20 deg about the centre moves the condyles in opposite directions without
-    slip."""
+def test_axial_rotation_alone_is_no_slip(roller: Surface) -> None:
+    """A rotation of 20 deg about the centre moves the condyles in opposite directions."""
     angle = np.deg2rad(np.linspace(0.0, 20.0, FRAMES))
     medial, lateral = both(condyle_slip(roller, bed(False), 0.0, motion(0.0, 0.0, angle)))
     assert lateral.insert_arc[-1] == pytest.approx(0.015 * np.sin(angle[-1]), rel=2e-3)
@@ -134,7 +133,7 @@ def test_rolling_with_axial_rotation_has_no_slip(roller: Surface) -> None:
 
 
 def test_arcs_in_a_trough(roller: Surface) -> None:
-    """The lowest point is below the axis; its projection runs on the trough's arc."""
+    """The lowest point is below the axis; its projection moves on the trough's arc."""
     ap = np.linspace(0.012, -0.014, FRAMES)
     moved = motion(ap, FLEXION)
     moved[:, 1] += 5e-3
@@ -146,7 +145,7 @@ def test_arcs_in_a_trough(roller: Surface) -> None:
 
 
 def test_slip_velocity_is_the_rigid_body_velocity(roller: Surface) -> None:
-    """Rolling plus slip plus axial rotation: by arcs, and by v + w x r without arcs."""
+    """Rolling, slip and axial rotation, by arcs and by v + w x r."""
     time = np.linspace(0.0, 1.0, FRAMES)
     angle = np.deg2rad(8.0) * time**2
     moved = motion(0.012 - 0.014 * time, FLEXION, angle)
@@ -168,7 +167,7 @@ def test_arc_is_exact_on_a_circle() -> None:
     assert arc(chord, turn) == pytest.approx(RADIUS * turn, rel=1e-12)
 
 
-def test_roll_slip_motion_gives_back_the_rolling(roller: Surface) -> None:
+def test_the_rolling_of_a_roll_slip_motion_is_recovered(roller: Surface) -> None:
     given = motion(0.01, FLEXION)
     rolled = roll_slip_motion(roller, bed(False), 0.0, given, np.zeros(FRAMES))
     assert rolled[:, 0] == pytest.approx(0.01 - RADIUS * FLEXION, abs=2e-5)
@@ -177,7 +176,7 @@ def test_roll_slip_motion_gives_back_the_rolling(roller: Surface) -> None:
     assert slipped[:, 0] == pytest.approx(0.01, abs=2e-5)
 
 
-def test_off_the_insert_is_not_a_number(roller: Surface) -> None:
+def test_slip_beside_the_insert_is_nan(roller: Surface) -> None:
     moved = motion(np.linspace(0.0, -0.05, FRAMES), FLEXION)
     medial, _ = both(condyle_slip(roller, bed(False), 0.0, moved))
     assert np.isfinite(medial.slip[:30]).all()
@@ -192,7 +191,7 @@ def test_profile_of_the_trough() -> None:
 
 
 def test_arcs_agree_with_the_exact_sections() -> None:
-    """On the shipped knee, 0-120 deg, circular arcs agree with splines along the sections."""
+    """On the shipped knee, 0 to 120 deg, circular arcs agree with splines along the sections."""
     path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
     case = load_case(load_scene(path))
     assert case.femoral is not None
@@ -201,9 +200,9 @@ def test_arcs_agree_with_the_exact_sections() -> None:
     poses = knee_pose(coordinates)
     side, _ = condyle_slip(case.femoral, case.insert, case.split, coordinates)
     points = np.array([LowestPoints(case.femoral, case.split).at(pose)[0] for pose in poses])
-    here = transform(inverse(poses), points[:, None])[:, 0]
-    profile = condyle_profile(case.femoral, float(here[:, 2].mean()))
-    section = np.ptp(profile.locate(here[[0, -1], :2]))
+    at_frame = transform(inverse(poses), points[:, None])[:, 0]
+    profile = condyle_profile(case.femoral, float(at_frame[:, 2].mean()))
+    section = np.ptp(profile.locate(at_frame[[0, -1], :2]))
     assert side.femoral_arc[-1] == pytest.approx(section, rel=5e-3)
     ahead = points[:-1] * [1.0, 1.0, 0.0] + points[0] * [0.0, 0.0, 1.0]
     behind = points[1:] * [1.0, 1.0, 0.0] + points[0] * [0.0, 0.0, 1.0]
@@ -212,9 +211,8 @@ def test_arcs_agree_with_the_exact_sections() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_forward_sliding_is_that_of_the_femoral_point_in_the_plane_of_the_centre(seed):
-    """At a point beside the contact, in the sagittal plane of the centre, the spin about y has no
-    part."""
+def test_forward_sliding_is_measured_in_the_sagittal_plane_of_the_centre(seed):
+    """The rotation about y does not contribute, also for a point beside the contact."""
     rng = np.random.default_rng(seed)
     place, rates = rng.normal(size=6) * [0.01, 0.01, 0.01, 0.3, 0.3, 0.3], rng.normal(size=6)
     centre, contact = rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.03
@@ -222,5 +220,5 @@ def test_forward_sliding_is_that_of_the_femoral_point_in_the_plane_of_the_centre
     on_femur = transform(inverse(knee_pose(place)), beside)
     step = 1e-6
     ahead, behind = (transform(knee_pose(place + s * rates), on_femur) for s in (step, -step))
-    wanted = (ahead - behind)[0] / (2 * step)
-    assert forward_sliding(place, rates, centre, contact) == pytest.approx(wanted, abs=1e-8)
+    expected = (ahead - behind)[0] / (2 * step)
+    assert forward_sliding(place, rates, centre, contact) == pytest.approx(expected, abs=1e-8)

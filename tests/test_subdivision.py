@@ -1,4 +1,4 @@
-"""A surface cut finer without being curved: the lattice's answer stays."""
+"""A surface with finer triangles and the same shape: the lattice's result does not change."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ LINEAR = material("polyethylene-linear")
 
 
 def halved(surface, times=1, seed=None):
-    """Return the surface with every triangle cut into four; shuffled and rounded with a seed."""
+    """Return the surface with triangles divided into four; with a seed shuffled and rounded."""
     points, faces = surface.vertices, surface.faces
     for _ in range(times):
         points, faces = trimesh.remesh.subdivide(points, faces)
@@ -44,21 +44,23 @@ def ball(subdivisions=4):
 @pytest.mark.parametrize("times", [1, 2, 3])
 @pytest.mark.parametrize("seed", [None, 5])
 def test_flat_subdivision_is_undone(times, seed):
-    """All triangles come back, each finer one where it lies on its own."""
+    """All coarser triangles are recovered, with the position of each finer triangle."""
     whole = box_insert(20e-3, 8e-3, 30e-3)
     for surface in (whole, ball(2)):
         finer = halved(surface, times, seed)
-        found = coarsened(finer)
-        assert len(found.surface.faces) == len(surface.faces)
-        assert found.surface.mesh.volume == pytest.approx(surface.mesh.volume, rel=1e-5)
-        corners = np.einsum("kij,kjl->kil", found.corners, found.surface.triangles[found.parent])
+        result = coarsened(finer)
+        assert len(result.surface.faces) == len(surface.faces)
+        assert result.surface.mesh.volume == pytest.approx(surface.mesh.volume, rel=1e-5)
+        corners = np.einsum("kij,kjl->kil", result.corners, result.surface.triangles[result.parent])
         assert np.abs(corners - finer.triangles).max() < 1e-7
-        again = np.sort(np.bincount(found.parent))
+        again = np.sort(np.bincount(result.parent))
         assert (again == 4**times).all()
 
 
-def test_only_what_was_cut_is_undone():
-    """Two balls, one cut finer; a ball whose middles lie on the sphere is another shape."""
+def test_only_flat_subdivisions_are_undone():
+    """One of two spheres is divided flatly. A subdivision with vertices on the sphere is another
+    shape.
+    """
     one, other = ball(2), halved(ball(2))
     both = Surface(
         np.vstack([one.vertices, other.vertices + 0.1]),
@@ -71,7 +73,7 @@ def test_only_what_was_cut_is_undone():
     assert coarsened(dished_insert(lambda x, z: 8e-3 + (x**2 + z**2) / 0.08)) is None
 
 
-def test_a_damaged_subdivision_is_left():
+def test_a_damaged_subdivision_is_not_undone():
     finer = halved(ball(2))
     moved = finer.vertices.copy()
     moved[-1] *= 1.0001
@@ -79,51 +81,49 @@ def test_a_damaged_subdivision_is_left():
     assert coarsened(Surface(finer.vertices, finer.faces[1:])) is None
 
 
-def test_the_curved_patches_stay():
-    """Height and normal over the same points, cut once and twice."""
+def test_curved_patches_do_not_change_with_subdivision():
     surface = ball(3)
     faces = np.flatnonzero(surface.face_normals[:, 1] > 0.8)
     generator = np.random.default_rng(1)
     weights = generator.dirichlet([1, 1, 1], len(faces))
     points = np.einsum("ij,ijk->ik", weights, surface.triangles[faces])
-    wanted = CurvedSurface.of(surface).shift(faces, weights, UP)
-    assert wanted[0].max() > 1e-5
+    expected = CurvedSurface.of(surface).shift(faces, weights, UP)
+    assert expected[0].max() > 1e-5
     for times in (1, 2):
         finer = halved(surface, times, seed=3)
         near = finer.rays.first(points + UP, -UP)[1]
         patches = CurvedSurface.of(finer)
-        found = patches.shift(near, finer.barycentric(points, near), UP)
-        assert np.abs(found[0] - wanted[0]).max() < 1e-8
-        assert np.abs(found[1] - wanted[1]).max() < 1e-4
+        result = patches.shift(near, finer.barycentric(points, near), UP)
+        assert np.abs(result[0] - expected[0]).max() < 1e-8
+        assert np.abs(result[1] - expected[1]).max() < 1e-4
 
 
 @pytest.mark.parametrize("cut", ["femoral", "insert"])
-def test_a_ball_in_a_dish_sinks_in_as_far(cut):
-    """Facets that stand 27 µm off at an approach of 0.2 mm: the cut moved it by 2 to 15 %."""
+def test_subdivision_does_not_change_the_approach_of_a_sphere(cut):
+    """The facets have a sagitta of 27 µm at an approach of 0.2 mm."""
     dish = dished_insert(lambda x, z: 8e-3 + (x**2 + z**2) / 0.08, 12e-3, 12e-3, 3e-3)
-    found = []
+    result = []
     for times in (0, 1):
         femoral = halved(ball(), times if cut == "femoral" else 0)
         insert = halved(dish, times if cut == "insert" else 0)
         model = contact_model("lattice-linear", 2.0)
         state = model.prepare(ContactPair(femoral, insert, LINEAR))
-        found.append(model.press(state, 800.0, above(0.3e-3, 0.2e-3)))
-    before, after = found
+        result.append(model.press(state, 800.0, above(0.3e-3, 0.2e-3)))
+    before, after = result
     assert after.approach == pytest.approx(before.approach, rel=1e-3)
     assert after.pressure.max() == pytest.approx(before.pressure.max(), rel=1e-3)
     assert after.medial.area == pytest.approx(before.medial.area, rel=1e-3)
 
 
-def test_the_shipped_condyles_sink_in_as_far():
-    """Before, the approach moved by 2.1 % with the femoral component cut, 1.9 % with the insert."""
+def test_subdivision_does_not_change_the_approach_of_the_shipped_condyles():
     case = load_case(load_scene(MODEL / "scene.toml"))
     pose = knee_pose(case.motion.coordinates[36])
-    model, found = contact_model("lattice", 3.0), []
+    model, result = contact_model("lattice", 3.0), []
     for times in (0, 1):
         femoral, insert = halved(case.femoral, times), halved(case.insert, times)
         state = model.prepare(ContactPair(femoral, insert, material("polyethylene")))
-        found.append(model.press(state, 1450.0, pose))
-    before, after = found
+        result.append(model.press(state, 1450.0, pose))
+    before, after = result
     assert before.status is after.status is ContactStatus.OK
     assert after.approach == pytest.approx(before.approach, rel=2e-3)
     assert after.pressure.max() == pytest.approx(before.pressure.max(), rel=2e-3)

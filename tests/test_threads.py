@@ -1,4 +1,4 @@
-"""Two threads: what is done by both, and that it does not show in an answer."""
+"""Two threads: their use, and results that do not depend on it."""
 
 import os
 import subprocess
@@ -27,7 +27,7 @@ def with_threads(monkeypatch):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_both_give_what_they_return_also_one_within_the_other(with_threads, count):
+def test_both_returns_the_results_also_in_nested_calls(with_threads, count):
     with_threads(count)
 
     def nested():
@@ -40,14 +40,14 @@ def test_both_give_what_they_return_also_one_within_the_other(with_threads, coun
     )
 
 
-def test_two_run_at_the_same_time(with_threads):
-    """Each waits for the other: one after the other they would never meet."""
+def test_two_functions_run_at_the_same_time(with_threads):
+    """Each function waits for the other one; in sequence they would never end."""
     with_threads(2)
     meeting = threading.Barrier(2, timeout=30)
     assert sorted(threads.both(meeting.wait, meeting.wait)) == [0, 1]
 
 
-def test_an_error_comes_out_once_the_other_has_ended(with_threads):
+def test_an_error_is_raised_after_the_other_function_has_ended(with_threads):
     with_threads(2)
     ended = []
 
@@ -67,11 +67,11 @@ def test_an_error_comes_out_once_the_other_has_ended(with_threads):
 
 
 def test_a_forked_process_has_a_second_thread_of_its_own(with_threads):
-    """As `multiprocessing` makes them: the parent's thread, and its lock, are not there."""
+    """As in `multiprocessing`: the child has neither the parent's thread nor its lock."""
     with_threads(2)
     assert threads.both(lambda: 1, lambda: 2) == (1, 2)
     busy, _ = threads._second()
-    assert busy.acquire(blocking=False)  # as if the other thread were at work
+    assert busy.acquire(blocking=False)  # as if the second thread were busy
     child = os.fork()
     if not child:
         meeting = threading.Barrier(2, timeout=30)
@@ -80,24 +80,24 @@ def test_a_forked_process_has_a_second_thread_of_its_own(with_threads):
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_a_wrong_number_of_threads_is_one_line(tmp_path):
+def test_a_wrong_number_of_threads_is_refused_in_one_line(tmp_path):
     command = [sys.executable, "-m", "tkamb", "run", "nothing.toml", "--out", tmp_path / "out"]
     environment = os.environ | {threads.VARIABLE: "many"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
-    assert "TKAMB_THREADS" in done.stderr and not (tmp_path / "out").exists()
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path)
+    assert process.returncode == 2 and len(process.stderr.splitlines()) == 1
+    assert "TKAMB_THREADS" in process.stderr and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", ["lattice", "lattice-linear", "foundation"])
-def test_a_press_is_the_same_to_the_bit(with_threads, name):
+def test_a_press_does_not_depend_on_the_number_of_threads(with_threads, name):
     bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), material("polyethylene"))
     pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, np.radians(0.3), 0.0])
-    found = []
+    result = []
     for count in (1, 2):
         with_threads(count)
         model = contact_model(name, 2.0)
-        found.append(model.press(model.prepare(bodies), 2000.0, pose))
-    one, two = found
+        result.append(model.press(model.prepare(bodies), 2000.0, pose))
+    one, two = result
     assert one.status is two.status is ContactStatus.OK
     assert one.pose.tobytes() == two.pose.tobytes()
     assert one.pressure.tobytes() == two.pressure.tobytes()
@@ -105,8 +105,8 @@ def test_a_press_is_the_same_to_the_bit(with_threads, name):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_fronts_are_divided_without_one_above_the_other(seed):
-    """Any forest: the two shares do not depend on each other, nor what is above on neither."""
+def test_the_two_shares_of_fronts_are_independent(seed):
+    """For any forest the two shares depend neither on each other nor on the fronts above."""
     chance = np.random.default_rng(seed)
     count = int(chance.integers(1, 80))
     parents = [int(chance.integers(i + 1, min(i + 12, count) + 1)) for i in range(count)]
@@ -135,7 +135,6 @@ def test_fronts_are_divided_without_one_above_the_other(seed):
 
 
 def test_a_balanced_tree_is_divided_in_two_halves():
-    """Two subtrees under one root, each of a top with two leaves."""
     parents = np.array([2, 2, 6, 5, 5, 6, -1])
     starts, empty = np.arange(8) * 10, np.zeros(0, np.int64)
     factor = CholeskyFactor(

@@ -21,7 +21,7 @@ MARKERS = {
 
 
 def shank(t):
-    """A shank that swings and walks: pose_tibia_in_laboratory (n, 4, 4)."""
+    """Return the pose_tibia_in_laboratory (n, 4, 4) of a shank in swing and gait."""
     angles = np.stack([0.05 * np.sin(2 * t), 0.2 * t, -0.4 + 0.6 * np.sin(3 * t)], axis=-1)
     place = np.stack([1.2 * t, 0.1 + 0.02 * np.sin(4 * t), 0.1 * np.cos(t)], axis=-1)
     return pose(Rotation.from_euler("XYZ", angles).as_matrix(), place)
@@ -70,7 +70,7 @@ def test_markers_give_pose_and_rates(tmp_path):
     np.testing.assert_allclose(tibia.velocity[:, 3:], spin, atol=2e-3)
 
 
-def test_laboratory_axes_turn_a_walk_towards_minus_x(tmp_path):
+def test_laboratory_axes_of_a_walk_towards_minus_x(tmp_path):
     backwards = pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)) @ shank(STAMPS)
     file = marker_file(tmp_path / "s.trc", backwards)
     tibia = load_tibia(marker_table(file, laboratory_axes="-x,+y,-z"), AT, "right", "none")
@@ -84,11 +84,11 @@ def test_residual_is_the_noise_of_the_markers(tmp_path):
     points = transform(shank(STAMPS), np.broadcast_to(reference, (241, 4, 3)))
     noisy = points + rng.normal(0, 1e-3, points.shape)
     _, residual = fit_rigid(noisy, reference)
-    # 12 coordinates, 6 fitted: half the variance is left
+    # 6 of 12 coordinates are fitted, so half of the variance remains
     assert np.sqrt(np.mean(residual**2)) == pytest.approx(np.sqrt(3 / 2) * 1e-3, rel=0.05)
 
 
-def test_fit_never_reflects():
+def test_the_fit_is_never_a_reflection():
     reference = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0]])
     turn = Rotation.random(20, random_state=1).as_matrix()
     poses, residual = fit_rigid(np.einsum("nij,mj->nmi", turn, reference), reference)
@@ -97,8 +97,8 @@ def test_fit_never_reflects():
     assert residual.max() < 1e-12
 
 
-def test_joint_centre_of_the_foot_stands_in_for_a_marker(tmp_path):
-    """Two shank markers and the ankle centre that the foot carries fix the shank."""
+def test_the_ankle_centre_replaces_a_missing_marker(tmp_path):
+    """Two shank markers and the ankle centre of the foot determine the shank's pose."""
     foot = {"heel": (-40.0, -60.0, 0.0), "toe": (180.0, -50.0, 10.0), "mid": (80.0, 20.0, 30.0)}
     ankle_in_foot = np.array([10.0, 30.0, -5.0])
     flex = Rotation.from_euler("ZX", np.stack([np.sin(5 * STAMPS), 0.2 * STAMPS], 1)).as_matrix()
@@ -151,7 +151,7 @@ def test_sagittal_lean_is_forward_about_a_fixed_ankle(tmp_path):
     assert not tibia.velocity[:, :5].any()
 
 
-def test_left_shank_is_mirrored_to_the_same_arrays(tmp_path):
+def test_a_left_shank_gives_the_arrays_of_its_mirror_image(tmp_path):
     mirrored = {name: tuple(MIRROR @ place) for name, place in MARKERS.items()}
     right_file = marker_file(tmp_path / "r.trc", shank(STAMPS))
     left_file = marker_file(tmp_path / "l.trc", mirrored_pose(shank(STAMPS)), mirrored)
@@ -167,7 +167,7 @@ def test_left_shank_is_mirrored_to_the_same_arrays(tmp_path):
     np.testing.assert_allclose(leaning.pose[:, :3, 3], np.tile([0.01, 0.08, 0.09], (21, 1)))
 
 
-def test_gap_outside_the_interval_is_cut_off(tmp_path):
+def test_a_gap_outside_the_interval_has_no_influence(tmp_path):
     reference = np.array(list(MARKERS.values()))
     points = transform(shank(STAMPS), np.broadcast_to(reference * 1e-3, (241, 4, 3))) * 1e3
     points[20, 1] = np.nan

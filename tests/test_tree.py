@@ -1,4 +1,4 @@
-"""The tree of boxes and what asks it: sorted triangles, numbers that are none, other arrays."""
+"""The tree of boxes and its searches: sorted triangles, NaN and inf, other array types."""
 
 import numpy as np
 import pytest
@@ -41,22 +41,22 @@ SLIVER = [
 
 
 def ribbon(count):
-    """So many triangles in a row along x, in this order."""
+    """Return that number of triangles in a row along x, in this order."""
     x = np.arange(count + 2.0)
     corners = np.stack([x, 0.0 * x, x % 2], axis=1)
     first = np.arange(count)[:, None]
     return Surface(corners, first + np.arange(3))
 
 
-def test_no_point_lies_nearest_to_one_that_is_none():
+def test_a_point_that_is_not_finite_has_no_nearest_point():
     ball = sphere(0.02, 2)
-    found = ball.nearest.at(np.concatenate([NONE, [[0.0, 0.03, 0.0]]]))
-    assert np.isinf(found.distance[:-1]).all() and (found.faces[:-1] == -1).all()
-    assert np.isnan(found.points[:-1]).all()
-    assert found.points[-1] == pytest.approx([0.0, 0.02, 0.0])
+    result = ball.nearest.at(np.concatenate([NONE, [[0.0, 0.03, 0.0]]]))
+    assert np.isinf(result.distance[:-1]).all() and (result.faces[:-1] == -1).all()
+    assert np.isnan(result.points[:-1]).all()
+    assert result.points[-1] == pytest.approx([0.0, 0.02, 0.0])
 
 
-def test_rays_from_or_along_what_is_none_meet_nothing():
+def test_rays_that_are_not_finite_have_no_crossing():
     rays = sphere(0.02, 2).rays
     start = np.array([[0.0, 0.05, 0.0]])
     for origins, directions in [(NONE, DOWN), (np.tile(start, (4, 1)), NONE), (start, np.zeros(3))]:
@@ -67,15 +67,15 @@ def test_rays_from_or_along_what_is_none_meet_nothing():
     assert after[-1] == pytest.approx(0.03)
 
 
-def test_rays_have_one_direction_or_each_its_own():
+def test_rays_have_one_common_direction_or_one_each():
     rays = sphere(0.02, 2).rays
     for count, directions in [(3, 2), (3, 0), (1, 2)]:
         with pytest.raises(ValueError, match=f"{directions} directions for {count} rays"):
             rays.first(np.zeros((count, 3)), np.ones((directions, 3)))
 
 
-def test_a_condyle_is_not_looked_for_at_a_pose_that_is_none(monkeypatch):
-    """Each comparison with NaN is false: every triangle would be held against every other."""
+def test_a_pose_that_is_not_finite_has_no_first_touch(monkeypatch):
+    """Every comparison with NaN is false, so the search would compare all triangles."""
     touch = FirstTouch(sphere(0.02, 2), plate())
     monkeypatch.setattr(first_touch, "_least_clearance", None)
     for place in [(0, 0), (0, 3), (1, 3)]:
@@ -90,8 +90,8 @@ def test_a_side_without_a_triangle_does_not_touch():
     assert lateral.travel == pytest.approx(0.02)
 
 
-def test_triangles_cut_to_shreds_by_rounding_stay_in_their_room():
-    """A wall along a sliver, whose corners lie on either side of each of its edges by rounding."""
+def test_cuts_of_slivers_fit_into_the_work_array():
+    """A wall along a sliver: by rounding its corners lie on either side of each edge."""
     wall, sliver = np.ravel(WALL), np.ravel(SLIVER)
     room = np.full((2, MOST_CORNERS + 8, 3), np.pi)
     plane = first_touch._plane(sliver)
@@ -101,7 +101,7 @@ def test_triangles_cut_to_shreds_by_rounding_stay_in_their_room():
     assert (room[:, MOST_CORNERS:] == np.pi).all()
 
 
-def test_what_is_asked_in_other_arrays_is_not_compiled_anew():
+def test_other_array_types_do_not_trigger_compilation():
     ball = sphere(0.02, 2)
     points = np.zeros((4, 3))
     asked = [lambda p: ball.rays.first(p, DOWN), lambda p: ball.rays.all(p, DOWN)]
@@ -120,8 +120,8 @@ def test_what_is_asked_in_other_arrays_is_not_compiled_anew():
     assert [set(loop.signatures) for loop in loops] == known
 
 
-def test_sorted_triangles_are_parted_as_they_come(monkeypatch):
-    """Some twice, to fill the leaves: the first ones after the last made it quadratic."""
+def test_sorted_triangles_are_divided_in_linear_time(monkeypatch):
+    """Some triangles appear twice, to fill the leaves, which must not make the work quadratic."""
     orders = []
     monkeypatch.setattr(nearest, "_halve", lambda centres, order, leaves: orders.append(order))
     for count in (5, 63, 100):
@@ -130,7 +130,7 @@ def test_sorted_triangles_are_parted_as_they_come(monkeypatch):
 
 
 def heights_over(points, triangle):
-    """Height of a triangle's plane at the x and z of points (n, 3); NaN beside the triangle."""
+    """Return the height of a triangle's plane at points (n, 3); NaN beside the triangle."""
     a, b, c = triangle
     weights = np.linalg.solve(np.stack([b - a, c - a])[:, [0, 2]].T, (points - a)[:, [0, 2]].T).T
     inside = (weights >= 0.0).all(axis=1) & (weights.sum(axis=1) <= 1.0)
@@ -138,7 +138,9 @@ def heights_over(points, triangle):
 
 
 def clearance(upper, lower):
-    """Least clearance of two triangles: at corners, and where edges cross, seen from above."""
+    """Return the smallest clearance of two triangles, at corners and crossings of edges in plan
+    view.
+    """
     apart = [*(upper[:, 1] - heights_over(upper, lower))]
     apart += [*(heights_over(lower, upper) - lower[:, 1])]
     for i, j in np.ndindex(3, 3):
@@ -162,9 +164,9 @@ def test_first_touch_is_the_least_clearance_of_any_two_triangles(seed, scale):
     upper = femoral.moved(at).triangles
     upward = insert.triangles[insert.face_normals[:, 1] > 0.0]
     assume(len(upward))
-    expected = min(clearance(one, other) for one in upper for other in upward)
-    found = FirstTouch(femoral, insert).travel(at)
+    expected = min(clearance(upper_triangle, other) for upper_triangle in upper for other in upward)
+    result = FirstTouch(femoral, insert).travel(at)
     if np.isinf(expected):
-        assert np.isnan(found)
+        assert np.isnan(result)
     else:
-        assert found == pytest.approx(expected, abs=1e-9 * scale)
+        assert result == pytest.approx(expected, abs=1e-9 * scale)

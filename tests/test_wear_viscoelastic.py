@@ -39,7 +39,7 @@ class ViscoelasticBed:
         self._memory = np.zeros((len(series.times), len(bed.points)))
 
     def press(self, load, pose, step):
-        """Go on by `step` s to a load (N) at a pose whose y is free; pressure (n,) Pa."""
+        """Advance by `step` s to a load (N) at a pose with free y; return the pressure (n,), Pa."""
 
         def missing(fall):
             result = self._pressed(pose, fall, step)[1]
@@ -47,19 +47,19 @@ class ViscoelasticBed:
 
         fall = brentq(missing, -5e-3, 5e-3, xtol=1e-9)
         strain, pressure = self._pressed(pose, fall, step)
-        _, decay, kept = self._series.response(step)
-        self._memory = decay[:, None] * self._memory + kept[:, None] * (strain - self._strain)
+        _, decay, remaining = self._series.response(step)
+        self._memory = decay[:, None] * self._memory + remaining[:, None] * (strain - self._strain)
         self._strain = strain
         return pressure
 
     def _pressed(self, pose, fall, step):
-        """Return strains and pressures (n,) with the femur `fall` below its pose."""
+        """Return strains and pressures (n,) after a move of the femur down by `fall` (m)."""
         moved = np.array(pose, float)
         moved[1, 3] -= fall
         gap = gaps_along_normals(self._bed, self._femoral, moved)
         asked = -gap / np.maximum(self._bed.thickness, FOUNDATION.least_thickness)
-        slope, decay, kept = self._series.response(step)
-        carried = decay @ self._memory - kept.sum() * self._strain
+        slope, decay, remaining = self._series.response(step)
+        carried = decay @ self._memory - remaining.sum() * self._strain
         free = -carried / slope  # strain at which the stress is zero
         strain = np.maximum(asked, free)
         return strain, self._modulus * np.maximum(slope * strain + carried, 0.0)
@@ -68,11 +68,11 @@ class ViscoelasticBed:
 SERIES = PronySeries((0.4, 0.3), (0.5, 20.0))
 
 
-def test_a_step_of_strain_relaxes_by_the_series_whatever_the_steps():
+def test_a_step_of_strain_relaxes_by_the_series_with_any_time_step():
     time = np.array([0.0, 0.01, 0.3, 1.0, 30.0, 31.0, 500.0])
-    found = SERIES.stress(time, np.full((len(time), 2), 0.02))
+    result = SERIES.stress(time, np.full((len(time), 2), 0.02))
     exact = 0.02 * np.array([SERIES.relaxation(t) for t in time])
-    assert found == pytest.approx(np.stack([exact, exact], axis=1), rel=1e-12)
+    assert result == pytest.approx(np.stack([exact, exact], axis=1), rel=1e-12)
 
 
 def test_a_ramp_has_its_closed_form():
@@ -84,7 +84,7 @@ def test_a_ramp_has_its_closed_form():
 
 
 @pytest.mark.parametrize(("period", "modulus"), [(1e-4, 1.0), (1e6, SERIES.equilibrium)])
-def test_fast_is_instantaneous_and_slow_is_in_equilibrium(period, modulus):
+def test_fast_loading_is_instantaneous_and_slow_loading_relaxed(period, modulus):
     time = np.linspace(0.0, period, 200)
     strain = np.sin(np.pi * time / period)
     assert SERIES.stress(time, strain) == pytest.approx(modulus * strain, abs=5e-3)
@@ -93,7 +93,7 @@ def test_fast_is_instantaneous_and_slow_is_in_equilibrium(period, modulus):
 @pytest.mark.parametrize(
     ("fractions", "times"), [((0.5, 0.5), (1, 2)), ((-0.1,), (1,)), ((0.1,), (0,)), ((0.1,), ())]
 )
-def test_what_is_no_series_is_refused(fractions, times):
+def test_an_invalid_series_is_refused(fractions, times):
     with pytest.raises(InputError, match="viscoelastic"):
         PronySeries(fractions, times)
 
@@ -105,7 +105,7 @@ def bodies():
 
 
 def moved(bodies, speed):
-    """Move a loaded ball 8 mm along x, in steps of half a millimetre; the last pressures."""
+    """Return the last pressures of a loaded sphere that moves 8 mm along x, in steps of 0.5 mm."""
     bed, femoral = bodies
     columns = ViscoelasticBed(bed, femoral, 2e9, PronySeries((0.6,), (1.0,)))
     for place in np.arange(-4e-3, 4.1e-3, 5e-4):
@@ -122,8 +122,8 @@ def runs(bodies):
     return {name: moved(bodies, speed) for name, speed in SPEEDS.items()}
 
 
-def test_a_moving_load_is_carried_ahead_of_its_middle_and_only_at_middling_speeds(runs):
-    """The front is fresh and stiff, the back has relaxed: the pressure leads the ball."""
+def test_the_pressure_leads_the_sphere_at_medium_speeds_only(runs):
+    """At the front the material is fresh and stiff, at the back it has relaxed."""
     slow, middling, fast = runs.values()
     assert middling[1] > 2e-4
     assert abs(slow[1]) < 0.02 * middling[1]
@@ -132,7 +132,7 @@ def test_a_moving_load_is_carried_ahead_of_its_middle_and_only_at_middling_speed
         assert force == pytest.approx(300.0, rel=1e-4)
 
 
-def test_slow_presses_like_the_relaxed_columns_and_fast_like_the_fresh_ones(bodies, runs):
+def test_slow_motion_has_relaxed_columns_and_fast_motion_fresh_ones(bodies, runs):
     bed, femoral = bodies
     place = pose(np.eye(3), [4e-3, 0, 0])
     for name, modulus in (("slow", 0.4 * 2e9), ("fast", 2e9)):
@@ -146,7 +146,7 @@ PAIR_SERIES = PronySeries((0.4, 0.2), (1.0, 20.0))
 
 
 def bonded(top, resolution=2e-3, modulus=500e6):
-    """A block of 10 mm, bonded below, on the lattice, under a rigid body."""
+    """Return a block of 10 mm on the lattice, bonded at its bottom, under a rigid body."""
     plate = shapes.block(lambda x, z: 0.01 + 0 * x, 0.02, 0.012, 2e-3)
     made_of = Material("m", modulus, 0.46)
     pair = ContactPair(top, plate, made_of, "fixed")
@@ -155,7 +155,7 @@ def bonded(top, resolution=2e-3, modulus=500e6):
 
 @pytest.fixture(scope="module")
 def flat():
-    """A rigid plate over all of the block."""
+    """Return a rigid plate that covers the block."""
     box = shapes.block(lambda x, z: 0.02 + 0 * x, 0.03, 0.02, 5e-3)
     return bonded(box)
 
@@ -165,19 +165,18 @@ def held_at(depth):
 
 
 def test_a_bonded_block_under_a_flat_plate_relaxes_by_the_series(flat):
-    """A step of displacement: the force falls as M(t), whatever the steps in time."""
+    """After a step of displacement the force falls as M(t), with any time step."""
     block = ViscoelasticLattice(*flat, PAIR_SERIES)
     first = -block.hold(held_at(0.1e-3), 1e-6).force[:, 1].sum()
     time = 0.0
     for step in (0.3, 0.7, 4.0, 15.0, 300.0):
         time += step
-        found = -block.hold(held_at(0.1e-3), step).force[:, 1].sum()
-        assert found / first == pytest.approx(PAIR_SERIES.relaxation(time), rel=1e-4)
+        result = -block.hold(held_at(0.1e-3), step).force[:, 1].sum()
+        assert result / first == pytest.approx(PAIR_SERIES.relaxation(time), rel=1e-4)
     assert first == pytest.approx(-elastic(flat, held_at(0.1e-3)).nodal_force[:, 1].sum(), rel=1e-4)
 
 
 def elastic(made, place, share=1.0, load=None):
-    """Return the elastic contact with a share of the modulus."""
     model, pair = made
     softer = replace(pair.material, young_modulus=share * pair.material.young_modulus)
     state = model.prepare(replace(pair, material=softer))
@@ -192,13 +191,13 @@ def test_a_bonded_block_under_a_constant_load_creeps_by_the_reciprocal_of_the_se
     first = block.press(500.0, place, 1e-6).displacement[:, 1].mean()
     for step in np.full(20, 0.1):
         time += step
-        found = block.press(500.0, place, step)
+        result = block.press(500.0, place, step)
         exact = (1.0 - g * np.exp(-time * (1.0 - g) / tau)) / (1.0 - g)
-        assert found.displacement[:, 1].mean() / first == pytest.approx(exact, rel=5e-3)
-        assert -found.force[:, 1].sum() == pytest.approx(500.0, rel=1e-6)
+        assert result.displacement[:, 1].mean() / first == pytest.approx(exact, rel=5e-3)
+        assert -result.force[:, 1].sum() == pytest.approx(500.0, rel=1e-6)
 
 
-def test_what_the_plate_has_left_creeps_back_to_where_it_was(flat):
+def test_the_unloaded_block_recovers_its_shape(flat):
     block = ViscoelasticLattice(*flat, PAIR_SERIES)
     block.hold(held_at(0.1e-3), 50.0)
     left = block.hold(held_at(-1e-3), 1e-6)
@@ -218,44 +217,45 @@ def rolled(ball):
 
 
 def moved_on_lattice(made, speed):
-    """Move a loaded ball 4 mm along x, in steps of half a millimetre; last pressures, lead."""
+    """Return last pressures and lead of a loaded sphere that moves 4 mm along x, in steps of 0.5
+    mm.
+    """
     block = ViscoelasticLattice(*made, PronySeries((0.6,), (1.0,)))
     for place in np.arange(-2e-3, 2.1e-3, 5e-4):
-        found = block.press(200.0, pose(np.eye(3), [place, 0, 0]), 5e-4 / speed)
-    force = -found.force[:, 1]
+        result = block.press(200.0, pose(np.eye(3), [place, 0, 0]), 5e-4 / speed)
+    force = -result.force[:, 1]
     lead = float(force @ block.points[:, 0] / force.sum()) - place
-    return found, lead, force.sum()
+    return result, lead, force.sum()
 
 
-def test_slow_is_the_relaxed_lattice_and_fast_the_fresh_one(ball, rolled):
+def test_slow_motion_is_on_the_relaxed_lattice_and_fast_motion_on_the_fresh_one(ball, rolled):
     place = pose(np.eye(3), [2e-3, 0, 0])
     for name, share in (("slow", 0.4), ("fast", 1.0)):
         expected = elastic(ball, place, share, 200.0)
-        found, _, force = rolled[name]
+        result, _, force = rolled[name]
         assert force == pytest.approx(200.0, rel=1e-6)
         peak = expected.pressure.max()
-        assert np.abs(found.pressure - expected.pressure).max() < 5e-3 * peak
-        assert found.pose[1, 3] == pytest.approx(expected.pose[1, 3], abs=5e-3 * 1e-4)
+        assert np.abs(result.pressure - expected.pressure).max() < 5e-3 * peak
+        assert result.pose[1, 3] == pytest.approx(expected.pose[1, 3], abs=5e-3 * 1e-4)
 
 
-def test_a_load_is_found_from_any_height(ball):
-    """The pose's height begins the search and says nothing more, above the block or in it."""
-    found = []
+def test_the_height_of_the_pose_is_only_an_initial_guess(ball):
+    result = []
     for height in (1e-3, 0.0, -0.5e-3):
         block = ViscoelasticLattice(*ball, PAIR_SERIES)
-        found.append(block.press(200.0, pose(np.eye(3), [0, height, 0]), 0.1))
-    for other in found[1:]:
-        assert np.abs(other.pressure - found[0].pressure).max() < 1e-6 * found[0].pressure.max()
-        assert other.pose[1, 3] == pytest.approx(found[0].pose[1, 3], abs=1e-10)
+        result.append(block.press(200.0, pose(np.eye(3), [0, height, 0]), 0.1))
+    for other in result[1:]:
+        assert np.abs(other.pressure - result[0].pressure).max() < 1e-6 * result[0].pressure.max()
+        assert other.pose[1, 3] == pytest.approx(result[0].pose[1, 3], abs=1e-10)
 
 
-def test_on_the_lattice_too_the_pressure_leads_at_middling_speeds_only(rolled):
+def test_on_the_lattice_the_pressure_leads_at_medium_speeds_only(rolled):
     slow, middling, fast = (lead for _, lead, _ in rolled.values())
     assert middling > 1e-4
     assert middling > 20 * max(abs(slow - fast), 1e-9)
 
 
-def test_a_step_that_does_not_go_on_and_a_ball_beside_the_block_are_refused(ball):
+def test_a_time_step_of_zero_and_a_sphere_beside_the_block_are_refused(ball):
     block = ViscoelasticLattice(*ball, PAIR_SERIES)
     with pytest.raises(InputError, match="a step of 0 s"):
         block.press(100.0, np.eye(4), 0.0)

@@ -14,12 +14,12 @@ class ContactAreaSettings:
     """Contact area from nodal pressures and gaps."""
 
     unknown_edge_share: float = 0.5
-    """1: share of a cell side that counts as in contact where the edge of contact between its two
-    nodes is unknown: the femoral surface ends between them, or is steeper than 45 deg. Chosen: the
-    middle, because contact may end anywhere between the nodes."""
+    """1: share of a triangle's side that counts as in contact where the edge of contact is unknown:
+    the femoral surface ends between the side's nodes, or is steeper than 45 deg. Chosen because
+    contact may end anywhere between the nodes."""
     least_gap: float = 1e-12
-    """m: smallest gap of a node that is not in contact. Chosen: it prevents a division by zero;
-    gaps that matter are above 1e-7 m."""
+    """m: smallest gap of a node that is not in contact. Chosen because it prevents a division by
+    zero; gaps that matter are above 1e-7 m."""
 
 
 CONTACT_AREA = ContactAreaSettings()
@@ -40,17 +40,17 @@ def covered_areas(
 
         p = C sqrt(d) inside,   gap = 4 C / (3 E*) d^(3/2) outside,   E* = E / (1 - nu²)
 
-    The pressure p at the node, the gap at its neighbour and their distance h therefore determine
-    the edge: y = C^(-2/3) solves p² y³ + (3 E* gap / 4)^(2/3) y = h. The nodes in contact share a
-    triangle's part within the edge evenly.
+    The two distances d add up to the length h of the side. With y = C^(-2/3) this condition is
+    p² y³ + (3 E* gap / 4)^(2/3) y = h. The area of a triangle inside the edge is divided evenly
+    among its nodes in contact.
 
     Args:
         points: (n, 3) m, nodes.
         triangles: (k, 3) nodes of each triangle.
         triangle_area: (k,) m².
-        pressure: (n,) Pa, a node's force over its tributary area; positive in contact.
+        pressure: (n,) Pa, force of a node over its tributary area; positive in contact.
         gap: (n,) m, gap of the deformed body near the contact.
-        material: material of the body.
+        material: material of the elastic body.
 
     Reference:
         Johnson, Contact Mechanics, Cambridge 1985, sections 4.2 (line contact) and 5.1 (any smooth
@@ -58,21 +58,24 @@ def covered_areas(
     """
     touched = pressure > 0
     a, b, c = touched[triangles.T].view(np.int8)
-    # Triangles with all corners in contact count whole; mixed ones are cut by a straight edge.
+    # A triangle with all corners in contact counts whole; the edge of contact cuts a mixed one.
     count = a + b + c
-    near = np.flatnonzero(count)
-    corners, count = triangles[near], count[near]
-    part = triangle_area[near]
+    touching = np.flatnonzero(count)
+    corners, count = triangles[touching], count[touching]
+    part = triangle_area[touching]
     mixed = np.flatnonzero(count < 3)
     # The odd corner is the only one in contact, or the only one out of contact. The edge of contact
-    # cuts the two sides that meet there.
+    # cuts the two sides that meet at the odd corner.
     single = count[mixed] == 1
     odd = np.argmax(touched[corners[mixed]] == single[:, None], axis=1)
-    own, others = corners[mixed, odd], corners[mixed[:, None], (odd[:, None] + [1, 2]) % 3]
-    inside = np.where(single[:, None], own[:, None], others)
-    outside = np.where(single[:, None], others, own[:, None])
+    odd_node, other_nodes = (
+        corners[mixed, odd],
+        corners[mixed[:, None], (odd[:, None] + [1, 2]) % 3],
+    )
+    inside = np.where(single[:, None], odd_node[:, None], other_nodes)
+    outside = np.where(single[:, None], other_nodes, odd_node[:, None])
     share = _share(points, inside, outside, pressure, gap, material)
-    # A triangle cut at shares s and t of two sides leaves the part s t at their common corner.
+    # A cut at the shares s and t of two sides separates the part s t of the area at their corner.
     cut = np.where(single, share.prod(axis=1), 1.0 - (1.0 - share).prod(axis=1))
     part[mixed] *= cut
     in_contact = touched[corners]
@@ -93,11 +96,11 @@ def _share(
     smooth = gap[outside] < distance
     opening = np.where(smooth, np.maximum(gap[outside], CONTACT_AREA.least_gap), distance)
     modulus = material.young_modulus / (1.0 - material.poisson_ratio**2)
-    # At the rim p² grows linearly with the distance inside the edge, and the gap with its power 3/2
-    # outside (Hertz). Both laws share one factor, which fixes where the edge lies.
+    # Inside the edge p² is proportional to the distance d, outside the gap is proportional to
+    # d^(3/2). Both laws share the factor C, which determines the place of the edge.
     square, rise = pressure[inside] ** 2, (0.75 * modulus * opening) ** (2 / 3)
     scale = np.sqrt(rise / (3.0 * square))
-    # Closed form of the only real root of the cubic; it has no cancellation for small gaps.
+    # Closed form of the only real root of the cubic, without cancellation for small gaps.
     root = 2.0 * scale * np.sinh(np.arcsinh(1.5 * distance / (rise * scale)) / 3.0)
     return np.where(
         smooth, np.minimum(square * root**3 / distance, 1.0), CONTACT_AREA.unknown_edge_share
@@ -107,11 +110,11 @@ def _share(
 def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:
     """Return the area (m²) where the pressure exceeds a level.
 
-    On each triangle q = p² is interpolated linearly between the corners. The mean difference of a
-    quadratic q from its linear interpolation is added as a constant: the sum over the edges of
-    (g_i - g_j).(x_j - x_i) / 24, with the gradients g of q at the corners. For a Hertzian pressure
-    the mean of q is exact, because q is then quadratic in the position. The area is a continuous
-    function of the pressures.
+    On each triangle q = p² is interpolated linearly between the corners. A constant is added: the
+    mean difference between a quadratic q and its linear interpolation. It is the sum over the edges
+    of (g_i - g_j).(x_j - x_i) / 24, with the gradients g of q at the corners. For a Hertzian
+    pressure, where q is quadratic, the mean of q is exact. The area is a continuous function of the
+    pressures.
 
     Args:
         points: (n, 3) m, nodes.
@@ -137,7 +140,7 @@ def _area_above(points: Array, triangles: Index, square: Array, level: float) ->
         if near[triangles[k, 0]] or near[triangles[k, 1]] or near[triangles[k, 2]]:
             size = _shape(points, triangles[k], edges, across)
             for axis in range(3):
-                slope = 0.0  # of the linear q, times size
+                slope = 0.0  # gradient of the linear q, times 4 size²
                 for i in range(3):
                     j, m = (axis + 1) % 3, (axis + 2) % 3
                     cross = across[j] * edges[i, m] - across[m] * edges[i, j]
@@ -156,9 +159,9 @@ def _area_above(points: Array, triangles: Index, square: Array, level: float) ->
         if near[corners[0]] or near[corners[1]] or near[corners[2]]:
             size, rise = _shape(points, corners, edges, across), 0.0
             for i in range(3):
-                one, other = corners[(i + 1) % 3], corners[(i + 2) % 3]
+                first, second = corners[(i + 1) % 3], corners[(i + 2) % 3]
                 for axis in range(3):
-                    rise += (total[one, axis] - total[other, axis]) * edges[i, axis]
+                    rise += (total[first, axis] - total[second, axis]) * edges[i, axis]
             for i in range(3):
                 # Linear interpolation underestimates a concave p²; the nodal slopes give the mean
                 # of the quadratic term.
@@ -184,7 +187,7 @@ def _shape(points: Array, corners: Index, edges: Array, across: Array) -> float:
 
 @compiled_as_written
 def _share_above(values: Array, level: float) -> float:
-    """Return the share of a triangle where linear values (3,) exceed a level; they are sorted."""
+    """Return the share of a triangle where linear values exceed a level; sort the values (3,)."""
     values.sort()
     low, middle, high = values[0], values[1], values[2]
     if level >= high:

@@ -1,19 +1,18 @@
-"""Cam and post as a contact pair of its own: the same contact model, in a turned frame.
+"""Cam and post as a separate contact pair: the same contact model, in a turned frame.
 
 Contact models press a femoral component along -y into an insert whose flat bottom lies in
 y = 0. A cam touches the post from behind. The post is therefore turned so that its posterior face
-faces up. With the insert's axes x anterior, y superior, z to the right, the turned axes are
+faces up. In the insert frame (x anterior, y superior, z to the right) the turned axes are
 
     x' = y,    y' = x_f - x,    z' = z,
 
 where x_f is the flat front of the post (`tkamb.geometry.post.divide_insert`). The posterior face
 then faces up along y'. The front is the fixed bottom of the layer, and the post's depth is the
-layer's thickness: **the post does not bend at its root**. The pair is evaluated at a pose, never
-pressed.
+layer's thickness. The post does not bend at its root. The pair is evaluated at a given pose.
 
 R and t are rotation and translation of pose_insert_in_turned. X = [[R, t x R], [0, R]] maps a small
 displacement of the femur (translation of its point at the origin, then rotation) into the turned
-frame. Power is the same in both frames, so wrench and stiffness in the insert frame are
+frame. Power is the same in both frames. Wrench and stiffness in the insert frame are therefore
 
     w = X^T w',    K = X^T K' X.
 """
@@ -43,17 +42,18 @@ class CamPostSettings:
     """Contact of cam and post."""
 
     ray_start_height: float = 1e-3
-    """m: height above the post at which rays down begin. Chosen well above the noise of a mesh."""
+    """m: height above the post at which rays along -y' begin. Chosen because it is well above the
+    noise of a mesh."""
     search_margin: float = 3 * MILLIMETRE
-    """m: the cam is searched up to this distance beside the post. Chosen: the femur moves from side
-    to side."""
+    """m: distance beside the post up to which triangles belong to the cam. Chosen because the femur
+    moves from side to side."""
 
 
 CAM_POST = CamPostSettings()
 
 TICKS, ZOOMS = 41, 3
-"""Rays along each edge of the grid on which the clearance is searched, and number of grids, each
-twenty times finer than the last. A place within 16 mm is then known to a few micrometres."""
+"""Number of rays along each edge of a search grid, and number of grids. Each grid is twenty times
+finer than the one before. On 16 mm the last one has a spacing of 1 µm."""
 NO_LINE_CONTACT = ("hertz",)
 """Models that cannot compute contact along a line."""
 
@@ -63,14 +63,13 @@ class PostPair(ContactPair):
 
     @property
     def split(self) -> None:
-        """None: cam and post are not divided into medial and lateral."""
+        """None, because cam and post have no medial and lateral side."""
 
     def clearance(self, pose: Array) -> float:
-        """Return the smallest distance (m) along y' from post to cam; NaN beside each other.
+        """Return the smallest gap (m) along y' of post and cam; NaN if no line along y' meets both.
 
-        Rays along y' on a grid over the post find the smallest distance; two finer grids follow
-        around it. A search over vertices alone would miss contact along the lines of long
-        triangles.
+        Rays along y' on a grid over the post find the smallest gap. Two finer grids around its
+        place follow. A search over vertices would miss contact on the edges of long triangles.
 
         Args:
             pose: (4, 4) pose_femoral_in_turned.
@@ -84,16 +83,15 @@ class PostPair(ContactPair):
             if not np.isfinite(gap).any():
                 break
             k = int(np.nanargmin(gap))
-            # Zoom into one cell of the grid around the smallest gap; each zoom gains a factor of
-            # 20.
-            least, reach = float(gap[k]), (high - low) / (TICKS - 1)
+            # The next grid covers one cell on each side of the smallest gap: it is 20 times finer.
+            least, cell = float(gap[k]), (high - low) / (TICKS - 1)
             place = np.array([x[k], z[k]])
-            low = np.maximum(place - reach, self.insert.bounds[0, [0, 2]])
-            high = np.minimum(place + reach, self.insert.bounds[1, [0, 2]])
+            low = np.maximum(place - cell, self.insert.bounds[0, [0, 2]])
+            high = np.minimum(place + cell, self.insert.bounds[1, [0, 2]])
         return least
 
     def _apart(self, points: Array, pose: Array) -> Array:
-        """Return the distance (n,) along y' at places (n, 3); NaN where a ray misses one part."""
+        """Return the gap (n,), m, along y' at places (n, 3); NaN where a ray misses a body."""
         far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
         below = points + (pose[1, 3] - 2 * far) * UP
         up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
@@ -105,11 +103,11 @@ class PostPair(ContactPair):
 
 @dataclass(frozen=True, eq=False)
 class PostContact:
-    """Cam and post at one pose, insert frame. Without contact the force is zero.
+    """Contact of cam and post at one pose, insert frame. Without contact the force is zero.
 
     Args:
         load: wrench of the normal forces on the insert; None without contact.
-        gap: m, distance along x between cam and post; negative: they overlap.
+        gap: m, along x between cam and post; negative if they overlap.
         area: m², contact area.
         peak_pressure: Pa.
         flags: warnings in words.
@@ -137,7 +135,7 @@ class PostContact:
 
 
 class CamPost:
-    """A contact model prepared for a cam and a post.
+    """A contact model that is prepared for a cam and a post.
 
     Args:
         model: the contact model.
@@ -161,7 +159,7 @@ class CamPost:
         if model.name in NO_LINE_CONTACT:
             hint = "take foundation, lattice or fe"
             raise InputError(f"contact model '{model.name}' has no line contact", WHERE, hint)
-        # The post is turned so that its back faces up: the contact models press along y.
+        # The post is turned so that its back faces up, because contact models press along -y.
         low, high = post.bounds
         front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
         self.in_turned = np.eye(4)
@@ -179,7 +177,7 @@ class CamPost:
         return self.state.pair.material
 
     def of_material(self, material: Material) -> "CamPost":
-        """Return the same cam and post with another material."""
+        """Return this contact with another material of the post."""
         other = object.__new__(CamPost)
         other.in_turned, other._foot = self.in_turned, self._foot
         other._prepare(self.model, replace(self.state.pair, material=material))
@@ -206,7 +204,7 @@ class CamPost:
         )
 
     def clearance(self, pose: Array) -> float:
-        """Return the least distance (m) along x between cam and post at a pose (4, 4).
+        """Return the smallest gap (m) along x between cam and post at a pose (4, 4).
 
         It is negative if they overlap, and NaN if the cam does not lie behind the post.
         """
@@ -214,7 +212,7 @@ class CamPost:
         return pair.clearance(self.in_turned @ pose)
 
     def probe(self) -> "PostProbe":
-        """Return a probe for equilibrium searches: wrench and stiffness, insert frame."""
+        """Return the probe of the post for a search of equilibrium, insert frame."""
         return PostProbe(self, self.model.probe(self.state))
 
     def probe_with(self, condyles: Any) -> Any:
@@ -222,14 +220,14 @@ class CamPost:
         return CondylesAndPost(condyles, self.probe())
 
     def seen(self, contact: ProbedContact) -> ProbedContact:
-        """Return a probed contact of the turned frame as the contact of the post, insert frame."""
+        """Return the post's contact in the insert frame, from a contact in the turned frame."""
         load = contact.condyles.get("medial")
         post = None if load is None else self._in_insert(load)
         return replace(contact, condyles={}, post=post)
 
     def _in_insert(self, load: CondyleWrench) -> CondyleWrench:
         x = twist_matrix(self.in_turned)
-        # Wrench and twist change frames by transposed matrices, so that the work stays the same.
+        # The transposed matrix transforms the wrench, so that the work is the same in both frames.
         stiffness = None if load.stiffness is None else x.T @ load.stiffness @ x
         centre = transform(inverse(self.in_turned), load.centre)
         return CondyleWrench(x.T @ load.wrench, centre, stiffness)
@@ -243,10 +241,10 @@ class CamPost:
 
 
 class PostProbe:
-    """Cam and post at neighbouring poses; see `tkamb.contact.model.Probe`."""
+    """Evaluates cam and post at neighbouring poses; see `tkamb.contact.model.Probe`."""
 
-    def __init__(self, cam_post: CamPost, rotated_model: Any) -> None:
-        self._cam_post, self._turned = cam_post, rotated_model
+    def __init__(self, cam_post: CamPost, turned_probe: Any) -> None:
+        self._cam_post, self._turned = cam_post, turned_probe
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact of the post at a pose_femoral_in_insert (4, 4)."""
@@ -254,11 +252,11 @@ class PostProbe:
 
 
 class CondylesAndPost:
-    """The condyles and the post of one insert at neighbouring poses, as one contact.
+    """Evaluates condyles and post of one insert at neighbouring poses, as one contact.
 
     Args:
-        condyles: probe of the condyles on the dishes.
-        post: probe of the cam on the post.
+        condyles: probe of the condyles.
+        post: probe of cam and post.
     """
 
     def __init__(self, condyles: Any, post: PostProbe) -> None:
@@ -286,7 +284,7 @@ def _together(condyles: ProbedContact, post: ProbedContact) -> ProbedContact:
 
 
 def twist_matrix(pose: Array) -> Array:
-    """Return X (6, 6), which maps a twist (translation, then rotation) from frame A to frame B.
+    """Return X (6, 6), which transforms a twist (translation, then rotation) from frame A to B.
 
     Args:
         pose: (4, 4) pose_A_in_B.
@@ -302,20 +300,20 @@ def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
     Args:
         femoral: femoral component, femoral frame.
         split: z (m) between the condyles.
-        reach: m, largest distance of the triangles from the split, along z.
+        reach: m, largest distance of the cam's triangles from the split, along z.
 
     Raises:
-        InputError: the component has no triangles there, or one condyle only.
+        InputError: the component has no such triangle, or only one condyle.
     """
     if split is None:
         hint = "leave the key out, or give a component with two condyles"
         raise InputError("one condyle has no cam", WHERE, hint)
-    # z of the triangles, measured from the plane between the condyles.
+    # z of the triangles' corners, measured from the plane between the condyles.
     across = femoral.triangles[:, :, 2] - split
     behind = femoral.triangles[:, :, 0].max(axis=1) < femoral.bounds[:, 0].mean()
-    own = behind & (across.min(axis=1) < reach) & (across.max(axis=1) > -reach)
-    if not own.any():
+    chosen = behind & (across.min(axis=1) < reach) & (across.max(axis=1) > -reach)
+    if not chosen.any():
         what = "the femoral component has no cam between its condyles"
         raise InputError(what, WHERE, "leave the key out, or give the mesh with its cam")
-    used, faces = np.unique(femoral.faces[own], return_inverse=True)
+    used, faces = np.unique(femoral.faces[chosen], return_inverse=True)
     return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "cam")

@@ -13,19 +13,20 @@ class CurvatureSettings:
     """Curvature of the two surfaces at a contact point, from a patch of rays."""
 
     samples: int = 21
-    """Rays per side of the square patch. Chosen: a quadric has six coefficients, 441 rays
-    average out the mesh."""
+    """Number of rays along the diameter of a patch. Chosen because about 350 rays for the six
+    coefficients of a quadric average out the facets of a mesh."""
     max_iterations: int = 12
-    """Largest number of iterations for the contact point. Chosen: contacts of knees need fewer."""
+    """Largest number of iterations for the contact point. Chosen because contacts of knees need
+    fewer."""
     position_tolerance: float = 1e-7
-    """m: the contact point has converged when an iteration moves it by less. Chosen: far below the
-    size of a triangle."""
+    """m: the contact point has converged when an iteration moves it by less. Chosen because it is
+    far below the size of a triangle."""
     max_distance: float = 3.0
-    """Largest distance of the contact point from first touch, in patch radii. Chosen: the patch
-    does not describe the surfaces farther away."""
+    """1: largest distance of the contact point from first touch, over the radius of a patch.
+    Farther away the quadrics do not describe the surfaces."""
     least_cover: float = 0.6
-    """1: least share of a patch that both meshes cover. Chosen: with a smaller share the quadric is
-    an extrapolation."""
+    """1: smallest share of a patch that both meshes must cover. With a smaller share the quadric
+    is an extrapolation."""
 
 
 CURVATURE = CurvatureSettings()
@@ -33,15 +34,15 @@ CURVATURE = CurvatureSettings()
 
 @dataclass(frozen=True, eq=False)
 class OsculatingContact:
-    """Quadrics of both surfaces at the place where they are nearest along their common normal.
+    """Normal, gap and curvatures of two surfaces at their contact point, from fitted quadrics.
 
     Args:
         point: (3,) m, insert frame, on the insert's quadric.
         normal: (3,) unit, out of the insert.
         axes: (2, 3) unit tangents along the smaller and the larger relative curvature.
         gap: m, distance of the two quadrics at the point, along the normal.
-        relative: (2,) 1/m, relative curvatures k along `axes`, ascending; at the distance s the gap
-            grows by k s²/2.
+        relative: (2,) 1/m, relative curvatures k along `axes`, ascending; at a distance s from the
+            point the gap is larger by k s²/2.
         insert_curvature: (2,) 1/m along `axes`, negative where the insert is concave.
         femoral_curvature: (2,) 1/m along `axes`, positive where the femur is convex.
     """
@@ -58,13 +59,13 @@ class OsculatingContact:
 def osculate(
     insert: RayCaster, femoral: RayCaster, pose: Array, start: Array, radius: float
 ) -> OsculatingContact | None:
-    """Fit both surfaces about a contact point and move it to where the quadrics are nearest.
+    """Fit quadrics to both surfaces, and find the contact point where the quadrics are nearest.
 
-    On a disc of `radius` in the tangent plane, evenly spaced rays along the normal sample both
+    The patch is a disc in the tangent plane. Evenly spaced rays along the normal sample both
     meshes. A quadric z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each mesh by least
-    squares. The disc is then moved to the minimum of their difference, with the mean normal there,
-    until the iteration has converged. Facets smaller than the disc average out. On a sphere of
-    radius R the relative error of the curvature is radius²/(4 R²), from the quartic term.
+    squares. Each iteration moves the disc to the minimum of the quadrics' difference, and turns it
+    to their mean normal there. Facets smaller than the disc average out. On a sphere of radius R
+    the relative error of the curvature is radius²/(4 R²), from the quartic term.
 
     Args:
         insert: ray caster, insert frame.
@@ -74,11 +75,11 @@ def osculate(
         radius: m, radius of the disc.
 
     Returns:
-        The quadrics at the contact point. None if a patch leaves a surface or the iteration
-        diverges, because the surfaces do not curve apart.
+        The quadrics at the contact point. None if a mesh covers too little of a patch, or if the
+        iteration does not converge because the surfaces do not curve apart.
     """
     point, normal = start, _start_normal(insert, start)
-    # The point depends on the normal and the normal on the point: fit, step, turn the frame.
+    # Point and normal depend on each other: each iteration fits, moves the point, turns the normal.
     for _ in range(CURVATURE.max_iterations):
         frame = np.stack([*_tangents(normal), normal])
         fits = _fit(insert, femoral, pose, point, frame, radius)
@@ -93,8 +94,8 @@ def osculate(
         if np.linalg.norm(step) < CURVATURE.position_tolerance:
             return _described(point, frame, of_insert, of_femoral)
         point = point + np.append(step, _value(of_insert, step)) @ frame
-        # At the contact point both surfaces share their normal; before convergence the mean is
-        # taken.
+        # At the contact point both surfaces have the same normal; before convergence the mean is
+        # the best estimate.
         slope = (_slope(of_insert, step) + _slope(of_femoral, step)) / 2
         normal = np.append(-slope, 1.0) @ frame
         normal /= np.linalg.norm(normal)
@@ -129,14 +130,14 @@ def _fit(
     over, _ = insert.first(places + radius * normal, -normal)
     under, _ = femoral.first(transform(back, places - radius * normal), rotate(back, normal))
     of_insert, of_femoral = radius - over, under - radius
-    # A ray that met another part of a mesh, or nothing, is no sample of this patch.
+    # A ray that meets no mesh, or another part of it, is no sample of this patch.
     covered = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
     if covered.mean() < CURVATURE.least_cover:
         return None
     u, v = u[covered], v[covered]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
     heights = np.stack([of_insert[covered], of_femoral[covered]], axis=1)
-    # Columns of equal size keep the least squares well conditioned: u is some millimetres.
+    # u is some millimetres: columns scaled to equal size keep the least squares well conditioned.
     scale = radius ** np.array([0, 1, 1, 2, 2, 2])
     coefficients = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
     return coefficients[:, 0], coefficients[:, 1]
@@ -156,14 +157,14 @@ def _slope(quadric: Array, place: Array) -> Array:
 
 
 def _nearest_place(difference: Array, radius: float) -> Array | None:
-    """Return the minimum (2,) of the gap, at most one radius away; None if it has none."""
+    """Return the place (2,), m, of a quadric's minimum, at most a radius away; None without one."""
     values, vectors = np.linalg.eigh(_hessian(difference))
     # Not convex in all directions: the bodies conform, and no nearest point exists.
     if values[0] <= 0:
         return None
     step = -vectors @ ((vectors.T @ difference[1:3]) / values)
     length = float(np.linalg.norm(step))
-    # The quadric describes the patch only, so that a step stays within it.
+    # The quadric describes the patch only; the step is therefore at most one radius long.
     return np.asarray(step * min(1.0, radius / length)) if length > 0 else step
 
 

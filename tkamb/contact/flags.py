@@ -1,10 +1,10 @@
-"""Flags of a contact whose peak pressure is not reliable: too narrow, or at the insert's edge.
+"""Flags of contacts with an unreliable peak pressure: too narrow, or at the insert's edge.
 
-A map knows the pressure at its points only. If contact is a few points wide, the highest pressure
-lies between them, and the sum over the points is not the integral over the contact.
+A map contains the pressure at its points only. If contact is a few points wide, the highest
+pressure lies between them, and the sum over the points is not the integral over the contact.
 
-A real edge is rounded more finely than any map resolves, and it wears and chips. The flag says
-where the peak lies, so that a reader does not rely on its value.
+A map does not resolve the rounding of a real edge, which also wears and chips. The flag of a
+contact at the edge states the place of the peak.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,13 +22,12 @@ TOO_NARROW = "contact is too narrow"
 
 @dataclass(frozen=True)
 class NarrowContactSettings:
-    """When a contact is too narrow for the map's points."""
+    """Definition of a contact that is too narrow for the map's points."""
 
     least_inner_points: int = 5
-    """Least number of points with contact all around. With this number a peak is right within 8 %,
-    wherever the contact lies among the points: a sphere's contact then has about 17 points, a
-    cylinder's three rows. Without such a point a lattice's peak is 5 to 96 % too low
-    (docs/lattice.md)."""
+    """Smallest number of inner points: map points with contact all around. With this number the
+    error of the peak is at most 8 %: a sphere then touches about 17 points, a cylinder three rows
+    of points. Without inner points the peak of a lattice is 5 to 96 % too low (docs/lattice.md)."""
 
 
 NARROW_CONTACT = NarrowContactSettings()
@@ -50,11 +49,11 @@ def narrow_flags(
         sides: side -> (n,) whether a point is under that condyle.
         points: word for the points in the message, e.g. "cells".
     """
-    within = surrounded(triangles, touched)
-    for side, own in sides.items():
+    inner = surrounded(triangles, touched)
+    for side, under_side in sides.items():
         if (
-            touched[own].any()
-            and np.count_nonzero(within & own) < NARROW_CONTACT.least_inner_points
+            touched[under_side].any()
+            and np.count_nonzero(inner & under_side) < NARROW_CONTACT.least_inner_points
         ):
             yield (
                 f"the {side} {TOO_NARROW} for the {points}: its peak pressure cannot be "
@@ -63,12 +62,12 @@ def narrow_flags(
 
 
 def surrounded(triangles: Index, touched: Mask) -> Mask:
-    """Return which points (n,) are inner points: all corners of their triangles are in contact."""
+    """Return whether each point (n,) is inner: all corners of its triangles are in contact."""
     a, b, c = touched[triangles.T]
     edge = triangles[(a | b | c) & ~(a & b & c)]
-    within = touched.copy()
-    within[edge] = False
-    return within
+    inner = touched.copy()
+    inner[edge] = False
+    return inner
 
 
 AT_EDGE = "contact reaches the edge of the insert's articular surface"
@@ -78,23 +77,23 @@ DOWN = np.array([0.0, -1.0, 0.0])
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """When a contact counts as being at the insert's edge."""
+    """Definition of a contact at the insert's edge."""
 
     spacing: float = 0.5 * MILLIMETRE
-    """m: spacing of the vertical rays that find the edge. Chosen: the distance from the edge is
-    known to half of it."""
+    """m: spacing of the vertical rays that find the edge. Larger: faster, but the error of the
+    distance from the edge is up to half of this spacing."""
     steepest: float = 50.0 * DEGREE
-    """rad: a surface beside the outline with a steeper slope belongs to the rim. Chosen: 50 deg is
-    steeper than any loaded part of a dish."""
+    """rad: a surface beside the outline with a steeper slope belongs to the rim. Chosen because no
+    loaded part of a dish is as steep."""
     rim: float = 4.0 * MILLIMETRE
-    """m: largest width of the rim. Chosen: a steep surface farther inside is a flank of the
+    """m: largest width of the rim. Chosen because a steep surface farther inside is a flank of the
     eminence or of a post."""
     reach: float = 2.5 * MILLIMETRE
-    """m: a contact nearer to the edge is flagged. Chosen: the radius of a usual insert's rounded
-    rim (1 to 2 mm) plus half the spacing of a map."""
+    """m: distance from the edge below which a contact is flagged. Chosen: the radius of a usual
+    insert's rounded rim (1 to 2 mm) plus half the spacing of a map."""
     share: float = 0.05
-    """1: a point counts as loaded from this share of the peak pressure on. Chosen: a smaller
-    pressure does no harm."""
+    """1: share of the peak pressure above which a point counts as loaded. Chosen because a smaller
+    pressure at the edge does no harm."""
 
 
 EDGE = EdgeSettings()
@@ -107,6 +106,7 @@ class ArticularEdge:
     Args:
         origin: (2,) m, x and z of the first cell.
         away: (a, b) m, distance of each cell's centre from the nearest cell beyond the edge.
+        spacing: m, edge of the cells.
     """
 
     origin: Array
@@ -115,13 +115,13 @@ class ArticularEdge:
 
     @classmethod
     def of(cls, insert: Surface, settings: EdgeSettings = EDGE) -> "ArticularEdge":
-        """Return the edge of an insert, where it ends or turns down to its walls.
+        """Return the edge of an insert: the line where it ends or turns down to its walls.
 
         Args:
             insert: insert, insert frame.
             settings: definition of the edge.
         """
-        from scipy.ndimage import distance_transform_edt  # a report needs the words alone
+        from scipy.ndimage import distance_transform_edt  # slow import, not needed for a report
 
         low, high = insert.bounds[:, [0, 2]]
         # Two rows of margin on each side, so that the outside is one connected region.
@@ -136,8 +136,7 @@ class ArticularEdge:
         upright = insert.face_normals[face][:, 1].reshape(count)
         inside = distance_transform_edt(covered, settings.spacing)
         steep = covered & (upright < np.cos(settings.steepest)) & (inside <= settings.rim)
-        # Steep ground counts as rim only where it is connected to the outside; a post's flank is
-        # not.
+        # Only a steep surface that is connected to the outside is rim; the flank of a post is not.
         beyond = _joined_to_outside(~covered | steep, ~covered)
         return cls(origin, distance_transform_edt(~beyond, settings.spacing), settings.spacing)
 
@@ -145,14 +144,14 @@ class ArticularEdge:
         """Return the distance (n,) of points (n, 3) from the edge in x and z, m; 0 beyond it."""
         cell = np.round((points[:, [0, 2]] - self.origin) / self.spacing).astype(int)
         cell = np.clip(cell, 0, np.array(self.away.shape) - 1)
-        # The distance is measured between ray places; the edge lies half a spacing nearer on
-        # average.
+        # The distance is measured between centres of cells; on average the edge lies half a spacing
+        # nearer.
         return np.asarray(np.maximum(self.away[tuple(cell.T)] - self.spacing / 2, 0.0), float)
 
 
 def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
     """Return the connected parts of a mask (a, b) that contain a cell outside the insert."""
-    from scipy.ndimage import label  # a report needs the words alone
+    from scipy.ndimage import label  # slow import, not needed for a report
 
     part, _ = label(flat, structure=np.ones((3, 3)))
     touching = np.unique(part[outside])
@@ -175,17 +174,17 @@ def edge_of_insert_flags(
         sides: side -> (n,) whether a point is under that condyle.
         settings: definition of a contact at the edge.
     """
-    for side, own in sides.items():
-        own_pressure = np.where(own, pressure, 0.0)
-        highest = float(own_pressure.max(initial=0.0))
+    for side, under_side in sides.items():
+        side_pressure = np.where(under_side, pressure, 0.0)
+        highest = float(side_pressure.max(initial=0.0))
         if highest <= 0.0:
             continue
-        # A faint pressure at the rim does not make an edge contact.
-        loaded = np.flatnonzero(own_pressure > settings.share * highest)
+        # A pressure below this share of the peak makes no contact at the edge.
+        loaded = np.flatnonzero(side_pressure > settings.share * highest)
         away = edge.distance(points[loaded])
         if away.min() > settings.reach:
             continue
-        peak = float(away[np.argmax(own_pressure[loaded])])
+        peak = float(away[np.argmax(side_pressure[loaded])])
         where = (
             "its peak pressure lies there"
             if peak <= settings.reach

@@ -30,16 +30,16 @@ class FoundationSettings:
     """The elastic foundation (bed of springs)."""
 
     least_thickness: float = 1e-6
-    """m: smallest thickness of the layer; at the rim it replaces smaller values. Chosen: it keeps
-    pressure = modulus * penetration / thickness finite."""
+    """m: smallest thickness of the layer; at the rim it replaces smaller values. Chosen because it
+    keeps pressure = modulus * penetration / thickness finite."""
     approach_step: float = 1e-9
-    """m: the reaction is taken as constant between two approaches this near to each other. Chosen:
-    with a stiffness of about 1e8 N/m it changes by 0.1 N."""
+    """m: difference of two approaches below which their reactions count as equal. Chosen because
+    with a stiffness of about 1e8 N/m the reactions differ by 0.1 N."""
     reached_share: float = 0.99
     """1: a reaction below `reached_share` * load - `reached_force` cannot rise to the load within
-    `approach_step`. Chosen: the reaction jumps by less when map points come into contact."""
+    `approach_step`. Chosen because the reaction jumps by less when map points come into contact."""
     reached_force: float = 1.0
-    """N: see `reached_share`. Chosen: ten times its change within `approach_step`."""
+    """N: see `reached_share`. Chosen: ten times the reaction's change within `approach_step`."""
 
 
 FOUNDATION = FoundationSettings()
@@ -49,7 +49,7 @@ OVER_THE_EDGE = (
     "the femoral component reaches over the insert's edge, deeper than half of its thickness there"
 )
 WIDEST_EDGE = NEAR
-"""m: largest change of the gap across one column (`FoundationProbe.smoothed`)."""
+"""m: upper limit of the change of the gap across one column (`FoundationProbe.smoothed`)."""
 SUMS = 46
 """Number of sums over the columns of one condyle; see `_add_up`."""
 
@@ -59,8 +59,8 @@ class ElasticFoundation(ContactModel):
     """A layer of local thickness h bonded to a rigid plate, pressed by a rigid body.
 
     Each column of the layer is an independent spring without lateral strain and without friction.
-    Let d be the penetration along the insert's normal, E and nu the material's constants at the
-    origin, and sigma its uniaxial curve. With the confined modulus
+    Let d be the penetration along the insert's normal, E and nu the material's constants at zero
+    strain, and sigma its uniaxial curve. With the confined modulus
 
         M = E (1 - nu) / ((1 + nu)(1 - 2 nu))      (nu = 0.45: M = 3.79 E)
 
@@ -72,16 +72,16 @@ class ElasticFoundation(ContactModel):
     The nonlinear law has two parts. First, the column keeps its cross-section, so the true stress
     is p and the true strain eps is -ln(1 - d/h) (Blankevoort 1991). Second, the polyethylene
     softens with pressure, as in Bei & Fregly (2004): p = (M/E) E_s(p) eps, with the secant modulus
-    E_s of the uniaxial curve at the stress p. Since sigma = E_s(sigma) eps, this is the curve
-    itself at (M/E) eps. A fully confined column would hardly yield, because its stress is nearly
+    E_s of the uniaxial curve at the stress p. Since sigma = E_s(sigma) eps, p is the curve itself
+    at (M/E) eps. A fully confined column would hardly yield, because its stress is nearly
     hydrostatic. A contact patch of a knee, however, is only as wide as the insert is thick, so its
     columns are not fully confined. With a linear material the law is Blankevoort's,
     p = -M ln(1 - d/h).
 
-    Limits: neighbouring columns do not share load, so the pressure ends at the edge of the overlap,
-    and peaks at rims are too high. A penetration of half the thickness or more, along y or along
-    the normal, is OUT_OF_RANGE. Walls parallel to y carry no load. A mobile bearing is pressed like
-    a fixed one.
+    Limits: neighbouring columns do not share load. The pressure therefore ends at the edge of the
+    overlap, and peaks at rims are too high. If the penetration is at least half of the thickness,
+    along y or along the normal, the result is OUT_OF_RANGE. Walls parallel to y carry no load. A
+    mobile bearing is pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -133,17 +133,17 @@ class ElasticFoundation(ContactModel):
         result = press_by_search(self, state, load, pose, guess, nearby.reaction)
         if result.status is ContactStatus.OK and result.residual <= PRESS.load_tolerance:
             return result
-        # The reduced set of columns may have missed one; only a clear answer is taken from it.
-        if result.status is ContactStatus.OUT_OF_RANGE and self._holds(nearby, load):
+        # The near columns may lack a column in contact, so their failure has to be confirmed.
+        if result.status is ContactStatus.OUT_OF_RANGE and self._load_out_of_range(nearby, load):
             return result
         return press_by_search(self, state, load, pose, guess)
 
-    def _holds(self, nearby: "_NearColumns", load: float) -> bool:
+    def _load_out_of_range(self, nearby: "_NearColumns", load: float) -> bool:
         """Return whether all columns together go out of range before they carry the load.
 
         If the near columns are out of range, all columns are. The reaction rises with the approach.
-        One evaluation of all columns is therefore enough, at the largest approach in range: if the
-        reaction is below the load there, it is below the load at every approach in range.
+        One evaluation of all columns, at the largest approach in range, is therefore enough: it
+        gives the largest reaction in range.
         """
         if nearby.beyond - nearby.within > FOUNDATION.approach_step:
             return False
@@ -156,7 +156,7 @@ class ElasticFoundation(ContactModel):
         )
 
     def probe(self, state: SampledContact, guess: Guess | None = None) -> Any:
-        """Return the probe with near columns and exact stiffness; see `ContactModel`."""
+        """Return a probe that evaluates the near columns, with exact stiffness."""
         return FoundationProbe(self.law, state)
 
 
@@ -174,8 +174,8 @@ class _NearColumns:
     """The reaction of the columns whose gap to the femoral component is less than `NEAR`.
 
     Attributes:
-        within: m, largest evaluated approach that is in range; -inf: none.
-        beyond: m, smallest evaluated approach that is out of range; inf: none.
+        within: m, largest evaluated approach that is in range; -inf if there is none.
+        beyond: m, smallest evaluated approach that is out of range; inf if there is none.
     """
 
     def __init__(self, law: Law, state: SampledContact, pose: Array, guess: Guess | None) -> None:
@@ -186,10 +186,10 @@ class _NearColumns:
         self.within, self.beyond, self._last = -np.inf, np.inf, 0.0
 
     def reaction(self, approach: float) -> float:
-        """Return the reaction (N) at an approach (m); inf where it is out of range.
+        """Return the reaction (N) at an approach (m); inf where the approach is out of range.
 
-        The end of the range is found to `FOUNDATION.approach_step`. Between the two approaches
-        that enclose it, the reaction is the last one within the range.
+        When `within` and `beyond` differ by at most `FOUNDATION.approach_step`, the reaction
+        between them is that at `within`.
         """
         if self.within < approach < self.beyond <= self.within + FOUNDATION.approach_step:
             return self._last
@@ -198,8 +198,8 @@ class _NearColumns:
         if approach > self._reach:
             samples, (gap, _, _) = self._around.at(pose)
             close = gap < NEAR
-            # The near columns serve until the femur has come down by half of the distance with
-            # which they were chosen; the other half is the margin for oblique gaps.
+            # This set of columns is used until the femur has moved down by half of NEAR. The other
+            # half is a margin, because gaps along inclined normals may shrink faster.
             self._near, self._reach, gap = samples.part(close), approach + NEAR / 2, gap[close]
         else:
             gap = gaps_along_normals(self._near, pair.femoral, pose)
@@ -217,21 +217,21 @@ class _NearColumns:
 
 
 def layer_pressure(law: Law, material: Material, strain: Array) -> Array:
-    """Return the pressure (n,), Pa, of a column compressed by `strain` = d/h in [0, 1)."""
+    """Return the pressure (n,), Pa, of columns with the compressive strain d/h (n,) in [0, 1)."""
     if law == "linear":
         return material.confined_modulus * strain
-    # A confined layer is stiffer than a free bar by M / E; the curve is that of the bar at a strain
-    # that is larger by this factor.
+    # A confined layer is stiffer than a free bar by the factor M/E. Its pressure is therefore the
+    # uniaxial stress at a strain that is larger by this factor.
     stiffening = material.confined_modulus / material.young_modulus
     pressure = np.zeros_like(strain)
     loaded = strain > 0
-    # Logarithmic strain: a layer pressed to nothing would carry an infinite stress.
+    # The strain is logarithmic, so that the stress tends to infinity as the thickness tends to 0.
     pressure[loaded] = material.stress(-stiffening * np.log1p(-strain[loaded]))
     return pressure
 
 
 def layer_slope(law: Law, material: Material, strain: Array) -> Array:
-    """Return d pressure / d strain (n,), Pa, of `layer_pressure`."""
+    """Return the derivative of `layer_pressure` by the strain (n,), Pa."""
     if law == "linear":
         return np.full_like(strain, material.confined_modulus)
     stiffening = material.confined_modulus / material.young_modulus
@@ -243,14 +243,14 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
 class FoundationProbe:
     """Forces and tangent stiffness of the near columns; see `tkamb.contact.model.Probe`.
 
-    A column meets the femur at a point h with the femoral normal m. A displacement u of that point
-    changes the gap along the insert's normal n by (m . u)/(m . n). A column of area A at the point
-    x of the insert, with the slope p'(d) of the layer's pressure, adds to the stiffness
+    A column of area A starts at the point x of the insert, along the normal n. It meets the femur
+    at the point h with the femoral normal m. A displacement u of h changes the gap along n by
+    (m . u)/(m . n). With the derivative p'(d) of the pressure, the column adds
 
         A p'(d)/(m . n)  [n; x cross n] [m; h cross m]^T
 
-    of the wrench on the insert. The facets of the meshes are not smoothed. The stiffness is the
-    exact tangent unless a ray crosses from facet to facet.
+    to the stiffness of the wrench on the insert. The facets of the meshes are not smoothed. The
+    stiffness is the exact tangent unless a ray crosses from facet to facet.
 
     Args:
         law: law of the layer.
@@ -262,7 +262,7 @@ class FoundationProbe:
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
         self._around = Neighbourhood(state)
-        self._seen: tuple[Array, SurfaceSamples, tuple[Array, Array, Index]] | None = None
+        self._last: tuple[Array, SurfaceSamples, tuple[Array, Array, Index]] | None = None
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4), with its stiffness."""
@@ -272,7 +272,7 @@ class FoundationProbe:
         return self._of(samples.part(loaded), gap[loaded], femoral_normal[loaded], pose)
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
-        """Return the contact at a result's pose, from its loaded columns; see `at`."""
+        """Return the contact at the pose of a result, from the columns that it loads; see `at`."""
         if np.isnan(result.gap).any():
             return self.at(result.pose)
         samples = self._state.surface.part(result.gap < 0)
@@ -301,10 +301,10 @@ class FoundationProbe:
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a column's width; see `Probe`.
 
-        The stiffness of a column jumps when the column comes into contact, and the transverse
-        stiffness of the contact may jump by half. Here the weight of a column is the share of its
-        cell inside the edge of contact, with a linear gap across the cell. The femoral normals are
-        those of the smooth surface, which is their mean over a displacement by one cell.
+        The stiffness of a column jumps when the column comes into contact. The transverse stiffness
+        of the contact may then jump by half of its value. Here each column is weighted with the
+        share of its cell inside the edge of contact; the gap is linear across the cell. The femoral
+        normals are those of the smooth surface.
         """
         samples, (gap, _, face) = self._columns(pose)
         near = gap < WIDEST_EDGE
@@ -326,9 +326,9 @@ class FoundationProbe:
 
     def _columns(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
         """Return the near columns, and their gaps and facets."""
-        if self._seen is None or not np.array_equal(self._seen[0], pose):
-            self._seen = pose.copy(), *self._around.at(pose)
-        return self._seen[1:]
+        if self._last is None or not np.array_equal(self._last[0], pose):
+            self._last = pose.copy(), *self._around.at(pose)
+        return self._last[1:]
 
     def _rate(self, samples: SurfaceSamples, gap: Array) -> Array:
         """Return the derivative (n,), N/m, of the columns' forces by their penetrations."""
@@ -366,31 +366,31 @@ def _add_up(
     """Sum the columns' forces, and their change as the femoral component moves.
 
     Args:
-        points: (n, 3) m, on the insert.
-        normals: (n, 3) unit, there.
-        femoral_normals: (n, 3) unit, where the columns meet the femoral component.
+        points: (n, 3) m, start of the columns on the insert.
+        normals: (n, 3) unit normals of the insert at these points.
+        femoral_normals: (n, 3) unit normals of the femoral component where the columns meet it.
         gap: (n,) m.
         force: (n,) N, force of each column.
         rate: (n,) N/m, derivative of the force by the penetration along the insert's normal.
         medial: (n,) whether a column belongs to the medial condyle.
-        sums: (2, `SUMS`) output, zeros at first, medial and lateral: force (N), force times
-            point (N·m), wrench on the femoral component (6,), stiffness of the wrench on the
-            insert (6, 6).
+        sums: (2, `SUMS`) output for medial and lateral, to which the columns are added: force (N),
+            force times point (3,) N·m, wrench on the femoral component (6,), stiffness of the
+            wrench on the insert (6, 6).
     """
     push, met = np.empty(6), np.empty(6)
     for n in range(len(points)):
-        own, along = sums[0 if medial[n] else 1], 0.0
+        side_sums, cosine = sums[0 if medial[n] else 1], 0.0
         for i in range(3):
             push[i], met[i] = normals[n, i], femoral_normals[n, i]
-            along += push[i] * met[i]
+            cosine += push[i] * met[i]
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
             y, z = points[n, j], points[n, k]
             push[3 + i] = y * push[k] - z * push[j]
             met[3 + i] = (y + gap[n] * push[j]) * met[k] - (z + gap[n] * push[k]) * met[j]
-            own[1 + i] += force[n] * points[n, i]
-        own[0] += force[n]
+            side_sums[1 + i] += force[n] * points[n, i]
+        side_sums[0] += force[n]
         for i in range(6):
-            own[4 + i] += force[n] * push[i]
+            side_sums[4 + i] += force[n] * push[i]
             for j in range(6):
-                own[10 + 6 * i + j] += push[i] * met[j] * (rate[n] / along)
+                side_sums[10 + 6 * i + j] += push[i] * met[j] * (rate[n] / cosine)

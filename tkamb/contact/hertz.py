@@ -1,4 +1,4 @@
-"""Hertz: an elliptical patch on each condyle, a rigid femur against an elastic half-space."""
+"""Hertz's contact of each condyle: a rigid femur on an elastic half-space, an elliptical patch."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -20,8 +20,8 @@ class EllipseSettings:
     """Hertz's contact ellipse."""
 
     smallest_axis_ratio: float = 1e-6
-    """1: smallest ratio of the semi-axes that is solved for. Chosen: below it the contact is a line
-    contact, and elliptic integrals lose their digits."""
+    """1: smallest ratio of the semi-axes. Chosen because a smaller ratio is a line contact, where
+    elliptic integrals lose their digits."""
 
 
 ELLIPSE = EllipseSettings()
@@ -29,11 +29,11 @@ ELLIPSE = EllipseSettings()
 
 @dataclass(frozen=True)
 class ContactEllipse:
-    """The elliptical patch of contact and its load.
+    """The elliptical patch of contact and its force.
 
     Args:
         long_axis: a, m, semi-axis along the smaller relative curvature.
-        short_axis: b, m.
+        short_axis: b, m, the other semi-axis.
         peak_pressure: p0, Pa; p = p0 sqrt(1 - (u/a)² - (v/b)²).
         force: N, 2/3 pi a b p0.
     """
@@ -57,15 +57,15 @@ def contact_ellipse(
         delta = p0/E* b K
 
     [K - E]/e² and [E/k² - K]/e² are Carlson's R_D(0, k², 1)/3 and R_D(0, 1, k²)/3, which
-    stay exact at k = 1. B/A fixes k; the rest follows.
+    are exact at k = 1, too. B/A determines k.
 
     Args:
         flat: A, 1/m, positive; half the smaller relative curvature.
         steep: B >= A, 1/m.
         approach: delta, m, positive: mutual approach of distant points along the normal.
-        plane_modulus: E* = E/(1 - nu²), Pa (the other body rigid).
+        plane_modulus: E* = E/(1 - nu²), Pa; the other body is rigid.
     """
-    # The axis ratio follows from the curvatures alone; size and pressure then from the approach.
+    # The curvatures determine the axis ratio; the approach determines size and pressure.
     ratio = _axis_ratio(steep / flat)
     # Complete elliptic integral K(1 - ratio²); `ellipkm1` keeps its digits for slender ellipses,
     # where K diverges.
@@ -83,8 +83,8 @@ def _axis_ratio(curvature_ratio: float) -> float:
 
     def excess(log_ratio: float) -> float:
         square = np.exp(2 * log_ratio)
-        both = elliprd(0.0, 1.0, square) / elliprd(0.0, square, 1.0)
-        return float(np.log(both) - np.log(curvature_ratio))
+        ratio = elliprd(0.0, 1.0, square) / elliprd(0.0, square, 1.0)
+        return float(np.log(ratio) - np.log(curvature_ratio))
 
     # Equal curvatures give a circle; rounding may put the root at a positive logarithm.
     if curvature_ratio <= 1.0 or excess(0.0) >= 0:
@@ -97,20 +97,20 @@ class HertzSettings:
     """Hertz's contact of a condyle."""
 
     short_axis_sub_cells: int = 10
-    """Sub-cells along the ellipse's short semi-axis; the pressure of a map point is the mean over
-    the sub-cells of its cell. Chosen: the mean is then exact to 1 %."""
+    """Number of sub-cells along the ellipse's short semi-axis. The pressure of a map point is the
+    mean over the sub-cells of its cell. Chosen because the mean is then exact to 1 %."""
     least_share_on_insert: float = 0.95
-    """1: share of the semi-ellipsoid of pressure that must lie on the insert. Chosen: with less the
-    contact reaches over the rim and Hertz's solution does not hold."""
+    """1: smallest share of the patch's force that must lie on the insert. Chosen because with less
+    the contact extends over the rim, and Hertz's solution does not hold."""
     smallest_curvature_ratio: float = 1e-6
-    """1: smallest ratio of the two relative curvatures. Chosen: a line contact has less."""
+    """1: smallest ratio of the two relative curvatures. Chosen because a smaller ratio is a line
+    contact."""
 
 
 HERTZ = HertzSettings()
 
 FEWEST_SUB_CELLS, MOST_SUB_CELLS = 6, 50
-"""Smallest and largest number of sub-cells per edge of a grid cell."""
-
+"""Smallest and largest number of sub-cells along an edge of a grid cell."""
 
 CONFORMING = "conforms to the insert: no ellipse (relative curvature is not positive)"
 
@@ -130,22 +130,22 @@ class CondyleGeometry:
 
 @dataclass(frozen=True)
 class Hertz(ContactModel):
-    """Elliptical Hertz contact, condyle by condyle.
+    """Elliptical Hertz contact of each condyle.
 
     The contact point of each condyle is its first touch along -y at the given rotation, x and z.
     Quadrics fitted there give the normal and the relative curvatures (`osculate`). Hertz's solution
     then gives F = c delta^1.5 (`contact_ellipse`), with E* = E/(1 - nu²) of the insert; E is the
-    slope of the material's curve at the origin. Both condyles move down together: delta of each is
-    its travel beyond first touch times n_y. The tilt therefore decides how they share the load.
-    Contact point and curvatures remain those of first touch.
+    slope of the material's curve at the origin. Both condyles move down together. The delta of a
+    condyle is its travel beyond first touch times n_y. The tilt therefore decides how the condyles
+    share the load. Contact point and curvatures remain those of first touch.
 
     The map contains the semi-ellipsoid of pressure, averaged over each grid cell and scaled so that
     its vertical force is exact. The wrench is the sum over the map. Area and peak of a condyle are
-    those of the ellipse (pi a b, p0), not of the map.
+    those of the ellipse: pi a b and p0.
 
     A result is OUT_OF_RANGE if a condyle conforms to the insert (relative curvature <= 0) or its
-    ellipse leaves the insert. It is flagged if the ellipse is wider than the insert is thick: the
-    half-space is then too soft. A mobile bearing is pressed like a fixed one.
+    ellipse leaves the insert. It is flagged if the ellipse's longer semi-axis exceeds the insert's
+    thickness: the half-space is then too soft. A mobile bearing is pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -202,18 +202,18 @@ class Hertz(ContactModel):
 def condyle_geometry(
     state: SampledContact, pose: Array, patch_radius: float
 ) -> tuple[CondyleGeometry | None, CondyleGeometry | None]:
-    """Return the first touch of each condyle; the pose's y does not matter.
+    """Return the first touch of each condyle; None for a condyle that is not over the insert.
 
-    It is None for a condyle that does not lie over the insert. The last eight results are cached.
+    The pose's y has no influence. The last eight results are cached.
     """
     level = np.array(pose, float)
-    # The geometry does not depend on the height, so that presses at one pose share it.
+    # The geometry does not depend on the height: all evaluations of one press share a result.
     level[1, 3] = 0.0
     return _geometry(state, level.tobytes(), patch_radius)
 
 
 def indentation(geometry: CondyleGeometry, pose: Array) -> float:
-    """Return delta (m) along the contact normal; negative when apart."""
+    """Return delta (m) along the contact normal; negative when apart, NaN without a contact."""
     contact = geometry.contact
     if contact is None:
         return float("nan")
@@ -227,18 +227,19 @@ def map_pressure(
     """Return the pressure (n,), Pa, at the samples, and the share of the force on the insert.
 
     The pressure is averaged over sub-cells of each grid cell, and scaled so that the vertical force
-    is the patch's force times n_y. The nearest point carries a patch much narrower than a cell.
+    is the patch's force times n_y. If the patch is much narrower than a cell, the nearest point
+    carries all of the force.
     """
     pressure = np.zeros(len(samples.points))
     offset = samples.points - contact.point
-    # The map must carry the y component of the force, which is what a load prescribes.
+    # The map must have the correct force along y, because a load prescribes this component.
     vertical_force = patch.force * contact.normal[1]
     if patch.short_axis < samples.resolution / MOST_SUB_CELLS * HERTZ.short_axis_sub_cells:
         nearest = int(np.einsum("ij,ij->i", offset, offset).argmin())
         pressure[nearest] = vertical_force / (samples.area[nearest] * samples.normals[nearest, 1])
         return pressure, 1.0
     beyond = np.abs(offset @ contact.axes.T) - [patch.long_axis, patch.short_axis]
-    # A second surface below or above the contact (post, lip) is not pressed.
+    # Another surface of the insert below or above the contact (post, lip) is not in contact.
     low = np.abs(offset @ contact.normal) < patch.long_axis + samples.resolution
     near = np.flatnonzero((beyond.max(axis=1) < 2 * samples.resolution) & low)
     pressure[near] = patch.peak_pressure * _cell_means(samples, near, contact, patch)
@@ -295,9 +296,9 @@ def _collected(
     patches: list[CondyleContact | None],
     flags: tuple[str, ...],
 ) -> ContactResult:
-    both = pressure.sum(axis=0)
+    total = pressure.sum(axis=0)
     gap = gaps_along_normals(state.surface, state.pair.femoral, pose)
-    result = ContactResult.of(state, pose, both, gap, medial=pressure[0] > 0)
+    result = ContactResult.of(state, pose, total, gap, medial=pressure[0] > 0)
     sides = {
         side: None
         if patch is None or condyle is None

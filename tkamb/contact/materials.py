@@ -1,9 +1,9 @@
 """The material of the insert: one-dimensional stress-strain laws and Poisson's ratio.
 
 The laws relate true (Cauchy) stress to true (logarithmic) strain, like the measured polyethylene
-data. They are odd functions: tension and compression have the same curve. A small-strain model uses
-its engineering strain instead; the two differ by 5 % at 10 % strain. Loading and unloading follow
-the same curve, without hysteresis or permanent set.
+data. Tension and compression have the same curve. A small-strain model uses its engineering strain
+in the law; the two strains differ by 5 % at 10 % strain. Loading and unloading follow the same
+curve, without hysteresis or permanent set.
 """
 
 from dataclasses import dataclass, field
@@ -22,11 +22,11 @@ from tkamb.units import MEGAPASCAL
 MOST_STEPS = 60
 """Largest number of Newton steps for one strain; most strains need five."""
 ROUNDING = 2e-16
-"""Relative size of a Newton step below which the solution has converged."""
+"""1: relative size of a Newton step below which the solution has converged."""
 
 
 class StressStrainLaw(Protocol):
-    """The shape of a stress-strain curve whose slope at the origin is Young's modulus."""
+    """A stress-strain law; its slope at the origin is Young's modulus, Pa."""
 
     def stress(self, strain: Array, young_modulus: float) -> Array:
         """Return stress, Pa."""
@@ -37,7 +37,7 @@ class StressStrainLaw(Protocol):
 
 @dataclass(frozen=True)
 class LinearElastic:
-    """Hooke: sigma = E eps, at any strain."""
+    """Hooke's law: sigma = E eps, at any strain."""
 
     def stress(self, strain: Array, young_modulus: float) -> Array:
         """Return stress, Pa."""
@@ -50,12 +50,11 @@ class LinearElastic:
 
 @dataclass(frozen=True)
 class RambergOsgood:
-    """Ramberg and Osgood: eps = sigma/E + alpha (|sigma|/sigma0)^(n-1) sigma/E.
+    """The law of Ramberg and Osgood: eps = sigma/E + alpha (|sigma|/sigma0)^(n-1) sigma/E.
 
     Newton's method solves u + alpha u^n = E |eps| / sigma0 for u = |sigma|/sigma0 to machine
-    precision. It starts above the solution and does not overshoot, because the function is convex
-    and increasing. The law is defined for every finite strain up to 1000; NaN stays NaN. Beyond the
-    measured strain it is an extrapolation, without a barrier at -100 %.
+    precision. The law is defined for every strain up to 1000; NaN gives NaN. Beyond the measured
+    strain it is an extrapolation, without a singularity at -100 %.
 
     Args:
         alpha: yield offset, >= 0.
@@ -102,8 +101,8 @@ class RambergOsgood:
 def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) -> None:
     """Write the solutions u (n,) of u + alpha u^n = elastic (n,), which is not negative."""
     for k in range(len(elastic)):
-        # Both the elastic and the plastic part alone are upper bounds of the ratio. Newton's method
-        # falls monotonically from the smaller one, because the equation is convex.
+        # The solution with the elastic or the plastic term alone is an upper bound of u. Newton's
+        # method falls monotonically from the smaller bound, because the function is convex.
         u, plastic = elastic[k], (elastic[k] / alpha) ** (1.0 / exponent)
         if plastic < u:
             u = plastic
@@ -120,15 +119,15 @@ def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) ->
 
 @dataclass(frozen=True)
 class TabulatedLaw:
-    """A measured true stress-strain curve, monotone and once differentiable (PCHIP).
+    """A measured true stress-strain curve, interpolated by a monotone cubic (PCHIP).
 
-    The table is mirrored through the origin, scaled to a slope of 1 there, and multiplied by
-    Young's modulus, so that a change of E scales the whole curve. Beyond the last point the curve
-    continues straight with the slope of the last chord.
+    The table is mirrored through the origin. The whole curve is scaled so that its slope at the
+    origin is the given Young's modulus. Beyond the last point the curve is straight, with the slope
+    of the last chord.
 
     Args:
         strain: strains, increasing from 0.
-        values: stresses at these strains, Pa, from 0, not falling.
+        values: stresses at these strains, Pa, not falling, from 0.
     """
 
     strain: tuple[float, ...]
@@ -158,12 +157,12 @@ class TabulatedLaw:
     def _curve(self) -> PchipInterpolator:
         """The mirrored table, extended by one step of the last chord."""
         strain, values = np.asarray(self.strain, float), np.asarray(self.values, float)
-        # The extra point lies in line with the last two, so that PCHIP's end condition does not
-        # change the slope at the table's last point.
+        # The extra point continues the last chord. Without it PCHIP's end condition would change
+        # the slope at the table's last point.
         strain = np.append(strain, 2 * strain[-1] - strain[-2])
         values = np.append(values, 2 * values[-1] - values[-2])
-        # The mirror image makes tension follow compression and removes an end condition at zero.
-        # PCHIP is monotone, so that the stress does not fall between points.
+        # The mirror image makes tension equal to compression and removes the end condition at zero.
+        # PCHIP is monotone: the stress does not fall between points.
         return PchipInterpolator(
             np.concatenate([-strain[:0:-1], strain]), np.concatenate([-values[:0:-1], values])
         )
@@ -240,20 +239,20 @@ class Material:
 
     @property
     def confined_modulus(self) -> float:
-        """M = E (1 - nu) / ((1 + nu)(1 - 2 nu)), Pa: no lateral strain, at the origin."""
+        """M = E (1 - nu) / ((1 + nu)(1 - 2 nu)), Pa, at the origin; without lateral strain."""
         nu = self.poisson_ratio
         return self.young_modulus * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
 
     def stress(self, strain: ArrayLike) -> Array:
-        """Return stress (Pa) at strain, any shape, positive in tension."""
+        """Return the stress (Pa) at strains of any shape; both are positive in tension."""
         return self.law.stress(np.asarray(strain, float), self.young_modulus)
 
     def tangent(self, strain: ArrayLike) -> Array:
-        """Return d stress / d strain (Pa) at strain, any shape."""
+        """Return d stress / d strain (Pa) at strains of any shape."""
         return self.law.tangent(np.asarray(strain, float), self.young_modulus)
 
     def secant(self, strain: ArrayLike) -> Array:
-        """Return stress / strain (Pa) at strain, any shape; E where strain is 0."""
+        """Return stress / strain (Pa) at strains of any shape; E where the strain is 0."""
         strain = np.asarray(strain, float)
         zero = strain == 0
         ratio = self.stress(strain) / np.where(zero, 1.0, strain)
@@ -280,12 +279,12 @@ MATERIALS = {
 
 
 def material(name: str, **overrides: float) -> Material:
-    """Return the material of that name.
+    """Return the built-in material of a name.
 
     Args:
         name: a key of `MATERIALS`.
-        overrides: young_modulus (Pa), poisson_ratio; for "polyethylene" also alpha,
-            reference_stress (Pa), exponent.
+        overrides: other values of young_modulus (Pa), poisson_ratio; for "polyethylene" also
+            alpha, reference_stress (Pa), exponent.
 
     Raises:
         InputError: unknown name or override, or a value out of range.
@@ -309,7 +308,13 @@ def material(name: str, **overrides: float) -> Material:
 def tabulated_material(
     name: str, strain: ArrayLike, stress: ArrayLike, poisson_ratio: float
 ) -> Material:
-    """Return a material from a true stress-strain table (n,), (n,) Pa; see `TabulatedLaw`.
+    """Return a material from a true stress-strain table; see `TabulatedLaw`.
+
+    Args:
+        name: name in messages.
+        strain: strains, shape (n,).
+        stress: stresses, Pa, shape (n,).
+        poisson_ratio: Poisson's ratio.
 
     Raises:
         InputError: the table does not rise from (0, 0).

@@ -1,8 +1,8 @@
 """The interface of every contact model (see docs/contact_model.md), and its probe.
 
-*Given this pose of the femoral component in the insert, what pressure and what wrench?*
-The work that depends on geometry alone is done once, in `prepare`. All vectors are in the insert
-frame (x anterior, y superior, z to the subject's right), SI units.
+A contact model computes pressure and wrench from the pose of the femoral component in the insert.
+Its `prepare` does the work that depends on geometry alone. All vectors are in the insert frame (x
+anterior, y superior, z to the right), in SI units.
 
 A `Probe` evaluates many neighbouring poses for a search of equilibrium.
 """
@@ -32,10 +32,10 @@ class ContactModel(ABC):
     """Base class of the contact models.
 
     A subclass is a frozen dataclass, and its fields are its options. Every model has `resolution`
-    (m), the spacing of its map points. A `guess`, an earlier result or a `WarmStart`, changes the
-    computing time, and the result by no more than the tolerance. A model stores nothing between
-    calls. `mobile_bearing` says whether the bottom of a mobile bearing slides. If it is False, the
-    model presses a mobile bearing like a fixed one, and every press and run has a note of that.
+    (m), the spacing of its map points. A `guess` is an earlier result or a `WarmStart`. It changes
+    the computing time, and the result by no more than the tolerance. A model stores nothing between
+    calls. `mobile_bearing` is True if the bottom of a mobile bearing slides. If it is False, the
+    model presses a mobile bearing like a fixed one, and presses and runs state this in a note.
     """
 
     name: ClassVar[str]
@@ -48,37 +48,37 @@ class ContactModel(ABC):
     def prepare(self, pair: ContactPair) -> Any:
         """Return the state of a pair: the work that depends on geometry and material alone.
 
-        This method samples the insert's surface and prepares the first touch. A model that prepares
-        more returns a subclass of `tkamb.contact.pair.PreparedContact`.
+        Here it is the sampled surface of the insert and the prepared first touch. A model may
+        return any subclass of `tkamb.contact.pair.PreparedContact`.
         """
         pair.touch_at(np.eye(4))
         return SampledContact(pair, sample_surface(pair.insert, self.resolution))
 
     @abstractmethod
     def evaluate(self, state: Any, pose: Array, guess: Guess | None = None) -> ContactResult:
-        """Return the contact at a given pose_femoral_in_insert (4, 4)."""
+        """Return the contact at a pose_femoral_in_insert (4, 4)."""
 
     def press(
         self, state: Any, load: float, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
-        """Find the approach along -y (rotation, x and z as given) that carries `load` (N).
+        """Return the contact at the approach along -y that carries `load` (N).
 
-        The load is the superior-inferior force on the insert. This generic search calls
-        `evaluate`; a model may override it with a faster one.
+        The load is the superior-inferior force on the insert. Rotation, x and z of the pose do not
+        change. This search calls `evaluate`; a model may override it with a faster one.
         """
         return press_by_search(self, state, load, pose, guess)
 
     def evaluate_from(
         self, state: Any, pose: Array, start: Guess | None = None
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the result of `evaluate`, and the warm start for a contact at a nearby pose."""
+        """Return the result of `evaluate`, and a warm start for a neighbouring pose."""
         result = self.evaluate(state, pose, start)
         return result, WarmStart.after(result)
 
     def press_from(
         self, state: Any, load: float, pose: Array, start: Guess | None = None
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the result of `press`, and the warm start for a contact at a nearby pose.
+        """Return the result of `press`, and a warm start for a neighbouring pose.
 
         A model whose solver uses a warm start overrides this and `evaluate_from`.
         """
@@ -88,7 +88,7 @@ class ContactModel(ABC):
     def probe(self, state: Any, guess: Guess | None = None) -> Any:
         """Return a `Probe`, which evaluates many neighbouring poses.
 
-        The generic probe calls `evaluate`; a model may return a faster one, with stiffness.
+        This probe calls `evaluate`; a model may return a faster probe with stiffness.
         """
         return Probe(self, state, guess)
 
@@ -100,9 +100,9 @@ class CondyleWrench:
     Args:
         wrench: (6,) force (N) and moment about the insert's origin (N·m), on the insert.
         centre: (3,) m, centre of pressure.
-        stiffness: (6, 6) derivative of the wrench by a small displacement of the femoral component:
-            translation (m) of its point at the insert's origin, then rotation (rad); None if it is
-            unknown.
+        stiffness: (6, 6) derivative of the wrench by a small displacement of the femoral component;
+            None if it is unknown. The displacement is the translation (m) of the component's point
+            at the insert's origin, then the rotation (rad).
     """
 
     wrench: Array
@@ -128,20 +128,18 @@ class CondyleWrench:
         """
         force = self.wrench[:3]
         moment = self.wrench[3:] - cross(self.centre, force)
-        # Point of the resultant's line that is nearest to the centre: the moment about it is
-        # parallel to the force.
         return self.centre + cross(force, moment) / (force @ force)
 
 
 @dataclass(frozen=True, eq=False)
 class ProbedContact:
-    """The contact at one pose, condyle by condyle; an unloaded side is absent.
+    """The wrenches of a contact at one pose.
 
     Args:
-        condyles: side -> wrench.
+        condyles: side -> wrench of that condyle; an unloaded condyle is absent.
         known: False if the model is out of range or has not converged.
-        tangent: whether the condyles' stiffness is known.
-        exact: whether that stiffness is the exact tangent.
+        tangent: True if the wrenches have a stiffness.
+        exact: True if the stiffness is the exact tangent.
         accuracy: 1, relative error of the contact force.
         post: wrench of a cam on the insert's post; None if the post is unloaded.
     """
@@ -155,27 +153,25 @@ class ProbedContact:
 
     @property
     def loads(self) -> tuple[CondyleWrench, ...]:
-        """Wrench of each condyle, and of the post."""
+        """Wrenches of the loaded condyles and of a loaded post."""
         return (*self.condyles.values(), *(() if self.post is None else (self.post,)))
 
     @property
     def wrench(self) -> Array:
-        """(6,) on the insert."""
+        """(6,) force (N) and moment about the insert's origin (N·m), on the insert."""
         return sum((load.wrench for load in self.loads), np.zeros(6))
 
 
 class Probe:
-    """Evaluations of a contact model at neighbouring poses, each with the last one's warm start.
-
-    A model that knows its tangent has a faster probe with stiffness.
+    """Evaluates a contact model at neighbouring poses, each with the warm start of the last one.
 
     Args:
         model: any contact model.
-        state: state that its `prepare` returned.
+        state: state that the model's `prepare` returned.
         start: earlier result or warm start for the first evaluation.
 
     Attributes:
-        exact: whether every result contains the tangent and costs less than a press.
+        exact: True if every result contains the tangent and costs less than a press.
         start: warm start of the next evaluation.
     """
 
@@ -193,7 +189,7 @@ class Probe:
         return self.seen(result, start)
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
-        """Return the contact at a pose (4, 4); only its forces have to be correct."""
+        """Return the contact and a warm start at a pose (4, 4); only its forces must be correct."""
         return self._model.evaluate_from(self._state, pose, self.start)
 
     def pressed(
@@ -202,7 +198,7 @@ class Probe:
         pose: Array,
         start: Guess | None,
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact under a load (N); only its forces have to be correct.
+        """Return the contact and a warm start under a load; only the forces must be correct.
 
         Args:
             load: N.
@@ -212,11 +208,13 @@ class Probe:
         return self._model.press_from(self._state, load, pose, start)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
-        """Return the contact with a stiffness averaged over a finite displacement.
+        """Return the contact with its stiffness averaged over a finite displacement.
+
+        A model without an averaged stiffness returns the contact unchanged.
 
         Args:
             pose: (4, 4) pose_femoral_in_insert.
-            contact: contact at that pose; a model without an averaged stiffness returns it.
+            contact: contact at that pose.
         """
         return contact
 
@@ -235,8 +233,8 @@ def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, Co
     magnitude = np.linalg.norm(result.nodal_force, axis=1)
     medial = medial_points(result.points, result.pose, split)
     wrenches = {}
-    for side, own in (("medial", medial), ("lateral", ~medial)):
-        chosen = own & (magnitude > 0)
+    for side, under_side in (("medial", medial), ("lateral", ~medial)):
+        chosen = under_side & (magnitude > 0)
         if chosen.any():
             weight = magnitude[chosen]
             centre = weight @ result.points[chosen] / weight.sum()

@@ -1,4 +1,4 @@
-"""Classes by name: built-in ones and those that other packages offer by an entry point."""
+"""Classes with names: built-in classes, and classes of other packages with an entry point."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ Base = TypeVar("Base")
 
 @dataclass(frozen=True)
 class NamedClasses(Generic[Base]):
-    """Classes of one kind by name; each is imported only when asked for.
+    """Named classes of one kind; `find` imports a class.
 
     Attributes:
-        kind: what they are, in the singular, for messages.
-        base: the class that each of them is a subclass of.
-        group: the entry-point group through which another package offers one.
-        built_in: name -> "module:Class".
+        kind: singular noun for these classes in messages, e.g. "contact model".
+        base: common base class.
+        group: entry-point group of the classes in other packages.
+        built_in: name -> "module:Class" of the built-in classes.
     """
 
     kind: str
@@ -36,11 +36,11 @@ class NamedClasses(Generic[Base]):
         return tuple(self._offers())
 
     def find(self, name: str) -> type[Base]:
-        """Return the class behind a name.
+        """Return the class of a name.
 
         Raises:
-            InputError: no such name, a name clash, or the class cannot be loaded or is of
-                another kind.
+            InputError: the name is unknown or used twice, or the class cannot be imported or is no
+                subclass of `base`.
         """
         offers = self._offers()
         if name not in offers:
@@ -58,7 +58,7 @@ class NamedClasses(Generic[Base]):
         return cls
 
     def _offers(self) -> dict[str, str]:
-        """Return name -> "module:Class"."""
+        """Return name -> "module:Class" of all classes."""
         offers = dict(self.built_in)
         for point in sorted(entry_points(group=self.group), key=lambda p: p.name):
             first = offers.setdefault(point.name, point.value)

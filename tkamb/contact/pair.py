@@ -1,4 +1,4 @@
-"""The two bodies of a contact, and the state that a model prepares from them."""
+"""The two bodies of a contact, and the state that a contact model prepares from them."""
 
 import copy
 import math
@@ -27,9 +27,9 @@ class ContactPair:
 
     Args:
         femoral: rigid femoral component, in the femoral frame.
-        insert: closed insert, in the insert frame, flat bottom in y = 0 facing -y.
+        insert: closed insert, in the insert frame; its flat bottom lies in y = 0 and faces -y.
         material: the insert's material.
-        bearing: "fixed" (bottom glued) or "mobile" (bottom slides in x and z).
+        bearing: "fixed" (the bottom is bonded) or "mobile" (the bottom slides in x and z).
     """
 
     femoral: Surface
@@ -39,12 +39,12 @@ class ContactPair:
 
     @cached_property
     def split(self) -> float | None:
-        """z (m, femoral frame) between the condyles; None: one condyle, called medial."""
+        """z (m, femoral frame) between the condyles; None for one condyle, which is medial."""
         return condyle_split(self.femoral)
 
     @cached_property
     def first_touch(self) -> FirstTouch:
-        """Object that finds the travel of the femoral component until each condyle touches."""
+        """Query of the travel along -y after which each condyle touches the insert."""
         return FirstTouch(self.femoral, self.insert, self.split)
 
     @cached_property
@@ -54,22 +54,22 @@ class ContactPair:
 
     @cached_property
     def closest_points(self) -> "ClosestPointQuery":
-        """Object that finds the closest points of the two undeformed bodies."""
+        """Query of the closest points of the two undeformed bodies."""
         from tkamb.geometry.closest import ClosestPointQuery
 
         return ClosestPointQuery(self.femoral, self.insert, self.split)
 
     def of_material(self, material: Material) -> "ContactPair":
-        """Return the pair with another material; computed geometry is kept."""
+        """Return the pair with another material; it shares the geometry computed so far."""
         other = copy.copy(self)
         object.__setattr__(other, "material", material)
         return other
 
     def touch_at(self, pose: Array) -> Touch | None:
-        """Return the first touch of either condyle; the travel starts at y = 0.
+        """Return the first touch of either condyle; its travel starts at y = 0.
 
-        The pose's own y does not matter. The result is None if the femoral component does not lie
-        over the insert or the pose is not finite. The last eight results are cached.
+        The pose's y has no influence. The result is None if the femoral component does not lie over
+        the insert or the pose is not finite. The last eight results are cached.
         """
         level = np.array(pose, float)
         if not np.isfinite(level).all():
@@ -80,8 +80,8 @@ class ContactPair:
     def first_touch_height(self, pose: Array) -> float:
         """Return the y (m) of the femoral origin at which the bodies first touch.
 
-        It depends on the rotation, x and z of pose_femoral_in_insert, not on its y. It is NaN if
-        there is no touch.
+        It depends on rotation, x and z of pose_femoral_in_insert. It is NaN if the bodies do not
+        touch.
         """
         touch = self.touch_at(pose)
         return math.nan if touch is None else -touch.travel
@@ -112,7 +112,7 @@ class ContactSurface:
         normals: (n, 3) outward unit normals.
         area: (n,) m², tributary area of each point on the true surface, not projected.
         thickness: (n,) m, insert below each point along y.
-        triangles: (k, 3) of neighbouring points, facing up.
+        triangles: (k, 3) point numbers of triangles between neighbouring points, facing up.
     """
 
     points: Array
@@ -124,11 +124,11 @@ class ContactSurface:
 
 @dataclass(frozen=True, eq=False)
 class PreparedContact:
-    """The state that `prepare` returns: read-only; a model may add fields in a subclass.
+    """The read-only state that a model's `prepare` returns; a subclass may add fields.
 
     Args:
         pair: the two bodies.
-        surface: the points of every map of this state.
+        surface: points of all pressure maps of this state.
     """
 
     pair: ContactPair

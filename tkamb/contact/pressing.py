@@ -25,26 +25,27 @@ class PressSettings:
     load_tolerance: float = 1e-6
     """1: relative difference of reaction and load below which the search has converged."""
     coarse_tolerance: float = 1e-3
-    """1: the tolerance for a model whose reaction jumps, because map points come into contact one
-    by one. If the difference is larger, the press has not converged."""
+    """1: relative difference above which the press has not converged. It exceeds `load_tolerance`,
+    because a reaction may jump where map points come into contact."""
     first_approach: float = 5e-5
     """m: initial guess of the approach if the caller gives none."""
     max_approach: float = 0.02
-    """m: largest approach that is searched; no insert carries a load beyond it."""
+    """m: largest approach of a search. Chosen because no insert carries a load beyond it."""
     least_bracket: float = 1e-16
-    """m: width at which a bracket is not narrowed further: the rounding of an approach of 1 mm."""
+    """m: width of the bracket at which the search ends. Chosen: the rounding of an approach of
+    1 mm."""
     max_evaluations: int = 80
-    """Evaluations of the reaction in one press; bisection of `max_approach` to `least_bracket`
-    needs 48."""
+    """Largest number of evaluations of the reaction in one press. Bisection of `max_approach` to
+    `least_bracket` needs 48."""
     flagged_thickness_share: float = 0.5
-    """1: a result is flagged from this ratio of approach to thickness. Chosen: from 1 on the
-    contact has failed."""
+    """1: ratio of approach to thickness from which a result is flagged. Chosen: half of the ratio
+    at which the contact has failed."""
     rim_distance: float = 0.5 * MILLIMETRE
-    """m: near the rim the thickness is the largest one within this distance. Chosen: at the rim
-    itself the thickness is zero."""
+    """m: near the rim the thickness is the largest one within this distance. Chosen because the
+    thickness at the rim itself is zero."""
     ray_start_depth: float = 1e-7
     """m: depth below the surface at which rays into the insert begin; it is also the smallest
-    thickness. Chosen: above the rounding of a mesh."""
+    thickness. Chosen because it is above the rounding of a mesh."""
 
 
 PRESS = PressSettings()
@@ -65,7 +66,7 @@ class Evaluates(Protocol):
 
 
 class Presses(Evaluates, Protocol):
-    """A contact model with evaluations and presses that use and return a warm start."""
+    """The part of a contact model that a probe needs; its methods use and return warm starts."""
 
     def evaluate_from(
         self, state: Any, pose: Array, start: Guess | None = None
@@ -83,10 +84,10 @@ class LoadSearch:
     """Result of the search for a load.
 
     Args:
-        approach: m; NaN if the load cannot be reached.
+        approach: m, approach that carries the load; NaN if the load cannot be reached.
         evaluations: number of computed reactions.
-        residual: |reaction - load| / load at that approach.
-        deepest: m, largest approach that was tried.
+        residual: smallest |reaction - load| / load of these evaluations.
+        deepest: m, largest evaluated approach.
     """
 
     approach: float
@@ -111,17 +112,16 @@ def press_by_search(
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
 
-    The rotation, x and z of `pose` are kept; its y is not used. The reaction is minus the y
-    component of the force on the insert.
+    Rotation, x and z of `pose` do not change; its y is not used.
 
     Args:
         model: any contact model.
-        state: state that its `prepare` returned.
-        load: N, superior-inferior.
+        state: state that the model's `prepare` returned.
+        load: superior-inferior force, N.
         pose: (4, 4) pose_femoral_in_insert.
-        guess: an earlier result or warm start; its approach starts the search.
-        reaction: function that returns the reaction (N) at an approach (m) faster than `evaluate`;
-            inf if the approach is out of range.
+        guess: earlier result or warm start; its approach is the initial guess of the search.
+        reaction: function that returns the reaction (N), minus the y component of the force on the
+            insert, at an approach (m), faster than `evaluate`; inf if out of range.
 
     Returns:
         The contact at the approach that carries the load. It is OUT_OF_RANGE, with NaN, if the load
@@ -154,7 +154,7 @@ def press_by_search(
 def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
     """Return the result with status, residual and flags of the search."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
-    # Written with `not`, so that NaN counts as missed.
+    # With `not <=` a residual of NaN counts as missed.
     missed = not residual <= PRESS.coarse_tolerance
     return replace(
         result,
@@ -166,7 +166,7 @@ def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactR
 
 
 class _Evaluations:
-    """Evaluates a model at approaches and keeps the last result."""
+    """Evaluations of a model at approaches; the last result is stored."""
 
     def __init__(self, model: Evaluates, state: Any, pose: Array, guess: Guess | None) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
@@ -192,9 +192,8 @@ class _Evaluations:
 def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
     """Find the approach at which a rising reaction equals the load.
 
-    A bracket is grown from `start`, then narrowed by false position (Illinois) on the
-    square root of the reaction, which is nearly straight in the approach: reactions grow
-    with its power 1.5 to 2.
+    The trial approach grows from `start` until the load is bracketed. False position (Illinois)
+    then narrows the bracket.
 
     Args:
         reaction: function that returns the reaction (N) at an approach (m): 0 at 0, inf if the
@@ -202,8 +201,8 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
         load: N, positive.
         start: m, initial guess of the approach.
     """
-    # The root of the reaction is nearly linear in the approach (F ~ d^2 for a sphere on a layer,
-    # d^1.5 on a half-space), so that the secant converges fast.
+    # The square root of the reaction is nearly linear in the approach (F ~ d^2 for a sphere on a
+    # layer, d^1.5 on a half-space), so that false position converges fast.
     target = math.sqrt(load)
     trial = start if 0 < start < PRESS.max_approach else PRESS.first_approach
     low, low_value, high, high_value = 0.0, -target, math.nan, math.nan
@@ -216,8 +215,8 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
             break
         side = -1 if force < load else 1
         if side < 0:
-            # Illinois rule: the value at an end that stays twice is halved, so that both ends of
-            # the bracket move.
+            # Illinois rule: if one end of the bracket stays twice, the value there is halved, so
+            # that this end moves, too.
             high_value *= 0.5 if last_side < 0 else 1.0
             low, low_value = trial, math.sqrt(max(force, 0.0)) - target
         else:
@@ -231,42 +230,42 @@ def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
             if math.isnan(high)
             else _between(low, low_value, high, high_value)
         )
-    # A bracket whose upper end has a finite reaction encloses the load; else the range ended below
-    # it.
+    # If the reaction at the bracket's upper end is not finite, the model goes out of range before
+    # the load is reached.
     reached = best[0] <= PRESS.load_tolerance or math.isfinite(high_value)
     return LoadSearch(best[1] if reached else math.nan, count, best[0], deepest)
 
 
 def _ahead(trial: float, force: float, load: float) -> float:
-    """Return a deeper trial (m), extrapolated quadratically; at most 4 times deeper."""
-    # No upper end yet: extrapolate by F ~ d^2, a little beyond, so that the load is bracketed next.
+    """Return a larger trial approach (m), at most 4 times larger."""
+    # Extrapolation with F ~ d^2, 5 % farther, so that the next trial brackets the load.
     factor = 2.0 if force <= 0 else min(1.05 * math.sqrt(load / force), 4.0)
     return min(trial * factor + 1e-9, PRESS.max_approach)
 
 
 def _between(low: float, low_value: float, high: float, high_value: float) -> float:
-    """Return the next trial (m): false position, or the middle if an end is out of range."""
+    """Return the next trial (m): false position, or the middle if the upper end is out of range."""
     middle = 0.5 * (low + high)
-    # Out of range at the upper end: a secant through infinity says nothing, so bisect.
+    # A secant needs a finite value at the upper end; otherwise bisect.
     if not math.isfinite(high_value):
         return middle
     trial = (low * high_value - high * low_value) / (high_value - low_value)
-    # Rounding may put the secant's root outside the bracket.
+    # Rounding may place the root of the secant outside the bracket.
     return trial if low < trial < high else middle
 
 
 def unloaded_result(model: Evaluates, state: Any, pose: Array) -> ContactResult:
-    """Return first touch: no pressure, no force."""
+    """Return the contact at first touch, without pressure and force."""
     touching = state.pair.pose_at_approach(pose, 0.0)
     gap = model.evaluate(state, touching).gap
     return ContactResult.of(state, touching, np.zeros(len(gap)), gap)
 
 
 def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResult:
-    """Return the result if the bodies are not pressed through each other.
+    """Return the result after a check that the bodies are not pressed through each other.
 
-    It is OUT_OF_RANGE if the approach is as large as the insert's thickness, and is flagged from
-    half of that on. See `compression`.
+    The result is OUT_OF_RANGE if the approach is at least the insert's thickness, and flagged if it
+    is at least `PRESS.flagged_thickness_share` of it. See `compression`.
 
     Args:
         state: prepared contact.
@@ -286,10 +285,9 @@ def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResul
 def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple[float, str]:
     """Return the largest ratio of approach to insert thickness, and a description of its place.
 
-    At first touch the undeformed bodies overlap by the whole approach. The approach is compared
-    with the insert's thickness at that place, which detects a spike of the femoral component. It is
-    also compared with the thickness under each condyle's centre of pressure, which detects a spike
-    of the insert.
+    At the place of first touch the undeformed bodies overlap by the whole approach. The ratio at
+    this place detects a spike of the femoral component. The ratio under each condyle's centre of
+    pressure detects a spike of the insert.
 
     Args:
         pair: the two bodies.
@@ -315,9 +313,9 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
 def thickness_near(pair: ContactPair, positions: Array) -> Array:
     """Return the insert's thickness (n,), m, along y at positions (n, 3), from its top down.
 
-    The thickness ends where a ray from the top first leaves the insert. Near a rim it is the
-    largest thickness within `PRESS.rim_distance`. If no ray meets the insert, it is the height
-    above the bottom.
+    A ray from the top measures it, up to the point where the ray first leaves the insert. Near a
+    rim the thickness is the largest one within `PRESS.rim_distance`. If no ray meets the insert, it
+    is the height of the position above the bottom.
     """
     low, high = pair.insert.bounds[:, 1]
     columns = (positions[:, None] + COLUMNS).reshape(-1, 3)
@@ -328,7 +326,7 @@ def thickness_near(pair: ContactPair, positions: Array) -> Array:
     leave, _ = pair.insert.rays.first(columns, DOWN)
     met &= np.isfinite(leave)
     thick = np.where(met, leave + PRESS.ray_start_depth, 0.0).reshape(len(positions), -1)
-    # Away from the rim all rays meet the insert and the middle one counts.
+    # Away from the rim all rays meet the insert, and the middle ray gives the thickness.
     whole = met.reshape(thick.shape).all(axis=1)
     thickness = np.where(whole, thick[:, 0], thick.max(axis=1))
     return np.maximum(

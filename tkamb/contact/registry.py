@@ -1,7 +1,7 @@
-"""Contact models by name: the built-in ones and those of other packages.
+"""Contact models by name: built-in models and models of other packages.
 
-A built-in model is one row here, "name": "module:Class", imported when it is used. Another
-package offers a model through the entry-point group `tkamb.contact`:
+A built-in model is one row of `BUILT_IN`. Another package offers a model through the entry-point
+group `tkamb.contact`:
 
     [project.entry-points."tkamb.contact"]
     my-model = "my_package.my_module:MyModel"
@@ -22,16 +22,16 @@ class MapGridSettings:
     """The spacing of a pressure map."""
 
     coarsest_mm: float = 10.0
-    """mm: largest spacing that is accepted. Chosen: a condyle's contact is 5 to 20 mm across; a
-    coarser map resolves nothing."""
+    """mm: largest accepted spacing. Chosen because a condyle's contact is 5 to 20 mm across, and a
+    coarser map does not resolve it."""
 
 
 MAP_GRID = MapGridSettings()
 
 
 OPTION_RANGES = {"tolerance": (1e-9, 0.1), "patch_radius": (5e-4, 3e-2)}
-"""Smallest and largest value of an option. A smaller tolerance is below rounding; with a larger one
-the pressures are meaningless. Discs of 0.5 to 30 mm fit on a condyle."""
+"""Smallest and largest value of options. A smaller tolerance is below rounding; with a larger one
+the pressures are meaningless. Patches with a radius of 0.5 to 30 mm fit on a condyle."""
 
 BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
@@ -61,10 +61,10 @@ def contact_names() -> tuple[str, ...]:
 
 
 def contact_class(name: str) -> type[ContactModel]:
-    """Return the class behind a name.
+    """Return the class of a contact model.
 
     Raises:
-        InputError: no such name, a name clash, or the class cannot be imported.
+        InputError: the name is unknown or used twice, or the class cannot be imported.
     """
     return CONTACT_MODELS.find(name)
 
@@ -76,17 +76,17 @@ def contact_model(
     resolution: float | None = None,
     **options: Any,
 ) -> ContactModel:
-    """Return the contact model of that name.
+    """Return the contact model of a name.
 
     Args:
         name: one of `contact_names()`.
-        resolution_mm: spacing of its map points, mm; 1 mm if neither is given.
+        resolution_mm: spacing of the map points, mm; by default 1 mm.
         resolution: spacing of the map points, m; an alternative to `resolution_mm`.
-        options: the model's own options, the fields of its class (SI).
+        options: other options of the model, which are fields of its class (SI).
 
     Raises:
-        InputError: no such name or option; a value that the option does not accept; a
-            resolution that is not positive, too coarse, or given twice.
+        InputError: the name, an option or the value of an option is unknown; the resolution is not
+            positive, too coarse, or given twice.
     """
     cls, where = contact_class(name), f"contact model '{name}'"
     if resolution is not None and resolution_mm is not None:
@@ -100,10 +100,10 @@ def contact_model(
         most = MAP_GRID.coarsest_mm
         hint = f"give more than 0, at most {most:g} mm ({most / 1e3:g} m)"
         raise InputError(words, where, hint)
-    own = _options(cls)
+    known_options = _options(cls)
     for option, value in options.items():
-        if option not in own:
-            raise InputError(f"has no option '{option}'", where, names_near(option, own))
+        if option not in known_options:
+            raise InputError(f"has no option '{option}'", where, names_near(option, known_options))
         choices = _words(cls, option)
         if choices and value not in choices:
             advice = f"one of {', '.join(map(str, choices))}"
@@ -113,32 +113,32 @@ def contact_model(
 
 
 def contact_options(name: str) -> tuple[str, ...]:
-    """Return the names of a model's own options."""
+    """Return the names of a model's options without `resolution`."""
     return tuple(_options(contact_class(name)))
 
 
 def _options(model: type[ContactModel]) -> list[str]:
-    """Return the names of a model's own options."""
+    """Return the names of a model's options without `resolution`."""
     names = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]
     return [option for option in names if option != "resolution"]
 
 
 def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
-    """Return the allowed values of an option declared as Literal; empty for another type."""
+    """Return the allowed values of an option of type Literal; empty for another type."""
     kind = get_type_hints(model)[option]
     return get_args(kind) if get_origin(kind) is Literal else ()
 
 
 def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) -> None:
-    """Raise an InputError for a value that is not of the option's type, or out of its range."""
+    """Raise an InputError for a value of a wrong type or out of the option's range."""
     from pydantic import TypeAdapter, ValidationError
 
     low, high = OPTION_RANGES.get(option, (-math.inf, math.inf))
     is_number = isinstance(value, float | int) and not isinstance(value, bool)
     if is_number and not (math.isfinite(value) and low <= value <= high):
         is_option = option in OPTION_RANGES
-        mend = f"give {low:g} to {high:g}" if is_option else "give a finite number"
-        raise InputError(f"option '{option}' cannot be {value!r}", where, mend)
+        range_hint = f"give {low:g} to {high:g}" if is_option else "give a finite number"
+        raise InputError(f"option '{option}' cannot be {value!r}", where, range_hint)
     kind = get_type_hints(model)[option]
     try:
         TypeAdapter(kind).validate_python(value, strict=True)
@@ -151,14 +151,14 @@ def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) 
 def contact_descriptions() -> dict[str, str]:
     """Return one line per model: its assumptions, its needs and its options.
 
-    The line of a model that cannot be loaded is the error message.
+    If a model cannot be loaded, its line is the error message.
     """
     lines = {}
     for name in contact_names():
         try:
             cls = contact_class(name)
-            own = ", ".join(_options(cls)) or "none"
-            lines[name] = f"assumes {cls.assumes}; needs {cls.needs}; options: {own}"
+            options = ", ".join(_options(cls)) or "none"
+            lines[name] = f"assumes {cls.assumes}; needs {cls.needs}; options: {options}"
         except InputError as error:
             lines[name] = str(error)
     return lines

@@ -1,7 +1,7 @@
 """The result of a contact model at one pose, and the warm start of its next evaluation.
 
-A `ContactResult` holds the pressure map, the wrench and the loads of each condyle. A caller that
-presses many times takes `ContactModel.press_from`: it returns the result and a `WarmStart`, which
+A `ContactResult` contains the pressure map, the wrench and the force of each condyle. A caller that
+presses many times uses `ContactModel.press_from`: it returns the result and a `WarmStart`, which
 the caller passes to the next press. A result may be passed instead, but saves less time.
 """
 
@@ -27,14 +27,14 @@ class ContactResultSettings:
     """Limits from which a contact result is flagged."""
 
     max_measured_pressure: float = 100.0 * MEGAPASCAL
-    """Pa: peak pressure beyond which polyethylene's stress-strain curves are extrapolated. Chosen:
-    they end at 40 to 60 MPa."""
+    """Pa: peak pressure above which a result is flagged. Chosen because measured stress-strain
+    curves of polyethylene end at 40 to 60 MPa."""
     least_patch_share: float = 0.05
-    """1: a patch of contact with a smaller share of the force is no second condyle's. Chosen: it
-    belongs to the contact of the first one."""
+    """1: smallest share of the force of a patch that may be the contact of a second condyle. Chosen
+    because smaller patches belong to the first condyle."""
     least_patch_distance: float = 15.0 * MILLIMETRE
-    """m: smallest distance between the centres of two condyles' patches. Chosen: those of a knee
-    are 40 to 50 mm apart."""
+    """m: smallest distance between the centres of two condyles' patches. Chosen because condyles of
+    a knee are 40 to 50 mm apart."""
 
 
 CONTACT_RESULT = ContactResultSettings()
@@ -55,8 +55,8 @@ class CondyleContact:
     Args:
         force: N, magnitude of the summed normal forces on the insert.
         area: m², area in contact.
-        mean_pressure: Pa, force / area: |sum F| / A, not sum |F| / A as in Sharma (2008), which is
-            larger on a curved surface.
+        mean_pressure: Pa, force / area. Sharma (2008) divides the sum of the nodal forces'
+            magnitudes by the area, which is larger on a curved surface.
         peak_pressure: Pa.
         centre_of_pressure: (3,) m, insert frame.
         thickness: m, insert under the centre of pressure, along y.
@@ -79,11 +79,11 @@ class ContactResult:
 
     Args:
         pair: the two bodies.
-        pose: (4, 4) pose_femoral_in_insert of this contact (after a press: the pressed pose).
-        points: (n, 3) map points on the undeformed insert.
-        normals: (n, 3) outward unit normals of the insert there.
+        pose: (4, 4) pose_femoral_in_insert of this contact; after a press the pressed pose.
+        points: (n, 3) m, map points on the undeformed insert.
+        normals: (n, 3) outward unit normals of the insert at these points.
         pressure: (n,) Pa, >= 0.
-        area: (n,) m², tributary area of each point (true surface, not projected).
+        area: (n,) m², tributary area of each point on the true surface, not projected.
         gap: (n,) m, positive when apart.
         nodal_force: (n, 3) N on the insert.
         wrench_on_insert: (6,) force (N) and moment about the insert origin (N·m).
@@ -92,7 +92,7 @@ class ContactResult:
         status: how the evaluation ended.
         iterations: number of iterations of the model's solver.
         residual: relative residual of that solver.
-        flags: warnings in words (strain below -0.4, ...).
+        flags: warnings in words.
     """
 
     pair: ContactPair
@@ -114,10 +114,10 @@ class ContactResult:
     def __repr__(self) -> str:
         """Return force, area and peak of each condyle in one line."""
         sides = [
-            f"{name} {one.force:.0f} N on {one.area / MILLIMETRE**2:.0f} mm², "
-            f"peak {one.peak_pressure / MEGAPASCAL:.1f} MPa"
-            for name, one in (("medial", self.medial), ("lateral", self.lateral))
-            if one is not None
+            f"{name} {condyle.force:.0f} N on {condyle.area / MILLIMETRE**2:.0f} mm², "
+            f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
+            for name, condyle in (("medial", self.medial), ("lateral", self.lateral))
+            if condyle is not None
         ]
         parts = [self.status.value, *(sides or ["nothing touches"]), f"{len(self.points)} points"]
         return f"<tkamb.ContactResult: {'; '.join(parts)}>"
@@ -145,20 +145,20 @@ class ContactResult:
         medial: Mask | None = None,
         **ending: Any,
     ) -> "ContactResult":
-        """Return the result that belongs to a pressure map.
+        """Return the result of a pressure map.
 
-        The force on point i is -p_i A_i n_i. The wrench is the sum over the points, with moments
-        about the insert's origin. If a pressure is not finite, the result is OUT_OF_RANGE.
+        The wrench is the sum of the nodal forces, with moments about the insert's origin. If a
+        pressure is not finite, the result is OUT_OF_RANGE.
 
         Args:
             state: state that `prepare` returned.
             pose: (4, 4) pose_femoral_in_insert.
             pressure: (n,) Pa, >= 0.
             gap: (n,) m, positive when apart.
-            nodal_force: (n, 3) N on the insert; by default -p_i A_i n_i.
+            nodal_force: (n, 3) N on the insert; by default pressure times area, against the normal.
             area: (n,) m², area of each point; by default the tributary area.
-            covered: (n,) m², area in contact around each point, whose sum is a condyle's area; by
-                default `area`.
+            covered: (n,) m², area in contact around each point, for the condyles' areas; by default
+                `area`.
             medial: (n,) whether a point is under the medial condyle; by default `medial_points`.
             ending: status, iterations, residual and flags of the result.
         """
@@ -213,7 +213,7 @@ class ContactResult:
         iterations: int = 0,
         residual: float = math.nan,
     ) -> "ContactResult":
-        """Return a result without numbers: OUT_OF_RANGE, NaN, and the reasons."""
+        """Return a result with the status OUT_OF_RANGE, NaN for all numbers, and the reasons."""
         points = state.surface.points
         unknown, vectors = np.full(len(points), np.nan), np.full_like(points, np.nan)
         return cls(
@@ -236,15 +236,13 @@ class ContactResult:
 
 
 def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
-    """Say which map points (n, 3) lie under the medial condyle.
-
-    A point belongs to the condyle on whose side of the femoral component it lies: femoral
-    z < split is medial (right knee; left ones are mirrored at input).
+    """Return whether each point (n,) lies under the medial condyle: its femoral z is below `split`.
 
     Args:
-        points: (n, 3) m, insert frame.
+        points: (n, 3) m, insert frame of a right knee; left knees are mirrored at input.
         pose: (4, 4) pose_femoral_in_insert.
-        split: z between the condyles in the femoral frame, m; None: one condyle, all medial.
+        split: z between the condyles in the femoral frame, m; None for one condyle, which is
+            medial.
     """
     if split is None:
         return np.ones(len(points), bool)
@@ -255,9 +253,9 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
 def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) -> Iterator[str]:
     """Yield a flag where a component with one condyle presses on two separate patches.
 
-    A patch is a set of loaded points that triangles of the map connect. There is a flag if two
-    patches carry at least `CONTACT_RESULT.least_patch_share` of the force each, and their centres
-    are at least `CONTACT_RESULT.least_patch_distance` apart.
+    A patch is a set of loaded points that the map's triangles connect. The condition of the flag is
+    two patches with `CONTACT_RESULT.least_patch_share` of the force each, whose centres are
+    `CONTACT_RESULT.least_patch_distance` apart.
 
     Args:
         surface: the map's points and triangles.
@@ -296,10 +294,10 @@ def wrench_of(points: Array, nodal_force: Array) -> Array:
 def _summed(
     chosen: Mask, points: Array, pressure: Array, area: Array, nodal_force: Array, thickness: Array
 ) -> CondyleContact | None:
-    """Return the contact of the chosen points (n,); None if there are none.
+    """Return the contact of the chosen points, a mask (n,); None if it is empty.
 
-    The area is at least the force divided by the peak pressure, so that the mean pressure of a
-    contact smaller than a cell is not above its peak.
+    The area is at least the force divided by the peak pressure. The mean pressure of a contact
+    smaller than a cell is therefore not above its peak.
     """
     if not chosen.any():
         return None
@@ -313,9 +311,10 @@ def _summed(
 
 
 def thickness_under(position: Array, points: Array, thickness: Array) -> float:
-    """Return the insert's thickness (m) under a position (3,), between the nearest map points.
+    """Return the insert's thickness (m) under a position (3,).
 
-    Inverse-distance weights of the four points nearest in x and z.
+    It is interpolated between the four map points that are nearest in x and z, with weights of the
+    inverse distance.
     """
     square = (points[:, 0] - position[0]) ** 2 + (points[:, 2] - position[2]) ** 2
     near = np.argpartition(square, 3)[:4] if len(points) > 4 else np.arange(len(points))
@@ -324,7 +323,7 @@ def thickness_under(position: Array, points: Array, thickness: Array) -> float:
 
 
 def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
-    """Yield a flag for each condyle with a peak pressure beyond the fitted material laws."""
+    """Yield a flag for each condyle with a peak pressure beyond measured stress-strain curves."""
     limit = CONTACT_RESULT.max_measured_pressure
     for side, condyle in sides.items():
         if condyle is not None and condyle.peak_pressure > limit:
@@ -356,7 +355,7 @@ class WarmStart:
 
     @classmethod
     def after(cls, result: ContactResult) -> "WarmStart":
-        """Return the warm start that a result gives without the model's help."""
+        """Return a warm start from the fields of a result."""
         return WarmStart(result.pair, result.pose, result.points, result.pressure, result.gap)
 
     @cached_property

@@ -1,6 +1,7 @@
 """The insert's articular surface, sampled on a regular grid, and its gap to the femur.
 
-`Neighbourhood` skips the map points that the femoral component cannot reach.
+A column is the part of the insert below a map point, along the normal. `Neighbourhood` skips the
+columns that the femoral component cannot reach.
 """
 
 from dataclasses import dataclass
@@ -21,23 +22,24 @@ class MapPointSettings:
     """The map points on the articular surface."""
 
     rim_rays: int = 8
-    """Rays along each edge of a map cell at the rim; the 64 rays of the cell measure its covered
+    """Number of rays along each edge of a map cell at the rim, which measure the cell's covered
     share."""
     least_normal_y: float = 0.1
     """1: smallest superior component of a normal by which a covered area is divided; a slope of 84
-    deg. Chosen: it prevents a division by zero."""
+    deg. Chosen because it prevents a division by zero."""
     side_start_normal_y: float = 0.5
-    """1: if the superior component of the normal is smaller (steeper than 60 deg), the start of a
-    column may lie in the femur beside the point. Chosen: on flatter surfaces it lies below the
+    """1: superior component of a normal below which the start of a column may lie in the femur
+    beside the point; a slope of 60 deg. Chosen because on flatter surfaces the start lies below the
     point."""
     ray_start_depth: float = 1e-6
-    """m: depth below the surface at which rays into the insert begin. Chosen: above the rounding of
-    a mesh."""
+    """m: depth below the surface at which rays into the insert begin. Chosen because it is above
+    the rounding of a mesh."""
     max_map_cells: int = 4_000_000
-    """Largest number of map cells over the bounding box. Chosen: a knee's map at about 0.03 mm."""
+    """Largest number of map cells over the bounding box: a knee's map with a spacing of about
+    0.03 mm."""
     max_inner_walls: int = 8
-    """Largest number of inner walls that a ray along the normal passes. Chosen: an insert of
-    several bodies has fewer."""
+    """Largest number of inner walls behind which a ray along the normal is continued. Chosen
+    because inserts of several bodies have fewer."""
 
 
 MAP_POINT = MapPointSettings()
@@ -45,10 +47,10 @@ MAP_POINT = MapPointSettings()
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples(ContactSurface):
-    """Map points on the upper surface: the first hits of rays from above, also on a post.
+    """Map points on the upper surface: the first crossings of rays from above, also on a post.
 
     The points lie on the mesh, and the normals are `Surface.smooth_normals`. The area of a point is
-    the covered part of its grid cell divided by n_y. Under a uniform pressure the vertical force is
+    the covered part of its grid cell divided by n_y. The vertical force of a uniform pressure is
     therefore exactly the pressure times the covered area in the plan view.
 
     Args:
@@ -74,7 +76,7 @@ class SurfaceSamples(ContactSurface):
 
 @dataclass(frozen=True, eq=False)
 class SampledContact(PreparedContact):
-    """A prepared contact whose map stands on samples of the insert's surface."""
+    """A prepared contact with map points sampled by rays."""
 
     surface: SurfaceSamples
 
@@ -89,11 +91,11 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     within 4 % of the values at 0.25 mm.
 
     Args:
-        insert: closed, in the insert frame.
+        insert: closed insert, insert frame.
         resolution: edge of the cells, m.
 
     Raises:
-        InputError: the insert is not closed, or the resolution does not suit its size.
+        InputError: the insert is not closed, or the resolution is too fine or too coarse for it.
     """
     centres, shape = _grid(insert, resolution)
     caster = insert.rays
@@ -101,7 +103,7 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     xz, covered, cell = _cells(caster, centres, hit.reshape(shape), resolution)
     points, face, thickness = _through(caster, xz, insert)
     normals = insert.smooth_normals(points, face)
-    # Covered area seen from above over the cosine of the slope: the area on the surface itself.
+    # The covered area in the plan view over the cosine of the slope is the area on the surface.
     area = covered * resolution**2 / np.maximum(normals[:, 1], MAP_POINT.least_normal_y)
     triangles = _grid_triangles(cell, shape)
     depth = _depth(caster, points, normals, thickness)
@@ -109,13 +111,13 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
 
 
 def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Array:
-    """Return the gap (n,) m along the insert's normals; negative = penetration.
+    """Return the gap (n,), m, along the insert's normals; negative for a penetration.
 
     A ray starts half-way through the insert and runs outward along the normal. Its first crossing
-    with the femoral component gives the gap. The gap is inf if there is no crossing, and -inf if
-    the ray starts inside the femoral component. On a steep rim the ray starts beside the rim, under
-    the dish, where the femoral component may be without touching the rim. A penetration there
-    counts only if the surface point lies inside the femoral component, too.
+    with the femoral component gives the gap. The gap is inf without a crossing, and -inf if the ray
+    starts inside the femoral component. On a steep rim the ray starts under the dish, where the
+    femoral component may be. A penetration counts there only if the surface point lies inside the
+    femoral component, too.
     """
     return _gaps(samples, femoral, inverse(pose))[0]
 
@@ -140,14 +142,14 @@ def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array
     gap, face = _first_entry(femoral, origins, normals)
     # Rays start inside the insert, so that they meet a penetrating femur from outside.
     gap -= below
-    # On a steep wall a column starts well beside its point, seen from above, and may start in the
-    # femur there. Where the surface point itself is free, the gap above it counts.
-    aside = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < MAP_POINT.side_start_normal_y))
-    if len(aside):
-        rim = origins[aside] + below[aside, None] * normals[aside]
-        above, onto = _first_entry(femoral, rim, normals[aside])
+    # On a steep wall a column may start inside the femur, beside its point. If the point is outside
+    # the femur, the gap above the point counts.
+    steep = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < MAP_POINT.side_start_normal_y))
+    if len(steep):
+        rim = origins[steep] + below[steep, None] * normals[steep]
+        above, onto = _first_entry(femoral, rim, normals[steep])
         free = above > 0
-        gap[aside[free]], face[aside[free]] = above[free], onto[free]
+        gap[steep[free]], face[steep[free]] = above[free], onto[free]
     return gap, face
 
 
@@ -161,11 +163,11 @@ def _columns(
     for n in range(len(points)):
         below[n] = DEEPEST * min(thickness[n], depth[n])
         for i in range(3):
-            place, way = back[i, 3], 0.0
+            start, component = back[i, 3], 0.0
             for k in range(3):
-                place += back[i, k] * points[n, k]
-                way += back[i, k] * normals[n, k]
-            along[n, i], origins[n, i] = way, place - below[n] * way
+                start += back[i, k] * points[n, k]
+                component += back[i, k] * normals[n, k]
+            along[n, i], origins[n, i] = component, start - below[n] * component
     return origins, along, below
 
 
@@ -184,15 +186,15 @@ def _mark_within(distance: Array, face: Index, directions: Array, normals: Array
             facing = 0.0
             for k in range(3):
                 facing += directions[n, k] * normals[face[n], k]
-            # The ray leaves the femur at its first hit, so that it began inside: the penetration
-            # is deeper than the column measures.
+            # A ray that leaves the femur at its first crossing starts inside the femur: the
+            # penetration is deeper than the start of the column.
             if facing > 0.0:
                 distance[n] = -np.inf
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
     """Return the cell centres (n, 2), x and z, and the number of cells along x and z."""
-    # Symmetric about the origin, so that a mirrored insert gets mirrored points.
+    # The cells are symmetric about the origin, so that a mirrored insert gets mirrored points.
     half = np.abs(insert.bounds[:, [0, 2]]).max(axis=0)
     count = np.maximum(np.ceil(half / resolution), 1)
     if 4 * count.prod() > MAP_POINT.max_map_cells:
@@ -209,26 +211,26 @@ def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
 def _cells(
     caster: RayCaster, centres: Array, hit: Mask, resolution: float
 ) -> tuple[Array, Array, Index]:
-    """Return per covered cell: its point (n, 2), covered share (n,) and cell number (n,)."""
+    """Return x and z of the point (n, 2), covered share (n,) and number (n,) of covered cells."""
     around = [np.roll(np.pad(hit, 1), (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    some, every = np.any(around, axis=0)[1:-1, 1:-1], np.all(around, axis=0)[1:-1, 1:-1]
-    rim = np.flatnonzero(some & ~every)
-    # Cells that the rim crosses: their covered share by rays at the centres of sub-cells.
+    any_hit, all_hit = np.any(around, axis=0)[1:-1, 1:-1], np.all(around, axis=0)[1:-1, 1:-1]
+    rim = np.flatnonzero(any_hit & ~all_hit)
+    # Rays at the centres of sub-cells measure the covered share of the cells that the rim crosses.
     ticks = (np.arange(MAP_POINT.rim_rays) + 0.5) / MAP_POINT.rim_rays - 0.5
     offsets = resolution * np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     rays = centres[rim, None] + offsets
-    on = np.isfinite(_first(caster, rays.reshape(-1, 2))[0]).reshape(
+    covered = np.isfinite(_first(caster, rays.reshape(-1, 2))[0]).reshape(
         len(rim), MAP_POINT.rim_rays**2
     )
-    count = on.sum(axis=1)
-    mean = np.einsum("ij,ijk->ik", on, rays) / np.maximum(count, 1)[:, None]
-    away = np.where(on, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
+    count = covered.sum(axis=1)
+    mean = np.einsum("ij,ijk->ik", covered, rays) / np.maximum(count, 1)[:, None]
+    away = np.where(covered, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
     nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
-    on_mean = np.isfinite(_first(caster, mean)[0])[:, None]
-    xz, share = centres.copy(), every.ravel().astype(float)
-    # The point of a partly covered cell is the centroid of what is covered, or the nearest ray to
-    # it that meets the insert.
-    xz[rim], share[rim] = np.where(on_mean, mean, nearest), count / MAP_POINT.rim_rays**2
+    mean_covered = np.isfinite(_first(caster, mean)[0])[:, None]
+    xz, share = centres.copy(), all_hit.ravel().astype(float)
+    # The point of a partly covered cell is the centroid of its covered part, or the nearest ray
+    # that meets the insert if the centroid is not covered.
+    xz[rim], share[rim] = np.where(mean_covered, mean, nearest), count / MAP_POINT.rim_rays**2
     cell = np.flatnonzero(share > 0)
     if not cell.size:
         raise InputError(
@@ -243,15 +245,15 @@ def _first(caster: RayCaster, xz: Array) -> tuple[Array, Index]:
 
 
 def _above(surface: Surface, xz: Array) -> Array:
-    """Return points (n, 3) over the surface at x, z (n, 2)."""
+    """Return points (n, 3), m, above the surface at x and z (n, 2)."""
     return np.stack([xz[:, 0], np.full(len(xz), surface.bounds[1, 1] + 1e-3), xz[:, 1]], axis=1)
 
 
 def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Index, Array]:
-    """Return first hits (n, 3), their faces (n,) and the thickness (n,) below them.
+    """Return the first crossings (n, 3) of vertical rays, their faces (n,) and thicknesses (n,), m.
 
-    The thickness ends where the column finally leaves the insert. An inner wall or a void does not
-    end it, because the material below transmits the load.
+    The thickness ends where the ray finally leaves the insert. An inner wall or a void does not end
+    it, because the material below transmits the load.
     """
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)
@@ -272,24 +274,26 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
 def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -> Array:
     """Return the depth (n,), m, of the insert along the inward normals.
 
-    An inner wall does not end the insert: the ray is continued behind it.
+    A ray that meets an inner wall is continued behind it.
     """
     depth = np.zeros(len(points))
-    open_ = np.arange(len(points))
+    active = np.arange(len(points))
     for _ in range(MAP_POINT.max_inner_walls):
-        start = points[open_] - (depth[open_] + MAP_POINT.ray_start_depth)[:, None] * normals[open_]
-        step, face = caster.first(start, -normals[open_])
-        facing = np.einsum("ij,ij->i", caster.surface.face_normals[face], normals[open_])
+        start = (
+            points[active] - (depth[active] + MAP_POINT.ray_start_depth)[:, None] * normals[active]
+        )
+        step, face = caster.first(start, -normals[active])
+        facing = np.einsum("ij,ij->i", caster.surface.face_normals[face], normals[active])
         inside = np.isfinite(step) & (facing < 0.0)
         if not inside.any():
             break
-        depth[open_[inside]] += MAP_POINT.ray_start_depth + step[inside]
-        open_ = open_[inside]
+        depth[active[inside]] += MAP_POINT.ray_start_depth + step[inside]
+        active = active[inside]
     return np.where(depth > 0.0, depth, thickness)
 
 
 def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:
-    """Return triangles between neighbouring points, facing +y."""
+    """Return the triangles (k, 3) between neighbouring points, facing +y."""
     number = np.full(shape, -1)
     number.ravel()[cell] = np.arange(len(cell))
     a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
@@ -305,19 +309,19 @@ def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:
 
 
 NEAR = 3e-4
-"""m: every column with a smaller gap is evaluated."""
+"""m: a column is evaluated if its gap may be smaller."""
 OBLIQUE = 2.0
 """1: largest ratio of the change of a gap, along the column, to the femoral displacement."""
 FARTHEST = 3e-3
-"""m: larger gaps are cut to this value, because another part of the femoral component may approach
-from the side."""
+"""m: upper limit of a stored gap, because another part of the femoral component may approach from
+the side."""
 
 
 class Neighbourhood:
-    """Selection of the columns that the femoral component may reach; the others are skipped.
+    """Evaluates only the columns that the femoral component may reach.
 
-    Let g be the gap of a column at its last evaluation, and m the distance by which the femoral
-    component has moved past it since. The gap is now at least g - 2 m if the angle between column
+    Let g be the gap of a column at its last evaluation, and m the displacement of the femoral
+    component at the column since then. The gap is now at least g - 2 m if the angle between column
     and femoral normal is less than 60 deg. A column is skipped if this bound is above `NEAR`.
 
     Args:
@@ -327,21 +331,26 @@ class Neighbourhood:
     def __init__(self, state: SampledContact) -> None:
         self._bed, self._femoral = state.surface, state.pair.femoral
         self._gap = np.full(len(self._bed.points), -np.inf)
-        self._seen_at = np.zeros_like(self._bed.points)
-        """(n, 3) m, femoral frame: position of the columns at their last evaluation."""
+        self._last_position = np.zeros_like(self._bed.points)
+        """(n, 3) m, femoral frame, positions of the columns at their last evaluation."""
 
     def take(self, pose: Array, gap: Array) -> None:
         """Store the gaps (n,) of all columns at a pose (4, 4)."""
-        self._gap, self._seen_at = np.minimum(gap, FARTHEST), self._places(pose)
+        self._gap, self._last_position = np.minimum(gap, FARTHEST), self._places(pose)
 
     def at(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
-        """Return the near columns at a pose (4, 4), and their gaps and facets."""
-        near, places = np.empty(len(self._gap), np.int64), np.empty_like(self._seen_at)
-        number = _near(self._bed.points, inverse(pose), self._seen_at, self._gap, near, places)
+        """Return the near columns at a pose (4, 4), and the results of `gaps_and_facets`."""
+        near, places = np.empty(len(self._gap), np.int64), np.empty_like(self._last_position)
+        number = _near(
+            self._bed.points, inverse(pose), self._last_position, self._gap, near, places
+        )
         near = near[:number]
         columns = self._bed.part(near)
         facing = gaps_and_facets(columns, self._femoral, pose)
-        self._gap[near], self._seen_at[near] = np.minimum(facing[0], FARTHEST), places[:number]
+        self._gap[near], self._last_position[near] = (
+            np.minimum(facing[0], FARTHEST),
+            places[:number],
+        )
         return columns, facing
 
     def _places(self, pose: Array) -> Array:
@@ -350,17 +359,17 @@ class Neighbourhood:
 
 @compiled_as_written
 def _near(
-    points: Array, pose: Array, seen_at: Array, gap: Array, near: Index, places: Array
+    points: Array, pose: Array, last_position: Array, gap: Array, near: Index, places: Array
 ) -> int:
-    """Write the columns that the femoral component may reach, and return how many.
+    """Write the columns that the femoral component may reach, and return their count.
 
     Args:
-        points: (n, 3) m, insert frame.
-        pose: (4, 4) of the insert in the femoral frame.
-        seen_at: (n, 3) m, femoral frame, position of the columns at their last evaluation.
-        gap: (n,) m, gap at that time.
-        near: (n,) output: numbers of the columns.
-        places: (n, 3) m, output: their positions in the femoral frame.
+        points: (n, 3) m, starts of all columns, insert frame.
+        pose: (4, 4) pose_insert_in_femoral.
+        last_position: (n, 3) m, femoral frame, positions at the last evaluation of each column.
+        gap: (n,) m, gap at the last evaluation.
+        near: (n,) output, numbers of the columns that may be reached.
+        places: (n, 3) m, output, positions of these columns in the femoral frame.
     """
     number = 0
     for n in range(len(points)):
@@ -369,7 +378,7 @@ def _near(
             places[number, i] = pose[i, 3]
             for j in range(3):
                 places[number, i] += pose[i, j] * points[n, j]
-            square += (places[number, i] - seen_at[n, i]) ** 2
+            square += (places[number, i] - last_position[n, i]) ** 2
         if gap[n] - OBLIQUE * np.sqrt(square) < NEAR:
             near[number] = n
             number += 1
@@ -378,5 +387,5 @@ def _near(
 
 DOWN = np.array([0.0, -1.0, 0.0])
 DEEPEST = 0.5
-"""Largest penetration that is measured, as a share of the thickness. Rays towards the femur start
-at this depth."""
+"""1: largest penetration that can be measured, as a share of the thickness. Rays towards the femur
+start at this depth."""

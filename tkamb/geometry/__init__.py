@@ -1,1 +1,1 @@
-"""Surfaces, frames, rays, closest points and sections: what body and contact both need."""
+"""Surfaces, frames, rays, closest points and sections, for the packages body and contact."""

@@ -1,22 +1,21 @@
-"""Femoral adjustment: fluoroscopy's coronal error is taken out before contact, then checked.
+"""Femoral adjustment: corrects the errors of fluoroscopy in a recorded pose before contact.
 
-Fluoroscopy errs by about 0.5 mm and 0.5 deg, which is more than the deformation itself. Sharma
-(2008), section 4.3, takes both as cut-offs:
+The errors of fluoroscopy are about 0.5 mm and 0.5 deg, which is more than the deformation. Sharma
+(2008), section 4.3, uses both as limits of the correction:
 
-1. Gap of each condyle at the recorded pose (closest points); coronal angle = difference of
-   the gaps / distance of the contact points in the coronal plane.
-2. Below 0.5 deg the femur is turned in the coronal plane, about the component's own centre,
-   until both condyles touch together. Above, it is not turned: that is evidence of lift-off. It is
-   not turned either where the turn that this takes would exceed 0.5 deg.
-3. It is moved along y to first touch, by 0.5 mm at most. A femur that is farther from touch
-   than fluoroscopy errs is flagged. The press moves it on to contact in any case, since it
-   moves the femur along y until the load is carried. The height therefore decides nothing
-   about the split, and the split has no step at the limit.
+1. The coronal angle is the difference of the condyles' gaps at the recorded pose, divided by the
+   distance of the contact points in the coronal plane.
+2. If this angle is below 0.5 deg, the femur is turned in the coronal plane until both condyles
+   touch together. A larger angle is evidence of lift-off, and the femur is not turned. It is not
+   turned either if the turn would exceed 0.5 deg.
+3. The femur is moved along y to first touch, by 0.5 mm at most. If first touch is farther away, the
+   frame is flagged. The press then moves the femur along y until the contact carries the load.
+   This limit therefore does not change the medial-lateral split.
 
-Sharma (2008) does not say about which point it turns. Registration places the component's centre
-better than any other point, so the centre stays where it was recorded. About the contact
-points, 25 mm below, 0.4 deg shift the component sideways by 0.2 mm, and in dishes little
-wider than the condyles the contact by 1.3 mm: enough to change the total force by 0.02 BW.
+Sharma (2008) does not give the centre of the turn. Here it is the component's centre, because
+registration places this point best. A turn of 0.4 deg about the contact points, 25 mm below, would
+shift the component sideways by 0.2 mm. In dishes little wider than the condyles the contact would
+move by 1.3 mm, and the total force would change by 0.02 BW.
 
 `tkamb.knee.adjustment` compares the adjustment with the deformation, and may
 restore the recorded rotation.
@@ -39,32 +38,32 @@ RestoreRule = Literal["both", "either"]
 
 @dataclass(frozen=True)
 class AdjustmentSettings:
-    """The limits of the adjustment and the rule by which it is undone."""
+    """The limits of the adjustment, and the rule that restores the recorded rotation."""
 
     largest_angle: float = 0.5 * DEGREE
-    """rad: a coronal angle of this size or more is lift-off and is not corrected (Sharma 2008:
-    0.5 deg, the error of fluoroscopy)."""
+    """rad: coronal angle from which the frame is a lift-off and is not corrected. From Sharma
+    (2008): 0.5 deg, the error of fluoroscopy."""
     largest_translation: float = 0.5 * MILLIMETRE
-    """m: the adjustment moves the femur by no more than this along y (Sharma 2008: 0.5 mm,
-    the error of fluoroscopy)."""
+    """m: largest move of the femur along y. From Sharma (2008): 0.5 mm, the error of
+    fluoroscopy."""
     restore_when: RestoreRule = "both"
-    """"both": the recorded rotation is restored if penetration and coronal angle after the
-    press exceed the adjustment (Sharma 2008); "either": if one of them does."""
+    """Condition that restores the recorded rotation. "both": penetration and coronal angle after
+    the press both exceed the adjustment (Sharma 2008). "either": one of them does."""
     input_change: float = 0.1 * MILLIMETRE
-    """m: if a change of the recorded pose by this much can change the answer by a step, the
-    result is flagged. Chosen: a fifth of the error of fluoroscopy."""
+    """m: change of a gap at the recorded pose. If it can change the answer by a step, the frame is
+    flagged. Chosen: a fifth of the error of fluoroscopy."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
-    """m: with both condyles farther than this from the insert the pose is no recorded contact.
-    Chosen: it is more than the errors of fluoroscopy."""
+    """m: if both condyles are farther from the insert, the pose is refused. Chosen because it is
+    more than the errors of fluoroscopy."""
     level_difference: float = 5e-6
-    """m: condyles whose gaps differ by less count as level, and the femur is not turned. Chosen:
+    """m: difference of the condyles' gaps below which the femur is not turned. Chosen because
     meshes do not resolve smaller differences."""
     touch_difference: float = 1e-7
-    """m: difference of the condyles' clearances below which they touch together. Chosen: far below
-    what changes a force."""
+    """m: difference of the condyles' clearances below which both touch together. Chosen because
+    forces do not change with smaller differences."""
     max_turns: int = 20
     """Largest number of steps of the search for the turn at which both condyles touch together.
-    Chosen: the search ends after fewer."""
+    Chosen because the search needs fewer."""
 
 
 ADJUSTMENT = AdjustmentSettings()
@@ -72,21 +71,22 @@ ADJUSTMENT = AdjustmentSettings()
 
 @dataclass(frozen=True, eq=False)
 class Adjustment:
-    """What was done to a recorded pose before contact.
+    """The adjustment of a recorded pose before contact.
 
     Args:
         pose: (4, 4) adjusted pose_femoral_in_insert.
-        recorded: (4, 4) the pose as recorded.
-        translation: m along y, of the component's centre; negative is downwards.
-        coronal_angle: rad about the insert's x axis by which the femur was turned.
+        recorded: (4, 4) recorded pose_femoral_in_insert.
+        translation: m, move of the component's centre along y; negative is downwards.
+        coronal_angle: rad, turn of the femur about the insert's x axis.
         measured_angle: rad, coronal angle of the recorded pose.
-        intercondylar_distance: m; NaN with one condyle.
-        settings: the limits that it was made with.
-        penetration: m, how deep the femur sank in afterwards; NaN before the press.
+        intercondylar_distance: m, between the contact points in the coronal plane; NaN with one
+            condyle.
+        settings: limits of the adjustment.
+        penetration: m, penetration after the press; NaN before the press.
         final_angle: rad, difference of the penetrations / intercondylar distance.
-        restored: the recorded rotation was put back after the press; `coronal_angle` then
-            says what had been tried, and `pose` is the restored one.
-        flags: in words, why the answer depends on a limit.
+        restored: whether the recorded rotation was restored after the press. `pose` is then the
+            restored pose, and `coronal_angle` the turn that was undone.
+        flags: warnings in words that the result depends on a limit.
     """
 
     pose: Array
@@ -111,8 +111,8 @@ def adjust(
 
     Args:
         query: closest points of the pair.
-        recorded: (4, 4) pose_femoral_in_insert.
-        settings: the limits, and how the adjustment is undone later.
+        recorded: (4, 4) recorded pose_femoral_in_insert.
+        settings: limits of the adjustment.
 
     Raises:
         InputError: neither condyle is near the insert.
@@ -139,7 +139,7 @@ def _limited_turn(
     distance: float,
     settings: AdjustmentSettings,
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the turn (rad) that is made, 0 beyond the limit, and a flag close to the limit."""
+    """Return the turn (rad), which is 0 beyond the limit, and a flag close to the limit."""
     limit, margin = settings.largest_angle, settings.input_change / distance
     if abs(angle) > limit + margin:
         return 0.0, ()
@@ -163,7 +163,7 @@ def moved_to_touch(
     """Return a pose (4, 4) moved along y to first touch, as far as the limit allows.
 
     Returns:
-        The pose, the move along y (m), and a flag where first touch is farther than the limit.
+        The pose, the move along y (m), and a flag if first touch is farther than the limit.
 
     Raises:
         ComputationError: the femur does not lie over the insert.
@@ -223,7 +223,7 @@ def _levelling_turn(
 
 
 def touches(query: ClosestPointQuery, at: Array) -> tuple[float, float]:
-    """Return travel (m) along -y to touch, medial and lateral; negative once inside."""
+    """Return the travel (m) along -y to touch, medial and lateral; negative for an overlap."""
     medial, lateral = query.first_touch.at(at)
     if medial is None or lateral is None:
         raise ComputationError("a condyle does not lie over the insert", "femoral adjustment")

@@ -18,34 +18,34 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class HeightBoundSettings:
-    """The grid of planes that bounds a surface's height from below."""
+    """The grid of planes that bounds a surface's height from above."""
 
     cell_edge: float = 1e-3
     """m: edge of a cell. Chosen: about the edge of a mesh's triangles."""
     most_cells: int = 400
-    """Largest number of cells along an edge of the grid; a larger surface gets larger cells.
-    Chosen: it bounds memory."""
+    """Largest number of cells along an edge of the grid; a larger surface gets larger cells. Chosen
+    because it limits memory."""
     wide_triangle_cells: int = 4
-    """Cells along an edge: triangles that span more are processed one by one. Chosen: such
-    triangles are few."""
+    """Number of cells along x or z. Triangles that span more are processed one by one. Chosen
+    because such triangles are few."""
     largest_slope: float = 3.0
-    """1: largest slope of a plane that bounds the height. Chosen: a steeper plane bounds too
-    loosely."""
+    """1: largest slope of a plane that bounds the height. Chosen because the bound of a steeper
+    plane is loose."""
 
 
 HEIGHT_BOUND = HeightBoundSettings()
 
 
 class HeightBound:
-    """One plane per cell of an x-z grid, with the surface below it: a bound of the height.
+    """An upper bound of a surface's height: one plane per cell of an x-z grid.
 
         y <= c + g . (x, z)      for every upward triangle over the cell
 
-    g is the mean slope over the cell, so that the plane lies closer than the cell's largest
-    height where the surface slopes.
+    g is the mean slope over the cell. On a slope the plane is closer to the surface than the
+    largest height of the cell.
 
     Args:
-        surface: the surface; its extent in x and z is the grid's.
+        surface: the surface; the grid covers its extent in x and z.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -68,7 +68,7 @@ class HeightBound:
         return np.clip(index, 0, self._last)
 
     def _cell_planes(self, surface: Surface) -> Array:
-        """Return the planes (i, j, 3) over each cell."""
+        """Return the plane of each cell, (i, j, 3): g along x and z, and c (m)."""
         faces = surface.faces[surface.face_normals[:, 1] > 0]
         triangles = surface.vertices[faces]
         a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
@@ -88,7 +88,12 @@ class HeightBound:
         return planes
 
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
-        """Yield rectangles (m,) and one cell (m,), (m,) that each of them covers."""
+        """Yield all cells under all rectangles: numbers of rectangles, rows and columns, (m,) each.
+
+        Args:
+            low: (n, 2) m, smallest x and z of the rectangles.
+            high: (n, 2) m, largest x and z of the rectangles.
+        """
         first, last = self._place(low), self._place(high)
         wide = (last - first >= HEIGHT_BOUND.wide_triangle_cells).any(axis=1)
         for t in np.flatnonzero(wide):
@@ -105,28 +110,29 @@ class HeightBound:
 
 @dataclass(frozen=True)
 class ClosestPointSettings:
-    """How the closest points of two surfaces are searched and weighted."""
+    """The search for the closest points of two surfaces."""
 
     region_radius: float = 1.6e-2
-    """m; radius of the close region around the closest point. Chosen: a condyle's contact lies
-    within it."""
+    """m: largest distance of a point of the close region from the closest point. Chosen because a
+    condyle's contact is smaller."""
     facing_cosine: float = 0.7
-    """Cosine of the angle between the surfaces, above which they face each other. Chosen: surfaces
-    at more than 45 deg do not touch face to face."""
+    """1: cosine of the angle between the surfaces above which they face each other. Chosen because
+    surfaces at more than 45 deg do not touch face to face."""
     clearance: float = 1e-6
-    """m: a point that is higher than this above the bound of the insert's height is outside the
-    insert. Chosen: above the rounding of a mesh."""
+    """m: a point that lies higher than this above the bound of the insert's height is outside the
+    insert. Chosen because it is above the rounding of a mesh."""
     gap_range: float = 10 * CONDYLE.facet_depth
-    """m: samples count up to this much above the smallest gap. Chosen: their weight there is
-    5e-5."""
+    """m: a sample counts if its gap exceeds the smallest gap by less. Chosen because the weight of
+    a farther sample is below 5e-5."""
     rounds: int = 3
-    """Rounds of projection between the two surfaces. Chosen: more rounds move the points by less
-    than the tolerance."""
+    """Number of times that the triangles around the deepest point are divided into four. Larger:
+    slower, but a finer position of the point."""
     kept_candidates: int = 8
-    """Triangles that are searched around each nearest vertex. Chosen: the nearest triangle is among
-    them."""
+    """Number of vertices or triangles with which the search of the deepest point continues. Chosen
+    because the deepest point is among them."""
     batch_size: int = 64
-    """Samples that are projected together. Chosen: it changes speed alone."""
+    """Number of vertices whose depth is computed together, and largest number of intersecting
+    triangles that are examined."""
 
 
 CLOSEST_POINT = ClosestPointSettings()
@@ -134,17 +140,17 @@ CLOSEST_POINT = ClosestPointSettings()
 
 @dataclass(frozen=True, eq=False)
 class CondyleGap:
-    """How far one condyle is from the insert, and where.
+    """The gap of one condyle, insert frame.
 
     Args:
-        gap: m, distance of the closest points; negative: depth of the deepest femoral point
-            below the insert's surface.
-        point_on_femoral: (3,) m, insert frame.
-        point_on_insert: (3,) m, insert frame.
-        centre: (3,) m, insert frame, on the insert: centre of the region in which the gap is
-            smallest within the resolution of the meshes. The line of action goes through it.
-        normal: (3,) unit, insert frame, from the insert to the femur: mean of the insert's vertex
-            normals over that region.
+        gap: m, distance of the closest points; for an overlap the depth of the deepest femoral
+            point below the insert's surface, negative.
+        point_on_femoral: (3,) m, closest or deepest point of the femoral component.
+        point_on_insert: (3,) m, closest point of the insert.
+        centre: (3,) m, on the insert, centre of the close region: the region in which the gap is
+            smallest within the resolution of the meshes.
+        normal: (3,) unit, from the insert to the femur, mean of the insert's vertex normals over
+            the close region.
     """
 
     gap: float
@@ -156,7 +162,7 @@ class CondyleGap:
 
 @dataclass(frozen=True, eq=False)
 class CondyleGaps:
-    """The gaps of both condyles; `lateral` is None if the femoral part has one condyle only."""
+    """The gaps of both condyles; `lateral` is None if the femoral component has one condyle."""
 
     medial: CondyleGap
     lateral: CondyleGap | None
@@ -165,20 +171,19 @@ class CondyleGaps:
 class ClosestPointQuery:
     """Closest points of one pair of bodies, prepared for many poses.
 
-    The gap is the smallest signed distance of the condyle's surface to the insert, so that it is
-    continuous through touch. If the bodies are apart, it is the exact distance of the two
-    triangulated surfaces (python-fcl). If they overlap, the deepest femoral vertices in the insert
-    are found first. The triangles around them are then divided to 1/8 of an edge, which resolves
-    about 1 µm of depth on implants.
+    The gap is the smallest signed distance of the condyle's surface to the insert. It is continuous
+    through touch. If the bodies are apart, it is the exact distance of the two triangulated
+    surfaces (python-fcl). If they overlap, the search finds the deepest femoral vertices in the
+    insert, and divides the triangles around them to 1/8 of an edge. This resolves about 1 µm of
+    depth on implants.
 
-    The normal is the mean of the insert's interpolated vertex normals over the region in which the
-    gap is smallest within the resolution of the meshes. It is defined at touch and turns smoothly
-    as the contact moves; the normal of a facet would not.
+    The normal is the mean over the close region (`CondyleGap`), because it turns smoothly as the
+    contact moves.
 
     Args:
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
-        split: z between the condyles in the femoral frame, None for one condyle.
+        split: z (m, femoral frame) between the condyles; None for one condyle.
     """
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None) -> None:
@@ -194,7 +199,7 @@ class ClosestPointQuery:
 
     @cached_property
     def first_touch(self) -> FirstTouch:
-        """How far either condyle travels along -y until it touches."""
+        """Query of the travel along -y after which each condyle touches the insert."""
         return FirstTouch(self.femoral, self.insert, self.split)
 
     def at(self, pose_femoral_in_insert: Array) -> CondyleGaps:
@@ -226,7 +231,10 @@ class ClosestPointQuery:
         return float(distance) * MILLIMETRE, on_femoral, on_insert
 
     def _touching(self, condyle: "_Condyle", pose: Array) -> Index:
-        """Return the triangles of the condyle that cut or touch the insert's surface."""
+        """Return triangles of the condyle that cut or touch the insert's surface.
+
+        If there is none, return those around the vertex nearest to the insert.
+        """
         request = fcl.CollisionRequest(
             num_max_contacts=CLOSEST_POINT.batch_size, enable_contact=True
         )
@@ -238,10 +246,10 @@ class ClosestPointQuery:
         return condyle.around(condyle.vertices[[np.argmin(distance)]])
 
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
-        """Return the few deepest vertices inside the insert, deepest first; none if apart.
+        """Return the `kept_candidates` deepest vertices inside the insert, deepest first.
 
-        The depth along y is an upper bound of the depth, and the search takes vertices in its
-        order. A vertex above the bound of the insert's height is outside and is skipped.
+        A vertex above the bound of the insert's height is outside. The depth along y is an upper
+        bound of the depth, so vertices are evaluated in its order.
         """
         near, points = _within_box(condyle.points, pose, *self.insert.bounds)
         under = points[:, 1] < self._ceiling.over(points) + CLOSEST_POINT.clearance
@@ -264,11 +272,14 @@ class ClosestPointQuery:
         return np.where(inside, distance, 0.0)
 
     def _refined(self, faces: Index, pose: Array) -> tuple[float, Array, Array]:
-        """Return the gap (m) of the deepest point of triangles, that point, and the insert's."""
+        """Return the gap (m) of the deepest point of triangles, this point, and its projection.
+
+        The projection is the nearest point of the insert.
+        """
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
         _, first = np.unique(self.femoral.faces[faces], return_index=True)
-        points = triangles.reshape(-1, 3)[first]  # corners that triangles share count once
+        points = triangles.reshape(-1, 3)[first]  # a corner shared by triangles appears once
         for _ in range(CLOSEST_POINT.rounds):
             triangles = _quartered(triangles)
             near = self._nearest.at(triangles.mean(axis=1))
@@ -288,7 +299,7 @@ class ClosestPointQuery:
 
 
 class _Condyle:
-    """One condyle: its triangles, vertices and tree."""
+    """Triangles, vertices and bounding-box tree of one condyle."""
 
     def __init__(self, femoral: Surface, faces: Index) -> None:
         self.faces, self._femoral = faces, femoral
@@ -301,7 +312,7 @@ class _Condyle:
 
     @cached_property
     def tree(self) -> fcl.BVHModel:
-        """The triangles as a tree for fcl."""
+        """Bounding-box tree of the triangles for fcl."""
         return _tree(self._femoral, self.faces)
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
@@ -316,11 +327,10 @@ class _Condyle:
 
 
 class _CloseRegion:
-    """Part of one body's surface, prepared to find its close region with another body.
+    """Part of one body's surface, prepared for the search of its close region with another body.
 
     On conforming surfaces the closest point of two meshes moves by millimetres from pose to pose,
-    although the gap differs by a few micrometres only. The centre of the close region moves
-    smoothly:
+    although the gap changes by a few micrometres. The centre of the close region moves smoothly:
 
         c = sum w_i p_i / sum w_i,   w_i = A_i exp(-(g_i - g) / d)
 
@@ -329,8 +339,8 @@ class _CloseRegion:
     minimum, the centre is the closest point.
 
     Args:
-        surface: the body, own frame.
-        faces: (k,) the triangles that belong to the part.
+        surface: surface of the body, in the body's frame.
+        faces: (k,) numbers of the triangles of the part.
     """
 
     def __init__(self, surface: Surface, faces: Index) -> None:
@@ -342,16 +352,18 @@ class _CloseRegion:
     def centre(
         self, other: NearestPoints, pose: Array, gap: float, closest: Array
     ) -> tuple[Array, Array]:
-        """Return the centre (3,) on the other body and its mean unit normal (3,) there.
+        """Return the centre (3,), m, and the mean unit normal (3,) of the close region.
+
+        Both belong to the other body and are given in its frame.
 
         Args:
             other: nearest points of the other body.
-            pose: (4, 4) of this body in the frame of the other body, in which results are given.
-            gap: m, the smallest signed gap.
-            closest: (3,) m, point of this body with that gap, in the other's frame.
+            pose: (4, 4) pose of this body in the other body's frame.
+            gap: m, smallest signed gap.
+            closest: (3,) m, point of this body with this gap, in the other body's frame.
         """
-        own = transform(inverse(pose), closest)
-        near = _facing_alike(self._samples, self._normals, own, CLOSEST_POINT.region_radius)
+        place = transform(inverse(pose), closest)
+        near = _facing_alike(self._samples, self._normals, place, CLOSEST_POINT.region_radius)
         points = np.concatenate([transform(pose, self._samples[near]), closest[None]])
         within, nearest = other.within(points, abs(gap) + CLOSEST_POINT.gap_range)
         near, points = near[within[:-1]], points[within[:-1]]
@@ -371,7 +383,10 @@ class _CloseRegion:
 
 
 def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
-    """Return one sample per cube of the sample spacing, and the area of all samples in the cube."""
+    """Return one sample (m,) per cube, and the area (m,) of all samples in the cube.
+
+    The edge of a cube is the sample spacing.
+    """
     cubes = np.floor(samples / CONDYLE.sample_spacing).astype(np.int64)
     cubes -= cubes.min(axis=0)
     number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
@@ -382,10 +397,9 @@ def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
 
 
 def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
-    """Return the triangles as a tree in millimetres.
+    """Return the bounding-box tree of triangles for fcl, in millimetres.
 
-    fcl compares with absolute tolerances. In metres it reports a touch of small triangles that are
-    30 µm apart.
+    fcl has absolute tolerances: in metres it reports contact of small triangles 30 µm apart.
     """
     model = fcl.BVHModel()
     model.beginModel(len(surface.vertices), len(faces))
@@ -396,7 +410,7 @@ def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
 
 @compiled_as_written
 def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[Index, Array]:
-    """Return which points (n, 3) lie within a box after a move, and their new positions."""
+    """Return the numbers and the new positions of points (n, 3) that a pose moves into a box."""
     inside, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
     for i in range(len(points)):
         within = True
@@ -416,13 +430,13 @@ def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[In
 
 @compiled_as_written
 def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
-    """Return the samples near a place whose normals are within 60 deg of the nearest sample's.
+    """Return the samples near a place with a normal within 60 deg of the nearest sample's normal.
 
     Args:
         samples: (n, 3) m.
         normals: (n, 3) unit normals of the samples.
         place: (3,) m.
-        radius: m, largest distance from the place.
+        radius: m, largest distance of a sample from the place.
     """
     square, nearest = np.empty(len(samples)), 0
     for i in range(len(samples)):
@@ -444,7 +458,7 @@ def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -
 
 @compiled_as_written
 def _quartered(triangles: Array) -> Array:
-    """Return the four triangles (4k, 3, 3) into which halved edges divide triangles (k, 3, 3)."""
+    """Divide triangles (k, 3, 3) at the middles of their edges; return the parts (4k, 3, 3)."""
     count = len(triangles)
     parts = np.empty((4 * count, 3, 3))
     for k in range(count):

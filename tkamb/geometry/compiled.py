@@ -1,9 +1,9 @@
-"""Loops compiled by numba when they are first called, and kept on disk for the next process.
+"""Decorators for loops that numba compiles at the first call and stores on disk.
 
-Import it only where meshes or a lattice are needed: it takes 0.1 to 0.4 s. The compiled code lies
-beside the module or, where that folder cannot be written, in the user's cache (`NUMBA_CACHE_DIR`
-names it). Indices are not checked against bounds. A compiled function uses nothing of another
-file, because the cache would not notice a change there.
+The import takes 0.1 to 0.4 s. The compiled code is stored beside the module. If that folder cannot
+be written, it is stored in the user's cache (`NUMBA_CACHE_DIR`). Indices are not checked against
+bounds. A compiled function uses no name of another file, because numba's cache does not detect
+changes of other files.
 """
 
 import logging
@@ -19,15 +19,15 @@ _log = logging.getLogger("tkamb")
 
 
 def compiled(function: Function) -> Function:
-    """Return the function compiled; it lets other threads run.
+    """Return the compiled function; other threads run during a call.
 
-    Sums may be taken in another order, for vector registers; all other IEEE arithmetic holds.
+    Sums may be reordered for vector registers, and a product and a sum may be rounded together.
     """
     return _compiled(function, {"reassoc", "contract", "nsz"})
 
 
 def compiled_as_written(function: Function) -> Function:
-    """Return the function compiled without that freedom: equal numbers stay equal.
+    """Return the compiled function with all operations in the written order.
 
     A division by zero gives inf or NaN, as in numpy.
     """
@@ -39,7 +39,7 @@ def _compiled(function: Function, fastmath: set[str], **more: str) -> Function:
     compiler: Any = njit
     try:
         return cast(Function, compiler(cache=True, **options)(function))
-    except RuntimeError:  # numba finds no folder that it may write to
+    except RuntimeError:  # numba has no folder for its cache
         _say_once()
         return cast(Function, compiler(**options)(function))
 
@@ -48,6 +48,5 @@ def _compiled(function: Function, fastmath: set[str], **more: str) -> Function:
 def _say_once() -> None:
     _log.warning(
         "compiled loops cannot be stored: every process compiles them again, in ten seconds or "
-        "more; "
-        "set NUMBA_CACHE_DIR to a folder that can be written to"
+        "more; set NUMBA_CACHE_DIR to a folder that can be written to"
     )

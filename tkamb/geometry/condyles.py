@@ -1,4 +1,4 @@
-"""Where a femoral component parts into two condyles, and the lowest point of each."""
+"""The plane between the two condyles of a femoral component, and the lowest point of each."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,35 +14,36 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 @dataclass(frozen=True)
 class CondyleSettings:
-    """How the two condyles of a femoral component are found."""
+    """The search for the two condyles of a femoral component."""
 
     notch_depth: float = 2e-3
-    """m: a component with a shallower notch along z has one condyle. Chosen: real components with
-    two have 6 to 14 mm."""
+    """m: a component with a shallower notch along z has one condyle. Chosen because real components
+    with two condyles have notches of 6 to 14 mm."""
     yawed_notch_depth: float = 3e-3
-    """m: least notch along another direction than z that shows two condyles. A single condyle of
-    a real component has up to 2.4 mm along some direction (DM, JW and the shipped knee cut in
+    """m: smallest depth of a notch along any direction that shows two condyles. Chosen because a
+    single condyle of a real component has notches up to 2.4 mm (DM, JW and the shipped knee cut in
     halves)."""
     extended_notch_depth: float = 0.5e-3
-    """m: least notch at 0 deg of flexion along the line through two condyles. Chosen: a single long
-    body has none there, although its ends may look like condyles in flexion."""
+    """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. Chosen because a
+    single long body has no notch there, although its ends may resemble condyles in flexion."""
     facet_depth: float = 3e-5
-    """m: depth that facets of 1 to 2 mm cut off a condyle. Chosen: heights that differ by less
-    count as equal."""
+    """m: largest distance between a facet of 1 to 2 mm and the curved condyle that it approximates.
+    Heights that differ by less count as equal."""
     strip_width: float = 1e-3
-    """m: width of the strips along z in which the notch is searched. Chosen: a condyle's ridge is
+    """m: width of the strips along z in which the notch is searched. Chosen because a condyle is
     wider."""
     sample_spacing: float = 1e-3
-    """m: spacing of the samples of a condyle's surface. Chosen: about the facets of a mesh."""
+    """m: spacing of the samples of a condyle's surface. Chosen: about the size of a mesh's
+    facets."""
     highest_sample: float = 10 * facet_depth
-    """m above the lowest vertex: higher samples have no weight. Chosen: higher samples are not in
-    contact."""
+    """m: height above the lowest vertex above which samples have no weight. Chosen because higher
+    samples are not in contact."""
     samples_per_box: int = 32
-    """Samples of a surface that share one box of the search tree. Chosen: it changes speed
-    alone."""
+    """Number of samples of a surface in one box of the search. Chosen for speed; results do not
+    depend on it."""
     deepest_notch: float = 15e-3
-    """m: height above the condyles up to which the notch between them is searched. Chosen: real
-    notches have 6 to 14 mm."""
+    """m: upper limit of heights above the lowest point. Chosen because notches are 6 to 14 mm
+    deep."""
 
 
 CONDYLE = CondyleSettings()
@@ -50,28 +51,28 @@ CONDYLE = CondyleSettings()
 
 @dataclass(frozen=True)
 class ShellSettings:
-    """How the front and the bone side of a femoral component are found from its shape."""
+    """The search for the front and the bone side of a femoral component from its shape."""
 
     least_inner_share: float = 0.33
-    """1: share of the surface that faces the middle of the bounding box, from which a part is a
-    shell that opens towards the bone. Measured: 0.41 to 0.44 in nine femoral components, at most
-    0.24 in inserts, 0 in convex bodies."""
+    """1: smallest share of the surface that faces the middle of the bounding box, the inner surface
+    of a shell. Chosen between 0.41 to 0.44 in nine femoral components and at most 0.24 in inserts;
+    convex bodies have 0."""
     least_opening_share: float = 0.3
-    """1: size of the sum of the area vectors of that part of the surface, as a share of its area,
-    from which it opens in one direction. Measured: 0.38 to 0.52 in nine femoral components, 0 for
-    two spheres side by side."""
+    """1: smallest magnitude of the sum of the inner surface's area vectors, as a share of its area.
+    A smaller sum shows no opening. Chosen below the 0.38 to 0.52 of nine femoral components; two
+    spheres side by side have 0."""
     opening_lean: float = 20.0 * DEGREE
-    """rad: angle from superior to the direction in which the shell opens, to posterior. Measured:
-    11 to 30 deg in nine femoral components."""
+    """rad: angle of the opening's direction from superior towards posterior. Measured: 11 to 30 deg
+    in nine femoral components."""
     flange_width_share: float = 0.1
-    """1: half the width, as a share of the component's, of the strip between the condyles in which
-    the flange is looked for. Chosen: narrower than the notch."""
+    """1: half the width of the strip between the condyles in which the flange is searched, as a
+    share of the component's width. Chosen because it is narrower than the notch."""
     flange_position: float = 0.75
-    """1: least position of the strip's upper half along the component, as a share of its length
-    from behind. Measured: 0.87 to 0.94 in nine femoral components."""
+    """1: smallest position of the flange along the component, as a share of the length from behind.
+    Chosen below the 0.87 to 0.94 of nine femoral components."""
     sideways: float = 45.0 * DEGREE
-    """rad: a shell that opens farther than this from its sagittal plane has wrong axes. Measured:
-    at most 2 deg in nine femoral components."""
+    """rad: if the opening's direction is farther from the sagittal plane, the axes are wrong.
+    Measured: at most 2 deg in nine femoral components."""
 
 
 SHELL = ShellSettings()
@@ -81,15 +82,16 @@ _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
 
 @dataclass(frozen=True)
 class YawSearch:
-    """How the line through both condyles is found in the horizontal plane.
+    """Settings of the search for the line through both condyles in the horizontal plane.
 
     Args:
-        step: rad, between the directions that are tried.
-        spacing: m, between the samples of the surface.
+        step: rad, angle between two directions of the search.
+        spacing: m, spacing of the samples of the surface.
         strip: m, width of the strips along a direction.
-        flexions: rad, at which the outline is taken.
-        largest_yaw: rad, between that line and z. The estimate is within 3 deg on real
-            components; at 20 deg the plane between the condyles already cuts them.
+        flexions: rad, flexions over which the outline is averaged.
+        largest_yaw: rad, largest accepted angle between the line and z. On real components the
+            error of the estimate is at most 3 deg; at 20 deg the plane between the condyles cuts
+            them.
     """
 
     step: float = 10.0 * DEGREE
@@ -106,28 +108,27 @@ YAW_SEARCH = YawSearch()
 def condyle_split(femoral: Surface) -> float | None:
     """Return the z (m, femoral frame) between the condyles; None for a single condyle.
 
-    The lower outline of the component in the frontal plane is taken at flexions from 0 to
-    120 deg (rotation about +z, as in `tkamb.geometry.frames`), in strips of 1 mm along z,
-    as height above its lowest point, and averaged over flexion. In this outline two condyles are
-    two valleys, and the notch between them is a ridge. The ridge must rise at least 3 mm above both
-    valleys, or 2 mm if it exists in extension, too. The split is the middle of the ridge at half
-    its height. A sphere, a cylinder along z or a unicondylar part has one valley.
+    The outline is the lowest height of the surface in each strip of 1 mm along z, above the lowest
+    point of all strips. It is averaged over flexions from 0 to 120 deg (rotation about +z, as in
+    `tkamb.geometry.frames`). Two condyles are two valleys of the outline, and the notch between
+    them is a ridge. The ridge must rise at least 3 mm above both valleys, or 2 mm if it exists in
+    extension, too. The split is the middle of the ridge at half its height. A sphere, a cylinder
+    along z or a unicondylar component has one valley.
 
     In a right knee z above the split is lateral, below it medial.
 
     Args:
-        femoral: in the femoral frame, anatomical axes (x anterior, y superior, z right).
+        femoral: femoral component, femoral frame (x anterior, y superior, z right).
 
     Raises:
-        InputError: the two condyles do not lie side by side along z, so that medial and lateral
-            cannot be told.
+        InputError: the two condyles do not lie side by side along z.
     """
     samples = _samples(femoral, CONDYLE.strip_width / 2)
     outline, middles = _mean_outline(samples, CONDYLE.strip_width, _FLEXIONS)
     rise = _rise(outline)
     top = int(np.argmax(rise))
     _check_yaw(femoral)
-    # A shallow notch counts if it is there in extension too: one condyle that lies askew has none.
+    # A shallow notch counts if it exists in extension, too; one condyle that lies askew has none.
     extended, _ = _mean_outline(samples, CONDYLE.strip_width, np.zeros(1))
     in_extension = _rise(extended).max() >= CONDYLE.notch_depth
     if rise[top] < (CONDYLE.notch_depth if in_extension else CONDYLE.yawed_notch_depth):
@@ -142,19 +143,19 @@ def condyle_split(femoral: Surface) -> float | None:
 
 
 def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float, float]:
-    """Return how far the line through both condyles is turned from z, and its notch.
+    """Return the angle between z and the line through both condyles, and the depth of the notch.
 
-    The notch is searched along every horizontal direction. It is deepest along the line through
-    both condyles. The angle of that line is the mean over all directions whose notch is deeper than
-    half the deepest one, weighted by depth.
+    The notch is searched along horizontal directions. It is deepest along the line through both
+    condyles. The angle is the mean over the directions with a notch deeper than half the deepest
+    one, weighted by depth.
 
     Args:
-        femoral: in the femoral frame.
-        search: settings.
+        femoral: femoral component, femoral frame.
+        search: settings of the search.
 
     Returns:
-        Angle about +y, rad, in (-90, 90] deg, and depth of the deepest notch, m. A single
-        condyle has no notch along any direction and no direction of its own.
+        Angle about +y, rad, in (-90, 90] deg, and depth of the deepest notch, m. Without a notch
+        the angle has no meaning.
     """
     samples = _samples(femoral, search.spacing)
     yaws = np.arange(-np.pi / 2, np.pi / 2 - search.step / 2, search.step)
@@ -175,13 +176,13 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
 
 
 def _check_yaw(femoral: Surface) -> None:
-    """Raise an InputError where two condyles lie along another direction than z."""
+    """Raise an InputError if the two condyles do not lie side by side along z."""
     yaw, notch = condyle_yaw(femoral)
     if notch < CONDYLE.yawed_notch_depth or abs(yaw) <= YAW_SEARCH.largest_yaw:
         return
     raise InputError(
         f"its two condyles lie along a line turned by {abs(yaw) / DEGREE:.0f} deg from the "
-        "medial-lateral axis, so that medial and lateral cannot be told",
+        "medial-lateral axis, so that medial and lateral cannot be distinguished",
         femoral.name,
         "check the axes of the mesh: anterior, superior, right",
     )
@@ -189,13 +190,14 @@ def _check_yaw(femoral: Surface) -> None:
 
 @dataclass(frozen=True)
 class Orientation:
-    """How a femoral component stands on an insert, from its shape and its pose.
+    """Orientation of a femoral component on an insert, from its shape and its pose.
 
     Args:
-        flexion: rad, from -pi to pi; at 0 its bone side faces up.
-        tilt: rad, angle of its medial-lateral axis from the horizontal plane; pi/2 also where the
-            component opens along the axis that the file calls medial-lateral.
-        forward: cosine of the angle between its front and the insert's, seen from above.
+        flexion: rad, from -pi to pi; at 0 the bone side faces up.
+        tilt: rad, angle of the medial-lateral axis from the horizontal plane; pi/2 also if the
+            component opens along the z axis of the mesh.
+        forward: 1, cosine of the angle between the fronts of component and insert, in the plan
+            view.
     """
 
     flexion: float
@@ -204,15 +206,15 @@ class Orientation:
 
 
 def orientation(femoral: Surface, pose: Array) -> Orientation | None:
-    """Return how a femoral component stands on the insert; None where its shape does not show it.
+    """Return the orientation of a femoral component on the insert; None if its shape is unclear.
 
-    Of the mesh's axes only z is used, the medial-lateral one. The bone side of a femoral component
-    is the part of its surface that faces the middle of its bounding box. The sum of its area
-    vectors points out of the opening. The strip between the condyles shows the front: its upper
-    half belongs to the flange alone. The flexion is right within about 10 deg.
+    Of the mesh's axes only z is used, the medial-lateral axis. The inner surface of the component
+    faces the middle of its bounding box. The sum of the inner surface's area vectors points out of
+    the opening, towards the bone. The upper half of the strip between the condyles belongs to the
+    flange, which is in front. The error of the flexion is about 10 deg.
 
     Args:
-        femoral: in the femoral frame.
+        femoral: femoral component, femoral frame.
         pose: (4, 4) pose_femoral_in_insert.
     """
     middle, centroids = femoral.bounds.mean(axis=0), femoral.triangles.mean(axis=1)
@@ -226,8 +228,8 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
     if abs(outward[2]) > np.sin(SHELL.sideways) * np.linalg.norm(outward):
         return Orientation(0.0, np.pi / 2, 0.0)
     opening = outward[:2] / np.linalg.norm(outward[:2])
-    across = np.array([opening[1], -opening[0]])  # forward if the component stands upright
-    along, height = (femoral.vertices[:, :2] @ way for way in (across, opening))
+    across = np.array([opening[1], -opening[0]])  # anterior if the component is upright
+    along, height = (femoral.vertices[:, :2] @ axis for axis in (across, opening))
     half_width = SHELL.flange_width_share * np.ptp(femoral.vertices[:, 2])
     strip = (np.abs(centroids[:, 2] - middle[2]) < half_width) & (
         centroids[:, :2] @ opening > 0.5 * (height.min() + height.max())
@@ -244,7 +246,7 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
     anterior = np.append(cosine * front - sine * opening, 0.0)
     up = rotate(pose, superior)
     right = rotate(pose, cross(anterior, superior))
-    forward = np.array([right[2], 0.0, -right[0]])  # insert's y x right
+    forward = np.array([right[2], 0.0, -right[0]])  # cross product of the insert's y and `right`
     length = float(np.linalg.norm(forward))
     if length == 0.0:
         return Orientation(0.0, np.pi / 2, 0.0)
@@ -259,8 +261,7 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
 def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
     """Return the triangles (k,) of the medial and of the lateral condyle.
 
-    A triangle belongs to the side that its centroid is on. Without a split all of them are
-    medial.
+    The centroid of a triangle decides its side. Without a split all triangles are medial.
     """
     if split is None:
         return np.arange(len(femoral.faces)), np.empty(0, np.int64)
@@ -269,13 +270,13 @@ def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
 
 
 def _samples(femoral: Surface, spacing: float) -> Array:
-    """Return samples (s, 3) of a surface, m, with the corners of its triangles."""
+    """Return samples of a surface and the corners of its triangles, (s, 3), m."""
     corners = femoral.vertices[np.unique(femoral.faces)]
     return np.concatenate([sampled(femoral, spacing)[0], corners])
 
 
 def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array, Array]:
-    """Return height (n,) of the outline above its lowest point and z (n,) of the strips, m.
+    """Return height (n,), m, of the outline above its lowest point, and z (n,), m, of its strips.
 
     Args:
         samples: (s, 3) m, samples of the surface.
@@ -290,7 +291,7 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
         height = samples[:, 0] * np.sin(flexion) + samples[:, 1] * np.cos(flexion)
         outline = np.full(count, np.inf)
         np.minimum.at(outline, strip, height)
-        # Long thin triangles leave strips without a sample: they are between their neighbours.
+        # Beside long thin triangles a strip may have no sample: its height is interpolated.
         sampled_strips = np.flatnonzero(np.isfinite(outline))
         outline = np.interp(np.arange(count), sampled_strips, outline[sampled_strips])
         total += np.minimum(outline - outline.min(), CONDYLE.deepest_notch)
@@ -299,22 +300,22 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
 
 
 def _rise(outline: Array) -> Array:
-    """Return the height (n,), m, of each strip above the higher of the two valleys beside it."""
-    least_before = np.minimum.accumulate(outline)
-    right = np.minimum.accumulate(outline[::-1])[::-1]
-    return np.asarray(outline - np.maximum(least_before, right), float)
+    """Return the height (n,), m, of each strip above the higher of the valleys on its two sides."""
+    left_valley = np.minimum.accumulate(outline)
+    right_valley = np.minimum.accumulate(outline[::-1])[::-1]
+    return np.asarray(outline - np.maximum(left_valley, right_valley), float)
 
 
 class LowestPoints:
     """Lowest point of each condyle along the insert's y, prepared for many poses.
 
     The point has the y of the lowest vertex. Its x and z are a weighted mean over the condyle's
-    surface, with the weight exp(-height / `CONDYLE.facet_depth`) for the height above that vertex.
-    It therefore moves smoothly and does not jump from vertex to vertex.
+    surface. The weight is exp(-height / `CONDYLE.facet_depth`), with the height above the lowest
+    vertex. The point therefore moves smoothly and does not jump from vertex to vertex.
 
     Args:
         femoral: femoral component, femoral frame.
-        split: z between the condyles in the femoral frame, None for one condyle.
+        split: z (m, femoral frame) between the condyles; None for one condyle.
     """
 
     def __init__(self, femoral: Surface, split: float | None) -> None:
@@ -336,7 +337,7 @@ class LowestPoints:
 
 @dataclass(frozen=True, eq=False)
 class _SampledCondyle:
-    """A condyle's samples in small boxes, so that only the samples of low boxes are evaluated.
+    """Samples of a condyle in small boxes; only samples in low boxes are evaluated.
 
     Args:
         vertices: (v, 3) m, femoral frame.
@@ -366,21 +367,21 @@ class _SampledCondyle:
         """Return the lowest point (3,) m, insert frame."""
         heights = self.vertices @ pose[1, :3]
         lowest, bottom = self.vertices[np.argmin(heights)], heights.min()
-        looked_at = self._low_samples(pose[1, :3], bottom + CONDYLE.highest_sample)
-        above = self.samples[looked_at] @ pose[1, :3] - bottom
+        candidates = self._low_samples(pose[1, :3], bottom + CONDYLE.highest_sample)
+        above = self.samples[candidates] @ pose[1, :3] - bottom
         near = above < CONDYLE.highest_sample
-        looked_at, above = looked_at[near], above[near]
-        weights = np.append(self.areas[looked_at], self.areas.mean()) * np.exp(
+        candidates, above = candidates[near], above[near]
+        weights = np.append(self.areas[candidates], self.areas.mean()) * np.exp(
             -np.append(above, 0) / CONDYLE.facet_depth
         )
-        across = rotate(pose, np.vstack([self.samples[looked_at], lowest]) - lowest)
+        across = rotate(pose, np.vstack([self.samples[candidates], lowest]) - lowest)
         step = weights @ across / weights.sum()
         return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])
 
     def _low_samples(self, up: Array, height: float) -> Index:
-        """Return the samples of all boxes that reach below a height (m) along `up` (3,)."""
+        """Return the samples of all boxes that extend below a height (m) along `up` (3,)."""
         least = self.centres @ up - self.halves @ np.abs(up)
-        # The rounding of a box is far smaller than the height over which samples have weight.
+        # The rounding error of a box is far smaller than the heights at which samples have weight.
         boxes = np.flatnonzero(least < height)
         chosen = boxes[:, None] * CONDYLE.samples_per_box + np.arange(CONDYLE.samples_per_box)
         return chosen[chosen < len(self.samples)]

@@ -1,8 +1,7 @@
 """The smooth surface that a triangulation approximates: a curved patch over every triangle.
 
-Some meshes are flat subdivisions: each edge of a coarser mesh was halved without a change of
-shape. The new vertices have the normals of two triangles at most, so that only the coarser
-triangles show the curvature. `coarsened` finds those coarser triangles.
+Some meshes are flat subdivisions: every edge of a coarser mesh was halved without a change of
+shape. Then only the coarser triangles show the curvature. `coarsened` finds them.
 """
 
 from dataclasses import dataclass
@@ -20,15 +19,17 @@ from tkamb.geometry.topology import Ragged, edge_use
 
 @dataclass(frozen=True)
 class SubdivisionSettings:
-    """How a flat subdivision of coarser triangles is recognised."""
+    """The search for flat subdivisions of coarser triangles."""
 
     halving_tolerance: float = 1e-6
-    """1: largest distance of a vertex from the middle of the coarser edge, as a share of the
-    surface's size. Chosen: files round coordinates by less."""
+    """1: largest distance of a vertex from the middle of a coarser edge, as a share of the
+    surface's size. Chosen because files round coordinates by less."""
     most_levels: int = 8
-    """Largest number of subdivisions that are undone. Chosen: 8 make 65,536 triangles of one."""
+    """Largest number of subdivisions that are undone. Chosen because 8 subdivisions make 65,536
+    triangles of one."""
     most_parts: int = 100
-    """A surface of more parts than this stays unchanged. Chosen: no implant has as many."""
+    """Largest number of connected parts; a surface of more parts stays unchanged. Chosen because no
+    implant has as many."""
 
 
 SUBDIVISION = SubdivisionSettings()
@@ -36,11 +37,11 @@ SUBDIVISION = SubdivisionSettings()
 
 @dataclass(frozen=True, eq=False)
 class Coarsened:
-    """The coarser triangles of a subdivided surface, and where the finer ones lie on them.
+    """The coarser triangles of a subdivided surface, and the positions of the finer ones on them.
 
     Args:
         surface: the coarser triangles.
-        parent: (k,) coarser triangle that holds each finer one.
+        parent: (k,) coarser triangle that contains each finer triangle.
         corners: (k, 3, 3) barycentric coordinates, on the parent, of each finer triangle's corners.
     """
 
@@ -50,9 +51,9 @@ class Coarsened:
 
 
 def coarsened(surface: Surface) -> Coarsened | None:
-    """Return the coarsest surface of which this one is a flat subdivision; None if it is none.
+    """Return the coarsest surface that subdivides flatly into this one; None if there is none.
 
-    Each connected part is examined on its own. Its subdivision is undone as a whole or not at all.
+    Each connected part is examined separately. Its subdivision is undone as a whole or not at all.
     """
     coarse: Coarsened | None = None
     for _ in range(SUBDIVISION.most_levels):
@@ -78,14 +79,14 @@ def _coarsened_once(surface: Surface) -> Coarsened | None:
     middle = np.concatenate(middles) if middles else np.zeros(0, np.int64)
     if not middle.size:
         return None
-    own = np.arange(len(middle))
+    numbers = np.arange(len(middle))
     parent = np.full(len(faces), -1)
-    parent[middle] = own
-    parent[across[middle]] = own[:, None]
-    rest = np.flatnonzero(parent < 0)
-    parent[rest] = len(middle) + np.arange(len(rest))
-    tips = np.concatenate([search.tips(middle), faces[rest]])
-    halves = np.concatenate([faces[middle], np.full((len(rest), 3), -1)])
+    parent[middle] = numbers
+    parent[across[middle]] = numbers[:, None]
+    unchanged = np.flatnonzero(parent < 0)
+    parent[unchanged] = len(middle) + np.arange(len(unchanged))
+    tips = np.concatenate([search.tips(middle), faces[unchanged]])
+    halves = np.concatenate([faces[middle], np.full((len(unchanged), 3), -1)])
     at_tip = faces[:, :, None] == tips[parent][:, None]
     at_half = faces[:, :, None] == halves[parent][:, None]
     corners = at_tip + 0.5 * (at_half.any(axis=2, keepdims=True) & ~at_half)
@@ -95,8 +96,9 @@ def _coarsened_once(surface: Surface) -> Coarsened | None:
 class _Search:
     """Search for the middle triangles of coarser triangles that were divided into four.
 
-    The corners of a middle triangle halve the edges between the tips of its three neighbours. The
-    search begins at one middle triangle and finds the next ones across the neighbours' tips.
+    The corners of a middle triangle halve the edges between the tips of its three neighbours; a tip
+    is a corner of the coarser triangle. The search begins at one middle triangle and finds the next
+    ones across the neighbours' tips.
     """
 
     def __init__(self, surface: Surface, across: Index) -> None:
@@ -107,10 +109,10 @@ class _Search:
         self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
 
     def tips(self, middle: Index) -> Index:
-        """Return the tips (m, 3): vertices of the three neighbours that are not shared."""
-        others, own = self._faces[self._across[middle]], self._faces[middle]
-        shared = (others[:, :, :, None] == own[:, None, None]).any(axis=3)
-        return np.take_along_axis(others, np.argmin(shared, axis=2)[..., None], axis=2)[..., 0]
+        """Return the tips (m, 3): the vertex of each neighbour that the middle does not share."""
+        neighbours, corners = self._faces[self._across[middle]], self._faces[middle]
+        shared = (neighbours[:, :, :, None] == corners[:, None, None]).any(axis=3)
+        return np.take_along_axis(neighbours, np.argmin(shared, axis=2)[..., None], axis=2)[..., 0]
 
     def middles_of(self, part: Index) -> Index:
         """Return the middle triangles of a connected part; none if it was not subdivided."""
@@ -124,8 +126,8 @@ class _Search:
         return np.zeros(0, np.int64)
 
     def _spread(self, start: Index) -> Index | None:
-        """Return all middle triangles that follow from a first one; None on a contradiction."""
-        kind = np.zeros(len(self._faces), np.int8)  # 1: middle, 2: at a tip
+        """Return the middle triangles that follow from a first one; None if they contradict."""
+        kind = np.zeros(len(self._faces), np.int8)  # 1: middle triangle, 2: triangle at a tip
         even = np.zeros(len(self._points), bool)
         new, layers = start, []
         while new.size:
@@ -145,7 +147,7 @@ class _Search:
         return None if even[self._faces[every]].any() else every
 
     def _are_middles(self, faces: Index) -> bool:
-        """Say whether the corners of faces halve the edges between their neighbours' tips."""
+        """Return whether all corners of faces halve the edges between their neighbours' tips."""
         if (faces < 0).any() or (self._across[faces] < 0).any():
             return False
         a, b, c = np.moveaxis(self._points[self.tips(faces)], 1, 0)
@@ -158,7 +160,7 @@ class _Search:
 
 
 def _across(faces: Index) -> Index:
-    """Return the face (k, 3) across the edge opposite each corner; -1: none, or several."""
+    """Return the face (k, 3) across the edge opposite each corner; -1 for none or several."""
     edge, count = edge_use(faces)
     order = np.argsort(edge, kind="stable")
     first = np.cumsum(count) - count
@@ -166,8 +168,8 @@ def _across(faces: Index) -> Index:
     two = count == 2
     pair[two] = order[first[two][:, None] + [0, 1]] // 3
     edges = pair[edge].reshape(-1, 3, 2)
-    own = np.arange(len(faces))[:, None]
-    other = np.where(edges[..., 0] == own, edges[..., 1], edges[..., 0])
+    number = np.arange(len(faces))[:, None]
+    other = np.where(edges[..., 0] == number, edges[..., 1], edges[..., 0])
     return np.roll(other, -1, axis=1)
 
 
@@ -181,7 +183,7 @@ def _parts(across: Index) -> tuple[int, Index]:
 
 
 SMALLEST_COSINE = 0.1
-"""Smallest cosine of the angle between normal and direction in a shift's denominator: 84 deg."""
+"""1: smallest cosine of the angle between normal and direction by which a shift is divided."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,18 +194,19 @@ class CurvedSurface:
 
         h = 4 (b2 b3 s1 + b3 b1 s2 + b1 b2 s3),    s = t_i t_j / (2 (t_i + t_j))
 
-    s is the sagitta of the edge e from corner i to j. t_i = -n_i.e / n_i.N and t_j = n_j.e / n_j.N
-    are the heights of the tangent planes of one end over the other end. On a quadratic surface
-    t_i = t_j, and h is exact. If they differ, s uses their harmonic mean; if they have opposite
-    signs, s is zero. A flat that meets a fillet therefore stays flat. If triangles are a flat
-    subdivision of coarser ones, the patches are those of the coarser triangles (`coarsened`).
+    h is the height of the patch over the triangle, and s is the sagitta of the edge e from corner i
+    to j, with corner normals n. t_i = -n_i.e / n_i.N is the height of the tangent plane of corner i
+    over corner j, and t_j = n_j.e / n_j.N that of corner j over i. On a quadratic surface both are
+    equal, and h is exact. If the signs of t_i and t_j differ, s is zero. A flat that meets a fillet
+    therefore stays flat. On a flat subdivision the patches are those of the coarser triangles
+    (`coarsened`).
 
     Args:
-        surface: the triangles of the patches, with shared vertices.
+        surface: triangles of the patches, with shared vertices.
         normals: (k, 3, 3) unit normals at the corners, see `Surface.corner_normals`.
         sagittas: (k, 3) m, sagitta of the edge opposite each corner, along the triangle's normal.
-        finer: the finer triangles on which points are given; None: points are given on the
-            triangles of `surface`.
+        finer: finer triangles on which points are given; None if points are given on the triangles
+            of `surface`.
 
     Reference:
         Vlachos et al., Curved PN triangles, Proc I3D 2001, doi:10.1145/364338.364387 (the
@@ -217,7 +220,7 @@ class CurvedSurface:
 
     @classmethod
     def of(cls, surface: Surface) -> "CurvedSurface":
-        """Return the patches of a surface from its own corner normals."""
+        """Return the patches of a surface from its corner normals."""
         finer = coarsened(surface)
         surface = surface if finer is None else finer.surface
         normals = surface.corner_normals
@@ -225,7 +228,7 @@ class CurvedSurface:
 
     @cached_property
     def _patches(self) -> Array:
-        """Corner normals, sagittas and plane's normal side by side (k, 15)."""
+        """Corner normals, sagittas and the triangle's normal, in one row per triangle (k, 15)."""
         return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
 
     def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
@@ -234,7 +237,7 @@ class CurvedSurface:
         It is correct to first order in the patch's height.
 
         Args:
-            faces: (n,) triangles, of the finer surface if there is one; -1 for none.
+            faces: (n,) triangles, of the finer surface if there is one; -1 for no triangle.
             weights: (n, 3) barycentric coordinates of the points on these triangles.
             direction: (3,) unit vector.
 
@@ -250,7 +253,7 @@ class CurvedSurface:
 
 @compiled_as_written
 def _shifts(patches: Array, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
-    """Return what `CurvedSurface.shift` does, from corner normals, sagittas and planes (k, 15)."""
+    """Return the result of `CurvedSurface.shift` from rows of `CurvedSurface._patches`."""
     shifts, normals = np.full(len(faces), np.nan), np.full((len(faces), 3), np.nan)
     for n in range(len(faces)):
         if faces[n] < 0:
@@ -277,8 +280,8 @@ def _sagittas(surface: Surface, normals: Array) -> Array:
     slant = normals / np.where(lean > 0.0, lean, np.inf)[..., None]
     start, end = np.roll(slant, -1, axis=1), np.roll(slant, -2, axis=1)
     edge = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
-    leaving = -np.einsum("kij,kij->ki", start, edge)
-    coming = np.einsum("kij,kij->ki", end, edge)
-    product, total = leaving * coming, leaving + coming
-    alike = product > 0.0
-    return np.where(alike, 0.5 * product / np.where(alike, total, 1.0), 0.0)
+    start_height = -np.einsum("kij,kij->ki", start, edge)
+    end_height = np.einsum("kij,kij->ki", end, edge)
+    product, total = start_height * end_height, start_height + end_height
+    same_sign = product > 0.0
+    return np.where(same_sign, 0.5 * product / np.where(same_sign, total, 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""How far the femoral component must travel along -y until it first touches the insert."""
+"""The travel of the femoral component along -y until it first touches the insert."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,25 +13,25 @@ from tkamb.geometry.nearest import TriangleTree
 from tkamb.geometry.surface import Surface
 
 STEEP = 1e-9
-"""1: a triangle whose area in plan view is a smaller share of its area is a wall. Its edges count
-as edges of its neighbours."""
+"""1: ratio of a triangle's area in the plan view to its area below which the triangle is a wall and
+is skipped. The edges of a wall are edges of its neighbours."""
 FACING = 0.2
-"""1: below this vertical component of a mean normal, its plane does not bound heights."""
+"""1: smallest vertical component of a mean normal with which its plane is used as a bound."""
 ROUNDING = 1e-12
 """m: rounding error of a plane's height."""
 MOST_WAITING = 256
 """Largest number of pairs of boxes on the stack: two for each level of both trees."""
 MOST_CORNERS = 9
-"""Corners of one triangle cut by another: six, and more by rounding. A cut that crosses c of n
-sides leaves at most n + c / 2 corners, and c is even: 4, 6 and 9 after the three cuts."""
+"""Largest number of corners of a triangle cut by another triangle: six, and up to nine by
+rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Where one condyle first touches the insert as it moves down.
+    """First touch of one condyle with the insert.
 
     Args:
-        travel: m, distance along -y until it touches; negative if it overlaps the insert already.
+        travel: m, distance along -y until the condyle touches; negative if it overlaps the insert.
         point: (3,) m, insert frame, contact point on the insert.
     """
 
@@ -42,16 +42,16 @@ class Touch:
 class FirstTouch:
     """Vertical clearance between two triangulated surfaces, exact for their triangles.
 
-    The clearance of two triangles is the smallest difference of their heights where one lies over
-    the other. The difference is linear over the polygon that both cover in the plan view, so it is
-    smallest at a corner of that polygon. The search takes the smallest value over all pairs, and
-    skips pairs of boxes and of triangles that cannot be below the best value so far.
+    The clearance of two triangles is the smallest difference of their heights over the polygon that
+    both cover in the plan view. The difference is linear, so it is smallest at a corner of this
+    polygon. The search skips pairs of boxes and triangles that cannot have a smaller clearance than
+    the smallest one so far.
 
     Args:
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
-        split: z (m, femoral frame) between the condyles; None: one condyle (medial). The centroid
-            of a triangle decides to which side it belongs.
+        split: z (m, femoral frame) between the condyles; None for one condyle, which is medial. The
+            centroid of a triangle decides its side.
     """
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
@@ -76,7 +76,7 @@ class FirstTouch:
         A touch is None if no part of that condyle lies over the insert, or the pose is not finite.
 
         Args:
-            pose: (4, 4) pose_femoral_in_insert; its y is where the travel starts.
+            pose: (4, 4) pose_femoral_in_insert; the travel starts at its y.
         """
         pose = np.asarray(pose, float)
         if self._split is None:
@@ -125,17 +125,18 @@ def _bound(
     rotation: Array,
     translation: Array,
 ) -> float:
-    """Return a lower bound (m) of the clearance of two boxes' triangles; inf: not over each other.
+    """Return a lower bound (m) of the clearance of the triangles in two boxes.
 
-    It is the larger of two bounds: the clearance of the boxes, and the clearance of the planes that
-    bound the triangles' heights, over the rectangle that both boxes cover.
+    It is the larger of the boxes' clearance and of their planes' clearance over the rectangle that
+    both boxes cover. It is inf if the boxes do not overlap in the plan view.
 
     Args:
         upper: (6,) m, box of the upper body, in the lower body's frame.
         lower: (6,) m, box of the lower body.
-        upper_support: (4,) plane of the upper box (`TriangleTree.supports`), in its own frame.
+        upper_support: (4,) plane of the upper box (`TriangleTree.supports`), in the upper body's
+            frame.
         lower_support: (4,) plane of the lower box.
-        rotation: (3, 3) from the upper body's frame to the lower body's.
+        rotation: (3, 3) rotation from the upper body's frame to the lower body's.
         translation: (3,) m, origin of the upper body's frame in the lower body's.
     """
     x0, x1 = max(upper[0], lower[0]), min(upper[3], lower[3])
@@ -160,7 +161,14 @@ def _bound(
 
 @compiled_as_written
 def _plane(corners: Array) -> tuple[float, float, float, float]:
-    """Return height and slopes (y = h + a x + b z) of a triangle (9,), and its area from above."""
+    """Return h, a and b of a triangle's plane y = h + a x + b z, and an area.
+
+    The area is twice the triangle's area in the plan view, m²; it is negative if the triangle faces
+    down, and zero for a wall.
+
+    Args:
+        corners: (9,) m, corners of the triangle.
+    """
     ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
     vx, vy, vz = corners[6] - corners[0], corners[7] - corners[1], corners[8] - corners[2]
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -172,7 +180,7 @@ def _plane(corners: Array) -> tuple[float, float, float, float]:
 
 @compiled_as_written
 def _over(upper: Array, lower: Array) -> bool:
-    """Say whether the rectangles about two triangles (9,) overlap, seen from above."""
+    """Return whether the bounding rectangles of two triangles (9,) overlap in the plan view."""
     for axis in (0, 2):
         a, b, c = upper[axis], upper[axis + 3], upper[axis + 6]
         d, e, f = lower[axis], lower[axis + 3], lower[axis + 6]
@@ -183,7 +191,7 @@ def _over(upper: Array, lower: Array) -> bool:
 
 @compiled_as_written
 def _beyond(upper: Array, plane: tuple[float, float, float, float]) -> float:
-    """Return the smallest height (m) of a triangle's corners above the plane of another one."""
+    """Return the smallest height (m) of a triangle's corners (9,) above another one's plane."""
     least = np.inf
     for corner in range(0, 9, 3):
         height = plane[0] + plane[1] * upper[corner] + plane[2] * upper[corner + 2]
@@ -202,9 +210,9 @@ def _cut(
     bz: float,
     way: float,
 ) -> int:
-    """Write the part of a polygon that lies on one side of the line a-b; return its corner count.
+    """Write the part of a polygon on one side of the line from a to b; return its corner count.
 
-    A corner (3,) holds x, z and the clearance there, m. `way` is 1 or -1 and selects the side.
+    A corner (3,) consists of x, z and clearance, m. `way` is 1 or -1 and selects the side.
     """
     number = 0
     for corner in range(count):
@@ -238,7 +246,7 @@ def _over_each_other(
     spare: Array,
     point: Array,
 ) -> float:
-    """Return the least clearance of two triangles (9,) where it is below the best so far.
+    """Return the smaller of the clearance (m) of two triangles and the smallest one so far.
 
     Args:
         upper: (9,) m, corners of the upper triangle, in the lower body's frame.
@@ -247,7 +255,7 @@ def _over_each_other(
         best: m, smallest clearance so far.
         polygon: (`MOST_CORNERS`, 3) work array.
         spare: (`MOST_CORNERS`, 3) work array.
-        point: (3,) m, output: the place on the lower triangle, if a smaller clearance is found.
+        point: (3,) m, output, place of a smaller clearance on the lower triangle.
     """
     height, a, b, area = plane
     for corner in range(3):
@@ -280,65 +288,69 @@ def _least_clearance(
     rotation: Array,
     translation: Array,
 ) -> tuple[float, Array]:
-    """Return the least clearance (m) of one surface over another, and where on the lower one.
+    """Return the smallest clearance (m) of two surfaces, and its place (3,), m, on the lower one.
+
+    Boxes, supports and corners are those of `TriangleTree`, in the frame of each surface. The
+    clearance is inf if the surfaces do not overlap in the plan view.
 
     Args:
-        upper_boxes: (2 p, 6) m, own frame.
-        upper_supports: (2 p, 4) see `TriangleTree.supports`, own frame.
-        upper_corners: (p c, 9) m, of the triangles of its leaves, own frame.
-        lower_boxes: (2 q, 6) m.
-        lower_supports: (2 q, 4).
-        lower_corners: (q d, 9) m.
-        rotation: (3, 3) of the upper one in the lower one's frame.
-        translation: (3,) m, likewise.
-
-    Returns:
-        Clearance, inf where nothing lies over each other; point (3,).
+        upper_boxes: (2 p, 6) m, boxes of the upper surface.
+        upper_supports: (2 p, 4) planes of these boxes.
+        upper_corners: (p c, 9) m, triangles in the leaves.
+        lower_boxes: (2 q, 6) m, boxes of the lower surface.
+        lower_supports: (2 q, 4) planes of these boxes.
+        lower_corners: (q d, 9) m, triangles in the leaves.
+        rotation: (3, 3) rotation from the upper surface's frame to the lower surface's.
+        translation: (3,) m, origin of the upper surface's frame in the lower surface's.
     """
     best, point = np.inf, np.full(3, np.nan)
     uppers, lowers = len(upper_boxes) // 2, len(lower_boxes) // 2
-    upper_held, lower_held = len(upper_corners) // uppers, len(lower_corners) // lowers
+    upper_size, lower_size = len(upper_corners) // uppers, len(lower_corners) // lowers
     waiting, least = np.empty((MOST_WAITING, 2), np.int64), np.empty(MOST_WAITING)
-    box, upper = np.empty(6), np.empty((upper_held, 9))
+    box, upper = np.empty(6), np.empty((upper_size, 9))
     polygon, spare = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
     waiting[0, 0], waiting[0, 1], least[0], size = 1, 1, -np.inf, 1
     while size > 0:
         size -= 1
-        one, other = waiting[size, 0], waiting[size, 1]
+        upper_box, lower_box = waiting[size, 0], waiting[size, 1]
         if least[size] >= best:
             continue
-        if one >= uppers and other >= lowers:
-            for place in range(upper_held):
-                corners = upper_corners[(one - uppers) * upper_held + place]
+        if upper_box >= uppers and lower_box >= lowers:
+            for item in range(upper_size):
+                corners = upper_corners[(upper_box - uppers) * upper_size + item]
                 for corner in range(0, 9, 3):
                     for i in range(3):
-                        upper[place, corner + i] = (
+                        upper[item, corner + i] = (
                             translation[i]
                             + rotation[i, 0] * corners[corner]
                             + rotation[i, 1] * corners[corner + 1]
                             + rotation[i, 2] * corners[corner + 2]
                         )
-            for below in range((other - lowers) * lower_held, (other - lowers + 1) * lower_held):
+            for below in range(
+                (lower_box - lowers) * lower_size, (lower_box - lowers + 1) * lower_size
+            ):
                 lower = lower_corners[below]
                 plane = _plane(lower)
                 if plane[3] == 0.0:
                     continue
-                for place in range(upper_held):
-                    if _over(upper[place], lower) and _beyond(upper[place], plane) < best:
+                for item in range(upper_size):
+                    if _over(upper[item], lower) and _beyond(upper[item], plane) < best:
                         best = _over_each_other(
-                            upper[place], lower, plane, best, polygon, spare, point
+                            upper[item], lower, plane, best, polygon, spare, point
                         )
             continue
-        # the larger of the two boxes is halved
-        _turned_box(upper_boxes[one], rotation, translation, box)
+        # The larger of the two boxes is halved.
+        _turned_box(upper_boxes[upper_box], rotation, translation, box)
         wide = box[3] - box[0] + box[5] - box[2]
-        below_box = lower_boxes[other]
-        halve = one < uppers and (
-            other >= lowers or wide > below_box[3] - below_box[0] + below_box[5] - below_box[2]
+        below_box = lower_boxes[lower_box]
+        halve = upper_box < uppers and (
+            lower_box >= lowers or wide > below_box[3] - below_box[0] + below_box[5] - below_box[2]
         )
         begin = size
         for child in range(2):
-            first, second = (2 * one + child, other) if halve else (one, 2 * other + child)
+            first, second = (
+                (2 * upper_box + child, lower_box) if halve else (upper_box, 2 * lower_box + child)
+            )
             if halve:
                 _turned_box(upper_boxes[first], rotation, translation, box)
             bound = _bound(
@@ -353,7 +365,7 @@ def _least_clearance(
                 continue
             waiting[size, 0], waiting[size, 1], least[size] = first, second, bound
             size += 1
-        if size == begin + 2 and least[begin] < least[begin + 1]:  # the lower one comes first
+        if size == begin + 2 and least[begin] < least[begin + 1]:  # the smaller bound is next
             for k in range(2):
                 waiting[begin, k], waiting[begin + 1, k] = waiting[begin + 1, k], waiting[begin, k]
             least[begin], least[begin + 1] = least[begin + 1], least[begin]

@@ -15,38 +15,38 @@ from tkamb.geometry.surface import Surface
 
 @dataclass(frozen=True)
 class FlatBottomSettings:
-    """What counts as the flat bottom of an insert."""
+    """Definition of the flat bottom of an insert."""
 
     flatness: float = 5e-5
-    """m; corners of one flat may lie this far from its plane (noise of the mesh). Chosen: noise of
-    a mesh is smaller."""
+    """m: largest distance of a flat's corners from its plane. Chosen because the noise of a mesh is
+    smaller."""
     comparable_share: float = 0.5
-    """1: a flat whose area is at least this share of the largest may be the bottom, too. Chosen: a
-    smaller flat is a recess."""
+    """1: smallest area of a flat that may be the bottom, as a share of the largest flat's area.
+    Chosen because a smaller flat is a recess."""
     clear_share: float = 0.9
-    """1: of two flats that face down, the larger one is the bottom if the other has less than this
-    share of its area. Chosen: where their areas differ by less, the user has to decide."""
+    """1: of two flats that face down, the larger one is the bottom if the smaller one has less than
+    this share of its area. If the areas are closer, the mesh is refused."""
     uneven_noise: float = 1e-6
-    """m: a bottom with a larger noise gets a notice. Chosen: a mesh in single precision rounds by
-    less."""
+    """m: noise of the bottom above which a notice is printed. Chosen because a mesh in single
+    precision rounds by less."""
     level_tilt: float = 1e-6
-    """rad; a smaller tilt is not corrected. Chosen: it moves the ends of the insert by less than
-    rounding."""
+    """rad: a smaller tilt is not corrected. Chosen because it moves the ends of the insert by less
+    than rounding."""
 
 
 FLAT_BOTTOM = FlatBottomSettings()
 
 TILT_LIMIT = math.radians(30.0)
-"""A bottom tilted by less than this from -y is turned level."""
+"""rad: a bottom tilted by less than this from -y is turned level."""
 
 
 @dataclass(frozen=True)
 class InnerFlatSettings:
-    """Flat faces inside a part."""
+    """Flats inside a body."""
 
     inner_share: float = 0.5
     """1: a flat is an inner wall if material lies in front of more than this share of its area.
-    Chosen: the majority decides."""
+    Chosen: the majority of the area."""
 
 
 INNER_FLAT = InnerFlatSettings()
@@ -64,9 +64,9 @@ class FlatBottom:
         normal: (3,) unit outward normal, in the surface's frame.
         centre: (3,) m, centre of area.
         area: m².
-        faces: (k,) indices of its triangles.
-        vertices: (n,) indices of the surface's vertices that lie in its plane.
-        noise: m, root mean square distance of the vertices from the plane.
+        faces: (k,) indices of the flat's triangles.
+        vertices: (n,) indices of the surface's vertices in the plane.
+        noise: m, root mean square distance of these vertices from the plane.
     """
 
     normal: Array
@@ -80,11 +80,10 @@ class FlatBottom:
 def find_flats(surface: Surface) -> list[FlatBottom]:
     """Return the flats that may be the bottom, largest first.
 
-    The search clusters triangles by normal and offset, weighted by area. The direction that the
-    most area faces is found first, then the most frequent offset of the faces within 15 deg of it.
-    A plane is fitted to these faces, and fitted again with tolerances that follow the noise of the
-    mesh. The triangles of the flat are then removed, and the search is repeated until no flat of
-    comparable area is left.
+    The search weights triangles by area. It finds the direction that most triangles face, and then
+    the most frequent offset of the triangles within 15 deg of it. A plane is fitted to these
+    triangles several times, with smaller and smaller tolerances. The triangles of the flat are then
+    removed, and the search is repeated until no flat of comparable area remains.
     """
     normals, area = surface.face_normals, surface.areas
     free = area > 0
@@ -103,14 +102,14 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
 
 
 def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBottom:
-    """Return the flat that the insert stands on: the largest one, which must face -y.
+    """Return the bottom of an insert: the largest flat that faces -y, within 30 deg.
 
-    A flat of at least half the largest one's area is taken instead if it faces -y (within
-    30 deg) and the largest does not; with a notice if it is clearly smaller.
+    Its area must be at least half of that of the largest flat. A notice is printed if it is clearly
+    smaller.
 
     Args:
-        surface: the insert in anatomical axes (x anterior, y superior, z right), m.
-        rotation: (3, 3) from mesh axes to anatomical axes, to name the mesh's own axes in
+        surface: insert in anatomical axes (x anterior, y superior, z right), m.
+        rotation: (3, 3) rotation from mesh axes to anatomical axes, for the mesh's axes in
             messages.
 
     Raises:
@@ -123,7 +122,7 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
             f"{surface.name} has no flat bottom", None, "give the mesh of a tibial insert"
         )
     down = [flat for flat in flats if -flat.normal[1] >= math.cos(TILT_LIMIT)]
-    if len(down) > 1:  # the wall between two touching bodies faces down too
+    if len(down) > 1:  # the wall between two touching bodies may face down, too
         outer = [flat for flat in down if not _is_inner(surface, flat)]
         down = outer or down
     if not down:
@@ -153,7 +152,7 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
 
 
 def _is_inner(surface: Surface, flat: FlatBottom) -> bool:
-    """Say whether most of a flat has material on its outer side."""
+    """Return whether material lies in front of most of a flat."""
     area = surface.areas[flat.faces]
     return bool(area @ facing_material(surface, flat.faces) > INNER_FLAT.inner_share * area.sum())
 
@@ -177,15 +176,14 @@ def _faces_elsewhere(name: str, flat: FlatBottom, rotation: Array) -> InputError
 
 
 def insert_placement(surface: Surface, rotation: Array | None = None) -> Array:
-    """Return the pose (4, 4) of the insert's mesh, in anatomical axes, in the insert frame.
+    """Return the pose (4, 4) of the insert's mesh, turned to anatomical axes, in the insert frame.
 
-    The insert frame stands on the flat bottom: y = 0 is its plane, facing -y; the origin is
-    the centre of its bounding rectangle in x and z. A tilt of the mesh is turned level by
-    the smallest rotation; x and z come from the declared axes.
+    The plane y = 0 of the insert frame is the flat bottom, which faces -y. The origin is the centre
+    of the bottom's bounding rectangle in x and z. The smallest rotation turns a tilted mesh level.
 
     Args:
-        surface: the insert in anatomical axes, about its mesh's own origin, m.
-        rotation: as for `find_flat_bottom`.
+        surface: insert in anatomical axes with the mesh's origin, m.
+        rotation: (3, 3) see `find_flat_bottom`.
 
     Raises:
         InputError: see `find_flat_bottom`.
@@ -200,9 +198,9 @@ def insert_placement(surface: Surface, rotation: Array | None = None) -> Array:
 
 def facing(direction: Array, rotation: Array | None = None) -> str:
     """Return the mesh axis ("+x" … "-z") nearest to a direction in anatomical axes."""
-    own = direction if rotation is None else rotation.T @ direction
-    axis = int(np.argmax(np.abs(own)))
-    return f"{'-' if own[axis] < 0 else '+'}{'xyz'[axis]}"
+    in_mesh = direction if rotation is None else rotation.T @ direction
+    axis = int(np.argmax(np.abs(in_mesh)))
+    return f"{'-' if in_mesh[axis] < 0 else '+'}{'xyz'[axis]}"
 
 
 def _described(flat: FlatBottom, rotation: Array) -> str:
@@ -226,7 +224,7 @@ def _levelling(normal: Array) -> Array:
 def _largest_flat(
     surface: Surface, normals: Array, area: Array, free: Mask, least: float
 ) -> FlatBottom | None:
-    """Return the largest flat of the free triangles; None if it cannot have the least area, m²."""
+    """Return the largest flat of the free triangles; None if all are smaller than `least` (m²)."""
     best: FlatBottom | None = None
     for seed in _peaks(normals[free], area[free]):
         near = np.flatnonzero(free & (normals @ seed > math.cos(_CONE)))
@@ -240,7 +238,7 @@ def _largest_flat(
 
 def _peaks(normals: Array, area: Array) -> list[Array]:
     """Return the directions (3,) that the most area faces: at most 8, at least 15 deg apart."""
-    # One number per cell of the sphere: `np.unique` is ten times faster than on rows.
+    # Each cell of the unit sphere has one number, because `np.unique` is slower on rows.
     number = np.round(normals * 6.0).astype(np.int64) @ [400, 20, 1]
     cells, cell = np.unique(number, return_inverse=True)
     weight = np.bincount(cell, area, len(cells))
@@ -293,7 +291,7 @@ def _grown(
 
 
 def _sharpened(direction: Array, normals: Array, weight: Array) -> Array:
-    """Return the mean normal (3,) near a direction; the cone around it is narrowed step by step."""
+    """Return the mean normal (3,) in a cone around a direction; the cone is narrowed in steps."""
     for cone in np.radians([15.0, 8.0, 4.0, 2.0, 2.0]):
         mean = (weight * (normals @ direction > math.cos(cone))) @ normals
         length = np.linalg.norm(mean)
@@ -304,7 +302,7 @@ def _sharpened(direction: Array, normals: Array, weight: Array) -> Array:
 
 
 def _densest(offsets: Array, weight: Array, window: float) -> float:
-    """Return the middle of the window of offsets that holds the most area."""
+    """Return the mean offset (m) in the window of offsets that contains the most area."""
     order = np.argsort(offsets)
     offsets, total = offsets[order], np.concatenate([[0.0], np.cumsum(weight[order])])
     last = np.searchsorted(offsets, offsets + window, side="right")
@@ -320,9 +318,9 @@ def _median(values: Array, weight: Array) -> float:
 
 
 def _plane(corners: Array, weight: Array, towards: Array) -> tuple[Array, float]:
-    """Return normal and offset of the plane that fits triangles (k, 3, 3) best.
+    """Return normal (3,) and offset (m) of the least-squares plane of triangles (k, 3, 3).
 
-    The fit is a least-squares fit over the area: each triangle's second moment is exact.
+    The squares are integrated over the area, exactly for each triangle.
     """
     total = weight.sum()
     middle = corners.mean(axis=1)

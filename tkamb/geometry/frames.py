@@ -1,10 +1,9 @@
 """Poses as 4x4 matrices and the knee coordinates of Grood and Suntay.
 
-`pose_A_in_B` maps points given in frame A to frame B. Every function broadcasts over
-leading axes.
+`pose_A_in_B` maps points from frame A to frame B. The functions broadcast over leading axes.
 
-The insert frame is x anterior, y superior, z to the subject's right. The pose of
-the femoral component of a right knee (left knees are mirrored at input) is
+The axes of the insert frame are x anterior, y superior, z to the right. The pose of the femoral
+component of a right knee (left knees are mirrored at input) is
 
     R = Ry(-axial_rotation) Rx(-adduction) Rz(flexion),   t = (ap, si, ml)
 
@@ -31,15 +30,15 @@ KNEE_JOINT_NAMES = tuple(f"knee_{name}" for name in KNEE_COORDINATES)
 """Names of the six joints in the URDF, in the same order."""
 
 PATELLA_COORDINATES = PATELLA_JOINT_NAMES = ("patella_ap", "patella_si", "patella_rotation")
-"""Coordinates of the patella in the femur's sagittal plane (m, m, rad), also their joint names."""
+"""Coordinates of the patella in the femur's sagittal plane (m, m, rad), and names of its joints."""
 
 SIDES = ("medial", "lateral")
-"""The condyles."""
+"""Names of the condyles."""
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 _ALONG = np.eye(3)
 _TURNS = np.array([-1.0, -1.0, 1.0])
-"""Signs of axial rotation, adduction and flexion as turns about y, x and z."""
+"""Signs of axial rotation, adduction and flexion as rotations about y, x and z."""
 
 
 def pose(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -61,7 +60,12 @@ def inverse(pose_a_in_b: ArrayLike) -> Array:
 
 
 def transform(pose_a_in_b: ArrayLike, points: ArrayLike) -> Array:
-    """Return points (n, 3) of frame A in frame B; also (f, 4, 4) with (3,) or (f, n, 3)."""
+    """Return points of frame A in frame B.
+
+    Args:
+        pose_a_in_b: (4, 4), or (f, 4, 4) for f poses.
+        points: (n, 3) or (3,), or (f, n, 3) for different points at f poses.
+    """
     pose_a_in_b, points = np.asarray(pose_a_in_b, float), np.asarray(points, float)
     rotation, translation = pose_a_in_b[..., :3, :3], pose_a_in_b[..., :3, 3]
     if points.ndim == 1:
@@ -79,7 +83,7 @@ def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return a x b of vectors (..., 3): equal to `np.cross`, but faster by 40 µs per call."""
+    """Return the result of `np.cross` for vectors (..., 3), faster by 40 µs per call."""
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
@@ -93,12 +97,12 @@ def knee_pose(coordinates: ArrayLike) -> Array:
 
 @lru_cache(maxsize=32)
 def _pose_of_knee(coordinates: bytes) -> Array:
-    """Return one pose, cached because a search asks for the same pose repeatedly."""
+    """Return one pose; it is cached, because a search needs the same pose repeatedly."""
     return _poses_of_knee(np.frombuffer(coordinates))
 
 
 def _poses_of_knee(c: Any) -> Array:
-    """Return the poses (..., 4, 4), with the product of the three rotations written out."""
+    """Return the poses (..., 4, 4), from the expanded product of the three rotations."""
     (sa, sb, sg), (ca, cb, cg) = (
         np.moveaxis(f(_TURNS * c[..., 3:]), -1, 0) for f in (np.sin, np.cos)
     )
@@ -114,7 +118,7 @@ def _poses_of_knee(c: Any) -> Array:
 def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
     """Return knee coordinates (..., 6) from pose_femoral_in_insert (..., 4, 4).
 
-    Flexion is unwrapped along the first axis so that deep flexion never jumps by 360 deg.
+    The angles are unwrapped along the first axis, so that they do not jump by 360 deg.
     """
     p = np.asarray(pose_femoral_in_insert, float)
     r = p[..., :3, :3]  # see `_poses_of_knee`
@@ -127,11 +131,11 @@ def knee_coordinates(pose_femoral_in_insert: ArrayLike) -> Array:
 
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
-"""Reflection in the sagittal plane, which turns a left knee into a right one."""
+"""Reflection in the sagittal plane, from a left knee to a right one."""
 
 
 def mirrored_pose(pose_a_in_b: ArrayLike) -> Array:
-    """Return the pose (..., 4, 4) between the mirrored frames."""
+    """Return the pose (..., 4, 4) of mirrored frame A in mirrored frame B."""
     p = np.asarray(pose_a_in_b, float)
     return pose(MIRROR @ p[..., :3, :3] @ MIRROR, p[..., :3, 3] @ MIRROR)
 
@@ -141,7 +145,7 @@ def knee_twist(coordinates: ArrayLike, rates: ArrayLike) -> tuple[Array, Array]:
 
     Args:
         coordinates: (..., 6) knee coordinates, m and rad.
-        rates: (..., 6) their time derivatives.
+        rates: (..., 6) time derivatives of the coordinates, m/s and rad/s.
 
     Returns:
         Velocity (..., 3) m/s of the femoral origin and angular velocity (..., 3) rad/s, both
@@ -154,15 +158,15 @@ def knee_twist(coordinates: ArrayLike, rates: ArrayLike) -> tuple[Array, Array]:
 def knee_axes(coordinates: ArrayLike) -> Array:
     """Return the femur's twist per unit rate of each knee coordinate.
 
-    A wrench w (force, moment about the insert's origin) on the femur has the generalised forces
-    `knee_axes(q) @ w` in the six coordinates.
+    The generalised forces of a wrench w on the femur (force, then moment about the insert's origin)
+    are `knee_axes(q) @ w`.
 
     Args:
         coordinates: (..., 6) knee coordinates, m and rad.
 
     Returns:
-        (..., 6, 6): row i is the velocity of the femoral point at the insert's origin and the
-        angular velocity, insert frame, for a unit rate of coordinate i.
+        (..., 6, 6), insert frame. Row i is the twist for a unit rate of coordinate i: the velocity
+        of the femur's point at the insert's origin, then the angular velocity.
     """
     c = np.asarray(coordinates, float)
     return _axes_of_knee(c.tobytes()).copy() if c.ndim == 1 else _axes_of_knees(c)
@@ -170,7 +174,7 @@ def knee_axes(coordinates: ArrayLike) -> Array:
 
 @lru_cache(maxsize=32)
 def _axes_of_knee(coordinates: bytes) -> Array:
-    """Return the axes at one pose, cached because a search asks for them repeatedly."""
+    """Return the axes at one pose; they are cached, because a search needs them repeatedly."""
     return _axes_of_knees(np.frombuffer(coordinates))
 
 

@@ -1,17 +1,16 @@
 """The intervals in which the lines of a structured grid run inside a closed surface.
 
-Every triangle is compared with the grid lines that cross its bounding rectangle in the plane across
-the lines. Three signed areas tell whether a line passes through the triangle. Their signs are
-exact, because they are computed with integers (`tkamb.geometry.winding.PlanGrid`), so no line
-passes between two triangles. A line that meets an edge exactly is moved by an infinitesimal
-distance into each of the four quadrants around it (simulation of simplicity, Edelsbrunner & Muecke,
-ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). A place that is inside for any of the four
-counts as inside, so that a line along a wall belongs to the part.
+Every triangle is compared with the grid lines that cross its bounding rectangle in the plane normal
+to the lines. The signs of three areas determine whether a line passes through the triangle. The
+signs are exact, because the areas are computed with integers (`tkamb.geometry.winding.PlanGrid`).
+No line therefore passes between two triangles. A line that meets an edge exactly is moved by an
+infinitesimal distance into each of the four quadrants around it (simulation of simplicity,
+Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). A place that is inside
+for any of the four counts as inside, so that a line along a wall belongs to the body.
 
-A place is inside if the surface winds around it (`tkamb.geometry.winding`): more entries than exits
-lie below it. A wall between two touching bodies therefore divides nothing, and a void stays empty.
-A line through a hole of the mesh has unequal numbers of entries and exits; its crossings are taken
-in pairs.
+A place is inside if more entries than exits lie below it (`tkamb.geometry.winding`). A wall between
+two touching bodies therefore does not end an interval, and a void stays empty. A line through a
+hole of the mesh has unequal numbers of entries and exits; its crossings are paired in order.
 """
 
 from dataclasses import dataclass
@@ -28,13 +27,14 @@ from tkamb.geometry.winding import PlanGrid
 
 @dataclass(frozen=True)
 class HeightFieldSettings:
-    """How the crossings of lines with a surface are paired and repaired."""
+    """Pairing and repair of the crossings of lines with a surface."""
 
     odd_share: float = 0.01
-    """1: up to this share of lines with an odd number of crossings the lines are repaired; above it
-    the mesh is refused. Chosen: small defects of a mesh touch fewer lines."""
+    """1: largest share of lines with an odd number of crossings. These lines are repaired; with a
+    larger share the mesh is refused. Chosen because small defects of a mesh affect fewer lines."""
     same_height: float = 1e-12
-    """m: crossings nearer to each other belong to duplicate faces. Chosen: above rounding."""
+    """m: crossings nearer to each other belong to duplicate faces. Chosen because it is above
+    rounding."""
 
 
 HEIGHT_FIELD = HeightFieldSettings()
@@ -42,10 +42,10 @@ HEIGHT_FIELD = HeightFieldSettings()
 
 @dataclass(frozen=True)
 class BodyContactSettings:
-    """Bodies of one mesh that touch."""
+    """Contact of the bodies of one mesh."""
 
     touching_distance: float = 1e-7
-    """m: bodies closer than this touch. Chosen: ten times the rounding of single precision."""
+    """m: distance below which bodies touch. Chosen: ten times the rounding of single precision."""
 
 
 BODY_CONTACT = BodyContactSettings()
@@ -53,13 +53,13 @@ BODY_CONTACT = BodyContactSettings()
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """The parts of grid lines that run inside the surface, sorted by line, then by height.
+    """The intervals of grid lines inside a surface, sorted by line, then by height.
 
     Args:
-        first: (m,) index of the line along the axis after `axis` (cyclic: y, z, x, y).
+        first: (m,) index of the interval's line along the axis after `axis` (cyclic: x, y, z, x).
         second: (m,) index of the line along the axis before `axis`.
-        lower: (m,) m, coordinate along `axis` at which the line enters.
-        upper: (m,) m, coordinate at which it leaves.
+        lower: (m,) m, coordinate along `axis` at which the line enters the surface.
+        upper: (m,) m, coordinate along `axis` at which the line leaves it.
         mended: number of lines with an odd number of crossings, repaired from their neighbours.
     """
 
@@ -71,7 +71,7 @@ class Intervals:
 
 
 def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -> Intervals:
-    """Return where lines along `axis` run inside a closed surface.
+    """Return the intervals in which lines along `axis` run inside a closed surface.
 
     Args:
         surface: closed surface, any frame.
@@ -80,8 +80,8 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
         second: (b,) increasing coordinates (m) of the lines along axis + 2 (cyclic).
 
     Raises:
-        InputError: more than 1 % of the lines cross the surface an odd number of times, or an
-            odd line has no neighbour from which it can be repaired.
+        InputError: more than 1 % of the lines cross the surface an odd number of times, or such a
+            line cannot be repaired from its neighbours.
     """
     line, height, rising, sides = _crossings(surface, axis, first, second)
     shape = (len(first), len(second))
@@ -131,7 +131,7 @@ def _crossings(
 
     Returns:
         line (m,); height (m,) m; rising (m,), whether the triangle faces along the line; counts
-        (4, m), whether the line passes through the triangle if it is moved into each quadrant.
+        (4, m), whether the line passes through the triangle when moved into each quadrant.
     """
     across, along = [(axis + 1) % 3, (axis + 2) % 3], axis
     flat = surface.vertices[:, across]
@@ -164,7 +164,7 @@ def _crossings(
     heights = surface.vertices[surface.faces[face], along]
     height = np.einsum("em,me->m", weight, heights)
     counts = (sides == sides[:1]).all(axis=0)
-    # how the triangle faces is known in the quadrants in which the line passes through it
+    # The signs give the triangle's facing in the quadrants in which the line passes through it.
     rising = (sides[0] * counts).sum(axis=0) > 0
     return a * len(second) + b, height, rising, counts
 
@@ -177,11 +177,11 @@ def _signed_areas(
     The second axis of the signs is the quadrant into which a point on an edge is moved.
 
     Args:
-        faces: (m, 3) one triangle per pair of triangle and line.
-        flat: (n, 2) m, positions of the vertices across the lines.
-        points: (m, 2) m, positions of the lines.
-        whole_flat: (n, 2) the vertices' positions as integers, which give the signs.
-        whole_points: (m, 2) the lines' positions as integers.
+        faces: (m, 3) vertices of the triangle in each pair of triangle and line.
+        flat: (n, 2) m, positions of the vertices in the plane normal to the lines.
+        points: (m, 2) m, position of the line in each pair.
+        whole_flat: (n, 2) positions of the vertices as integers.
+        whole_points: (m, 2) positions of the lines as integers.
     """
     area = np.empty((3, len(faces)))
     sides = np.empty((3, 4, len(faces)), np.int8)
@@ -208,12 +208,12 @@ def _signed_areas(
 
 
 def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index, Array]:
-    """Return line and height of all entries and exits, in turn, sorted by line and height.
+    """Return line and height of all entries and exits, sorted by line and height.
 
     Args:
         line: (m,) line of each crossing.
         height: (m,) m, height of each crossing.
-        rising: (m,) whether the triangle faces along the line, so that the line leaves there.
+        rising: (m,) whether the triangle faces along the line: the crossing is an exit.
         count: number of lines.
     """
     step = np.where(rising, -1, 1)
@@ -237,7 +237,7 @@ def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index
 
 
 def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
-    """Return the crossings sorted by line and height; duplicate faces count once."""
+    """Return line and height of the crossings, sorted; duplicate faces count once."""
     order = np.lexsort((height, rising, line))
     line, height, rising = line[order], height[order], rising[order]
     keep = np.ones(len(line), bool)
@@ -254,7 +254,7 @@ def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
 def _mend(
     line: Index, height: Array, odd: Mask, shape: tuple[int, int], name: str
 ) -> tuple[Index, Array]:
-    """Return the crossings; lines with an odd number are completed from their neighbours."""
+    """Return the crossings; lines with an odd number of them are repaired from their neighbours."""
     if not odd.any():
         return line, height
     crossed = np.count_nonzero(np.bincount(line, minlength=odd.size))
@@ -267,42 +267,46 @@ def _mend(
     start = np.searchsorted(line, np.arange(odd.size + 1))
     lines, heights = [line[~odd[line]]], [height[~odd[line]]]
     for ray in np.flatnonzero(odd):
-        own = height[start[ray] : start[ray + 1]]
-        whole = _completed(
-            own, [height[start[n] : start[n + 1]] for n in _around(int(ray), odd, shape)]
+        heights_of_ray = height[start[ray] : start[ray + 1]]
+        repaired = _completed(
+            heights_of_ray, [height[start[n] : start[n + 1]] for n in _around(int(ray), odd, shape)]
         )
-        if whole is None:
+        if repaired is None:
             a, b = divmod(int(ray), shape[1])
             raise InputError(f"a hole wider than one cell at grid line ({a}, {b})", name)
-        lines.append(np.full(len(whole), ray))
-        heights.append(whole)
-    mended, values = np.concatenate(lines), np.concatenate(heights)
-    order = np.lexsort((values, mended))
-    return mended[order], values[order]
+        lines.append(np.full(len(repaired), ray))
+        heights.append(repaired)
+    repaired_lines, values = np.concatenate(lines), np.concatenate(heights)
+    order = np.lexsort((values, repaired_lines))
+    return repaired_lines[order], values[order]
 
 
 def _around(ray: int, odd: Mask, shape: tuple[int, int]) -> list[int]:
-    """Return the neighbouring lines (of eight) that are crossed an even number of times."""
+    """Return those of the eight neighbouring lines that have an even number of crossings."""
     a, b = divmod(ray, shape[1])
     near = [(a + i, b + k) for i in (-1, 0, 1) for k in (-1, 0, 1) if i or k]
     inside = [n for n in near if 0 <= n[0] < shape[0] and 0 <= n[1] < shape[1]]
     return [i * shape[1] + k for i, k in inside if not odd[i * shape[1] + k]]
 
 
-def _completed(own: Array, neighbours: list[Array]) -> Array | None:
-    """Return a line's heights with a crossing added or removed, so that their number is even.
+def _completed(crossings: Array, neighbours: list[Array]) -> Array | None:
+    """Return a line's crossings after one was added or removed; None if the neighbours differ.
 
     Args:
-        own: (n,) m, heights of the line's crossings; n is odd.
-        neighbours: heights of the crossings of the lines around it.
+        crossings: (n,) m, heights of the line's crossings; n is odd.
+        neighbours: heights (m) of the crossings of each neighbouring line.
     """
-    for count in (len(own) + 1, len(own) - 1):
+    for count in (len(crossings) + 1, len(crossings) - 1):
         fitting = [n for n in neighbours if len(n) == count]
         if len(fitting) < 2:
             continue
         mean = np.mean(fitting, axis=0)
-        longer, shorter = (mean, own) if count > len(own) else (own, mean)
+        longer, shorter = (mean, crossings) if count > len(crossings) else (crossings, mean)
         misfit = [np.abs(np.delete(longer, i) - shorter).sum() for i in range(len(longer))]
         spare = int(np.argmin(misfit))
-        return np.sort(np.append(own, mean[spare])) if count > len(own) else np.delete(own, spare)
+        return (
+            np.sort(np.append(crossings, mean[spare]))
+            if count > len(crossings)
+            else np.delete(crossings, spare)
+        )
     return None

@@ -1,4 +1,4 @@
-"""Memory that a process uses, and that it may still use by the machine and its limits."""
+"""Memory that a process uses, and memory that is still available to it."""
 
 import ctypes
 import gc
@@ -15,10 +15,13 @@ OWN = Path("/proc/self/statm")
 
 
 def peak_rss(process: int | None = None) -> float:
-    """Return the largest resident memory of a process so far, MB (1e6 bytes); default: this one.
+    """Return the largest resident memory of a process so far, MB (1e6 bytes).
 
-    Asked of /proc where there is one: `getrusage` counts what the parent held when it started
-    the process, which is not the process's own. NaN for another process that is not known.
+    /proc is read where it exists, because `getrusage` includes memory of the parent process. NaN
+    for another process without an entry in /proc.
+
+    Args:
+        process: process number; by default this process.
     """
     with suppress(OSError):
         status = Path(f"/proc/{process or os.getpid()}/status").read_text()
@@ -32,17 +35,17 @@ def peak_rss(process: int | None = None) -> float:
 
 
 def available_memory() -> float:
-    """Return the bytes that this process may still take.
+    """Return the number of bytes that this process may still allocate.
 
-    The least of: what the machine has left without swapping, what the limit of its control
-    group leaves (cgroup 2 or 1), and what its own limit of address space leaves. Where none of
-    them is known, all of the machine's memory, or inf.
+    It is the smallest of the machine's available memory without swapping, the rest of the control
+    group's limit (cgroup 2 or 1), and the rest of the process's limit of address space. If the
+    available memory is unknown, the machine's memory replaces it. Without any value it is inf.
     """
     return min(_machine(), _group(), _address_space())
 
 
 def _machine() -> float:
-    """Return what the machine has left, what it can drop from its caches counted."""
+    """Return the machine's available memory, bytes, including caches that can be dropped."""
     try:
         for line in STATISTICS.read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -56,7 +59,7 @@ def _machine() -> float:
 
 
 def _group() -> float:
-    """Return what the control group's limit leaves; inf without one."""
+    """Return the rest of the control group's memory limit, bytes; inf without a limit."""
     pairs = (
         ("memory.max", "memory.current"),
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
@@ -71,7 +74,7 @@ def _group() -> float:
 
 
 def _address_space() -> float:
-    """Return what the limit of address space (`ulimit -v`) leaves; inf without one."""
+    """Return the rest of the limit of address space (`ulimit -v`), bytes; inf without a limit."""
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     if soft == resource.RLIM_INFINITY:
         return float("inf")
@@ -83,11 +86,11 @@ def _address_space() -> float:
 
 
 def give_back() -> None:
-    """Free what only refers to itself, and return freed memory to the system where that is known.
+    """Collect reference cycles, and return freed memory to the system (with glibc).
 
     A knee with its meshes has reference cycles. Python collects them by the number of objects, not
-    by their size: eighteen knees one after another held 0.73 GB, but at most 0.38 GB when collected
-    after each. In addition, glibc does not return freed memory that lies between used blocks.
+    by their size. Eighteen knees one after another used 0.73 GB, but at most 0.38 GB with a
+    collection after each. In addition, glibc keeps freed memory between used blocks.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -1,11 +1,11 @@
-"""Nearest points of a triangulated surface, the tree of boxes behind it, and surface samples.
+"""Nearest points of a triangulated surface, its tree of bounding boxes, and surface samples.
 
-The tree divides the triangles at the median along the longest side of their box, again and again,
-until a leaf holds a few. All leaves are at the same depth, so the tree needs no pointers: the
+The tree divides the triangles at the median along the longest side of their box, until a leaf
+contains a few triangles. All leaves are at the same depth, so the tree needs no pointers: the
 children of box i are 2i and 2i + 1, and the root is 1. A search visits the nearer child first and
-skips the boxes beyond its best result. Each triangle is evaluated in double precision on its own,
-so the result does not depend on the order of the search. Rays (`tkamb.geometry.rays`) and first
-touch (`tkamb.geometry.first_touch`) search the same tree.
+skips boxes that are farther away than the best result so far. The result does not depend on the
+order of the search. Rays (`tkamb.geometry.rays`) and first touch (`tkamb.geometry.first_touch`)
+search the same tree.
 """
 
 from dataclasses import dataclass
@@ -27,28 +27,30 @@ class BoxTreeSettings:
     """The tree of boxes around a surface's triangles."""
 
     triangles_per_leaf: int = 4
-    """Triangles in a leaf, at most. Chosen: it changes speed alone."""
+    """Largest number of triangles in a leaf. Chosen for speed; results do not depend on it."""
     margin: float = 1e-7
-    """1: boxes are wider by this share of the surface's size. Chosen: above rounding."""
+    """1: distance by which boxes are enlarged, as a share of the surface's size. Chosen because it
+    is above rounding."""
 
 
 BOX_TREE = BoxTreeSettings()
 
 
 def rows(vectors: ArrayLike) -> Array:
-    """Return vectors (n, 3), or one vector (3,), as an array (n, 3) that the loops accept.
+    """Return vectors (n, 3), or one vector (3,), as an array (n, 3) for the compiled loops.
 
-    It is contiguous, writable and in double precision: the loops are compiled for this type only.
+    It is contiguous, writable and in double precision, because the loops are compiled for this type
+    only.
     """
     return np.require(vectors, np.float64, ["C", "W", "E"]).reshape(-1, 3)
 
 
 class TriangleTree:
-    """The tree of one surface, in its frame.
+    """The tree of one surface, in the surface's frame.
 
     Args:
-        surface: the surface, open or closed.
-        chosen: (m,) its triangles that the tree holds; None: all.
+        surface: open or closed surface.
+        chosen: (m,) triangles of the tree; None for all triangles.
 
     Attributes:
         boxes: (2 p, 6) m, smallest and largest coordinates of each box; leaf l is box p + l.
@@ -82,11 +84,10 @@ class TriangleTree:
 
     @cached_property
     def supports(self) -> Array:
-        """One plane (2 p, 4) per box, with all triangles of the box behind it.
+        """Plane of each box (2 p, 4); all triangles of the box lie behind its plane.
 
-        A row holds the unit normal n and the offset n . x (m). The normal is the mean normal of
-        the triangles, so the plane is close to a nearly flat surface. It is zero if the mean
-        vanishes.
+        A row contains the unit normal n and the offset n . x (m). The normal is the mean normal of
+        the triangles, or zero if the mean vanishes.
         """
         count = len(self.boxes) // 2
         planes = np.zeros((2 * count, 4))
@@ -103,19 +104,19 @@ class TriangleTree:
 
 
 def _halved(centres: Array) -> Index:
-    """Return the triangles of the leaves (p, c), p a power of two; some twice, to fill the rows."""
+    """Return the triangles (p, c) of the p leaves; some appear twice, to fill the rows."""
     leaves = 1
     while leaves * BOX_TREE.triangles_per_leaf < len(centres):
         leaves *= 2
     room = leaves * -(-len(centres) // leaves)
-    order = np.arange(room) * len(centres) // room  # a sorted input is sorted again quickly
+    order = np.arange(room) * len(centres) // room  # order of the input, which is often sorted
     _halve(np.ascontiguousarray(centres), order, leaves)
     return order.reshape(leaves, -1)
 
 
 @compiled_as_written
 def _halve(centres: Array, order: Index, leaves: int) -> None:
-    """Sort triangles into the leaves: each part is divided along the longest side of its box.
+    """Sort triangles into leaves; each part is divided along the longest side of its box.
 
     Args:
         centres: (n, 3) m, centres of the triangles' boxes.
@@ -144,10 +145,10 @@ def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle
     Args:
         centres: (n, 3) m, centres of the triangles' boxes.
         order: (m,) triangle numbers, changed in place.
-        axis: 0, 1 or 2, the coordinate that is compared.
+        axis: 0, 1 or 2, axis of the compared coordinate.
         first: index of the part's first item in `order`.
-        last: index of its last item.
-        middle: index that gets the same item as in a full sort.
+        last: index of the part's last item.
+        middle: index at which the part is divided.
     """
     while first < last:
         pivot = centres[order[(first + last) // 2], axis]
@@ -173,7 +174,7 @@ class NearestSettings:
     """Samples that cover a surface."""
 
     max_samples: int = 150_000
-    """Largest number of samples of a surface. Chosen: it bounds memory and time."""
+    """Largest number of samples of a surface. Chosen because it limits memory and time."""
 
 
 NEAREST = NearestSettings()
@@ -181,7 +182,7 @@ NEAREST = NearestSettings()
 FLAT = 1e-14
 """1: a triangle counts as a line if 4 area² / (edge² edge²) is smaller."""
 DEEPEST = 64
-"""Largest number of boxes that wait in a search: one per level of the tree."""
+"""Largest number of boxes on the stack of a search: one per level of the tree."""
 NO_TRIANGLE = -1
 
 
@@ -190,10 +191,10 @@ class Nearest:
     """The points of a surface that are nearest to n given points.
 
     Args:
-        distance: (n,) m, from each given point.
+        distance: (n,) m, between each given point and its nearest point.
         faces: (n,) triangle on which the nearest point lies.
-        weights: (n, 3) its barycentric coordinates there.
-        surface: the search that found the points.
+        weights: (n, 3) barycentric coordinates of the nearest point.
+        surface: search object of the surface.
     """
 
     distance: Array
@@ -203,7 +204,7 @@ class Nearest:
 
     @cached_property
     def points(self) -> Array:
-        """The points (n, 3), m, on the surface."""
+        """The nearest points (n, 3), m."""
         return np.einsum("ij,ijk->ik", self.weights, self.surface.surface.triangles[self.faces])
 
     @cached_property
@@ -217,7 +218,7 @@ class NearestPoints:
 
     Args:
         surface: the surface.
-        tree: its tree, if it exists already.
+        tree: tree of the surface; None: it is built.
     """
 
     def __init__(self, surface: "Surface", tree: TriangleTree | None = None) -> None:
@@ -226,14 +227,19 @@ class NearestPoints:
         self._tree = tree.boxes, tree.faces, tree.corners
 
     def at(self, points: ArrayLike) -> Nearest:
-        """Return the nearest points to `points` (n, 3), m, in the surface's frame.
+        """Return the points of the surface nearest to `points` (n, 3), m, in the surface's frame.
 
-        A point that is not finite gets the distance inf, the triangle -1 and NaN weights.
+        The result of a point that is not finite is the distance inf, triangle -1 and NaN weights.
         """
         return self._found(points, np.inf)
 
     def within(self, points: Array, reach: float) -> tuple[Index, Nearest]:
-        """Return the points (n, 3) within `reach` (m) of the surface, and what `at` returns."""
+        """Return the numbers of the points within `reach` (m) of the surface, and their `Nearest`.
+
+        Args:
+            points: (n, 3) m, in the surface's frame.
+            reach: m, largest distance.
+        """
         nearest = self._found(points, reach)
         near = np.flatnonzero(nearest.faces >= 0)
         return near, Nearest(
@@ -245,10 +251,10 @@ class NearestPoints:
 
 
 def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
-    """Return samples (n, 3) that cover every triangle, the triangle (n,) and area (n,) of each.
+    """Return samples (n, 3) of a surface, and the triangle (n,) and area (n,) of each sample.
 
-    A triangle is divided into n² similar triangles whose edges are at most `spacing` (m) long. The
-    samples are their centres. The spacing grows if the surface needs more than
+    A triangle is divided into similar triangles with edges of at most `spacing` (m). The samples
+    are their centres. The spacing is increased if the surface needs more than
     `NEAREST.max_samples` samples.
     """
     triangles = surface.triangles
@@ -268,7 +274,7 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
 
 
 def _centres(n: int) -> Array:
-    """Return the centres (n², 3), barycentric, of the parts of a triangle with n parts per edge."""
+    """Return barycentric centres (n², 3) of the parts of a triangle with n parts per edge."""
     i, j = np.divmod(np.arange(n * n), n)
     upright, inverted = i + j < n, i + j < n - 1
     first = np.concatenate([i[upright] + 1 / 3, i[inverted] + 2 / 3]) / n
@@ -296,9 +302,9 @@ def _on_edge(along: float, length: float) -> float:
 def _foot(corners: Array, point: Array) -> tuple[float, float, float]:
     """Return the squared distance (m²) of a triangle's nearest point and its barycentrics 2 and 3.
 
-    The nearest point is the projection onto the triangle's plane if that lies inside the triangle,
-    else the nearest projection onto an edge. There is no absolute tolerance, so the result is right
-    for triangles of any size.
+    The nearest point is the projection onto the triangle's plane if it lies inside the triangle,
+    else the nearest projection onto an edge. Without absolute tolerances the result is correct for
+    triangles of any size.
 
     Args:
         corners: (9,) m, the triangle's corners.
@@ -343,22 +349,24 @@ def _nearest_place(
     waiting: Index,
     apart: Array,
 ) -> tuple[int, float, float, float]:
-    """Return the position in `faces` of the triangle nearest to a point; -1: none within reach.
+    """Return the triangle nearest to a point, and the point on it.
 
-    Of several equally near triangles the one with the lowest number is taken.
+    Of several equally near triangles the result is the one with the lowest number.
 
     Args:
         boxes: (2 p, 6) m, see `TriangleTree`.
         faces: (p c,) triangles of the leaves.
         corners: (p c, 9) m, corners of these triangles.
         point: (3,) m.
-        reach: m, largest distance that counts.
-        guess: position in `faces` of a triangle that is probably near; it saves time. -1: none.
-        waiting: (`DEEPEST`,) work array.
-        apart: (`DEEPEST`,) work array.
+        reach: m, largest distance of the search.
+        guess: position in `faces` of a triangle that is probably near, which saves time; -1 for
+            none.
+        waiting: (`DEEPEST`,) work array, boxes on the stack.
+        apart: (`DEEPEST`,) work array, squared distances of these boxes (m²).
 
     Returns:
-        Place in `faces`, squared distance (m²), barycentrics 2 and 3 of the nearest point.
+        Position in `faces`, -1 if none is within reach; squared distance (m²); barycentrics 2 and 3
+        of the nearest point.
     """
     leaves, place, size = len(boxes) // 2, NO_TRIANGLE, 1
     leaf_size = len(faces) // leaves
@@ -380,15 +388,15 @@ def _nearest_place(
                     continue
                 place, best, second, third = row, square, s, t
             continue
-        one, other = 2 * box, 2 * box + 1
-        near, far = _apart(boxes[one], point), _apart(boxes[other], point)
+        near_box, far_box = 2 * box, 2 * box + 1
+        near, far = _apart(boxes[near_box], point), _apart(boxes[far_box], point)
         if far < near:
-            one, other, near, far = other, one, far, near
+            near_box, far_box, near, far = far_box, near_box, far, near
         if far <= best:
-            waiting[size], apart[size] = other, far
+            waiting[size], apart[size] = far_box, far
             size += 1
         if near <= best:
-            waiting[size], apart[size] = one, near
+            waiting[size], apart[size] = near_box, near
             size += 1
     return place, best, second, third
 
@@ -397,18 +405,11 @@ def _nearest_place(
 def _nearest_points(
     boxes: Array, faces: Index, corners: Array, points: Array, reach: float
 ) -> tuple[Array, Index, Array]:
-    """Return the nearest point to each of many, see `_nearest_place`.
-
-    Args:
-        boxes: (2 p, 6) m.
-        faces: (p c,).
-        corners: (p c, 9) m.
-        points: (n, 3) m.
-        reach: m.
+    """Return the nearest points of many points (n, 3), m; arguments as in `_nearest_place`.
 
     Returns:
-        Distance (n,) m, inf for none and for points that are not finite; triangle (n,), -1;
-        barycentrics (n, 3), NaN.
+        Distance (n,), m, triangle (n,) and barycentrics (n, 3). They are inf, -1 and NaN if no
+        triangle is within reach or the point is not finite.
     """
     count = len(points)
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)

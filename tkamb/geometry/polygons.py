@@ -1,6 +1,6 @@
-"""Plane polygons: sagittal sections of surfaces, their convex outline, and cutting into triangles.
+"""Plane polygons: sagittal sections of surfaces, convex outlines, and division into triangles.
 
-A sagittal section is the cut of a surface with a plane z = const of its frame.
+A sagittal section is the intersection of a surface with a plane z = const of its frame.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,28 +17,28 @@ from tkamb.geometry.topology import counted
 
 
 def sagittal_section(surface: Surface, z: float) -> Array:
-    """Return the cut with the plane at z as segments (k, 2, 2) in x-y, m, unordered."""
+    """Return the section with the plane at z (m) as unordered segments (k, 2, 2) in x-y, m."""
     corners = surface.triangles
     height = corners[:, :, 2] - z
     above = height > 0.0
     cut = above.any(axis=1) & ~above.all(axis=1)
     corners, height, above = corners[cut], height[cut], above[cut]
-    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    single = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     rows = np.arange(len(corners))
     ends = []
     for step in (1, 2):
-        other = (lone + step) % 3
-        share = height[rows, lone] / (height[rows, lone] - height[rows, other])
-        a, b = corners[rows, lone, :2], corners[rows, other, :2]
+        other = (single + step) % 3
+        share = height[rows, single] / (height[rows, single] - height[rows, other])
+        a, b = corners[rows, single, :2], corners[rows, other, :2]
         ends.append(a + share[:, None] * (b - a))
     return np.stack(ends, axis=1)
 
 
 def convex_outline(points: Array, offset: float = 0.0, step_deg: float = 2.0) -> Array:
-    """Return the convex hull of points (n, 2), grown by `offset`, counter-clockwise.
+    """Return the convex hull of points (n, 2), enlarged by `offset`, counter-clockwise.
 
-    The grown hull's corners lie on circles about the hull's corners, `step_deg` apart: it is
-    inside the exact one by at most offset (1 - cos(step/2)), 0.015 % of the offset.
+    The corners of the enlarged hull lie on circles about the hull's corners, `step_deg` apart. With
+    2 deg it is too small by at most 0.015 % of the offset.
 
     Raises:
         InputError: the points span no area.
@@ -66,14 +66,14 @@ def sagittal_outline(
     Args:
         surfaces: surfaces in one frame, e.g. femur and femoral component.
         z_values: m, planes of the sections; the outline encloses all sections.
-        offset: m, growth of the outline, e.g. half the thickness of a wrapping tendon.
-        below: m, largest y of the grown outline; parts of the sections above it are left out.
+        offset: m, enlargement of the outline, e.g. half the thickness of a wrapping tendon.
+        below: m, upper limit of y for the enlarged outline.
 
     Returns:
         Strictly convex polygon, counter-clockwise, x-y, m.
 
     Raises:
-        InputError: no surface is cut, or the cuts span no area.
+        InputError: no plane meets a surface, or the sections span no area.
     """
     return _outline(tuple(surfaces), tuple(float(z) for z in z_values), offset, below)
 
@@ -98,7 +98,7 @@ def _outline(
 
 
 def _points_below(segments: Array, y: float) -> Array:
-    """Return the ends (n, 2) of segments (k, 2, 2) cut off at y."""
+    """Return the ends (n, 2) of the parts of segments (k, 2, 2) below y (m)."""
     if np.isfinite(y):
         low, high = np.sort(segments[:, :, 1], axis=1).T
         a, b = segments[(low < y) & (high > y)].transpose(1, 0, 2)
@@ -112,28 +112,29 @@ def _points_below(segments: Array, y: float) -> Array:
 
 @dataclass(frozen=True)
 class PolygonSettings:
-    """Cutting of polygons into triangles."""
+    """Division of polygons into triangles."""
 
     area_rounding: float = 1e-12
-    """1: a signed area below this share of the polygon's area is zero. Chosen: above rounding."""
+    """1: a signed area below this share of the polygon's area is zero. Chosen because it is above
+    rounding."""
     least_area_share: float = 1e-9
-    """1: a polygon that encloses a smaller share of the area that it covers crosses itself. Chosen:
-    above rounding."""
+    """1: smallest ratio of a polygon's enclosed area to the total area of its triangles. With a
+    smaller one the polygon crosses itself. Chosen because it is above rounding."""
 
 
 POLYGON = PolygonSettings()
 
 
 class CrossedPolygonError(ValueError):
-    """A polygon crosses itself, so that it has no inside."""
+    """A polygon crosses itself."""
 
 
 def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
-    """Return polygons as triangles (k, 3), wound as the polygons are.
+    """Return polygons as triangles (k, 3) with the winding of the polygons.
 
-    A polygon becomes a fan about its first corner. If that fan leaves the polygon, because it is
-    concave, ears are cut off one by one (Meisters, Am Math Monthly 82:648, 1975). Polygons of fewer
-    than three corners are left out.
+    A convex polygon becomes a fan about its first corner. From a concave polygon ears are cut off
+    one by one (Meisters, Am Math Monthly 82:648, 1975). Polygons with fewer than three corners are
+    skipped.
 
     Args:
         vertices: (n, 3) positions.
@@ -176,7 +177,7 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
     Args:
         vertices: (n, 3) positions.
         ring: (m,) vertices of the polygon, in order.
-        normal: (3,) the polygon's normal, its length twice the polygon's area.
+        normal: (3,) normal of the polygon; its length is twice the polygon's area.
     """
     axis = int(np.argmax(np.abs(normal)))
     plane = [(axis + 1) % 3, (axis + 2) % 3]
@@ -198,9 +199,8 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
             at, tried, flat_ears = max(at - 1, 0), 0, False
             continue
         at, tried = at + 1, tried + 1
-        if tried > len(
-            remaining
-        ):  # what is left has no ear of an area: collinear corners, or crossed
+        if tried > len(remaining):
+            # No ear with an area remains: the corners are collinear, or the polygon crosses itself.
             if flat_ears:
                 raise CrossedPolygonError(f"a polygon of {len(ring)} corners crosses itself")
             tried, flat_ears = 0, True
@@ -211,12 +211,12 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
 def _is_ear(
     points: Array, remaining: list[int], ear: tuple[int, int, int], least: float, flat: bool
 ) -> bool:
-    """Say whether a corner is an ear: it is convex, and its triangle holds no other corner.
+    """Return whether a corner is an ear: it is convex, and its triangle contains no other corner.
 
     Args:
         points: (m, 2) all corners.
-        remaining: corners that are not cut off yet.
-        ear: the corner's predecessor, the corner itself and its successor.
+        remaining: numbers of the corners that are not cut off.
+        ear: numbers of the corner's predecessor, the corner itself and its successor.
         least: twice the area below which a triangle counts as a line.
         flat: whether a corner on the line between its neighbours counts as an ear, too.
     """
@@ -224,10 +224,14 @@ def _is_ear(
     area = _twice_area(a, b, c)
     if area <= least:
         return bool(flat and abs(area) <= least)
-    others = points[remaining]
-    corner = (others == a).all(axis=1) | (others == b).all(axis=1) | (others == c).all(axis=1)
-    sides = np.stack([_twice_area(p, q, others) for p, q in ((a, b), (b, c), (c, a))])
-    return not ((sides >= -least).all(axis=0) & ~corner).any()
+    candidates = points[remaining]
+    at_corner = (
+        (candidates == a).all(axis=1)
+        | (candidates == b).all(axis=1)
+        | (candidates == c).all(axis=1)
+    )
+    sides = np.stack([_twice_area(p, q, candidates) for p, q in ((a, b), (b, c), (c, a))])
+    return not ((sides >= -least).all(axis=0) & ~at_corner).any()
 
 
 def _twice_area(a: Array, b: Array, c: Array) -> Array:

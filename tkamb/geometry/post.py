@@ -1,7 +1,7 @@
 """The post of an insert: its search, and its separation from the dishes.
 
 In a posterior-stabilised insert a cam of the femoral component pushes against the post from behind.
-The contact models press along y and do not see that contact. `divide_insert` therefore divides the
+Contact models that press along y do not include this contact. `divide_insert` therefore divides the
 insert into two bodies: the dishes for the condyles, and the post for the cam.
 """
 
@@ -22,14 +22,13 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class CutSettings:
-    """How a cutting plane avoids the vertices of a mesh."""
+    """Distance of a cutting plane from the vertices of a mesh."""
 
     vertex_clearance: float = 1e-9
-    """m; the plane keeps at least this distance from every vertex (see `plane_shift`). Chosen:
-    above rounding."""
+    """m: smallest distance of the plane from a vertex. Chosen because it is above rounding."""
     plane_shift: float = 1e-7
-    """m; distance by which the plane is moved until it keeps `vertex_clearance`. Chosen: it changes
-    no result."""
+    """m: step by which the plane is moved until its distance from all vertices is at least
+    `vertex_clearance`. Chosen because it changes no result."""
 
 
 CUT = CutSettings()
@@ -37,50 +36,52 @@ CUT = CutSettings()
 
 @dataclass(frozen=True)
 class PostSettings:
-    """What counts as the post of an insert, and where it is cut off."""
+    """Definition of the post of an insert, and of the plane that cuts it off."""
 
     line_spacing: float = 1e-3
-    """m between the lines along y. Chosen: a post is several times as wide."""
+    """m: spacing of the lines along y that measure the insert's height. Chosen because a post is
+    several times as wide."""
     least_rise: float = 8e-3
-    """m: a part that rises more than this above the lowest dish may be a post. Chosen: flanks and
-    lips of dishes are lower."""
+    """m: smallest rise of a post above the lowest dish. Chosen because flanks and lips of dishes
+    are lower."""
     side_drop: float = 3e-3
-    """m: the side of a post falls by at least this within two lines (see `steep_share`). Chosen: a
-    slope of 56 deg is steeper than a dish."""
+    """m: smallest drop of a steep side of a post within two lines. Chosen because this slope of
+    56 deg is steeper than a dish."""
     steep_share: float = 0.75
-    """1: least share of a post's outline that is steeper than `side_drop`. Chosen: a post may merge
-    into the insert along the rest."""
+    """1: smallest share of a post's outline with a drop of `side_drop`. Chosen because a post may
+    merge into the insert along the rest."""
     middle_share: float = 0.25
-    """1: the centre of a post lies within this share of the width from the middle. Chosen: dishes
-    lie farther out."""
+    """1: largest distance of a post's centre from the middle, as a share of half the insert's
+    width. Chosen because dishes lie farther out."""
     foot_clearance: float = 0.25e-3
-    """m: height above its surroundings at which the post is cut off. Chosen: above the noise of a
-    mesh."""
+    """m: height above the surroundings at which the post is cut off. Chosen because it is above the
+    noise of a mesh."""
     back_share: float = 0.75
-    """1: height above the foot, as a share of the post's height, at which its front is measured."""
+    """1: height above the foot at which the post's front is measured, as a share of its height."""
     least_thickness: float = 2e-3
-    """m: least thickness of a post. Chosen: a thinner one cannot carry a cam."""
+    """m: smallest thickness of a post. Chosen because a thinner post cannot carry the force of a
+    cam."""
 
 
 POST = PostSettings()
 
 FOOT_RING = (3, 5)
-"""Inner and outer distance from the patch, in lines, of the ring in which the height of the
-surroundings is measured. It lies beyond the slanted sides of the post."""
+"""Inner and outer distance, in lines, of a ring around the post. The height of the surroundings is
+measured in this ring, which lies beyond the slanted sides of the post."""
 
 
 @dataclass(frozen=True)
 class Post:
-    """Place and size of a post, insert frame.
+    """Position and size of a post, insert frame.
 
     Args:
-        x: m, x of its centre.
-        z: m, z of its centre.
-        height: m, height of its tip above the lowest dish.
-        area: m², area of its footprint.
-        foot: m, y above which nothing around it is as high.
-        front: m, x of its anterior face, at three quarters of its height above the foot.
-        half_width: m, half its width along z.
+        x: m, x of the centre.
+        z: m, z of the centre.
+        height: m, height of the tip above the lowest dish.
+        area: m², area of the post in the plan view.
+        foot: m, y of the plane at which the post is cut off.
+        front: m, x of the anterior face, at three quarters of the height above the foot.
+        half_width: m, half the width along z.
     """
 
     x: float
@@ -93,7 +94,7 @@ class Post:
 
     @property
     def notice(self) -> str:
-        """Say what is not modelled."""
+        """Notice that cam-post contact is not modelled."""
         return (
             f"post at x = {self.x / MILLIMETRE:.0f}, z = {self.z / MILLIMETRE:.0f} mm, "
             f"{self.height / MILLIMETRE:.0f} mm above the dishes: cam-post contact is not modelled "
@@ -123,7 +124,7 @@ def find_post(insert: Surface) -> Post | None:
         if centred and patch.sum() >= 9 and _steep_share(top, patch) >= POST.steep_share:
             tip = float(top[patch].max())
             foot = _ground(top, patch, dish) + POST.foot_clearance
-            if tip <= foot:  # its surroundings are higher
+            if tip <= foot:  # the surroundings are higher
                 continue
             high = patch & (top > foot + POST.back_share * (tip - foot))
             return Post(
@@ -142,8 +143,8 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     """Return the insert without its post, and the post, both closed, insert frame.
 
     A horizontal plane just above the surroundings separates them: the post is above it, the dishes
-    are below. In front the post ends in a plane x = const. That plane is the fixed bottom of the
-    cam's contact: it does not deform, and the material in front of it is left out.
+    are below. In front the post is cut at a plane x = const, and the material in front of the plane
+    is removed. This plane is the fixed bottom of the cam-post contact.
 
     Args:
         insert: closed, insert frame.
@@ -157,9 +158,11 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     vertices, below, above = split_faces(*merged(insert.vertices, insert.faces), 1, post.foot)
     number = connected_parts(above)
     middles = vertices[above].mean(axis=1)[:, [0, 2]]
-    own = number == number[np.hypot(*(middles - [post.x, post.z]).T).argmin()]
-    dishes = closed_by_fans(vertices, np.concatenate([below, above[~own]]), insert.name)
-    vertices, behind, _ = split_faces(*closed_by_fans(vertices, above[own], "post"), 0, post.front)
+    in_post = number == number[np.hypot(*(middles - [post.x, post.z]).T).argmin()]
+    dishes = closed_by_fans(vertices, np.concatenate([below, above[~in_post]]), insert.name)
+    vertices, behind, _ = split_faces(
+        *closed_by_fans(vertices, above[in_post], "post"), 0, post.front
+    )
     if not len(behind) or np.ptp(vertices[behind][:, :, 0]) < POST.least_thickness:
         raise InputError("the post has no depth that could carry a cam", where, "leave it out")
     return Surface(*dishes, insert.name), Surface(*closed_by_fans(vertices, behind, "post"), "post")
@@ -173,7 +176,7 @@ def _ground(top: Array, patch: Mask, dish: float) -> float:
 
 
 def _steep_share(top: Array, patch: Mask) -> float:
-    """Return the share of the lines around a patch that end at least `side_drop` below its edge."""
+    """Return the share of the lines around a patch that end at least `side_drop` below the edge."""
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
     edge = float(np.median(top[patch & ~_eroded(patch)]))
@@ -187,16 +190,16 @@ def _eroded(patch: Mask) -> Mask:
 def split_faces(
     vertices: Array, faces: Index, axis: int, level: float
 ) -> tuple[Array, Index, Index]:
-    """Return the vertices with those of the cut, and the faces below and above the plane.
+    """Return all vertices, and the faces below and above a plane.
 
-    Triangles that the plane crosses are divided. Both parts share the vertices of the cut, which
-    lie on edges of the mesh.
+    Triangles that the plane crosses are divided. The new vertices on the plane lie on edges of the
+    mesh and are shared by faces below and above.
 
     Args:
         vertices: (n, 3) m, no two at the same place.
         faces: (k, 3) vertices of the triangles.
         axis: 0, 1 or 2: the axis along the plane's normal.
-        level: m, coordinate of the plane; it is moved by up to a micrometre off the vertices.
+        level: m, coordinate of the plane, which is moved off the vertices (`CUT`).
     """
     height = vertices[:, axis] - level
     while (np.abs(height) < CUT.vertex_clearance).any():
@@ -204,7 +207,7 @@ def split_faces(
     above = height[faces] > 0
     count = above.sum(axis=1)
     crossed = np.flatnonzero((count == 1) | (count == 2))
-    # turned so that the corner that is alone on its side comes first
+    # The corners are rotated, so that the single corner on one side of the plane comes first.
     lone = np.where((count[crossed] == 1)[:, None], above[crossed], ~above[crossed]).argmax(axis=1)
     a, b, c = (faces[crossed, (lone + i) % 3] for i in range(3))
     edges = np.sort(np.stack([np.stack([a, b], 1), np.stack([a, c], 1)]), axis=-1)
@@ -232,14 +235,14 @@ def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Ind
         name: name of the part in a message.
 
     Raises:
-        InputError: a hole has a part of its outline that its centre does not see.
+        InputError: a fan about a hole's centre would overlap itself.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     key, back = (edges * [len(vertices), 1]).sum(1), (edges * [1, len(vertices)]).sum(1)
     rim = edges[~np.isin(key, back)]
     for number in np.unique(loops := _loops(rim, len(vertices))):
-        own = rim[loops == number]
-        start, end = vertices[own[:, 0]], vertices[own[:, 1]]
+        outline = rim[loops == number]
+        start, end = vertices[outline[:, 0]], vertices[outline[:, 1]]
         length = np.linalg.norm(end - start, axis=1)
         middle = length @ (start + end) / 2 / length.sum()
         normals = np.cross(start - middle, end - middle)
@@ -249,7 +252,7 @@ def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Ind
                 name,
                 "give a post with a convex outline, or leave out [contact] post",
             )
-        fan = np.column_stack([own[:, ::-1], np.full(len(own), len(vertices))])
+        fan = np.column_stack([outline[:, ::-1], np.full(len(outline), len(vertices))])
         vertices, faces = np.vstack([vertices, middle]), np.concatenate([faces, fan])
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3).astype(np.int64)

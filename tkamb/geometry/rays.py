@@ -1,4 +1,4 @@
-"""Rays against a triangulated surface, in double precision."""
+"""Crossings of rays with a triangulated surface, in double precision."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -21,26 +21,27 @@ class RaySettings:
     """Tolerances of the ray caster."""
 
     edge_tolerance: float = 1e-9
-    """1: a crossing up to this far outside a triangle, in barycentric coordinates, belongs to it.
-    Chosen: above rounding."""
+    """1: largest distance of a crossing outside a triangle, in barycentric coordinates. Chosen
+    because it is above rounding."""
     same_crossing: float = 1e-10
-    """1: crossings of one ray that are nearer to each other than this share of the part's radius
-    are one crossing. Chosen: above rounding."""
+    """1: distance below which two crossings of a ray are one crossing, as a share of half the
+    diagonal of the bounding box. Chosen because it is above rounding."""
     usual_crossings: int = 4
-    """Crossings per ray for which memory is reserved at first. Chosen: most rays have fewer."""
+    """Number of crossings per ray for which memory is allocated at first. Chosen because most rays
+    have fewer."""
     threaded_rays: int = 500
-    """From this number of rays on, two threads share them. Chosen: for fewer rays a thread costs
-    more time than it saves."""
+    """Number of rays from which two threads share the work. Chosen because with fewer rays the
+    second thread costs more time than it saves."""
 
 
 RAY = RaySettings()
 
 STILL = 1e-200
-"""A component of a direction below this counts as zero, so that its inverse stays finite."""
+"""1: smallest component of a direction that is inverted, so that the inverse stays finite."""
 PARALLEL = 1e-9
-"""Sine of the angle to a triangle's plane below which a ray does not cross it."""
+"""1: sine of the angle between ray and triangle below which they do not cross."""
 DEEPEST = 64
-"""Largest number of boxes that wait in a search: one per level of the tree."""
+"""Largest number of boxes on the stack of a search: one per level of the tree."""
 NO_TRIANGLE = -1
 
 
@@ -49,7 +50,8 @@ class RayGapSettings:
     """Gaps between shells along a ray."""
 
     touching_distance: float = 1e-6
-    """m: shells closer than this have no gap between them. Chosen: above the rounding of a mesh."""
+    """m: distance below which two shells touch. Chosen because it is above the rounding of a
+    mesh."""
 
 
 RAY_GAP = RayGapSettings()
@@ -58,13 +60,13 @@ RAY_GAP = RayGapSettings()
 class RayCaster:
     """Crossings of rays with one surface.
 
-    No ray passes through the surface at an inner edge or vertex. A ray that touches an edge or a
-    vertex of the outline may hit or miss. Distances are exact to rounding (about 1e-16 m divided by
-    the sine of the angle to the surface).
+    No ray passes between two triangles. A ray that touches an edge or a vertex of the outline may
+    cross the surface or not. The error of a distance is about 1e-16 m divided by the sine of the
+    angle to the surface.
 
     Args:
         surface: the surface; rays are given in its frame.
-        tree: its tree, if it exists already.
+        tree: tree of the surface; None: it is built.
     """
 
     def __init__(self, surface: "Surface", tree: TriangleTree | None = None) -> None:
@@ -84,17 +86,17 @@ class RayCaster:
             directions: (n, 3) or (3,), any length but zero.
 
         Returns:
-            distance (n,) m, inf where nothing is hit; face (n,), -1 where nothing is hit.
+            distance (n,), m, and face (n,); inf and -1 without a crossing.
         """
         distance, face, _ = self.first_in_face(origins, directions)
         return distance, face
 
     def last_exit(self, origins: ArrayLike, directions: ArrayLike) -> Array:
-        """Return the distance (n,) m at which each ray finally leaves the part; inf: never.
+        """Return the distance (n,), m, at which each ray finally leaves the body; inf without exit.
 
-        An exit does not count at an inner wall, where the next shell begins at once, or into a
-        closed void, whose shell differs from the one that the ray entered through. An undercut that
-        is open to the outside ends the part.
+        Two kinds of exit do not count: through an inner wall, where the next shell begins at the
+        same place, and into a closed void, which has a shell of its own. An exit into an undercut
+        counts.
 
         Args:
             origins: (n, 3) m.
@@ -102,26 +104,28 @@ class RayCaster:
         """
         origins, directions = _rays(origins, directions)
         ray, along, face = self.all(origins, directions)
-        way = np.broadcast_to(directions, origins.shape)[ray]
-        leaves = np.einsum("ij,ij->i", self.surface.face_normals[face], way) > 0.0
+        direction_of_crossing = np.broadcast_to(directions, origins.shape)[ray]
+        leaves = np.einsum("ij,ij->i", self.surface.face_normals[face], direction_of_crossing) > 0.0
         last = np.full(len(origins), np.inf)
         np.minimum.at(last, ray[leaves], along[leaves])
-        twice = np.flatnonzero(np.bincount(ray[leaves], minlength=len(origins)) > 1)
-        shell = self._shells() if len(twice) else np.empty(0, np.int64)
-        for number in twice:
+        several = np.flatnonzero(np.bincount(ray[leaves], minlength=len(origins)) > 1)
+        shell = self._shells() if len(several) else np.empty(0, np.int64)
+        for number in several:
             first, end = np.searchsorted(ray, [number, number + 1])
-            own, out = along[first:end], leaves[first:end]
+            distances, exits = along[first:end], leaves[first:end]
             shells = shell[face[first:end]]
-            for k in np.flatnonzero(out):
-                last[number] = own[k]
+            for k in np.flatnonzero(exits):
+                last[number] = distances[k]
                 entries = np.flatnonzero(
-                    ~out & (own >= own[k] - RAY_GAP.touching_distance) & (np.arange(len(own)) != k)
+                    ~exits
+                    & (distances >= distances[k] - RAY_GAP.touching_distance)
+                    & (np.arange(len(distances)) != k)
                 )
-                later = entries[own[entries] > own[0] + RAY_GAP.touching_distance]
+                later = entries[distances[entries] > distances[0] + RAY_GAP.touching_distance]
                 if not len(later):
                     break
                 next_in = later[0]
-                touching = own[next_in] - own[k] <= RAY_GAP.touching_distance
+                touching = distances[next_in] - distances[k] <= RAY_GAP.touching_distance
                 void = shells[k] == shells[next_in] != shells[0]
                 if not (touching or void):
                     break
@@ -135,37 +139,37 @@ class RayCaster:
     def first_in_face(
         self, origins: ArrayLike, directions: ArrayLike
     ) -> tuple[Array, Index, Array]:
-        """Return the result of `first`, and the place in the triangle at which each ray crosses.
+        """Return the result of `first`, and the barycentric coordinates (n, 3) of the crossings.
 
-        Returns:
-            distance (n,) m, face (n,), barycentric coordinates (n, 3), NaN where nothing is hit.
+        The coordinates are NaN without a crossing.
         """
         origins, directions = _rays(origins, directions)
 
-        def crossings(some: slice) -> tuple[Array, Index, Array]:
-            along = directions[some] if len(directions) > 1 else directions
+        def crossings(part: slice) -> tuple[Array, Index, Array]:
+            along = directions[part] if len(directions) > 1 else directions
             return _first_crossings(
-                *self._tree, origins[some], along, -self._same, RAY.edge_tolerance
+                *self._tree, origins[part], along, -self._same, RAY.edge_tolerance
             )
 
         if len(origins) < RAY.threaded_rays:
             return crossings(slice(0, len(origins)))
-        one, other = in_halves(crossings, len(origins))
-        distance, face, weights = (np.concatenate(two) for two in zip(one, other, strict=True))
+        first_half, second_half = in_halves(crossings, len(origins))
+        distance, face, weights = (
+            np.concatenate(halves) for halves in zip(first_half, second_half, strict=True)
+        )
         return distance, face, weights
 
     def all(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Index, Array, Index]:
         """Return every crossing of every ray at or beyond its origin.
 
-        A crossing at an edge or vertex shared by triangles that face the same way is reported
-        once.
+        A crossing at an edge or a vertex appears once if its triangles face in the same direction.
 
         Args:
             origins: (n, 3) m.
             directions: (n, 3) or (3,), any length but zero.
 
         Returns:
-            ray (m,), distance (m,) m and face (m,), sorted by ray, then by distance.
+            ray (m,), distance (m,), m, and face (m,), sorted by ray, then by distance.
         """
         rays = _rays(origins, directions)
         number, room = RAY.usual_crossings * len(rays[0]), -1
@@ -180,7 +184,7 @@ class RayCaster:
     def _merged(
         self, ray: Index, t: Array, face: Index, directions: Array
     ) -> tuple[Index, Array, Index]:
-        """Return the crossings sorted, one per place and facing."""
+        """Return the sorted crossings without duplicates, which have the same place and facing."""
         along = directions[ray] if len(directions) > 1 else directions
         entering = (along * self.surface.face_normals[face]).sum(axis=1) < 0.0
         order = np.lexsort((face, t, entering, ray))
@@ -194,7 +198,7 @@ class RayCaster:
 
 
 def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
-    """Return origins (n, 3) and directions (n, 3), or (1, 3) for all."""
+    """Return origins (n, 3) and directions (n, 3), or one direction (1, 3) of all rays."""
     rays = rows(origins), rows(directions)
     if len(rays[1]) not in (1, len(rays[0])):
         raise ValueError(f"{len(rays[1])} directions for {len(rays[0])} rays")
@@ -211,7 +215,7 @@ def _crossing(plane: Array, origin: Array, direction: Array) -> tuple[float, flo
         direction: (3,) unit.
 
     Returns:
-        Distance (m), inf where the ray runs along the plane or the triangle has none.
+        Distance (m), inf if the ray is parallel to the plane or the triangle has no area.
     """
     x, y, z = origin[0] - plane[0], origin[1] - plane[1], origin[2] - plane[2]
     slope = direction[0] * plane[3] + direction[1] * plane[4] + direction[2] * plane[5]
@@ -226,12 +230,12 @@ def _crossing(plane: Array, origin: Array, direction: Array) -> tuple[float, flo
 
 @compiled_as_written
 def _entry(box: Array, origin: Array, slowness: Array) -> float:
-    """Return the distance at which a ray enters a box (6,), inf where it misses it, m.
+    """Return the distance (m) at which a ray enters a box; inf without a crossing.
 
     Args:
         box: (6,) m.
         origin: (3,) m.
-        slowness: (3,) one over the unit direction.
+        slowness: (3,) inverse components of the unit direction.
     """
     enters, leaves = -np.inf, np.inf
     for axis in range(3):
@@ -243,9 +247,9 @@ def _entry(box: Array, origin: Array, slowness: Array) -> float:
 
 @compiled_as_written
 def _set_direction(vector: Array, direction: Array, slowness: Array) -> None:
-    """Write the unit vector of a vector (3,), and its inverse, finite where a component is zero.
+    """Write the unit vector of a vector (3,), and its finite inverse components.
 
-    A vector of zero length gives NaN, and such a ray meets nothing.
+    A vector of zero length gives NaN, and its ray has no crossing.
     """
     length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     for axis in range(3):
@@ -264,7 +268,7 @@ def _first_crossings(
     least: float,
     outside: float,
 ) -> tuple[Array, Index, Array]:
-    """Return the first crossing of each ray; of equally near triangles the lowest number counts.
+    """Return the first crossing of each ray; of equally near triangles that with the lowest number.
 
     Args:
         boxes: (2 p, 6) m, see `TriangleTree`.
@@ -272,11 +276,11 @@ def _first_crossings(
         planes: (p c, 12) planes of these triangles, see `_crossing`.
         origins: (n, 3) m.
         directions: (n, 3) of any length, or (1, 3) for all rays.
-        least: m, smallest distance that counts.
+        least: m, smallest distance of a crossing.
         outside: 1, largest distance outside the triangle in barycentric coordinates.
 
     Returns:
-        Distance (n,) m, inf for none; triangle (n,), -1; barycentrics (n, 3), NaN.
+        Distance (n,), m, triangle (n,) and barycentrics (n, 3); inf, -1 and NaN without a crossing.
     """
     count, leaves = len(origins), len(boxes) // 2
     leaf_size = len(faces) // leaves
@@ -306,15 +310,18 @@ def _first_crossings(
                         best, best_face = t, faces[place]
                         weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - u - v, u, v
                 continue
-            one, other = 2 * box, 2 * box + 1
-            near, far = _entry(boxes[one], origin, slowness), _entry(boxes[other], origin, slowness)
+            near_box, far_box = 2 * box, 2 * box + 1
+            near, far = (
+                _entry(boxes[near_box], origin, slowness),
+                _entry(boxes[far_box], origin, slowness),
+            )
             if far < near:
-                one, other, near, far = other, one, far, near
+                near_box, far_box, near, far = far_box, near_box, far, near
             if far < np.inf and far <= best:
-                waiting[size], enters[size] = other, far
+                waiting[size], enters[size] = far_box, far
                 size += 1
             if near < np.inf and near <= best:
-                waiting[size], enters[size] = one, near
+                waiting[size], enters[size] = near_box, near
                 size += 1
         distance[n], face[n] = best, best_face
     return distance, face, weights
@@ -333,19 +340,14 @@ def _all_crossings(
     distance: Array,
     face: Index,
 ) -> int:
-    """Count every crossing of every ray, and write as many as fit into the arrays.
+    """Return the number of all crossings, and write those that fit into the output arrays.
+
+    The other arguments are those of `_first_crossings`.
 
     Args:
-        boxes: (2 p, 6) m, see `TriangleTree`.
-        faces: (p c,) triangles of the leaves.
-        planes: (p c, 12) planes of these triangles, see `_crossing`.
-        origins: (n, 3) m.
-        directions: (n, 3) of any length, or (1, 3) for all rays.
-        least: m, smallest distance that counts.
-        outside: 1, largest distance outside the triangle in barycentric coordinates.
-        ray: (m,) output: ray of each crossing.
-        distance: (m,) m, output: distance of each crossing.
-        face: (m,) output: triangle of each crossing.
+        ray: (m,) output, ray of each crossing.
+        distance: (m,) m, output, distance of each crossing.
+        face: (m,) output, triangle of each crossing.
     """
     leaves, number = len(boxes) // 2, 0
     leaf_size = len(faces) // leaves

@@ -1,11 +1,11 @@
 """Repairs of a triangulated surface, with a notice of each, and removal of its inner walls.
 
-CAD systems export touching bodies with the wall between them still there. The two sides of such a
-wall face each other, each towards the material of the other body. A triangle with material on its
-outer side separates nothing. If the whole wall consists of such triangles, it is removed, and the
-two skins are joined along its rim: an open edge is divided where vertices of the other skin lie
-on it. If bodies overlap, or a triangle reaches beyond the wall, the wall stays. It does no harm:
-the winding number (`tkamb.geometry.winding`) decides what is inside, and it ignores walls.
+Files of CAD systems contain the wall between touching bodies. Such a wall has two sides, and a
+triangle of one side has the other body's material in front of it. If the whole wall consists of
+such triangles, it is removed. The outer surfaces of the two bodies are then joined along the rim of
+the wall: an open edge is divided at the vertices of the other surface that lie on it. If bodies
+overlap, or a triangle extends beyond the wall, the wall stays. It does not change results, because
+winding numbers (`tkamb.geometry.winding`) do not depend on walls.
 """
 
 from collections import defaultdict
@@ -34,15 +34,17 @@ from tkamb.geometry.topology import (
 
 @dataclass(frozen=True)
 class RepairSettings:
-    """Which openings of a mesh are closed when it is read."""
+    """Repair of openings when a mesh is read."""
 
     weld_distance: float = 5e-5
-    """m; open edges whose ends are closer than this are one edge. Chosen: below the facets of a
-    mesh, above the rounding of its file."""
+    """m: distance below which vertices of open edges are merged. Chosen below the facets of a mesh
+    and above the rounding of its file."""
     gap_width: float = 2e-3
-    """m; a hole up to this wide is closed by a fan of triangles. Chosen: about one lattice cell."""
+    """m: largest width of a hole that is closed by a fan of triangles. Chosen: about one lattice
+    cell."""
     triangle_width: float = 5e-3
-    """m; a hole of three edges is filled up to this width. Chosen: it is one missing triangle."""
+    """m: largest width of a hole of three edges that is closed. It may be wider than other holes,
+    because it is one missing triangle."""
 
 
 REPAIR = RepairSettings()
@@ -50,15 +52,15 @@ REPAIR = RepairSettings()
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A repaired surface and what was done to it.
+    """A repaired surface and the notices of its repairs.
 
     Args:
         vertices: (n, 3) m.
-        faces: (k, 3) vertices of the triangles, wound consistently; outward if closed.
-        notices: one phrase per kind of repair; empty if nothing was repaired.
-        holes: the loops that stay open, widest first.
+        faces: (k, 3) vertices of the triangles, with consistent winding; outward if closed.
+        notices: one phrase per kind of repair; empty without repairs.
+        holes: loops that are open after the repair, widest first.
         forks: (m,) vertices of edges that an odd number (3 or more) of faces share.
-        one_sided: whether the surface has no consistent winding (a Möbius strip).
+        one_sided: whether the surface has no consistent winding, like a Möbius strip.
     """
 
     vertices: Array
@@ -72,8 +74,8 @@ class Repair:
 def repair(vertices: Array, faces: Index) -> Repair:
     """Repair duplicate and degenerate faces, winding, cracks, small holes and loose vertices.
 
-    Triangles may have their own corners, as in an STL file: equal corners are merged without a
-    notice. A triangle without area but with three different corners stays, because it closes the
+    Equal vertices are merged without a notice, because in an STL file every triangle has separate
+    vertices. A triangle without area but with three different corners stays, because it closes the
     surface.
 
     Args:
@@ -132,10 +134,10 @@ def _without_collapsed(faces: Index) -> tuple[Index, int]:
 
 
 def _without_duplicates(faces: Index) -> tuple[Index, int]:
-    """Remove duplicates of a face, and both faces of a pair that lie back to back.
+    """Remove duplicates of a face, and both faces of a pair with opposite winding.
 
     Returns:
-        The other faces, and the number of faces removed.
+        The remaining faces, and the number of removed faces.
     """
     corners = np.sort(faces, axis=1)
     most = int(faces.max(initial=0)) + 1
@@ -164,10 +166,10 @@ def _without_duplicates(faces: Index) -> tuple[Index, int]:
 
 
 def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
-    """Reverse faces so that the windings of neighbours agree; the smaller area is reversed.
+    """Reverse faces so that neighbours have consistent winding; the smaller area is reversed.
 
-    Every face has two states, original and reversed. A graph links the states of neighbours that
-    agree. Only on a one-sided surface both states of a face are in one component.
+    Every face has two states, original and reversed. A graph connects consistent states of
+    neighbours. Both states of a face are in one component only on a one-sided surface.
 
     Returns:
         The faces, the number of reversed faces, and whether the surface is one-sided.
@@ -177,10 +179,10 @@ def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
     directed = half_edges(faces)
     order = np.argsort(edge, kind="stable")
     pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
-    one, other = pairs[:, 0] // 3, pairs[:, 1] // 3
+    first_face, second_face = pairs[:, 0] // 3, pairs[:, 1] // 3
     differ = directed[pairs[:, 0], 0] == directed[pairs[:, 1], 0]
-    rows = np.concatenate([one, one + k])
-    columns = np.concatenate([other + k * differ, other + k * ~differ])
+    rows = np.concatenate([first_face, first_face + k])
+    columns = np.concatenate([second_face + k * differ, second_face + k * ~differ])
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * k, 2 * k))
     labels = connected_components(graph, directed=False)[1]
     forward, backward = labels[:k], labels[k:]
@@ -198,7 +200,11 @@ def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
 
 
 def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Merge ends of open edges that are within `REPAIR.weld_distance` of each other."""
+    """Merge vertices of open edges within `REPAIR.weld_distance` of each other.
+
+    Returns:
+        The faces, and the number of merged vertices.
+    """
     loose = np.unique(open_edges(faces))
     if len(loose) == 0:
         return faces, 0
@@ -214,7 +220,11 @@ def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
 
 
 def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
-    """Close small holes: one of three edges by a triangle, a larger one by a fan of triangles."""
+    """Close small holes: a hole of three edges by a triangle, another hole by a fan of triangles.
+
+    Returns:
+        Vertices, faces, number of closed holes, and the largest width (m) of these holes.
+    """
     new_vertices, new_faces = [vertices], [faces]
     widest, total, filled = 0.0, len(vertices), 0
     for loop in boundary_loops(vertices, faces):
@@ -235,7 +245,11 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
 
 
 def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Reverse the faces of inside-out bodies; a void within another body stays a void."""
+    """Reverse the faces of inside-out bodies, but not those of a void within another body.
+
+    Returns:
+        The faces, and the number of reversed faces.
+    """
     part = connected_parts(faces)
     volume = np.bincount(part, signed_volumes(vertices, faces))
     if (volume >= 0).all():
@@ -266,7 +280,7 @@ def _referenced(vertices: Array, faces: Index) -> tuple[Array, Index]:
 
 
 def _used(vertices: Array, faces: Index) -> Mask:
-    """Say which vertices (n,) belong to a face."""
+    """Return whether each vertex (n,) belongs to a face."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     return used
@@ -280,16 +294,16 @@ def _forks(faces: Index) -> Index:
 
 @dataclass(frozen=True)
 class InnerWallSettings:
-    """Walls inside a part."""
+    """Walls inside a surface."""
 
     probe_distance: float = 2e-5
-    """m: distance from a triangle at which material is looked for. Chosen: bodies with a wider gap
-    are separate."""
+    """m: distance in front of a triangle at which material is searched. Chosen because bodies with
+    a wider gap are separate."""
     edge_distance: float = 1e-6
-    """m: a vertex nearer to an open edge than this lies on it. Chosen: above the rounding of a
-    mesh."""
+    """m: distance below which a vertex lies on an open edge. Chosen because it is above the
+    rounding of a mesh."""
     least_area: float = 2e-6
-    """m²: a smaller area is no wall. Chosen: triangles in a narrow corner have less."""
+    """m²: smallest area of a wall. Chosen because triangles in a narrow corner have less area."""
 
 
 INNER_WALL = InnerWallSettings()
@@ -298,18 +312,18 @@ SAMPLES = np.array(
     [[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.45, 0.45, 0.1],
      [0.1, 0.45, 0.45], [0.45, 0.1, 0.45]]
 )  # fmt: skip
-"""Barycentric coordinates of the points of a triangle at which material is looked for."""
+"""Barycentric coordinates of the points in front of a triangle at which material is searched."""
 
 
 @dataclass(frozen=True, eq=False)
 class InnerWall:
-    """A wall inside a part, and the part without it.
+    """A wall inside a surface, and the surface without the wall.
 
     Args:
         faces: (m,) triangles of both sides of the wall.
         area: m², area of one side.
         centre: (3,) m, centroid of the wall.
-        without: vertices and faces of the part without the wall; None if the wall has to stay.
+        without: vertices and faces of the surface without the wall; None if the wall must stay.
     """
 
     faces: Index
@@ -319,7 +333,7 @@ class InnerWall:
 
 
 def facing_material(surface: Surface, faces: Index) -> Mask:
-    """Say which triangles (m,) of a closed surface have material on their outer side."""
+    """Return whether each triangle (m,) of a closed surface has material on its outer side."""
     points = np.einsum("sc,kcx->ksx", SAMPLES, surface.triangles[faces])
     points += INNER_WALL.probe_distance * surface.face_normals[faces][:, None]
     within = surface.winding.inside(points.reshape(-1, 3)).reshape(len(faces), -1)
@@ -337,25 +351,25 @@ def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
         faces: (k, 3) vertices of the triangles, wound outward.
     """
     surface = Surface(vertices, faces, merged=True)
-    within = facing_material(surface, np.arange(len(faces)))
+    inner_faces = facing_material(surface, np.arange(len(faces)))
     part = connected_parts(faces)
-    if len(np.setdiff1d(part, part[~within])):
+    if len(np.setdiff1d(part, part[~inner_faces])):
         return None
-    inner = np.flatnonzero(within)
+    inner = np.flatnonzero(inner_faces)
     area = surface.areas[inner]
     if area.sum() / 2.0 < INNER_WALL.least_area:
         return None
     centre = area @ surface.triangles[inner].mean(axis=1) / area.sum()
-    rest = _joined_along_rims(vertices, np.delete(faces, inner, axis=0))
-    whole = None
-    if len(rest) and is_closed(rest):
-        used, number = np.unique(rest, return_inverse=True)
-        whole = vertices[used], number.reshape(-1, 3).astype(np.int64)
-    return InnerWall(inner, float(area.sum() / 2.0), centre, whole)
+    remaining = _joined_along_rims(vertices, np.delete(faces, inner, axis=0))
+    without = None
+    if len(remaining) and is_closed(remaining):
+        used, number = np.unique(remaining, return_inverse=True)
+        without = vertices[used], number.reshape(-1, 3).astype(np.int64)
+    return InnerWall(inner, float(area.sum() / 2.0), centre, without)
 
 
 def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: Index) -> int:
-    """Return the number of groups of bodies; bodies of a group touch or overlap.
+    """Return the number of groups of touching or overlapping bodies.
 
     Args:
         vertices: (n, 3) m.
@@ -364,9 +378,9 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
         wall: (m,) triangles of the inner walls.
     """
     group = list(range(len(bodies)))
-    skins = [Surface(vertices, faces[own], merged=True) for own in bodies]
-    for a, own in enumerate(bodies):
-        part = np.intersect1d(own, wall)
+    skins = [Surface(vertices, faces[body], merged=True) for body in bodies]
+    for a, body in enumerate(bodies):
+        part = np.intersect1d(body, wall)
         if not len(part):
             continue
         whole = Surface(vertices, faces[part], merged=True)
@@ -378,7 +392,7 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
 
 
 def _joined_along_rims(vertices: Array, faces: Index) -> Index:
-    """Return the triangles; open edges are divided at the open vertices that lie on them."""
+    """Return the triangles after division of open edges at the open vertices that lie on them."""
     edges = open_edges(faces)
     if not len(edges):
         return faces
@@ -392,14 +406,16 @@ def _joined_along_rims(vertices: Array, faces: Index) -> Index:
         near = loose[tree.query_ball_point(middle, length / 2.0 + INNER_WALL.edge_distance)]
         near = near[(near != start) & (near != end)]
         share = (vertices[near] - vertices[start]) @ along / length**2
-        off = np.linalg.norm(vertices[near] - vertices[start] - share[:, None] * along, axis=1)
-        on = (
-            (off < INNER_WALL.edge_distance)
+        distance = np.linalg.norm(vertices[near] - vertices[start] - share[:, None] * along, axis=1)
+        dividing_vertices = (
+            (distance < INNER_WALL.edge_distance)
             & (share * length > INNER_WALL.edge_distance)
             & ((1 - share) * length > INNER_WALL.edge_distance)
         )
-        if on.any():
-            dividing[int(start), int(end)] = near[on][np.argsort(share[on])]
+        if dividing_vertices.any():
+            dividing[int(start), int(end)] = near[dividing_vertices][
+                np.argsort(share[dividing_vertices])
+            ]
     return _divided(vertices, faces, dividing)
 
 
@@ -409,7 +425,7 @@ def _divided(vertices: Array, faces: Index, dividing: dict[tuple[int, int], Inde
     Args:
         vertices: (n, 3) m.
         faces: (k, 3) vertices of the triangles.
-        dividing: directed edge -> vertices to be inserted, in order.
+        dividing: directed edge -> vertices to insert, in order.
     """
     by_face: dict[int, list[int]] = defaultdict(list)
     starts = {start for start, _ in dividing}

@@ -1,4 +1,4 @@
-"""A triangulated surface in SI units and one named frame, and the normals of its smooth shape."""
+"""A triangulated surface in SI units, and normals of the smooth surface that it approximates."""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from tkamb.geometry.winding import WindingNumber
 
 SHARP_EDGE = float(np.deg2rad(40.0))
-"""rad: neighbouring triangles that turn by more than this meet in a sharp edge."""
+"""rad: angle between the normals of neighbouring triangles above which their edge is sharp."""
 NO_CREASE = float(np.pi)
-"""rad: all triangles at a vertex count, however they turn."""
+"""rad: crease angle with which all triangles at a vertex count."""
 
 
 @dataclass(frozen=True)
@@ -27,28 +27,28 @@ class NormalSettings:
     """Normals of a mesh."""
 
     cosine_rounding: float = 1e-9
-    """1: difference of two cosines that is rounding. Chosen: above rounding."""
+    """1: difference below which two cosines are equal. Chosen because it is above rounding."""
 
 
 NORMAL = NormalSettings()
 
 
 SMOOTH_WITHIN = np.radians(30.0)
-"""rad; triangles that meet at a larger angle belong to different smooth surfaces."""
+"""rad: angle between normals above which triangles belong to different smooth surfaces."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A triangulated surface; the right-hand rule gives the outward normals.
 
-    Objects that are costly to compute (rays, nearest points, normals) are computed at their first
-    use and stored with the surface.
+    Trees, ray casters, normals and other derived objects are computed at their first use and stored
+    with the surface.
 
     Args:
         vertices: (n, 3) m.
         faces: (k, 3) vertices of the triangles.
         name: name in messages.
-        merged: whether all vertices lie at different places.
+        merged: True if no two vertices are at the same place.
     """
 
     vertices: Array
@@ -58,8 +58,8 @@ class Surface:
 
     @cached_property
     def mesh(self) -> "trimesh.Trimesh":
-        """The same surface for trimesh, unprocessed."""
-        import trimesh  # half a second, which a report or a message need not wait for
+        """The surface as an unprocessed mesh of trimesh."""
+        import trimesh  # its import takes half a second
 
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
@@ -82,7 +82,7 @@ class Surface:
     @cached_property
     def longest_edges(self) -> Array:
         """The longest edge (k,) of every triangle, m."""
-        corners = np.moveaxis(self.triangles, (1, 2), (0, 1)).copy()  # by corner and axis: quicker
+        corners = np.moveaxis(self.triangles, (1, 2), (0, 1)).copy()  # contiguous rows are faster
         square = [
             (end - start) ** 2 for start, end in zip(corners, corners[[1, 2, 0]], strict=True)
         ]
@@ -90,7 +90,7 @@ class Surface:
 
     @cached_property
     def _cross(self) -> Array:
-        """Normals (k, 3) whose length is twice the triangle's area, m²."""
+        """Normals (k, 3) with a length of twice the triangle's area, m²."""
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         return np.cross(b - a, c - a)
 
@@ -110,8 +110,8 @@ class Surface:
     def barycentric(self, points: Array, faces: Index) -> Array:
         """Return the barycentric coordinates (n, 3) of points (n, 3), m, on triangles (n,).
 
-        For a point beside its triangle they are clipped to 0 to 1. On a degenerate triangle all are
-        one third.
+        For a point outside its triangle they are clipped to 0 to 1. On a degenerate triangle they
+        are one third.
         """
         weights = np.empty((len(points), 3))
         offset = points - self.triangles[faces, 0]
@@ -125,23 +125,23 @@ class Surface:
 
     @cached_property
     def bounds(self) -> Array:
-        """Lower and upper corner (2, 3), m."""
+        """Lower and upper corner (2, 3), m, of the bounding box."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
     def corner_vertices(self) -> Index:
-        """The faces (k, 3); vertices at the same place have the same number."""
+        """Vertices (k, 3) of the faces, numbered so that vertices at one place have one number."""
         return self.faces if self.merged else same_places(self.vertices)[1][self.faces]
 
     @cached_property
     def corners_at_vertices(self) -> Ragged:
-        """For each of the `corner_vertices` its corners, numbered 3 face + corner."""
+        """Corners at each of the `corner_vertices`; the number of a corner is 3 face + corner."""
         vertex = self.corner_vertices.ravel()
         return Ragged.by_key(vertex, int(vertex.max(initial=-1)) + 1)
 
     @cached_property
     def corner_normals(self) -> Array:
-        """Unit normals (k, 3, 3) at the corners, angle-weighted; edges over 40 deg stay sharp.
+        """Unit normals (k, 3, 3) at the corners, weighted by angle; edges over 40 deg stay sharp.
 
         Their error is at most a tenth of the error of facet normals.
         """
@@ -164,7 +164,7 @@ class Surface:
         """Return unit normals (n, 3) at points (n, 3), m, on triangles `faces` (n,).
 
         They are interpolated between angle-weighted normals at the corners. Triangles beyond a
-        crease of 30 deg do not count there: a box keeps its face normals. On a faceted sphere the
+        crease of 30 deg do not count, so that a box has its face normals. On a faceted sphere the
         normals are radial to second order.
         """
         weights = self.barycentric(points, faces)
@@ -173,7 +173,7 @@ class Surface:
     @cached_property
     def tree(self) -> "TriangleTree":
         """The tree of all triangles."""
-        from tkamb.geometry.nearest import TriangleTree  # numba, which not all need
+        from tkamb.geometry.nearest import TriangleTree  # imports numba, which is slow
 
         return TriangleTree(self)
 
@@ -181,7 +181,7 @@ class Surface:
     def upward_tree(self) -> "TriangleTree":
         """The tree of the triangles that face up (+y); of all triangles if none does.
 
-        A triangle that faces down or sideways is topmost only at an edge of one that faces up.
+        The topmost points of other triangles lie on edges of triangles that face up.
         """
         from tkamb.geometry.nearest import TriangleTree
 
@@ -197,7 +197,7 @@ class Surface:
 
     @cached_property
     def nearest(self) -> "NearestPoints":
-        """Search for the surface's nearest points."""
+        """Search for nearest points of the surface."""
         from tkamb.geometry.nearest import NearestPoints
 
         return NearestPoints(self, self.tree)
@@ -211,7 +211,7 @@ class Surface:
 
     @cached_property
     def volume(self) -> float:
-        """The enclosed volume, m³; an overlap of two bodies counts twice."""
+        """Enclosed volume, m³; an overlap of two bodies counts twice."""
         a, b, c = np.moveaxis(self.triangles - self.bounds.mean(axis=0), 1, 0)
         return float(np.einsum("kj,kj->", a, np.cross(b, c)) / 6.0)
 
@@ -223,16 +223,16 @@ class Surface:
         return Surface(vertices, self.faces, self.name, self.merged)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields alone: derived objects are far larger and can be computed again."""
+        """Return the fields without derived objects, which are larger and can be computed again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
     """Return unit normals (k, 3, 3), one per triangle and corner.
 
-    A normal is the weighted mean over the triangles at the vertex whose normals differ by at most
-    `crease` from the triangle's own. A rim therefore does not tilt the normals beside it. A
-    triangle without area has zero normals.
+    The normal of a triangle at a vertex is the weighted mean over triangles at this vertex. A
+    triangle counts if its normal differs by at most `crease`. A sharp edge therefore does not tilt
+    the normals beside it. A triangle without area has zero normals.
 
     Args:
         surface: the surface; vertices at the same place count as one.
@@ -244,8 +244,8 @@ def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
     mean = _sums(vertex, weighted)
     total = mean[vertex]
     if crease < NO_CREASE:
-        # Normals within half the crease angle of their mean are within the crease angle of each
-        # other, so they need no comparison in pairs.
+        # If all normals at a vertex are within half the crease angle of their mean, they are within
+        # the crease angle of each other. Only other vertices need a comparison in pairs.
         lean = np.einsum("cj,cj->c", normals, _unit(mean)[vertex])
         rough = np.zeros(len(mean), bool)
         rough[vertex[~(lean > np.cos(crease / 2) + NORMAL.cosine_rounding)]] = True
@@ -260,7 +260,7 @@ def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
 
 
 def corner_angles(surface: Surface) -> Array:
-    """Return the angles (k, 3), rad, of the triangles."""
+    """Return the angles (k, 3), rad, of triangles at their corners."""
     corners = surface.triangles
     ahead = np.roll(corners, -1, axis=1) - corners
     behind = np.roll(corners, 1, axis=1) - corners
@@ -269,12 +269,12 @@ def corner_angles(surface: Surface) -> Array:
 
 
 def _mean_normals(weights: Array, normals: Array) -> Array:
-    """Return the unit means (n, 3) of three normals (n, 3, 3), by barycentric weights (n, 3)."""
+    """Return unit means (n, 3) of three normals (n, 3, 3) with barycentric weights (n, 3)."""
     return _unit(np.einsum("ij,ijk->ik", weights, normals))
 
 
 def sharp_edges(surface: Surface, sharp: float = SHARP_EDGE) -> Mask:
-    """Return whether the edge opposite each corner (k, 3) is sharp, open or shared by many."""
+    """Return whether the edge opposite each corner (k, 3) is sharp, or not shared by two faces."""
     edge, count = edge_use(surface.faces)
     cosine = 0.5 * (_sums(edge, np.repeat(surface.face_normals, 3, axis=0)) ** 2).sum(axis=1) - 1
     flags = (count != 2) | (cosine < np.cos(sharp))
@@ -282,7 +282,7 @@ def sharp_edges(surface: Surface, sharp: float = SHARP_EDGE) -> Mask:
 
 
 def _sums(index: Index, rows: Array, count: int = 0) -> Array:
-    """Return the sums (count or more, n) of the rows (m, n) with each index (m,)."""
+    """Return the sum (n,) of the rows (m, n) of each index (m,); at least `count` sums."""
     return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
 
 

@@ -1,8 +1,8 @@
 """A second thread, for compiled loops that release Python's interpreter lock.
 
-TKAMB_THREADS says how many threads a process may use, 1 or 2; without it 2, where the machine
-gives it two processors. What is computed does not depend on it, to the last bit: work is divided
-in the same way whether one thread does it or two.
+The environment variable TKAMB_THREADS is the number of threads of a process, 1 or 2. The default is
+2 if the process has two processors. Results do not depend on it, to the last bit, because work is
+divided in the same way for one thread or two.
 """
 
 import os
@@ -21,25 +21,26 @@ Second = TypeVar("Second")
 
 
 def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
-    """Call two functions, at the same time if the other thread has nothing to do.
+    """Call two functions, at the same time if the second thread is free.
 
     Args:
-        first: called in this thread.
-        second: must not need what `first` makes, nor write to what it reads.
+        first: function that is called in this thread.
+        second: function that is independent of `first`: it neither needs results of `first` nor
+            changes its data.
 
     Returns:
-        What they return. An error of `first` is raised when `second` has ended.
+        The results of both functions. An error of `first` is raised after `second` has ended.
     """
     busy, thread = _second()
     if threads() == 1 or not busy.acquire(blocking=False):
         return first(), second()
     try:
-        other = thread.submit(second)
+        future = thread.submit(second)
         try:
             result = first()
         finally:
-            other.exception()
-        return result, other.result()
+            future.exception()
+        return result, future.result()
     finally:
         busy.release()
 
@@ -52,24 +53,24 @@ def in_halves(part: Callable[[slice], First], count: int) -> tuple[First, First]
 
 @cache
 def threads() -> int:
-    """Return how many threads this process may use: 1 or 2.
+    """Return the number of threads that this process may use, 1 or 2.
 
     Raises:
-        InputError: TKAMB_THREADS is neither.
+        InputError: TKAMB_THREADS is neither 1 nor 2.
     """
     text = os.environ.get(VARIABLE, "")
     if text not in ("", "1", "2"):
         raise InputError(f"{text!r} is neither 1 nor 2", VARIABLE)
     if text:
         return int(text)
-    own = getattr(os, "sched_getaffinity", None)  # Linux: what this process was given
-    return min(2, len(own(0)) if own else os.cpu_count() or 1)
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux: processors of this process
+    return min(2, len(affinity(0)) if affinity else os.cpu_count() or 1)
 
 
 @cache
 def _second() -> tuple[Lock, ThreadPoolExecutor]:
-    """The second thread, and the lock that is held while it works."""
+    """Return a lock that is closed while the second thread works, and the thread's executor."""
     return Lock(), ThreadPoolExecutor(1, "tkamb")
 
 
-os.register_at_fork(after_in_child=_second.cache_clear)  # a forked process does not have it
+os.register_at_fork(after_in_child=_second.cache_clear)  # a forked process has no second thread

@@ -1,4 +1,4 @@
-"""How a triangulated surface is connected: its edges, open loops, parts and bodies.
+"""Topology of a triangulated surface: its edges, open loops, connected parts and bodies.
 
 `Ragged` stores lists of different lengths, such as the triangles at each vertex, in flat arrays.
 """
@@ -12,11 +12,11 @@ from tkamb.geometry.frames import Array, Index
 
 @dataclass(frozen=True, eq=False)
 class BoundaryLoop:
-    """One closed loop of open edges, walked as its triangles walk them.
+    """One closed loop of open edges, in the direction of the half edges of its triangles.
 
     Args:
-        vertices: (n,) vertex indices in order; the loop closes from the last to the first.
-        centre: (3,) mean of its vertices, units of the surface.
+        vertices: (n,) vertex indices in order; the last edge runs from the last to the first.
+        centre: (3,) mean of the vertices, units of the surface.
         width: smallest distance between two parallel lines that enclose the loop in its
             best-fitting plane, units of the surface.
         perimeter: length of the loop, units of the surface.
@@ -29,12 +29,12 @@ class BoundaryLoop:
 
 
 def half_edges(faces: Index) -> Index:
-    """Return the directed edges (3k, 2) of faces (k, 3), face by face."""
+    """Return the directed edges (3k, 2) of faces (k, 3), in the order of the faces."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
 def edge_use(faces: Index) -> tuple[Index, Index]:
-    """Return for every half edge its undirected edge (3k,), and how many faces use each edge."""
+    """Return the undirected edge (3k,) of every half edge, and each edge's number of faces (m,)."""
     ends = np.sort(half_edges(faces), axis=1)
     key = ends[:, 0] * (int(faces.max(initial=0)) + 1) + ends[:, 1]
     _, edge, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -42,7 +42,7 @@ def edge_use(faces: Index) -> tuple[Index, Index]:
 
 
 def is_closed(faces: Index) -> bool:
-    """Say whether two faces share every edge and run through it in opposite directions."""
+    """Return whether every edge is shared by two faces, with opposite directions."""
     edge, count = edge_use(faces)
     start, end = half_edges(faces).T
     balance = np.bincount(edge, np.sign(end - start), len(count))
@@ -52,7 +52,7 @@ def is_closed(faces: Index) -> bool:
 def same_places(points: Array) -> tuple[Index, Index]:
     """Group points (n, 3) that are equal.
 
-    Points are grouped by a hash of their bits. If a hash stands for different points, they are
+    Points are grouped by a hash of their bits. If different points have the same hash, they are
     sorted instead.
 
     Returns:
@@ -84,8 +84,8 @@ def open_edges(faces: Index) -> Index:
 def boundary_loops(vertices: Array, faces: Index) -> list[BoundaryLoop]:
     """Return the loops of open edges, widest first.
 
-    Two holes that share a vertex are two loops. A chain that does not close, because the winding
-    is inconsistent, is returned as a loop.
+    Two holes that share a vertex are two loops. With inconsistent winding a chain of edges may not
+    close; it is returned as a loop, too.
     """
     loops = [_measured(vertices, loop) for loop in _traced(open_edges(faces))]
     return sorted(loops, key=lambda loop: -loop.width)
@@ -132,7 +132,7 @@ def _measured(vertices: Array, loop: Index) -> BoundaryLoop:
 
 
 def _width(points: Array) -> float:
-    from scipy.spatial import ConvexHull, QhullError  # slow to import: a report needs no hull
+    from scipy.spatial import ConvexHull, QhullError  # slow import, rarely needed
 
     plane = np.linalg.svd(points, full_matrices=False)[2][:2]
     flat = points @ plane.T
@@ -147,7 +147,7 @@ def _width(points: Array) -> float:
 
 
 def connected_parts(faces: Index) -> Index:
-    """Return for every face (k,) the number of the connected part that it belongs to."""
+    """Return the number of the connected part of every face (k,)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -159,7 +159,7 @@ def connected_parts(faces: Index) -> Index:
 
 
 def signed_volumes(vertices: Array, faces: Index) -> Array:
-    """Return the volume (k,) that each face spans with the centre of the vertices, m³."""
+    """Return the signed volume (k,), m³, between each face and the centre of the vertices."""
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
 
@@ -169,11 +169,11 @@ class Body:
     """A connected part of a surface, with the voids within it.
 
     Args:
-        faces: (m,) indices of its faces.
-        extents: (3,) size of its bounding box, units of the surface.
-        centre: (3,) centre of the box, units of the surface.
-        area: area of its outer skin, square units of the surface.
-        closed: whether its skin has no open edge.
+        faces: (m,) indices of the faces.
+        extents: (3,) size of the bounding box, units of the surface.
+        centre: (3,) centre of the bounding box, units of the surface.
+        area: area of the outer surface, square units of the surface.
+        closed: True if the outer surface has no open edge.
     """
 
     faces: Index
@@ -184,10 +184,10 @@ class Body:
 
 
 def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
-    """Return the bodies of a surface, the one with the largest skin first.
+    """Return the bodies of a surface, that with the largest outer surface first.
 
-    The normals of a void point into it, so its volume is negative. A closed part is a void of
-    another closed part if its volume is negative and its bounding box lies within the other's.
+    The normals of a void point into the void, so its volume is negative. A closed part is a void of
+    another closed part if its volume is negative and its bounding box lies within the other part's.
 
     Args:
         vertices: (n, 3), any unit.
@@ -212,8 +212,8 @@ def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
             min(around, key=lambda q: parts_as_bodies[q].area, default=k), []
         ).append(parts[k])
     bodies = [
-        Body(np.sort(np.concatenate(own)), b.extents, b.centre, b.area, b.closed)
-        for b, own in ((parts_as_bodies[k], own) for k, own in contained.items())
+        Body(np.sort(np.concatenate(members)), b.extents, b.centre, b.area, b.closed)
+        for b, members in ((parts_as_bodies[k], members) for k, members in contained.items())
     ]
     return sorted(bodies, key=lambda body: -body.area)
 
@@ -238,7 +238,7 @@ class Ragged:
 
     Args:
         first: (n + 1,) start of each row in `items`, then the end of the last row.
-        items: (m,) items of all rows, row after row.
+        items: (m,) items of all rows, in the order of the rows.
     """
 
     first: Index
@@ -246,18 +246,18 @@ class Ragged:
 
     @classmethod
     def by_key(cls, keys: Index, count: int) -> "Ragged":
-        """Return one row per key from 0 to `count` - 1: indices in `keys` (m,) with that key."""
+        """Return a row for each key from 0 to `count` - 1: the indices of this key in `keys`."""
         order = np.argsort(keys, kind="stable")
         return cls(np.searchsorted(keys[order], np.arange(count + 1)), order)
 
     def of(self, rows: Index) -> tuple[Index, Index]:
-        """Return the items of chosen rows (k,), preceded by the index in `rows` of each item."""
+        """Return the index (m,) in `rows` (k,) and the item (m,) of all items of these rows."""
         begin = self.first[rows]
         owner, rank = counted(self.first[rows + 1] - begin)
         return owner, self.items[begin[owner] + rank]
 
 
 def counted(counts: Index) -> tuple[Index, Index]:
-    """Return the group of each member, and its rank there; group g has `counts[g]` members."""
+    """Return group and rank within the group of each member; group g has `counts[g]` members."""
     group = np.repeat(np.arange(len(counts)), counts)
     return group, np.arange(len(group)) - (np.cumsum(counts) - counts)[group]

@@ -1,4 +1,4 @@
-"""Winding numbers of points about a closed surface: they tell which points are inside.
+"""Winding numbers of points about a closed surface, which decide whether a point is inside.
 
 A vertical ray leaves a body through a triangle that faces up and enters it through one that faces
 down. The winding number of a point is the number of exits less the number of entries above it:
@@ -6,19 +6,19 @@ down. The winding number of a point is the number of exits less the number of en
     w = sum of sign(n_y) over the triangles above the point
 
 The number is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one file overlap.
-A wall between two touching bodies changes it by -1 and +1 at one place, so the wall does not count.
+The two sides of a wall between touching bodies change it by -1 and +1, so the wall does not count.
 The parity of the number of crossings would be wrong for voids with wrong winding, overlaps and
 walls.
 
-The signs of three areas in the plan view tell whether a ray passes through a triangle. Positions in
-the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The areas are therefore exact, and
-all triangles at an edge or a vertex agree. A ray that meets an edge exactly is moved by an
-infinitesimal distance to +z, and by a much smaller one to +x (simulation of simplicity,
-Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). The result is right
-for all points that do not lie on the surface itself.
+The signs of three areas in the plan view decide whether a ray passes through a triangle. Positions
+in the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The areas are therefore exact,
+and the results of all triangles at an edge or a vertex are consistent. A ray that meets an edge
+exactly is moved by an infinitesimal distance to +z, and by a much smaller one to +x (simulation of
+simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). The result
+is correct for all points that do not lie on the surface.
 
-A ray may leave through a small hole of the mesh. The count of the triangles above then differs from
-the count of those below; in a closed surface they are equal. The larger count is taken.
+In a closed surface the sum over the triangles below the point, with the opposite sign, is equal. If
+a ray leaves through a small hole of the mesh, the larger sum is the result.
 """
 
 from dataclasses import dataclass
@@ -39,10 +39,11 @@ class WindingSettings:
     """The plan view in which winding numbers are computed."""
 
     max_buckets: int = 1_000_000
-    """Largest number of buckets of the plan view. Chosen: more would cost memory and not save
-    time."""
+    """Largest number of buckets of the plan view. Larger: more memory. Chosen because a larger
+    number saves no time."""
     plan_bits: int = 29
-    """Bits of the largest integer position. Chosen: products of differences fit into 63 bits."""
+    """Number of bits of the largest integer position. Chosen because products of differences fit
+    into 63 bits."""
 
 
 WINDING = WindingSettings()
@@ -53,7 +54,7 @@ class PlanGrid:
     """Conversion of positions in a plane to integers.
 
     Args:
-        middle: (2,) m, position that becomes (0, 0).
+        middle: (2,) m, position of the integers (0, 0).
         scale: 1/m, integer steps per metre.
     """
 
@@ -69,11 +70,11 @@ class PlanGrid:
 
     @property
     def step(self) -> float:
-        """Distance of two neighbouring integers, m."""
+        """Distance between the positions of two neighbouring integers, m."""
         return 1.0 / self.scale
 
     def whole(self, plan: Array) -> Index:
-        """Return positions (n, 2), m, as integers; positions far outside are clipped."""
+        """Return positions (n, 2), m, as integers; positions far from the surface are clipped."""
         numbers = np.rint((plan - self.middle) * self.scale)
         return np.clip(
             numbers, -(2 ** (WINDING.plan_bits + 1)), 2 ** (WINDING.plan_bits + 1)
@@ -87,7 +88,7 @@ class WindingNumber:
     compared only with the triangles in its bucket.
 
     Args:
-        surface: closed, outward normals, any frame whose y is vertical.
+        surface: closed surface with outward normals.
     """
 
     def __init__(self, surface: "Surface") -> None:
@@ -122,13 +123,13 @@ class WindingNumber:
         )
 
     def inside(self, points: Array) -> Mask:
-        """Say which points (n, 3) lie within a body."""
+        """Return whether each point (n, 3), m, lies within a body."""
         return self.at(points) > 0
 
 
 @compiled_as_written
 def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index, Index]:
-    """Return where each bucket's triangles begin (b + 1,), and the triangles.
+    """Return the starts (b + 1,) of the buckets in the list of triangles, and this list (m,).
 
     Args:
         first: (k, 2) lowest bucket of each triangle along x and z.
@@ -153,10 +154,10 @@ def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index
 
 @compiled_as_written
 def _signed_area(plan: Index, start: int, end: int, x: int, z: int) -> tuple[int, int]:
-    """Return twice the signed area of the triangle of an edge and a point, and its sign.
+    """Return twice the signed area of the triangle of an edge and a point, and a sign.
 
-    A point on the edge counts as moved by an infinitesimal to +z, and by a much smaller one
-    to +x: then the sign is 0 only for an edge that is a point in the plan view.
+    For a point on the edge the sign is that of a point moved by an infinitesimal distance to +z,
+    and by a much smaller one to +x. It is 0 only if the edge has no length in the plan view.
     """
     du, dv = plan[end, 1] - plan[start, 1], plan[end, 0] - plan[start, 0]
     area = du * (x - plan[start, 0]) - dv * (z - plan[start, 1])
@@ -184,9 +185,9 @@ def _winding_numbers(
     Args:
         points: (n, 3) m.
         plan: (n, 2) x and z of the points as integers.
-        bucket: (n,) bucket of each point; -1 for a point beside the surface.
-        starts: (b + 1,) where the triangles of each bucket begin in `items`.
-        items: (m,) triangles, bucket after bucket.
+        bucket: (n,) bucket of each point; -1 for a point outside all buckets.
+        starts: (b + 1,) start of each bucket's triangles in `items`.
+        items: (m,) triangles, in the order of the buckets.
         vertices: (v, 3) m.
         vertex_plan: (v, 2) x and z of the vertices as integers.
         faces: (k, 3) vertices of the triangles.
@@ -199,19 +200,19 @@ def _winding_numbers(
         above, below = 0, 0
         for place in range(starts[bucket[n]], starts[bucket[n] + 1]):
             a, b, c = faces[items[place], 0], faces[items[place], 1], faces[items[place], 2]
-            first, side = _signed_area(vertex_plan, b, c, x, z)
-            second, other = _signed_area(vertex_plan, c, a, x, z)
-            if side == 0 or other != side:
+            first, first_sign = _signed_area(vertex_plan, b, c, x, z)
+            second, second_sign = _signed_area(vertex_plan, c, a, x, z)
+            if first_sign == 0 or second_sign != first_sign:
                 continue
-            third, last = _signed_area(vertex_plan, a, b, x, z)
-            if last != side:
+            third, third_sign = _signed_area(vertex_plan, a, b, x, z)
+            if third_sign != first_sign:
                 continue
-            # a triangle that the ray passes has an area in the plan view
+            # The area in the plan view is not zero, because the ray passes through the triangle.
             height = first * vertices[a, 1] + second * vertices[b, 1] + third * vertices[c, 1]
             height /= float(first) + float(second) + float(third)
             if height > points[n, 1]:
-                above += side
+                above += first_sign
             else:
-                below -= side
+                below -= first_sign
         result[n] = max(above, below)
     return result

@@ -1,4 +1,4 @@
-"""A Winkler foundation: springs along the insert's normal, of one stiffness per area."""
+"""A Winkler foundation: springs along the insert's normal, with a uniform stiffness per area."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,7 +12,7 @@ from tkamb.contact.samples import gaps_along_normals
 
 @dataclass(frozen=True)
 class Winkler(ContactModel):
-    """Pressure = modulus times penetration, whatever the material and the thickness."""
+    """Pressure = modulus times penetration, for any material and thickness."""
 
     name: ClassVar[str] = "winkler"
     assumes: ClassVar[str] = "springs of one stiffness per area"
