@@ -36,7 +36,7 @@ def refused(capfd, *arguments):
     capfd.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
     said = capfd.readouterr().err
-    assert said.count("\n") == 1 and "not foreseen" not in said
+    assert said.count("\n") == 1 and "unexpected error" not in said
     return said
 
 

@@ -187,7 +187,10 @@ def test_a_file_that_grows_too_large_by_one_byte(tmp_path):
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (ZeroDivisionError("float division"), "not foreseen: ZeroDivisionError: float division"),
+        (
+            ZeroDivisionError("float division"),
+            "unexpected error: ZeroDivisionError: float division",
+        ),
         (MemoryError(), "not enough memory"),
         (RecursionError("too deep"), "RecursionError"),
         (OSError(5, "Input/output error"), "Input/output error"),
