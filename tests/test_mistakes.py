@@ -155,7 +155,7 @@ FLAGGED = {
         both(*(cells("ground_reaction.csv", f"point_{a}_mm", lambda v: 1e-3 * v) for a in "xyz")),
         "is it in centimetres or metres?"),
     "centre's sign": (cells("ground_reaction.csv", "point_x_mm", lambda v: -v),
-                      "mm behind the ankle .*where no foot is .*is its sign"),
+                      "mm behind the ankle.*not under the foot.*is its sign"),
     "point in metres": (key("ligament.0.proximal.point_mm", [0.0015, 0.0005, -0.042]),
                         "is point_mm in metres?"),
     "pounds": (key("patient.mass_kg", 165.3), "pounds?"),

@@ -250,7 +250,7 @@ def test_the_other_reading_restores_where_the_height_was_right(meshes):
     assert any("whether the recorded rotation is restored" in line for line in report.lines())
     with pytest.raises(InputError, match="needs the femoral adjustment"):
         press_meshes(*bodies, 1500.0, pose=pose, restore_when="either")
-    with pytest.raises(InputError, match="'neither' is no rule"):
+    with pytest.raises(InputError, match="'neither' is not a rule"):
         press_meshes(*bodies, 1500.0, pose=pose, adjust=True, restore_when="neither")
 
 

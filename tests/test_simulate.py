@@ -175,7 +175,7 @@ def test_frames_outside_the_motion_are_refused(frames):
 
 
 def test_the_refusal_of_frames_says_which_there_are():
-    with pytest.raises(InputError, match="it has frames 0 to 100; 0:101 are all of them"):
+    with pytest.raises(InputError, match="it has frames 0 to 100; all are 0:101"):
         simulate(fast_scene(), frames=slice(0, 3000, 10))
 
 

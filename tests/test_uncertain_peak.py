@@ -110,7 +110,7 @@ def test_a_recorded_patella_that_its_lines_do_not_hold_is_flagged(tmp_path, band
     across = np.abs(run["patellofemoral_tangential_N"])
     assert (across > 100).all() == flagged
     for status in run.status:
-        assert ("recorded patella is not held by its lines" in status) == flagged
+        assert ("recorded patella is not in equilibrium with its lines" in status) == flagged
 
 
 def test_a_run_tells_how_its_peak_lies_among_the_samples(tmp_path):

@@ -292,7 +292,7 @@ def _motion(source: LegRecording, kinematics: Kinematics, time: Array) -> Coordi
         q = fit.state
     if time[0] < stamps[0] - 1e-9 or time[-1] > stamps[-1] + 1e-9:
         raise InputError(
-            f"covers {stamps[0]:g} to {stamps[-1]:g} s, the frames {time[0]:g} to {time[-1]:g} s",
+            f"covers {stamps[0]:g} to {stamps[-1]:g} s, but frames {time[0]:g} to {time[-1]:g} s",
             recorded.path,
         )
     return coordinate_motion(
