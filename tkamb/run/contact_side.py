@@ -46,7 +46,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class CouplingSettings:
-    """The iteration between contact and muscles of one frame."""
+    """Convergence of the coupling of body and contact in one frame."""
 
     force_tolerance: float = 0.1
     """N: largest change of the load in a converged iteration. Chosen because no contact model

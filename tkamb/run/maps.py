@@ -40,7 +40,7 @@ class MapWriteSettings:
 
     buffer_bytes: float = 4e6
     """bytes: size of the maps that are collected for one write. Chosen because a write takes as
-    long as the computation of one map."""
+    long as the maps of one frame."""
 
 
 MAP_WRITE = MapWriteSettings()

@@ -246,8 +246,8 @@ class RecorderSettings:
     """How often the results of the finished frames are written."""
 
     shortest_pause_seconds: float = 1.0
-    """s: least time before the first and between later copies of the results. Chosen because users
-    wait longer for a frame."""
+    """s: least time before the first and between later copies of the results. Chosen so that the
+    results of a killed run lack few frames."""
     largest_time_share: float = 0.02
     """1: largest share of the computing time for these copies. Chosen because it is not
     noticeable."""

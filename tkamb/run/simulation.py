@@ -221,9 +221,9 @@ def simulate(
             is the contact model.
 
     Raises:
-        InputError: the scene, a file, a key or the number of workers cannot be used, a case is
-            given with another contact model, resolution, preset or override, the run to resume is
-            another one, or the folder cannot be claimed (`tkamb.io.claim`).
+        InputError: the scene, a file, a key or the number of workers cannot be used; a case is
+            given with `contact`, `resolution_mm`, `preset` or changed values; the run to resume is
+            another one; or the folder cannot be claimed (`tkamb.io.claim`).
         ComputationError: a worker was killed.
         KeyboardInterrupt: the run was interrupted. The finished frames are in `directory`.
     """

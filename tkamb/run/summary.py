@@ -132,9 +132,12 @@ def summary_of(
 def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
     """Return numbers for a Methods section that are not in the scene.
 
-    They are the frame rate of an evenly sampled motion, number of triangles and median longest edge
-    of each mesh, least and largest thickness of the insert below the centres of pressure, and
-    tolerances of the contact solver. Unknown numbers are missing.
+    - frame rate of an evenly sampled motion;
+    - number of triangles, and median of their longest edges, of each mesh;
+    - least and largest thickness of the insert below the centres of pressure;
+    - tolerances of the contact solver.
+
+    Unknown numbers are missing.
     """
     time = case.motion.time
     result: dict[str, Any] = {}

@@ -182,9 +182,10 @@ def share_load(problem: LoadSharing) -> Shared:
 def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
     """Return the largest relative violation of the optimality conditions.
 
-    The conditions of Karush, Kuhn and Tucker are stationarity (gradient plus multipliers is zero,
-    relative to the largest term of the gradient), feasibility, and complementarity (multiplier
-    times distance from the bound is zero).
+    The conditions (Karush, Kuhn and Tucker) are stationarity, feasibility and complementarity.
+    Stationarity means that gradient plus multipliers is zero. Its violation is relative to the
+    largest term of the gradient. Complementarity means that multiplier times distance from the
+    bound is zero.
     """
     a, y = shared.activation, shared.others
     slope = problem.gradient(a)

@@ -1,12 +1,13 @@
 """Muscle forces of a whole recording by inverse dynamics and static optimisation.
 
-In each frame, with the generalised forces τ of the motion (inertia, gravity, external loads) and
-the moment arms R = -dL/dq of the muscle lines about the balanced coordinates c,
+In each frame,
 
     τ_c = Σ_i R_ci (a_i F_i + P_i) + r_c.
 
-F_i is a muscle's force at full activation and P_i its passive force. The reserve r_c is the moment
-that the muscles do not provide. Activations a and reserves minimise
+τ are the generalised forces of the motion (inertia, gravity, external loads), and R = -dL/dq the
+moment arms of the muscle lines about the balanced coordinates c. F_i is a muscle's force at full
+activation, and P_i its passive force. The reserve r_c is the moment that the muscles lack.
+Activations a and reserves minimise, with the options of `Sharing`,
 
     Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
 
