@@ -210,7 +210,7 @@ def test_values_of_the_scene_are_changed_by_keyword_or_mapping(bend):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"contct": "hertz"}, "contct: is not an option"),
+        ({"contct": "hertz"}, "contct: is neither an option"),
         ({"patient": {"mas_kg": 80.0}}, "unknown key 'patient.mas_kg'"),
         ({"patient": {"mass_kg": 80.0}, "overrides": {"patient.mass_kg": 70.0}}, "given twice"),
     ],
