@@ -196,16 +196,16 @@ class ContactSide:
             contact = self.press_load(body, self.mechanics.poses[k], contact.start)
             seconds += contact.seconds
             change = abs(float(body.loads.contact_force[1] - load))
-            moved = _travel(points, _points(body))
+            travel = _travel(points, _points(body))
             contact = replace(
                 contact,
                 seconds=seconds,
                 iterations=iteration,
                 load_change=change,
-                point_change=moved if coupled else NAN,
+                point_change=travel if coupled else NAN,
                 post=post,
             )
-            if change < COUPLING.force_tolerance and moved < COUPLING.point_tolerance:
+            if change < COUPLING.force_tolerance and travel < COUPLING.point_tolerance:
                 return body, contact
         problem = "the iteration of body and contact does not converge"
         return replace(body, loads=unsolved([problem])), replace(

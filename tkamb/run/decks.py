@@ -287,10 +287,10 @@ def _mesh(root: Element, problem: "PressProblem") -> None:
 
 def _motion(root: Element, travel: float) -> None:
     """Add the boundary conditions: fixed bottom, femoral component displaced by `travel`, mm."""
-    held = SubElement(SubElement(root, "Boundary"), "bc", name="held", node_set="bottom")
-    held.set("type", "zero displacement")
+    bottom = SubElement(SubElement(root, "Boundary"), "bc", name="held", node_set="bottom")
+    bottom.set("type", "zero displacement")
     for freedom in ("x_dof", "y_dof", "z_dof"):
-        SubElement(held, freedom).text = "1"
+        SubElement(bottom, freedom).text = "1"
     rigid = SubElement(root, "Rigid")
     fixed = SubElement(rigid, "rigid_bc", name="guided", type="rigid_fixed")
     SubElement(fixed, "rb").text = "femur"

@@ -234,12 +234,12 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     chosen = [one for one in errors if one.force == force]
     if not chosen:
         return None
-    own = [one.bias for one in chosen if one.activity == activity]
+    activity_biases = [one.bias for one in chosen if one.activity == activity]
     biases = np.array([one.bias**2 for one in chosen])
     scatters = np.array([one.scatter**2 for one in chosen])
     share = float(biases.sum() / max((biases + scatters).sum(), np.finfo(float).tiny))
     published = float(getattr(DISCREPANCY, f"published_{force}_BW")) / DISCREPANCY.walking_load_BW
-    weight = 0.5 * (1.0 + 1.0 / (len(own) + 1))  # of S² in A
+    weight = 0.5 * (1.0 + 1.0 / (len(activity_biases) + 1))  # of S² in A
     of_published = (weight * share + 1.0 - share) * published**2
     of_trials = weight * biases + scatters
     frames = np.array([max(1.0, one.independent_frames - 1.0) for one in chosen])
@@ -249,10 +249,10 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     total = of_published + float(of_trials.sum())
     inputs = float(np.mean([one.inputs**2 for one in chosen]))
     return Discrepancy(
-        mean=sum(own) / (len(own) + 1),
+        mean=sum(activity_biases) / (len(activity_biases) + 1),
         deviation=float(np.sqrt(max(0.0, total / (len(chosen) + 1) - inputs))),
         freedom=total**2 / max(uncertain, np.finfo(float).tiny),
-        own_trials=len(own),
+        own_trials=len(activity_biases),
         trials=len(chosen),
     )
 
@@ -355,14 +355,14 @@ def rms_error(errors: Sequence[TrialError], force: str, activity: str | None) ->
 def discrepancy_words(summary: Mapping[str, Any]) -> str:
     """Return a sentence on the errors of the method against measured knees."""
     errors, activity = known_errors(), summary.get("activity")
-    own = _of_activity(errors, activity)
+    compared = _of_activity(errors, activity)
     of_what = f"in {activity}" if any(one.activity == activity for one in errors) else "in all"
     parts = []
     for force in FORCES:
-        if any(one.force == force for one in own):
+        if any(one.force == force for one in compared):
             parts.append(f"{rms_error(errors, force, activity):.2f} BW ({force})")
-    trials = len({one.trial for one in own})
-    subjects = len({one.subject for one in own})
+    trials = len({one.trial for one in compared})
+    subjects = len({one.subject for one in compared})
     words = (
         f"when this method was compared with measured knees, it was off by {', '.join(parts)} RMS "
         f"{of_what}: {trials} trial{'s' * (trials != 1)}, "

@@ -63,8 +63,8 @@ class KnownError:
 
 def setting_label(model: str, options: Mapping[str, Any]) -> str:
     """Return the label of a setting in the trade-off study: name and options of the model."""
-    own = ",".join(f"{key}={value}" for key, value in options.items() if key not in SAME_ANSWER)
-    return f"{model}[{own}]" if own else model
+    text = ",".join(f"{key}={value}" for key, value in options.items() if key not in SAME_ANSWER)
+    return f"{model}[{text}]" if text else model
 
 
 @cache

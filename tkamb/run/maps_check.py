@@ -62,8 +62,8 @@ def check_maps_file(file: Any, path: str | Path) -> None:
         dataset = _dataset(file, name, path)
         shape = tuple(points.shape[0] if size == "points" else size for size in sizes[1:])
         # a killed run has more rows than times: the last frames were not completed
-        whole = len(dataset.shape) == len(sizes) and dataset.shape[0] >= frames
-        _check(whole and dataset.shape[1:] == shape, name, dataset, path)
+        is_complete = len(dataset.shape) == len(sizes) and dataset.shape[0] >= frames
+        _check(is_complete and dataset.shape[1:] == shape, name, dataset, path)
 
 
 def check_values(file: Any, path: str | Path) -> None:

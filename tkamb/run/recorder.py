@@ -189,10 +189,10 @@ class Shards:
             arrays = read_arrays(content)
             row = dict(json.loads(arrays.pop("row").tobytes()))
             shard = Shard(row, arrays or None)
-            whole = is_whole(shard)
+            is_valid = is_whole(shard)
         except UNREADABLE:
-            whole = False
-        if not whole:
+            is_valid = False
+        if not is_valid:
             what = "has content that no frame of this run has: somebody changed it"
             raise InputError(what, path, "remove it, or leave out resume=True to begin again")
         return shard

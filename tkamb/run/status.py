@@ -105,11 +105,11 @@ def split_determined(body: "FrameLoads", contact: "FrameContact") -> float:
     """
     if np.isnan(contact.sensitivity):
         return NAN
-    moved = abs(contact.sensitivity) * AGREEMENT.adduction_error
+    shifted = abs(contact.sensitivity) * AGREEMENT.adduction_error
     load = abs(float(body.loads.contact_force[1]))
     share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
     alone = min(share, 1.0 - share) < AGREEMENT.unloaded_share < abs(share - balanced)
-    return float(moved <= AGREEMENT.moved_load_share * load and not alone)
+    return float(shifted <= AGREEMENT.moved_load_share * load and not alone)
 
 
 def _percent(part: float, whole: float) -> str:
@@ -238,9 +238,11 @@ def _patella_flags(case: "Case", body: "FrameLoads") -> list[str]:
 
 def _motion_flags(case: "Case", k: int) -> list[str]:
     motion = case.motion
-    far = motion.deviation_translation[k] > STATUS.filter_translation
+    translated = motion.deviation_translation[k] > STATUS.filter_translation
     rotated = motion.deviation_rotation[k] > STATUS.filter_rotation
-    result = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or rotated else []
+    result = (
+        ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if translated or rotated else []
+    )
     if motion.markers is not None:
         time = motion.time[k : k + 1]
         if motion.markers.at(motion.markers.missing.astype(float), time)[0] > 0:

@@ -198,13 +198,15 @@ def _gait(case: Case) -> dict[str, Any]:
         or case.motion.cycle_percent is not None
     ):
         return inputs
-    offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
+    toe_offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
     inputs["gait"] = {
         "foot_strike_s": gait.foot_strikes,
         "toe_off_s": gait.toe_offs,
         "stance_s": gait.spans(),
         "threshold_N": GAIT.contact_force_N,
-        "toe_off_percent": [float(cycle_percent(np.array(off), cycle)) for off in offs if cycle],
+        "toe_off_percent": [
+            float(cycle_percent(np.array(off), cycle)) for off in toe_offs if cycle
+        ],
     }
     return inputs
 
@@ -345,13 +347,13 @@ def _marker_reading(case: Case) -> str:
     }
     names = ", ".join(case.scene.motion.markers.coordinates)
     time = case.motion.time
-    off = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
+    distance = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
     difference = np.abs(markers.flexion["segments"] - markers.flexion["chain"])
     difference = markers.at(np.nan_to_num(difference), time).max() / DEGREE
     return (
         f"Shank and {names} come from skin markers, by {used[markers.method]}. The knee "
-        f"centres of shank and thigh markers are up to {off:.0f} mm apart. The flexions of the two "
-        f"methods (separate fits, fit with joints) differ by up to {difference:.1f} deg."
+        f"centres of shank and thigh markers are up to {distance:.0f} mm apart. The flexions of "
+        f"the two methods (separate fits, fit with joints) differ by up to {difference:.1f} deg."
     )
 
 

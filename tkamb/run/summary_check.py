@@ -337,11 +337,11 @@ def _depth_of_message(text: str) -> int:
 
 
 def _is(value: Any, word: str) -> bool:
-    whole = isinstance(value, int) and not isinstance(value, bool)
+    is_integer = isinstance(value, int) and not isinstance(value, bool)
     return {
         "text": isinstance(value, str),
-        "number": whole or (isinstance(value, float) and math.isfinite(value)),
-        "count": whole and value >= 0,
+        "number": is_integer or (isinstance(value, float) and math.isfinite(value)),
+        "count": is_integer and value >= 0,
         "null": value is None,
         "other law": isinstance(value, str) and value not in ("ramberg-osgood", "tabulated"),
         "any": True,

@@ -237,14 +237,14 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
 
 def _post_row(post: "PostContact") -> dict[str, float]:
     """Return force, pressure and gap of cam and post."""
-    force, centre, disengaged = post.force, post.centre, NAN if post.problem else 1.0
+    force, centre, factor = post.force, post.centre, NAN if post.problem else 1.0
     return {
         "post_force_N": float(np.linalg.norm(force)),
         "post_force_ap_N": force[0],
         "post_force_si_N": -force[1],
         "post_force_ml_N": force[2],
-        "post_area_mm2": disengaged * post.area / MILLIMETRE**2,
-        "post_peak_pressure_MPa": disengaged * post.peak_pressure / MEGAPASCAL,
+        "post_area_mm2": factor * post.area / MILLIMETRE**2,
+        "post_peak_pressure_MPa": factor * post.peak_pressure / MEGAPASCAL,
         "post_cop_si_mm": centre[1] / MILLIMETRE,
         "post_cop_ml_mm": centre[2] / MILLIMETRE,
         "post_gap_mm": post.gap / MILLIMETRE,

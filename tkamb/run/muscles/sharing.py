@@ -341,8 +341,8 @@ class Sharing:
     def check(self, coordinates: Sequence[str]) -> None:
         """Raise an InputError for an option out of range."""
         if isinstance(self.reserve, Mapping) and set(self.reserve) != set(coordinates):
-            odd = sorted(set(self.reserve) ^ set(coordinates))
-            raise InputError(f"reserve and coordinates differ in {', '.join(odd)}", "muscles")
+            unmatched = sorted(set(self.reserve) ^ set(coordinates))
+            raise InputError(f"reserve and coordinates differ in {', '.join(unmatched)}", "muscles")
         if not (self.reserves(coordinates) >= 0.0).all():
             raise InputError("a reserve is negative or no number", "muscles")
         if not (0.0 <= self.lowest < self.highest < np.inf and 2.0 <= self.exponent < np.inf):
@@ -389,8 +389,8 @@ class FrameProblems:
                 if shared.kkt_residual < SHARING.kkt_tolerance:
                     return shared.activation, shared.others, shared.kkt_residual, "ok"
                 reason = f"the conditions of the optimum are violated by {shared.kkt_residual:.1g}"
-        nothing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)
-        return *nothing, np.nan, f"failed: {reason}"
+        missing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)
+        return *missing, np.nan, f"failed: {reason}"
 
     def _unknown(self, k: int) -> str | None:
         """Return why frame k cannot be solved; None if it can."""

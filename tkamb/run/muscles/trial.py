@@ -193,7 +193,7 @@ class MuscleTrial:
             InputError: muscles end on the patella, and the force of the patellar ligament is
                 unknown.
         """
-        own = ("tibia", "foot")
+        shank = ("tibia", "foot")
         if "patella" in self.bones.names:
             patella = self.bones.attachments("patella", "tibia").points
             other = [None, "femur"]
@@ -209,7 +209,7 @@ class MuscleTrial:
                     "muscles",
                     "use a model with quadriceps lines past the patella to the tibia",
                 )
-        return self.bones.demand_of(own, "tibia") - self.muscle_wrench(own, "tibia")
+        return self.bones.demand_of(shank, "tibia") - self.muscle_wrench(shank, "tibia")
 
 
 def solve_trial(
@@ -279,10 +279,10 @@ def trial_problems(
     q, groups = motion.q, leg_bones(leg)
     bones = kinematics.motion(q)
     needed = required_wrenches(kinematics, bones, q, motion.rates, motion.accelerations, loads)
-    own = kinematics.coupling(q)[:, :, [kinematics.coordinates[name] for name in balanced]]
-    moment = np.einsum("fbin,fbi,fnc->fc", bones.twists, needed, own, optimize=True)
+    coupling = kinematics.coupling(q)[:, :, [kinematics.coordinates[name] for name in balanced]]
+    moment = np.einsum("fbin,fbi,fnc->fc", bones.twists, needed, coupling, optimize=True)
     pulls = LineSet(kinematics, names).pulls(q, list(groups.values()))
-    arms = pulls.moment_arms @ own
+    arms = pulls.moment_arms @ coupling
     active, passive = _strength(kinematics, motion, sharing, pulls)
     muscles = [model.muscles[name] for name in names]
     problem = FrameProblems(muscles, balanced, sharing, moment, arms, active, passive)

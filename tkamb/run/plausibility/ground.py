@@ -186,15 +186,15 @@ def posture_questions(case: Case) -> Iterator[Question]:
         + np.linalg.norm(chain.link_in("hip", "femur")[:3, 3])
     )
     ahead = np.einsum("fi,fi->f", _to_hip(case), _forward(case))
-    off = loaded & (np.abs(ahead) > GROUND_REACTION_LIMITS.max_hip_distance * length)
-    if off.any():
-        k = int(np.argmax(np.where(off, np.abs(ahead), 0.0)))
+    frames = loaded & (np.abs(ahead) > GROUND_REACTION_LIMITS.max_hip_distance * length)
+    if frames.any():
+        k = int(np.argmax(np.where(frames, np.abs(ahead), 0.0)))
         side = "ahead of" if ahead[k] > 0 else "behind"
         yield Question(
             f"the hip is {abs(ahead[k]) / MILLIMETRE:.0f} mm {side} the centre of pressure of a "
             "loaded foot: is the sign of [tibia]'s lean, or of the flexion, wrong?",
             "hip not above the foot",
-            off,
+            frames,
         )
 
 
@@ -259,9 +259,9 @@ def foot_questions(case: Case) -> Iterator[Question]:
         ("below", "above", -away[:, 1], ANKLE_ABOVE),
     )
     for word, opposite, place, (low, high) in places:
-        off = loaded & ((place < low) | (place > high))
-        if off.any():
-            k = int(np.argmax(np.where(off, np.maximum(low - place, place - high), -np.inf)))
+        frames = loaded & ((place < low) | (place > high))
+        if frames.any():
+            k = int(np.argmax(np.where(frames, np.maximum(low - place, place - high), -np.inf)))
             yield Question(
                 f"the centre of pressure lies {abs(place[k]) / MILLIMETRE:.0f} mm "
                 f"{word if place[k] >= 0 else opposite} the ankle at "

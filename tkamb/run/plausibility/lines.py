@@ -83,10 +83,10 @@ def attachment_questions(case: Case) -> Iterator[Question]:
             ("[patellar_ligament] proximal", case.patellar_ligament.proximal),
             ("[patellar_ligament] distal", case.patellar_ligament.distal),
         ]
-    tiny = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
-    if tiny:
+    near_origin = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
+    if near_origin:
         yield Question(
-            f"{some(tiny)}: within 1 mm of the link's origin; is point_mm in metres?",
+            f"{some(near_origin)}: within 1 mm of the link's origin; is point_mm in metres?",
             "attachment within 1 mm of its link's origin",
         )
 

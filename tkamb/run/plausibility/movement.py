@@ -81,14 +81,14 @@ def motion_questions(case: Case) -> Iterator[Question]:
             )
     for name, (low, high) in USUAL_DEG.items():
         angle = angles[name] / DEGREE
-        far = (angle < low) | (angle > high)
-        if far.any():
+        frames = (angle < low) | (angle > high)
+        if frames.any():
             worst = angle[int(np.argmax(np.maximum(low - angle, angle - high)))]
             yield Question(
                 f"{name} reaches {worst:.0f} deg, where few knees go ({low} to {high}): is its "
                 "column, sign ([motion] signs_turned) or axis another one?",
                 f"{name} of {worst:.0f} deg",
-                far,
+                frames,
             )
         fast = np.abs(rates[name]) > USUAL_RATE[name]
         if fast.any():
@@ -101,15 +101,15 @@ def motion_questions(case: Case) -> Iterator[Question]:
             )
     if motion.patella is not None:
         away = np.hypot(motion.patella[:, 0], motion.patella[:, 1])
-        far = (away < PATELLA_AWAY[0]) | (away > PATELLA_AWAY[1])
-        if far.any():
+        frames = (away < PATELLA_AWAY[0]) | (away > PATELLA_AWAY[1])
+        if frames.any():
             nearest, farthest = away.min() / MILLIMETRE, away.max() / MILLIMETRE
             yield Question(
                 f"the patella lies {nearest:.3g} to {farthest:.3g} mm from the flexion axis: are "
                 "its ap and si in millimetres, from the femoral component's origin, with the right "
                 "sign?",
                 "patella too near to or far from the flexion axis",
-                far,
+                frames,
             )
     yield from _translation_questions(case)
     if motion.time[0] == 0.0 and motion.time[-1] == 100.0:
