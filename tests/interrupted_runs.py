@@ -1,4 +1,4 @@
-"""Runs that are interrupted, and folders into which another process writes."""
+"""Interrupted runs, and folders that another process claims."""
 
 import tempfile
 import threading
@@ -12,7 +12,7 @@ from tkamb.run.simulation import simulate
 CLOCKS = ("status", "body_seconds", "query_seconds", "contact_seconds")
 EFFORT = ("iterations", "contact_trials", "coupling_iterations")
 RESIDUALS = ("coupling_change_N", "coupling_change_mm")
-"""What is left of an iteration that has converged; no result."""
+"""Columns with residuals of a converged iteration, which are no results."""
 TOLERANCES = {
     "approach_mm": 1e-3,
     "peak_pressure_MPa": 2e-3,
@@ -21,14 +21,14 @@ TOLERANCES = {
     "area_above_yield": 4e-3,
     "per_adduction_N_per_deg": 1e-2,
 }
-"""End of a column's name -> how far the lattice's answer may depend on its warm start: twice what
-`tests/test_lattice_residual.py` holds it to. Of the column's peak; of one for shares."""
+"""Suffix of a column -> largest effect of the lattice's warm start, as a share of the column's peak
+(of 1 for shares). It is twice the tolerance in `tests/test_lattice_residual.py`."""
 OTHER = 1e-3
-"""Of the largest contact force for forces, of the column's peak for all others."""
+"""The same for other columns, as a share of the largest contact force or of the column's peak."""
 
 
 def broken_off(after):
-    """Return a `progress` that is interrupted after so many jobs."""
+    """Return a `progress` function that raises KeyboardInterrupt after a number of jobs."""
 
     def progress(jobs, count=None):
         for index, one in enumerate(jobs):
@@ -41,36 +41,36 @@ def broken_off(after):
 
 @contextmanager
 def held_elsewhere(folder):
-    """Have another thread write into a folder while the block runs."""
-    held, done = threading.Event(), threading.Event()
+    """Claim a folder in another thread during the block."""
+    claimed, end = threading.Event(), threading.Event()
 
     def hold():
         with claimed_directory(folder):
-            held.set()
-            done.wait()
+            claimed.set()
+            end.wait()
 
-    other = threading.Thread(target=hold)
-    other.start()
-    held.wait()
+    thread = threading.Thread(target=hold)
+    thread.start()
+    claimed.wait()
     try:
         yield
     finally:
-        done.set()
-        other.join()
+        end.set()
+        thread.join()
 
 
 def interrupted(scene, stops, **options):
-    """Return the results of a run that is interrupted after so many more frames, each time."""
-    with tempfile.TemporaryDirectory(prefix="tkamb-interrupted-") as place:
-        given = {"directory": place, "resume": True, **options}
+    """Return the results of a run that is interrupted and resumed for each number of frames."""
+    with tempfile.TemporaryDirectory(prefix="tkamb-interrupted-") as folder:
+        arguments = {"directory": folder, "resume": True, **options}
         for stop in stops:
             with suppress(KeyboardInterrupt):
-                simulate(scene, progress=broken_off(stop), **given)
-        return simulate(scene, **given)
+                simulate(scene, progress=broken_off(stop), **arguments)
+        return simulate(scene, **arguments)
 
 
 def deviations(found, whole):
-    """Return column -> difference of two runs of the same frames, as a share of its tolerance."""
+    """Return column -> difference of two runs over its tolerance."""
     assert found.status == whole.status
     result = {}
     for name in whole.columns:

@@ -1,4 +1,4 @@
-"""Folders of results without a report, which takes longer to draw than all the rest."""
+"""Results folders without a report, since drawing it takes long."""
 
 from tkamb.files import replaced_together
 from tkamb.io.claim import claimed_directory
@@ -7,12 +7,12 @@ from tkamb.run.results_folder import put_numbers
 
 
 def keep(results, folder, maps=None):
-    """Write results into a folder as a run does, but for the report; return the folder.
+    """Write results without a report into a folder, and return the folder.
 
     Args:
-        results: what to keep.
-        folder: where; made if it is not there.
-        maps: instead of the results' own.
+        results: the results.
+        folder: path of the folder, which is created if it does not exist.
+        maps: pressure maps; None: those of the results.
     """
     maps = results.maps if maps is None else maps
     with claimed_directory(folder) as place, replaced_together(place) as files:

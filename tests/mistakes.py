@@ -1,7 +1,7 @@
-"""A bench for mistakes: edit a copy of a scene and see whether the product notices.
+"""A test bench for mistakes: it edits a copy of a scene, and checks whether tkamb reports them.
 
-The body side alone is run, for a few frames; meshes, and what is built from them, are read once
-and kept, since nothing here but their placement changes.
+Only the rigid-body equations of a few frames are computed. Meshes are read once, since edits change
+only their positions.
 """
 
 import csv
@@ -31,33 +31,33 @@ NUMBER = re.compile(r"-?\d[\d.]*(e[+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a scene: refused with a message, or words about it and forces."""
+    """The outcome of a scene: its refusal, or questions and flags, and forces."""
 
     refused: str
     words: frozenset[str]
     forces: np.ndarray
 
     def notices(self, untouched):
-        """Say whether a reader is warned: a refusal, or a question or flag that was not there."""
+        """Return whether there is a refusal, or a question or flag that the original lacks."""
         return bool(self.refused) or bool(self.words - untouched.words)
 
     def same(self, untouched):
-        """Say whether all forces are the untouched scene's to 1e-9."""
+        """Return whether all forces agree with the original scene to 1e-9."""
         if self.refused or self.forces.shape != untouched.forces.shape:
             return False
         return np.allclose(self.forces, untouched.forces, rtol=1e-9, atol=1e-9, equal_nan=True)
 
 
-def kept(factory, store):
-    """Return a factory that makes the same thing from the same surfaces and words once."""
+def cached(factory, store):
+    """Return a factory that caches its results by its arguments."""
 
-    def made(*arguments, **named):
+    def make(*arguments, **named):
         key = (factory.__name__, *map(_key, arguments), *map(_key, sorted(named.items())))
         if key not in store:
             store[key] = factory(*arguments, **named)
         return store[key]
 
-    return made
+    return make
 
 
 def _key(value):
@@ -66,7 +66,7 @@ def _key(value):
 
 
 def keep_meshes(monkeypatch):
-    """Have meshes, their repair and their search trees made once."""
+    """Cache meshes, their repair and their search trees."""
     store = {}
     for module, name in (
         ("tkamb.io.recordings.meshes", "load_surface"),
@@ -74,16 +74,16 @@ def keep_meshes(monkeypatch):
         ("tkamb.knee.extensor", "PatellofemoralContact"),
     ):
         place = __import__(module, fromlist=[name])
-        monkeypatch.setattr(place, name, kept(getattr(place, name), store))
+        monkeypatch.setattr(place, name, cached(getattr(place, name), store))
 
 
 class Bench:
-    """A scene in a folder of its own, edited again and again.
+    """A scene in its own folder for repeated edits.
 
     Args:
-        folder: where the files are; `files` of them may be edited.
-        content: the scene as plain values.
-        frames: to look at.
+        folder: folder of the scene's files.
+        content: keys of the scene.
+        frames: frames to compute.
     """
 
     def __init__(self, folder, content, frames):
@@ -93,7 +93,7 @@ class Bench:
         self.untouched = self.outcome()
 
     def outcome(self, edit=None):
-        """Return what comes of an edit: a function of (scene content, file name -> text)."""
+        """Return the outcome of an edit, a function of (scene content, file name -> text)."""
         content, texts = tomllib.loads(as_toml(self.content)), dict(self.texts)
         if edit is not None:
             edit(content, texts)
@@ -111,7 +111,7 @@ class Bench:
     def _run(self, scene):
         case = load_case(load_scene(scene))
         contact = case.scene.contact
-        if contact is not None:  # what the contact side, which is not run, would refuse
+        if contact is not None:  # contact is not computed, but its settings are checked
             contact_model(contact.model, contact.resolution_mm, **contact.options)
             material(contact.material)
         mechanics = mechanics_of(case)
@@ -129,7 +129,7 @@ class Bench:
 
 
 def shipped_bench(folder):
-    """Return the shipped knee, its motion at five times."""
+    """Return the bench of the shipped knee with five frames."""
     for path in MODEL.iterdir():
         if path.suffix in (".csv", ".urdf"):
             shutil.copy(path, folder)
@@ -141,7 +141,7 @@ def shipped_bench(folder):
 
 
 def dm_bench(folder):
-    """Return subject DM without the patella, its recordings cut to the stride and thinned."""
+    """Return the bench of subject DM without patella, for one stride."""
     shutil.copy(DM / "patient.urdf", folder)
     content = tomllib.loads((DM / "scene.toml").read_text(encoding="utf-8"))
     for name in ("patella", "quadriceps", "patellar_ligament"):
@@ -159,7 +159,7 @@ def dm_bench(folder):
 
 
 def _cut(text, every):
-    """Return a recording's rows between 3 and 6.5 s, each `every`-th, with its header."""
+    """Return the header and every `every`-th row of a recording between 3 and 6.5 s."""
     header, rows, column = [], [], None
     for line in filter(str.strip, text.splitlines()):
         cells = line.split("\t") if "\t" in line else line.split()
@@ -173,7 +173,7 @@ def _cut(text, every):
 
 
 def cells_of(text, separator=","):
-    """Return a CSV's rows."""
+    """Return the rows of a CSV text."""
     return list(csv.reader(text.splitlines(), delimiter=separator))
 
 
@@ -183,7 +183,7 @@ def text_of(rows, separator=","):
 
 
 def set_key(content, dotted, value):
-    """Set a key of the scene, tables separated by dots; None takes it out."""
+    """Set a dotted key of the scene; None removes it."""
     *tables, key = dotted.split(".")
     for name in tables:
         content = content[int(name)] if isinstance(content, list) else content.setdefault(name, {})

@@ -1,4 +1,4 @@
-"""A made-up run with muscles, EMG and a measured force: a gait whose parts sum up."""
+"""A synthetic gait run with muscles, EMG and measured forces, and consistent contributions."""
 
 from dataclasses import replace
 
@@ -26,11 +26,11 @@ KEPT += [
     for side in ("medial", "lateral")
     for kind in ("force_N", "force_equilibrium_N")
 ]
-"""Columns of the plain run; few, so that the page is soon made."""
+"""Columns from the run without muscles. They are few, so that the report is drawn fast."""
 
 
 def muscle_run(frames: int = 56) -> Results:
-    """Return the run; one frame failed, the measured force lacks the last two."""
+    """Return the run. One frame has failed, and the last two have no measured force."""
     plain = make_run("gait", frames, maps=False)
     s = np.linspace(0, 1, frames)
     columns = {name: plain.columns[name] for name in KEPT}

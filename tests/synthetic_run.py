@@ -1,7 +1,7 @@
-"""A made-up but self-consistent run: two Hertz-like patches that roll over a dished insert.
+"""A synthetic, self-consistent run: two Hertzian contacts that roll over a dished insert.
 
-Each condyle carries F = (2/3) p0 pi a b on an ellipse, so that area = pi a b and
-mean pressure = (2/3) p0 hold exactly; muscles, balance and shares are consistent with it.
+The force of each condyle is F = (2/3) p0 pi a b, with the area pi a b and the mean pressure
+(2/3) p0. Muscle forces, equilibrium and shares are consistent with it.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ CENTRES_Z = (-23e-3, 23e-3)
 
 
 def dished_top(spacing: float = 1.5e-3) -> tuple[Array, Array]:
-    """Points (n, 3) and triangles (k, 3) of an insert's top with two dishes."""
+    """Return points (n, 3) and triangles (k, 3) of an insert's top with two dishes."""
     x = np.arange(-24e-3, 24e-3 + spacing / 2, spacing)
     z = np.arange(-36e-3, 36e-3 + spacing / 2, spacing)
     gx, gz = np.meshgrid(x, z, indexing="ij")
@@ -37,7 +37,7 @@ def dished_top(spacing: float = 1.5e-3) -> tuple[Array, Array]:
 
 
 def make_run(kind: str = "bend", frames: int = 101, *, maps: bool = True) -> Results:
-    """A deep knee bend ("bend") or a gait cycle of a left knee with flags ("gait")."""
+    """Return a deep knee bend ("bend") or a gait cycle of a left knee with flags ("gait")."""
     columns = _bend(frames) if kind == "bend" else _gait(frames)
     _derived(columns)
     contact_maps = _maps(columns) if maps else None
@@ -141,7 +141,7 @@ def _derived(columns: dict[str, Any]) -> None:
 
 
 def _spoil(columns: dict[str, Any]) -> None:
-    """One singular frame, a few whose raw and filtered motion differ."""
+    """Add one failed frame and six flagged frames."""
     frames = len(columns["status"])
     for k in range(frames // 2, frames // 2 + 6):
         columns["status"][k] = "raw_filtered_differ"

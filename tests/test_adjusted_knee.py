@@ -1,4 +1,4 @@
-"""What the femoral adjustment does to the forces of the shipped knee."""
+"""Effect of the femoral adjustment on the forces of the shipped knee."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def split(results):
 
 
 def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
-    """Sharma (2008): the total changes by less than 0.001 BW. Here 1e-5: nothing to be mended."""
+    """Sharma (2008): the total changes by less than 0.001 BW."""
     adjusted, recorded = with_and_without(wrong_scene(tmp_path, 0.0, 0.0))
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     assert np.abs(change).max() < 0.001
@@ -45,8 +45,8 @@ def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
 
 
 @pytest.mark.parametrize("degrees", [0.35, pytest.param(-0.35, marks=pytest.mark.slow)])
-def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path, degrees):
-    """0.35 deg and 0.3 mm of error: the split is mended, the total changes by 0.006 BW."""
+def test_the_adjustment_corrects_the_split_of_a_coronal_error(tmp_path, degrees):
+    """With errors of 0.35 deg and 0.3 mm the total changes by 0.006 BW."""
     right = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))
     adjusted, recorded = with_and_without(wrong_scene(tmp_path / "wrong", degrees, 0.3))
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
@@ -62,20 +62,19 @@ def test_the_adjustment_mends_the_split_of_a_coronal_error(tmp_path, degrees):
     assert error[0] < 0.2 * error[1]
 
 
-def test_a_total_that_hangs_on_the_adjustment_is_flagged(tmp_path):
-    """One condyle 0.6 mm too high is lift-off once the other has been brought to touch."""
+def test_a_total_that_depends_on_the_adjustment_is_flagged(tmp_path):
+    """A condyle that is 0.6 mm too high lifts off when the other one touches."""
     path = wrong_scene(tmp_path, 0.9, -0.2)
     adjusted, recorded = with_and_without(path)
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     np.testing.assert_allclose(adjusted["adjust_force_change_BW"], change, rtol=1e-9)
     assert (np.abs(change) > 0.01).any()
     for status, one in zip(adjusted.status, change, strict=True):
-        told = "femoral adjustment changes the total" in status
-        assert told == (abs(one) > 0.01)
+        flagged = "femoral adjustment changes the total" in status
+        assert flagged == (abs(one) > 0.01)
 
 
-def test_a_restored_frame_is_the_recorded_rotation_for_the_body_too(tmp_path):
-    """The load pressed in is that of the points at the restored pose."""
+def test_a_restored_frame_has_its_contact_points_at_the_recorded_rotation(tmp_path):
     path = wrong_scene(tmp_path, 0.3, 0.0)
     changes = {"contact.adjust": True, "contact.adjust_restore_when": "either"}
     case = load_case(load_scene(path, changes | {"motion.frames": 26}))
@@ -86,8 +85,8 @@ def test_a_restored_frame_is_the_recorded_rotation_for_the_body_too(tmp_path):
         if not contact.adjustment.restored:
             continue
         restored += 1
-        there = side.mechanics.query.at(contact.adjustment.pose)
+        closest = side.mechanics.query.at(contact.adjustment.pose)
         for name, point in body.geometry.condyles.items():
-            np.testing.assert_array_equal(point.point, getattr(there, name).centre)
+            np.testing.assert_array_equal(point.point, getattr(closest, name).centre)
         np.testing.assert_array_equal(contact.result.pose[:3, :3], side.mechanics.poses[k][:3, :3])
     assert restored

@@ -1,4 +1,4 @@
-"""What the body adds to the results: sliding, strains, wrapping; roll-slip, generic ligaments."""
+"""Results of the rigid-body equations: sliding, strains, wrapping, roll-slip, ligaments."""
 
 import weakref
 
@@ -34,13 +34,13 @@ def test_slip_velocity_by_arcs_is_that_of_the_rigid_body(bend, side):
 
 
 @pytest.mark.parametrize("side", ["medial", "lateral"])
-def test_shipped_motion_keeps_the_contact_constraint(bend, side):
-    """Its poses are first touches of smooth surfaces; facets leave 0.1 mm/s of 17 mm/s."""
+def test_the_shipped_motion_satisfies_the_contact_constraint(bend, side):
+    """Its poses are first touches of smooth surfaces. The facets cause up to 0.1 mm/s."""
     assert np.abs(bend[f"{side}_normal_velocity_mm_per_s"]).max() < 0.1
 
 
-def test_a_femur_that_is_lifted_violates_it(tmp_path):
-    """1 mm in a second, upwards: that velocity along the normal, in every frame."""
+def test_a_lifted_femur_violates_the_contact_constraint(tmp_path):
+    """An added upward velocity of 1 mm/s is the normal velocity in every frame."""
     path = write_scene(tmp_path)
     file = path.parent / "motion.csv"
     header = file.read_text(encoding="utf-8").split("\n", 1)[0]
@@ -53,21 +53,21 @@ def test_a_femur_that_is_lifted_violates_it(tmp_path):
 
 
 def test_strains_and_first_wrapping_are_in_the_summary(bend):
-    found = bend.summary["ligament_strain"]
-    assert list(found["flexion_deg"]) == [0.0, 60.0, 90.0]
-    assert set(found["strain"]) == {bundle.name for bundle in load_scene(fast_scene()).ligament}
-    assert all(abs(strain) < 0.2 for row in found["strain"].values() for strain in row)
+    strains = bend.summary["ligament_strain"]
+    assert list(strains["flexion_deg"]) == [0.0, 60.0, 90.0]
+    assert set(strains["strain"]) == {bundle.name for bundle in load_scene(fast_scene()).ligament}
+    assert all(abs(strain) < 0.2 for row in strains["strain"].values() for strain in row)
     wrapped = bend["flexion_deg"][bend["quadriceps_wrap_deg"] > 0]
     assert bend.summary["first_wrapping_flexion_deg"] == wrapped.min()
     table = strain_table(bend.summary)
-    shown = {name: cells for name, *cells in table.rows}
-    assert "PCL_anterolateral" in shown
-    drawn = f"{100 * found['strain']['MCL_deep'][0]:.1f}".replace("-", "−")
-    assert shown["MCL_deep"][0] == drawn
+    rows = {name: cells for name, *cells in table.rows}
+    assert "PCL_anterolateral" in rows
+    text = f"{100 * strains['strain']['MCL_deep'][0]:.1f}".replace("-", "−")
+    assert rows["MCL_deep"][0] == text
 
 
 def test_roll_slip_with_the_recorded_slip_is_the_recorded_motion():
-    """AP from rolling plus slip gives back AP, SI from contact SI, on a motion in touch."""
+    """For a motion in contact, rolling plus slip gives the recorded AP, and contact gives SI."""
     recorded = load_case(load_scene(fast_scene(), FEW)).motion
     case = load_case(load_scene(fast_scene(), FEW | {"motion.motion": "roll-slip"}))
     rolled = case.motion
@@ -80,13 +80,13 @@ def test_roll_slip_with_the_recorded_slip_is_the_recorded_motion():
         assert min(abs(gaps.medial.gap), abs(gaps.lateral.gap)) < 2e-6
 
 
-def test_pure_rolling_leaves_this_insert_and_says_so():
+def test_pure_rolling_off_the_insert_is_refused():
     changes = FEW | {"motion.motion": "roll-slip", "motion.slip_share": 0.0}
     with pytest.raises(InputError, match="rolls off the insert at"):
         load_case(load_scene(fast_scene(), changes))
 
 
-def test_generic_ligaments_are_named_so():
+def test_generic_ligaments_have_generic_in_their_names():
     changes = FEW | {"ligament": [], "generic_ligaments.ligaments": ["MCL", "PCL"]}
     results = simulate(load_scene(fast_scene(), changes), frames=slice(15, 16))
     names = [name for name in results.columns if name.startswith("ligament_")]
@@ -107,7 +107,7 @@ def test_generic_ligaments_are_named_so():
         ({"quadriceps.band_mm": -1.0}, "band_mm"),
     ],
 )
-def test_keys_that_do_not_go_together(changes, words):
+def test_keys_that_exclude_each_other_are_refused(changes, words):
     with pytest.raises(InputError, match=words):
         load_scene(fast_scene(), changes)
 
@@ -115,10 +115,9 @@ def test_keys_that_do_not_go_together(changes, words):
 @pytest.mark.parametrize("table", ["quadriceps", "patellar_ligament"])
 @pytest.mark.parametrize(("key", "value"), [("half_thickness_mm", 0.0035), ("band_mm", 0.005)])
 def test_a_tendon_in_metres_is_refused(table, key, value):
-    """It ran as ok: at 120 deg a string of a quadriceps pulls 0.7 % more than a tendon."""
     with pytest.raises(InputError, match=f"{value:g} is neither 0 nor within .* in millimetres"):
         load_scene(fast_scene(), {f"{table}.{key}": value})
-    load_scene(fast_scene(), {f"{table}.{key}": 0.0})  # a string, or its own plane, as before
+    load_scene(fast_scene(), {f"{table}.{key}": 0.0})  # a line without thickness or breadth
 
 
 def test_a_reference_pose_that_was_not_recorded_is_refused(tmp_path):
@@ -132,8 +131,8 @@ def test_a_reference_pose_that_was_not_recorded_is_refused(tmp_path):
         simulate(load_scene(path, changes), frames=slice(0, 1))
 
 
-def test_a_wider_band_wraps_sooner_and_further():
-    """The flanges stand in front of the groove's floor."""
+def test_a_wider_quadriceps_band_wraps_earlier_and_over_a_larger_angle():
+    """The ridges beside the groove are in front of its floor."""
     wraps = []
     for band in (5.0, 12.0):
         mechanics = mechanics_of(
@@ -144,13 +143,13 @@ def test_a_wider_band_wraps_sooner_and_further():
     assert (np.array(wraps[1]) > np.array(wraps[0])).all()
 
 
-def test_a_long_motion_keeps_no_state_of_every_frame(monkeypatch):
-    """A state holds Pinocchio's data, a quarter of a MB: 3,000 of them were 0.8 GB."""
-    at, seen = Chain.at, []
+def test_a_long_motion_stores_no_chain_state_per_frame(monkeypatch):
+    """A state with its Pinocchio data has a quarter of a MB."""
+    at, states = Chain.at, []
 
     def watched(self, motion):
         state = at(self, motion)
-        seen.append(weakref.ref(state))
+        states.append(weakref.ref(state))
         return state
 
     monkeypatch.setattr(Chain, "at", watched)
@@ -158,12 +157,12 @@ def test_a_long_motion_keeps_no_state_of_every_frame(monkeypatch):
     assert mechanics.ligaments
     for k in range(len(mechanics.motion)):
         mechanics.geometry(k)
-    assert len(seen) >= 26
-    assert sum(one() is not None for one in seen) <= 1
+    assert len(states) >= 26
+    assert sum(one() is not None for one in states) <= 1
 
 
-def test_a_contact_out_of_range_leaves_no_load_of_the_body(tmp_path):
-    """At a recorded pose: the body has its forces, but the insert cannot carry them."""
+def test_a_frame_with_contact_out_of_range_has_no_forces(tmp_path):
+    """The equations have a solution, but the insert cannot carry the load."""
     path = write_scene(tmp_path)
     file = path.parent / "ground_reaction.csv"
     header = file.read_text(encoding="utf-8").split("\n", 1)[0]
@@ -176,6 +175,6 @@ def test_a_contact_out_of_range_leaves_no_load_of_the_body(tmp_path):
     assert not carried.startswith("failed")
     assert crushed.startswith("failed: contact out of range")
     motion = {"time_s", "flexion_deg", "adduction_deg", "axial_rotation_deg"}
-    told = {name for name, v in results.columns.items() if name != "status" and np.isfinite(v[1])}
-    assert motion <= told <= {*motion, *WHY_IT_FAILED}
+    numbers = {n for n, v in results.columns.items() if n != "status" and np.isfinite(v[1])}
+    assert motion <= numbers <= {*motion, *WHY_IT_FAILED}
     assert np.isfinite(results["force_total_N"][0])

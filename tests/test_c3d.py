@@ -1,4 +1,4 @@
-"""C3D recordings: what a plate measured, on which clock, and what is refused."""
+"""C3D recordings: wrenches of force plates, clocks, and refused files."""
 
 import struct
 from pathlib import Path
@@ -19,7 +19,7 @@ from tkamb.run.plausibility.movement import sample_questions
 
 JW = Path(__file__).parents[2] / "shared" / "data" / "jw" / "motion"
 COUNT, RATIO = 20, 10
-A, B, Z0 = 0.12, 0.2, -0.04  # m; where a type 3 plate has its sensors
+A, B, Z0 = 0.12, 0.2, -0.04  # m: position of the sensors of a type 3 plate
 
 
 def pushes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -31,7 +31,7 @@ def pushes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def plate_signals(kind: int, corners: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return the channels (c, k) that a plate of a type gives under `pushes`; N, N·mm and mm."""
+    """Return the channels (c, k) of a plate of a type under `pushes`, N, N·mm and mm."""
     force, point, free = pushes()
     x, y = corners[0] - corners[1], corners[0] - corners[3]
     axes = np.stack([x / np.linalg.norm(x), y / np.linalg.norm(y), np.zeros(3)])
@@ -45,7 +45,7 @@ def plate_signals(kind: int, corners: np.ndarray, origin: np.ndarray) -> np.ndar
     about = m + np.cross(origin if kind != 3 else [0, 0, origin[2]], f)
     if kind != 3:
         return np.column_stack([f, about * 1e3]).T
-    # the eight sensors' shares: any that give this force and moment
+    # any distribution over the eight sensors with this force and moment
     fx = [f[:, 0] / 2, f[:, 0] / 2]
     fy = [f[:, 1] / 2 + about[:, 2] / (2 * A), f[:, 1] / 2 - about[:, 2] / (2 * A)]
     roll, pitch = about[:, 0] / (4 * B), about[:, 1] / (4 * A)
@@ -59,7 +59,7 @@ FLIPPED = AMTI_CORNERS[[1, 0, 3, 2]]  # x and z of the plate turned: its z point
 
 @pytest.mark.parametrize("corners", [AMTI_CORNERS, FLIPPED], ids=["up", "down"])
 @pytest.mark.parametrize("kind", [1, 2, 3, 4])
-def test_each_type_gives_the_wrench_that_acts(tmp_path, kind, corners):
+def test_each_plate_type_gives_the_applied_wrench(tmp_path, kind, corners):
     origin = {2: [0.003, -0.002, -0.03], 3: [A, B, Z0], 4: [0.0, 0.0, -0.05]}.get(kind, [0, 0, 0])
     signals = plate_signals(kind, corners, np.array(origin, float))
     plate = {"type": kind, "corners": corners, "origin": origin}
@@ -86,7 +86,7 @@ def test_each_type_gives_the_wrench_that_acts(tmp_path, kind, corners):
 
 
 def two_plates(tmp_path: Path, **more) -> Path:
-    """Write a recording whose load is shared by two plates of type 2, half each."""
+    """Write a recording with half of the load on each of two plates of type 2."""
     beside = AMTI_CORNERS + np.array([0.0, 0.5, 0.0])
     halves = [0.5 * plate_signals(2, corners, np.zeros(3)) for corners in (AMTI_CORNERS, beside)]
     plates = [
@@ -104,7 +104,7 @@ def two_plates(tmp_path: Path, **more) -> Path:
     )
 
 
-def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure(tmp_path):
+def test_one_foot_on_two_plates_has_the_sum_of_their_wrenches(tmp_path):
     path = two_plates(tmp_path)
     table = GroundReactionTable(
         file=path, plates=(1, 2), laboratory_axes="+x,+z,-y", cutoff_Hz="none"
@@ -122,7 +122,7 @@ def test_one_foot_on_two_plates_is_their_summed_wrench_at_one_centre_of_pressure
         load_ground_reaction(on_plate, time, "right")
 
 
-def test_an_odd_sample_of_a_c3d_is_no_cell_but_a_spike_of_its_plates(tmp_path):
+def test_an_outlier_in_a_c3d_file_is_called_a_spike_of_the_plates(tmp_path):
     path = two_plates(tmp_path)
     table = GroundReactionTable(file=path, plates=(1, 2), cutoff_Hz=6.0)
     ground = SimpleNamespace(odd=(OddSample(path, "upward force", 0.05, 75.8, "N"),))
@@ -134,10 +134,9 @@ def test_an_odd_sample_of_a_c3d_is_no_cell_but_a_spike_of_its_plates(tmp_path):
     assert "spike" in question.text and "cell" not in question.text
 
 
-def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
-    """What the foot bears is the same wrench, given at the level that it stands on."""
+def test_the_centre_of_pressure_on_a_step_is_on_the_same_line_of_action(tmp_path):
     path = two_plates(tmp_path)
-    both = {}
+    reactions = {}
     for surface in (0.0, 400.0):
         table = GroundReactionTable(
             file=path,
@@ -146,22 +145,22 @@ def test_on_a_step_the_point_moves_along_the_line_of_action(tmp_path):
             cutoff_Hz="none",
             surface_mm=surface,
         )
-        both[surface] = load_ground_reaction(table, np.array([0.05, 0.1]), "right")
-    flat, step = both.values()
+        reactions[surface] = load_ground_reaction(table, np.array([0.05, 0.1]), "right")
+    flat, step = reactions.values()
     np.testing.assert_allclose(step.force, flat.force)
     np.testing.assert_allclose(step.point[:, 1] - flat.point[:, 1], 0.4)
     shift = step.point - flat.point
     np.testing.assert_allclose(np.cross(shift, flat.force)[:, [0, 2]], 0.0, atol=1e-9)
-    for found in both.values():
-        about = found.moment + np.cross(found.point, found.force)
+    for ground in reactions.values():
+        about = ground.moment + np.cross(ground.point, ground.force)
         np.testing.assert_allclose(about, flat.moment + np.cross(flat.point, flat.force), atol=1e-9)
-        np.testing.assert_allclose(found.moment[:, [0, 2]], 0.0, atol=1e-9)
+        np.testing.assert_allclose(ground.moment[:, [0, 2]], 0.0, atol=1e-9)
     table = GroundReactionTable(file=tmp_path / "x.mot", cutoff_Hz="none", surface_mm=1.0)
     with pytest.raises(InputError, match="surface_mm"):
         load_ground_reaction(table, np.array([0.05]), "right")
 
 
-def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
+def test_the_wrench_below_the_force_threshold_is_unchanged(tmp_path):
     path = two_plates(tmp_path)
     table = GroundReactionTable(
         file=path, plates=(1,), laboratory_axes="+x,+z,-y", cutoff_Hz="none", unloaded_N=195.0
@@ -174,7 +173,7 @@ def test_below_the_threshold_the_point_is_held_and_the_wrench_kept(tmp_path):
     np.testing.assert_allclose(about, recording.plates[0].wrench[:, 3:] @ into.T, atol=1e-6)
 
 
-def test_the_clock_is_the_recordings_own(tmp_path):
+def test_times_count_from_the_first_frame_of_the_recording(tmp_path):
     path = two_plates(tmp_path, first_frame=217)
     recording = read_c3d(path)
     np.testing.assert_allclose(recording.time, (217 + np.arange(COUNT)) / 100.0, rtol=1e-12)
@@ -184,7 +183,7 @@ def test_the_clock_is_the_recordings_own(tmp_path):
     np.testing.assert_allclose(read_table(path).time(), recording.time)
 
 
-def test_channels_of_no_plate_are_kept_by_name(tmp_path):
+def test_channels_without_a_plate_are_available_by_name(tmp_path):
     signal = np.sin(np.arange(COUNT * RATIO))
     path = write_c3d(
         tmp_path / "emg.c3d", standing_markers(), analog={"soleus": signal}, units=["V"]
@@ -194,7 +193,7 @@ def test_channels_of_no_plate_are_kept_by_name(tmp_path):
     assert recording.channel_units == {"soleus": "V"} and recording.plates == ()
 
 
-def test_gaps_are_not_places(tmp_path):
+def test_gaps_of_markers_are_nan(tmp_path):
     markers = standing_markers()
     markers["JW:RToe"][3] = np.nan
     markers["JW:RHeel"][5] = 0.0
@@ -203,12 +202,12 @@ def test_gaps_are_not_places(tmp_path):
     assert np.isfinite(points[:, 2]).all()
 
 
-def test_labels_match_whatever_their_prefix_and_dots():
-    found = matched_labels(
+def test_labels_match_independent_of_prefix_and_dots():
+    matches = matched_labels(
         ["R.Thigh.Superior", "R_Heel", "Nobody", "RToe"],
         ["JW:RThighSuperior", "RHeel", "A:RToe", "B:RToe"],
     )
-    assert found == {"R.Thigh.Superior": "JW:RThighSuperior", "R_Heel": "RHeel"}
+    assert matches == {"R.Thigh.Superior": "JW:RThighSuperior", "R_Heel": "RHeel"}
 
 
 def written(tmp_path: Path, **changes) -> Path:
@@ -229,7 +228,7 @@ def cut(path: Path, share: float) -> Path:
 
 
 def stating(path: Path, analog_rate: float) -> Path:
-    """Change ANALOG:RATE in the file's bytes, the second RATE after POINT's."""
+    """Change ANALOG:RATE, the second RATE in the file."""
     content = bytearray(path.read_bytes())
     at = content.index(b"RATE", content.index(b"RATE") + 4) + 8
     content[at : at + 4] = struct.pack("<f", analog_rate)
@@ -273,7 +272,7 @@ def text(folder: Path, content: str) -> Path:
 
 
 @pytest.mark.parametrize("mistake", REFUSED)
-def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, mistake):
+def test_an_unreadable_file_or_plate_is_refused_in_one_line(tmp_path, mistake):
     make, words = REFUSED[mistake]
     path = make(tmp_path)
     with pytest.raises(InputError) as caught:
@@ -284,13 +283,13 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, mistake):
 @pytest.mark.parametrize(
     ("plates", "words"), [((), "plates"), ((3,), "no force plate 3"), ((1, 9), "no force plate 9")]
 )
-def test_the_plates_must_be_named_and_there(tmp_path, plates, words):
+def test_missing_plate_numbers_are_refused(tmp_path, plates, words):
     table = GroundReactionTable(file=two_plates(tmp_path), plates=plates, cutoff_Hz="none")
     with pytest.raises(InputError, match=words):
         load_ground_reaction(table, np.zeros(1), "right")
 
 
-def test_a_plate_that_pushes_down_is_refused(tmp_path):
+def test_a_downward_ground_reaction_is_refused(tmp_path):
     signals = -plate_signals(2, AMTI_CORNERS, np.zeros(3))
     path = written(tmp_path, analog={f"c{k}": s for k, s in enumerate(signals)})
     table = GroundReactionTable(
@@ -301,16 +300,16 @@ def test_a_plate_that_pushes_down_is_refused(tmp_path):
 
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's recordings are not beside the project")
-def test_jw_squat_stands_on_two_plates_and_keeps_its_weight():
+def test_the_vertical_force_of_jw_s_squat_is_the_body_weight():
     recording = read_c3d(JW / "jw_2legsquat1.c3d")
     vertical = sum(plate.force[:, 2] for plate in recording.plates)
     assert recording.points.shape == (1637, 56, 3)
-    assert np.median(vertical) == pytest.approx(645.0, abs=5.0)  # N, the data's own page
+    assert np.median(vertical) == pytest.approx(645.0, abs=5.0)  # N, stated with the data
     assert "vasmed" in recording.channels and "Fz1" not in recording.channels
 
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's recordings are not beside the project")
-def test_jw_gait_keeps_the_clock_of_the_longer_trial():
+def test_jw_s_gait_begins_at_its_first_frame():
     recording = read_c3d(JW / "jw_ngait_og3.c3d")
     assert recording.time[0] == pytest.approx(217 / 120, abs=1e-9)
     assert np.isnan(read_c3d(JW / "jw_stairupf1.c3d").points).mean() == pytest.approx(

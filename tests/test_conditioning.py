@@ -1,4 +1,4 @@
-"""Frames at the edge of what the equations can say: status and condition number tell."""
+"""Nearly singular equations: condition number and status of the frame."""
 
 from dataclasses import replace
 from functools import cache
@@ -32,15 +32,15 @@ def shipped_frame() -> FrameLoads:
 
 
 def contact_axis(frame: FrameLoads) -> np.ndarray:
-    """Midpoint of the condyles' contact points (3,)."""
+    """Return the midpoint of the condyles' contact points (3,)."""
     return np.mean([condyle.point for condyle in frame.geometry.condyles.values()], axis=0)
 
 
 def solved_with_arm(arm: float):
-    """Solve the shipped frame with its patellar ligament turned about its proximal end.
+    """Solve the shipped frame with the patellar ligament rotated about its proximal end.
 
     Args:
-        arm: m, at which it then passes the contact, in front of it if positive.
+        arm: distance of the ligament from the contact, m, positive if it is in front.
     """
     geometry = shipped_frame().geometry
     on_patella, on_tibia = geometry.extensor.patellar_ligament
@@ -64,7 +64,7 @@ def test_condition_number_grows_as_one_over_the_moment_arm():
 
 
 @pytest.mark.parametrize("arm", [5e-4, 1e-5, 0.0, -1e-5])
-def test_a_ligament_through_the_contact_holds_no_number(arm):
+def test_a_patellar_ligament_through_the_contact_makes_the_equations_singular(arm):
     loads = solved_with_arm(arm)
     assert loads.problems == ("singular equations",)
     assert loads.condition > UNKNOWNS.max_condition
@@ -72,8 +72,8 @@ def test_a_ligament_through_the_contact_holds_no_number(arm):
     assert np.isnan(loads.contact_force).all()
 
 
-def test_a_scene_that_comes_near_the_singularity_says_so(tmp_path):
-    """The tuberosity is put where the ligament passes through the contact at one frame."""
+def test_a_singular_frame_fails_and_the_other_frames_do_not(tmp_path):
+    """The ligament of this scene passes through the contact in one frame."""
     frame = shipped_frame()
     proximal = frame.geometry.extensor.patellar_ligament[0].points[0]
     distal = proximal + 1.3 * (contact_axis(frame) - proximal)
@@ -96,8 +96,8 @@ def test_a_scene_that_comes_near_the_singularity_says_so(tmp_path):
         assert failed or results["condition_number"][k] < UNKNOWNS.max_condition
 
 
-def test_quadriceps_through_the_patellofemoral_contact_holds_no_number():
-    """Then it cannot pull on the patellar ligament, whatever its tension."""
+def test_a_quadriceps_through_the_patellofemoral_contact_makes_the_equations_singular():
+    """It cannot balance the patellar ligament at any tension."""
     geometry = shipped_frame().geometry
     quadriceps = geometry.muscles[0].loads
     (on_patella,) = (load for load in quadriceps if load.link == "patella")
@@ -110,8 +110,8 @@ def test_quadriceps_through_the_patellofemoral_contact_holds_no_number():
 
 
 @pytest.mark.parametrize("friction", [0.0, 1.0])
-def test_friction_at_its_ends(friction):
-    """Each condyle's force leans by atan(mu) from its normal, against the sliding."""
+def test_a_condyle_s_force_is_at_the_friction_angle_from_its_normal(friction):
+    """Friction acts against the sliding."""
     frame = mechanics(friction).frame(MIDDLE)
     assert frame.loads.problems == ()
     assert frame.loads.condition < 500.0
@@ -120,7 +120,7 @@ def test_friction_at_its_ends(friction):
         normal = force @ condyle.normal
         across = force - normal * condyle.normal
         assert np.linalg.norm(across) == pytest.approx(friction * normal, rel=0.02, abs=1e-9)
-        assert across @ condyle.sliding <= 1e-12 * normal  # without friction: rounding
+        assert across @ condyle.sliding <= 1e-12 * normal  # rounding if there is no friction
     total = np.linalg.norm(frame.loads.contact_force)
     assert total == pytest.approx(np.linalg.norm(shipped_frame().loads.contact_force), rel=0.5)
 
@@ -137,7 +137,7 @@ def noisy_scene(folder):
     return path
 
 
-def test_noise_of_fluoroscopy_is_flagged_and_never_silent(tmp_path):
+def test_noise_of_fluoroscopy_is_flagged(tmp_path):
     path = noisy_scene(tmp_path)
     case = load_case(load_scene(path, {"contact.adjust": True}))
     noisy = mechanics_of(case)

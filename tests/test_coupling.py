@@ -1,4 +1,4 @@
-"""Body and contact agree: points coupled, adduction released, on the shipped knee bend."""
+"""Coupling of body and contact on the shipped knee bend: points, and released adduction."""
 
 import numpy as np
 import pytest
@@ -41,8 +41,7 @@ def shares(results):
     return medial / (medial + lateral), results["medial_share_equilibrium"]
 
 
-def test_uncoupled_is_the_body_and_then_a_press():
-    """Bit for bit: the load of the equations, pressed in at the recorded pose."""
+def test_an_uncoupled_frame_is_a_press_with_the_load_of_the_equations():
     case = load_case(load_scene(SCENE, COARSE))
     mechanics = mechanics_of(case)
     side = contact_side(case, mechanics)
@@ -55,7 +54,7 @@ def test_uncoupled_is_the_body_and_then_a_press():
     assert contact.iterations == 0
 
 
-def test_points_agree_within_five_iterations(uncoupled, coupled):
+def test_coupled_points_converge_within_five_iterations(uncoupled, coupled):
     assert coupled["coupling_iterations"].max() <= 5
     assert coupled["coupling_change_N"].max() < COUPLING.force_tolerance
     assert coupled["coupling_change_mm"].max() < COUPLING.point_tolerance * 1e3
@@ -64,13 +63,12 @@ def test_points_agree_within_five_iterations(uncoupled, coupled):
     assert 0 < change.max() < 0.02
 
 
-def test_the_pressed_load_is_the_load_of_the_equations(coupled):
-    """Superior-inferior: nodal forces without friction against the force with it."""
+def test_the_sum_of_nodal_forces_is_the_superior_inferior_force(coupled):
     pressed = -coupled.maps.nodal_force_N[..., 1].sum(axis=1)
     assert np.allclose(pressed, coupled["force_si_N"], rtol=1e-5)
 
 
-def test_released_adduction_brings_both_estimates_of_the_split_together(uncoupled, tilting):
+def test_both_estimates_of_the_split_agree_with_released_adduction(uncoupled, tilting):
     deformed, balanced = shares(uncoupled)
     assert np.abs(deformed - balanced).max() > 0.02
     deformed, balanced = shares(tilting)
@@ -82,14 +80,14 @@ def test_released_adduction_brings_both_estimates_of_the_split_together(uncouple
         assert np.allclose(tilting[f"{axis}_mm"], uncoupled[f"{axis}_mm"], atol=1e-9)
 
 
-def test_nothing_pulls(coupled, tilting):
+def test_pressures_and_condylar_forces_are_never_negative(coupled, tilting):
     for results in (coupled, tilting):
         assert (results.maps.pressure_Pa >= 0).all()
         assert (results["medial_force_equilibrium_N"] >= 0).all()
         assert (results["lateral_force_equilibrium_N"] >= 0).all()
 
 
-def test_adjusting_and_releasing_exclude_each_other():
+def test_adjustment_and_released_coordinates_exclude_each_other():
     with pytest.raises(InputError, match="exclude"):
         load_scene(SCENE, {"contact.released": ["ml"], "contact.adjust": True})
     with pytest.raises(InputError, match="twice"):

@@ -1,4 +1,4 @@
-"""One frame of a run as other programs read it: CalculiX solves it, FEBio's file is whole."""
+"""Decks of one frame for CalculiX and FEBio."""
 
 import shutil
 from dataclasses import replace
@@ -25,7 +25,7 @@ WITH_CALCULIX = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """One frame of the starter knee by the finite elements, small strain, coarse."""
+    """Results folder of one frame of the starter knee, by finite elements at small strain."""
     root = tmp_path_factory.mktemp("deck")
     scene = lay_out(root / "knee")
     text = scene.read_text().replace('model = "lattice"', 'model = "fe"')
@@ -41,19 +41,18 @@ def pressed(folder):
 
 
 @WITH_CALCULIX
-def test_calculix_runs_the_deck_and_carries_the_load(pressed):
+def test_calculix_balances_the_load_of_the_deck(pressed):
     result, balance = peer_result(pressed.problem, run_calculix(pressed.deck("ccx")))
     assert balance == pytest.approx(1.0, abs=2e-3)
     assert -result.wrench_on_insert[1] == pytest.approx(pressed.problem.load, rel=2e-3)
-    # CalculiX keeps the starter's femoral facets: their middles lie 10 µm off the surface (median).
+    # The deck has the facets of the femur. Their centres are 10 µm off the smooth surface (median).
     assert result.approach == pytest.approx(pressed.approach, abs=1e-5)
 
 
 @pytest.mark.slow
 @WITH_CALCULIX
 def test_calculix_agrees_with_a_frame_of_the_shipped_knee(tmp_path):
-    """Within what the trade-off finds of lattice and CalculiX at 2 mm: 0.6 % in approach, 4.7 % in
-    peak pressure; measured 0.25 % and 4.3 %."""
+    """The tolerances are the differences of lattice and CalculiX at 2 mm in the trade-off study."""
     settings = {"contact__model": "fe", "contact__material": "polyethylene-linear"}
     scene = write_scene(tmp_path / "knee", **settings)
     out = tmp_path / "run"
@@ -65,17 +64,17 @@ def test_calculix_agrees_with_a_frame_of_the_shipped_knee(tmp_path):
     assert result.pressure.max() == pytest.approx(pressed.peak_pressure, rel=0.047)
 
 
-def test_the_command_writes_a_deck_that_says_what_to_compare(folder, pressed, tmp_path, capsys):
+def test_the_deck_states_frame_model_approach_and_load(folder, pressed, tmp_path, capsys):
     out = tmp_path / "frame.inp"
-    asked = ["export", str(folder), "--deck", "ccx", "--frame", "0", "--out", str(out)]
-    assert main(asked) == 0
+    command = ["export", str(folder), "--deck", "ccx", "--frame", "0", "--out", str(out)]
+    assert main(command) == 0
     lines = out.read_text().splitlines()
     assert lines[0].startswith("** Frame 0 of ") and "by fe at 4 mm" in lines[0]
     assert any(f"approach since first touch {pressed.approach * 1e3:.6g} mm" in k for k in lines)
     assert f"load {pressed.problem.load:.6g} N" in capsys.readouterr().out
 
 
-def test_febio_s_file_holds_the_same_bodies_and_the_travel(pressed):
+def test_the_febio_deck_has_the_same_bodies_and_the_approach(pressed):
     root = ElementTree.fromstring(pressed.deck("feb"))
     assert root.get("version") == "4.0"
     places = [one.text.split(",") for one in root.findall("Mesh/Nodes/node")]
@@ -92,11 +91,11 @@ def test_febio_s_file_holds_the_same_bodies_and_the_travel(pressed):
     quads = contact_quads(lattice)
     a, b, c, d = (lattice.nodes[quads[:, k]] for k in range(4))
     up = np.cross(c - a, d - b)[:, 1]
-    assert len(quads) > 50 and (up > 0).all()  # outward of an articular surface
+    assert len(quads) > 50 and (up > 0).all()  # outward of the articular surface is upward
     assert set(np.unique(lattice.contact_triangles)) == set(np.unique(quads))
 
 
-def test_a_deck_says_what_its_answer_differs_from_the_runs_by(folder, pressed, tmp_path, capsys):
+def test_a_deck_states_its_differences_from_the_run(folder, pressed, tmp_path, capsys):
     (line,) = pressed.notes
     assert "Material 'polyethylene-linear', linear: E 561.5 MPa, nu 0.45" in line
     assert "the run's model assumes finite elements" in line
@@ -109,14 +108,14 @@ def test_a_deck_says_what_its_answer_differs_from_the_runs_by(folder, pressed, t
         out = tmp_path / f"frame.{suffix}"
         assert main(["export", str(other), "--deck", kind, "--frame", "0", "--out", str(out)]) == 0
         said = capsys.readouterr().out
-        for words in ("neither load nor peak: 123 N, peak 9.5 MPa", "computed as its mirror image"):
+        for words in ("not in this deck: 123 N, peak 9.5 MPa", "computed as its mirror image"):
             assert words in out.read_text() and words in said
         assert "z medial" in out.read_text()
     assert main(["export", str(other), "--vtp", "--out", str(tmp_path / "vtp")]) == 0
     assert "without the post's pressure" in capsys.readouterr().out
 
 
-def test_what_febio_s_deck_does_not_hold_is_refused(pressed):
+def test_a_febio_deck_of_a_nonlinear_material_is_refused(pressed):
     pair = replace(pressed.problem.pair, material=material("polyethylene"))
     nonlinear = replace(pressed, problem=replace(pressed.problem, pair=pair))
     with pytest.raises(InputError, match="polyethylene-linear"):
@@ -124,9 +123,9 @@ def test_what_febio_s_deck_does_not_hold_is_refused(pressed):
 
 
 @pytest.mark.parametrize(("frame", "words"), [("7", "no frame 7"), ("-2", "no frame -2")])
-def test_a_frame_that_is_not_there_is_one_line(folder, tmp_path, capsys, frame, words):
+def test_a_missing_frame_is_refused_in_one_line(folder, tmp_path, capsys, frame, words):
     out = tmp_path / "frame.inp"
-    asked = ["export", str(folder), "--deck", "ccx", f"--frame={frame}", "--out", str(out)]
-    assert main(asked) == 2
+    command = ["export", str(folder), "--deck", "ccx", f"--frame={frame}", "--out", str(out)]
+    assert main(command) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1 and not out.exists()

@@ -1,4 +1,4 @@
-"""What the model leaves out: fitted on trials, added to samples, told in words."""
+"""Model discrepancy: fit to trials, band with samples, and sentence in the summary."""
 
 import numpy as np
 import pytest
@@ -24,9 +24,10 @@ from tkamb.studies.uncertainty.bands import discrepancy_columns, influences, pea
 def one_trial(
     rng, name="a", activity="walking", bias=0.0, scatter=0.2, inputs=0.1, frames=40, count=50
 ):
-    """A trial whose truth is off by shares of the load, with samples about the nominal.
+    """Return error, samples, measured force and load of a synthetic trial.
 
-    Its error is a bias and white noise. Returned are the error, samples, truth and load.
+    The error is a bias plus white noise, as shares of the load. The samples scatter about the
+    nominal force.
     """
     nominal = 700.0 * (1.5 + np.sin(np.linspace(0, 6, frames)))
     load = np.hypot(nominal, 350.0)
@@ -34,11 +35,12 @@ def one_trial(
     samples = nominal + load * inputs * rng.standard_normal((count, frames))
     time = np.arange(frames) / 30
     names = (name, "S", activity, "total")
-    known = load_of(samples, 700.0)
-    return trial_error(names, time, samples, truth, nominal, known, 700.0), samples, truth, known
+    median_load = load_of(samples, 700.0)
+    error = trial_error(names, time, samples, truth, nominal, median_load, 700.0)
+    return error, samples, truth, median_load
 
 
-def test_a_known_bias_scatter_and_input_deviation_are_found_again():
+def test_the_fit_recovers_bias_scatter_and_deviation_of_the_inputs():
     error, _, _, load = one_trial(np.random.default_rng(0), bias=0.3, frames=2000, count=200)
     assert error.bias == pytest.approx(0.3, abs=0.02)
     assert error.scatter == pytest.approx(0.2, abs=0.01)
@@ -55,7 +57,7 @@ def test_the_load_is_the_median_total_and_never_below_half_a_body_weight():
     assert np.isnan(load[2])
 
 
-def test_the_correlation_time_of_an_ar1_is_found_again():
+def test_the_fit_recovers_the_correlation_time_of_an_ar1_process():
     rng, step, tau = np.random.default_rng(1), 1 / 30, 0.2
     rho, noise = np.exp(-step / tau), [0.0]
     for _ in range(6000):
@@ -66,15 +68,15 @@ def test_the_correlation_time_of_an_ar1_is_found_again():
     time = np.arange(len(truth)) * step
     error = trial_error(names, time, np.tile(nominal, (30, 1)), truth, nominal, nominal, 700.0)
     assert error.correlation_s == pytest.approx(tau, rel=0.1)
-    # variance of the variance of an AR(1): (1 + rho²)/(1 - rho²) of that of white noise
+    # the variance of an AR(1)'s variance is (1 + rho²)/(1 - rho²) times that of white noise
     share = (1 - rho**2) / (1 + rho**2)
     assert error.independent_frames == pytest.approx(6001 * share, rel=0.1)
 
 
-def test_the_band_of_inputs_and_discrepancy_covers_a_trial_that_it_was_not_fitted_on():
+def test_the_band_of_inputs_and_discrepancy_covers_another_trial():
     rng, shares = np.random.default_rng(2), []
     for _ in range(150):
-        of_activity = rng.standard_normal()  # m and b of the module's docstring, S = 0.4
+        of_activity = rng.standard_normal()  # m and b of tkamb.run.discrepancy with S = 0.4
         biases = 0.4 * (of_activity + rng.standard_normal(9)) / np.sqrt(2)
         trials = [one_trial(rng, str(k), bias=bias, frames=10) for k, bias in enumerate(biases)]
         found = fitted([one[0] for one in trials[1:]], "total", "walking")
@@ -83,7 +85,7 @@ def test_the_band_of_inputs_and_discrepancy_covers_a_trial_that_it_was_not_fitte
     assert 0.85 <= np.mean(shares) <= 0.95
 
 
-def test_an_activity_s_own_bias_moves_its_band_and_another_s_does_not():
+def test_only_the_bias_of_the_same_activity_shifts_a_band():
     rng = np.random.default_rng(3)
     trials = [one_trial(rng, str(k), "squat", -0.5)[0] for k in range(3)]
     squat, other = (fitted(trials, "total", one) for one in ("squat", "stairs up"))
@@ -92,7 +94,7 @@ def test_an_activity_s_own_bias_moves_its_band_and_another_s_does_not():
     assert fitted(trials, "medial", "squat") is None
 
 
-def test_a_band_with_discrepancy_is_never_below_zero_and_empty_without_samples():
+def test_a_band_with_discrepancy_is_never_negative_and_nan_without_samples():
     samples = np.full((30, 2), 100.0)
     samples[:, 1] = np.nan
     found = Discrepancy(0.0, 1.0, 4.0, 1, 3)
@@ -122,7 +124,7 @@ def test_the_sentence_names_trials_and_subjects():
     assert "without [muscles]" in discrepancy_words({"activity": "squat"})
 
 
-def test_columns_and_peaks_carry_the_wider_band():
+def test_columns_and_peaks_have_the_band_with_discrepancy():
     rng = np.random.default_rng(4)
     values = 1400.0 + 70.0 * rng.standard_normal((60, 2, 3))
     columns = discrepancy_columns(["force_si_N", "quadriceps_N"], values, SUMMARY, 700.0)
@@ -152,19 +154,19 @@ def test_peaks_and_saturated_muscles_of_a_run():
     assert saturated_muscles(columns) == {"vaslat": 1}
 
 
-def test_defaults_follow_the_kind_of_recording_and_given_numbers_stay():
-    marked, seen = (UncertaintyTable().completed(one) for one in (True, False))
-    assert seen.flexion_deg == FLUOROSCOPY_ERROR.flexion_deg
-    assert marked.flexion_deg == SKIN_MARKER_ERROR.flexion_deg
+def test_default_errors_depend_on_the_recording_and_given_errors_are_unchanged():
+    markers, fluoroscopy = (UncertaintyTable().completed(one) for one in (True, False))
+    assert fluoroscopy.flexion_deg == FLUOROSCOPY_ERROR.flexion_deg
+    assert markers.flexion_deg == SKIN_MARKER_ERROR.flexion_deg
     given = UncertaintyTable.model_validate({"flexion_deg": 0.1, "ap_mm": 0.0})
     assert given.completed(True).flexion_deg == 0.1 and given.completed(True).ap_mm == 0.0
 
 
-def test_few_samples_still_say_which_input_moves_a_result():
+def test_the_influential_input_is_found_with_few_samples():
     rng, count = np.random.default_rng(5), 60
     x = rng.standard_normal((100, 1, count))
     y = (3.0 * x[:, :, 7] + 0.3 * rng.standard_normal((100, 1)))[:, None, :]
     rows = influences(["y"], [str(k) for k in range(count)], y, x)
     assert rows[0].name == "7" and rows[0].share > 0.9
     assert rows[0].change == pytest.approx(3.0, abs=0.2)
-    assert abs(sum(row.share for row in rows[1:-1])) < 0.5  # chance is taken off
+    assert abs(sum(row.share for row in rows[1:-1])) < 0.5  # without the share by chance

@@ -1,4 +1,4 @@
-"""EMG: envelopes of known value, targets and bounds in the sharing, agreement with activations."""
+"""EMG: envelopes, guidance of the static optimisation, agreement with activations."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def test_the_envelope_of_a_sine_is_its_rectified_mean():
 
 
 def test_the_envelope_has_no_phase_and_half_the_amplitude_at_the_cutoff():
-    """A carrier at 150 Hz whose amplitude swings at the low-pass cut-off."""
+    """The amplitude of a carrier at 150 Hz oscillates at the cut-off of the low-pass filter."""
     swing = 1 + 0.5 * np.sin(2 * np.pi * 5.0 * TIME)
     found = envelope(swing * np.sin(2 * np.pi * 151.7 * TIME), RATE, 5.0, 30.0)[INSIDE]
     expected = 2 / np.pi * (1 + 0.25 * np.sin(2 * np.pi * 5.0 * TIME[INSIDE]))
@@ -38,18 +38,17 @@ def test_the_envelope_has_no_phase_and_half_the_amplitude_at_the_cutoff():
 
 @pytest.mark.parametrize("high_pass", [20.0, "none"])
 def test_the_envelope_is_that_of_filters_run_forwards_and_backwards(high_pass):
-    """The peer filters sample by sample."""
     signal = np.random.default_rng(3).normal(size=len(TIME)) * (1.2 + np.sin(5.0 * TIME))
-    found, wanted = envelope(signal, RATE, 6.0, high_pass), signal - signal.mean()
+    found, expected = envelope(signal, RATE, 6.0, high_pass), signal - signal.mean()
     if high_pass != "none":
-        wanted = sosfiltfilt(butter(2, high_pass, "highpass", fs=RATE, output="sos"), wanted)
-    wanted = sosfiltfilt(butter(2, 6.0, fs=RATE, output="sos"), np.abs(wanted))
+        expected = sosfiltfilt(butter(2, high_pass, "highpass", fs=RATE, output="sos"), expected)
+    expected = sosfiltfilt(butter(2, 6.0, fs=RATE, output="sos"), np.abs(expected))
     middle = slice(1500, -1500)
-    np.testing.assert_allclose(found[middle], wanted[middle], atol=1e-6 * wanted.max())
+    np.testing.assert_allclose(found[middle], expected[middle], atol=1e-6 * expected.max())
 
 
-def test_an_envelope_ends_with_a_mean_as_it_has_elsewhere():
-    """Not with its last sample, which a point-wise reflection keeps."""
+def test_the_ends_of_an_envelope_have_the_mean_of_its_interior():
+    """A reflection about the last sample would keep the value of this sample."""
     ends = [
         envelope(np.random.default_rng(k).normal(size=len(TIME)), RATE, 6.0, "none")[[0, -1]]
         for k in range(40)
@@ -58,7 +57,7 @@ def test_an_envelope_ends_with_a_mean_as_it_has_elsewhere():
     assert np.std(ends) < 0.2
 
 
-def test_the_high_pass_takes_slow_movement_away():
+def test_the_high_pass_filter_removes_slow_movement():
     slow = 3.0 * np.sin(2 * np.pi * 1.5 * TIME)
     assert envelope(slow, RATE, 6.0, 30.0)[INSIDE].max() < 0.01
     mean, _ = quad(lambda phase: 3.0 * abs(np.sin(phase)) / np.pi, 0, np.pi)
@@ -73,21 +72,21 @@ def test_the_high_pass_takes_slow_movement_away():
         (np.ones(100), 6.0, "shorter than a period of the cut-off 6 Hz"),
     ],
 )
-def test_signals_that_carry_no_envelope_are_refused(signal, cutoff, words):
+def test_signals_without_an_envelope_are_refused(signal, cutoff, words):
     with pytest.raises(InputError, match=words):
         envelope(signal, RATE, cutoff, "none")
 
 
 def table(file, **changes):
-    given = {"channels": {"VL": ("vaslat",)}, "high_pass_Hz": 20.0, "cutoff_Hz": 6.0}
-    return EmgTable(**({"file": file} | given | changes))
+    keys = {"channels": {"VL": ("vaslat",)}, "high_pass_Hz": 20.0, "cutoff_Hz": 6.0}
+    return EmgTable(**({"file": file} | keys | changes))
 
 
 def burst(centre):
     return np.exp(-(((TIME - centre) / 0.2) ** 2)) * np.sin(2 * np.pi * 97.3 * TIME)
 
 
-def test_channels_of_a_c3d_stand_on_its_clock_over_their_largest_value(tmp_path):
+def test_channels_of_a_c3d_have_its_times_and_a_maximum_of_one(tmp_path):
     markers = {"heel": np.ones((400, 3))}
     path = write_c3d(
         tmp_path / "a.c3d", markers, first_frame=50, ratio=12, analog={"VL": 3e-4 * burst(1.5)}
@@ -97,11 +96,11 @@ def test_channels_of_a_c3d_stand_on_its_clock_over_their_largest_value(tmp_path)
     assert values.max() == pytest.approx(1.0)
     assert found.time[values.argmax()] == pytest.approx(0.5 + 0.04 + 1.5, abs=0.01)
     assert np.isnan(found.at("vaslat", np.array([0.5, 4.6]))).all()
-    given = load_envelopes(table(path, normalised_by={"VL": 3e-4}), TIME)
-    assert given.values["VL"].max() < 2 / np.pi
+    normalised = load_envelopes(table(path, normalised_by={"VL": 3e-4}), TIME)
+    assert normalised.values["VL"].max() < 2 / np.pi
 
 
-def test_a_table_serves_as_well(tmp_path):
+def test_emg_is_read_from_a_csv_table(tmp_path):
     path = tmp_path / "emg.csv"
     rows = [f"{t:.6f},{v:.9f}," for t, v in zip(TIME, burst(2.0), strict=True)]
     path.write_text("\n".join(["clock,VL,", *rows]).replace("VL,", "VL"), encoding="utf-8")
@@ -117,8 +116,8 @@ def test_a_table_serves_as_well(tmp_path):
 
 @pytest.mark.parametrize("level", [0.0, 0.3, -1e-4])
 @pytest.mark.parametrize("high_pass", [20.0, "none"])
-def test_an_electrode_that_gave_one_value_throughout_is_no_signal(tmp_path, level, high_pass):
-    """The round-off of 0.3 less its mean, over its own largest value, was an envelope of 1."""
+def test_a_constant_channel_is_no_signal(tmp_path, level, high_pass):
+    """The rounding error of 0.3 minus its mean must not be normalised to 1."""
     path = tmp_path / "flat.csv"
     path.write_text("\n".join(["time,VL", *(f"{t:.6f},{level}" for t in TIME)]), encoding="utf-8")
     with pytest.raises(InputError, match="'VL' holds no signal"):
@@ -146,15 +145,15 @@ ARMS = np.array([0.0, 0.05, 0.04])
 
 
 def sharing(guide, lowest=0.0):
-    """Return the frame of two flexors that carry 70 N·m without reserve."""
+    """Return the problem of two flexors that balance 70 N·m without a reserve."""
     problems = two_flexors(1, reserve=0.0, least=lowest).problems
     arms = np.zeros((1, 3, 1))
     arms[0, :, 0] = ARMS
     return replace(problems, moment=np.full((1, 1), MOMENT), arms=arms, guide=guide)
 
 
-def test_a_target_has_the_optimum_of_its_closed_form():
-    """min Σ a² + W (a_2 - e)² with d.a = M: a = (W e - λ d)/(1 + W) and -λ d by Lagrange."""
+def test_a_target_has_the_optimum_of_the_closed_form():
+    """Minimum of Σ a² + W (a_2 - e)² with d.a = M: a_2 = (W e - λ d_2)/(1 + W), a_3 = -λ d_3."""
     guide = EmgGuide(np.array([[np.nan, ENVELOPE, np.nan]]), "target", WEIGHT)
     activation, _, residual, status = sharing(guide).solved(0)
     d = (ARMS * STRENGTHS)[1:]
@@ -165,7 +164,7 @@ def test_a_target_has_the_optimum_of_its_closed_form():
     assert residual < SHARING.kkt_tolerance
 
 
-def test_bounds_hold_the_activation_near_the_envelope():
+def test_bounds_limit_the_activation_to_the_width_about_the_envelope():
     guide = EmgGuide(np.array([[np.nan, 0.4, np.nan]]), "bounds", 0.05)
     activation, _, residual, status = sharing(guide).solved(0)
     assert activation[1] == pytest.approx(0.45)  # without EMG it is 0.61
@@ -174,7 +173,7 @@ def test_bounds_hold_the_activation_near_the_envelope():
     assert residual < SHARING.kkt_tolerance
 
 
-def test_bounds_never_leave_those_of_every_muscle():
+def test_bounds_of_the_envelope_are_within_those_of_all_muscles():
     guide = EmgGuide(np.array([[np.nan, 1.7, 0.0]]), "bounds", 0.2)
     problem = guide.applied(sharing(None, lowest=0.05).frame(0), 0)
     np.testing.assert_allclose(problem.lowest, [0.05, 1.0, 0.05])
@@ -192,28 +191,29 @@ def test_each_frame_of_a_knee_has_its_own_envelope():
         assert activation[1] == pytest.approx(values[k, 1], abs=1e-4)
 
 
-def test_agreement_finds_correlation_error_and_lag():
-    """Frames at 30 Hz of an activation that is half the envelope, 60 ms later."""
-    own = np.exp(-(((TIME - 2.0) / 0.3) ** 2))
-    envelopes = Envelopes(None, TIME, {"VL": own}, {"vaslat": "VL"}, {"VL": 1.0})
+def test_agreement_states_correlation_error_and_lag():
+    """The activation has half the size of the envelope and is 60 ms later."""
+    values = np.exp(-(((TIME - 2.0) / 0.3) ** 2))
+    envelopes = Envelopes(None, TIME, {"VL": values}, {"vaslat": "VL"}, {"VL": 1.0})
     time = np.arange(0.5, 3.5, 1 / 30)
     activation = 0.5 * envelopes.at("vaslat", time - 0.06)
     activation[[3, 40]] = np.nan
     columns = {"time_s": time, "activation_vaslat": activation}
     found = compare_emg(envelopes, columns)["vaslat"]
-    both, there = np.isfinite(activation), envelopes.at("vaslat", time)
+    finite, expected = np.isfinite(activation), envelopes.at("vaslat", time)
+    activation, expected = activation[finite], expected[finite]
     assert found["lag_s"] == pytest.approx(0.06, abs=0.0026)
-    assert found["pearson_r"] == pytest.approx(np.corrcoef(activation[both], there[both])[0, 1])
-    assert found["rmse"] == pytest.approx(np.std(activation[both] - there[both], mean=0.0))
+    assert found["pearson_r"] == pytest.approx(np.corrcoef(activation, expected)[0, 1])
+    assert found["rmse"] == pytest.approx(np.std(activation - expected, mean=0.0))
     assert (found["frames_compared"], found["frames_left_out"]) == (len(time) - 2, 2)
 
 
 def test_the_fitted_normalisation_makes_the_envelope_the_activation():
-    """Two muscles of one channel at 0.3 and 0.5 of it: 0.4 of it fits both; one runs against it."""
-    own = np.exp(-(((TIME - 2.0) / 0.3) ** 2))
+    """Two muscles of a channel have 0.3 and 0.5 of its envelope, so that 0.4 is the best fit."""
+    values = np.exp(-(((TIME - 2.0) / 0.3) ** 2))
     names = {"vaslat": "VL", "vasint": "VL", "soleus": "SO"}
-    both = {"VL": own, "SO": own}
-    envelopes = Envelopes(None, TIME, both, names, {"VL": 2e-4, "SO": 1.0})
+    channels = {"VL": values, "SO": values}
+    envelopes = Envelopes(None, TIME, channels, names, {"VL": 2e-4, "SO": 1.0})
     time = np.arange(0.5, 3.5, 1 / 30)
     course = envelopes.at("vaslat", time)
     columns = {"activation_vaslat": 0.3 * course, "activation_vasint": 0.5 * course}
@@ -225,10 +225,10 @@ def test_the_fitted_normalisation_makes_the_envelope_the_activation():
 
 
 @pytest.mark.parametrize("shape", [lambda t: np.exp(-((t - 2.5) ** 2)), lambda t: 3 * t])
-def test_a_lag_beyond_the_window_is_none(shape):
-    """An activation half a second late, and a ramp, which correlates alike at every lag."""
-    own = {"VL": TIME if shape(1.0) == 3.0 else np.exp(-((TIME - 2.0) ** 2))}
-    envelopes = Envelopes(None, TIME, own, {"vaslat": "VL"}, {"VL": 1.0})
+def test_a_lag_outside_the_range_is_nan(shape):
+    """The activation is 0.5 s late, or a ramp, with the same correlation at all lags."""
+    values = {"VL": TIME if shape(1.0) == 3.0 else np.exp(-((TIME - 2.0) ** 2))}
+    envelopes = Envelopes(None, TIME, values, {"vaslat": "VL"}, {"VL": 1.0})
     time = np.arange(1.0, 3.0, 1 / 30)
     columns = {"time_s": time, "activation_vaslat": shape(time)}
     assert np.isnan(compare_emg(envelopes, columns)["vaslat"]["lag_s"])

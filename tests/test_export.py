@@ -1,4 +1,4 @@
-"""`tkamb export`: results as OpenSim's storage."""
+"""`tkamb export`: results as an OpenSim storage file."""
 
 import importlib.util
 import subprocess
@@ -26,7 +26,7 @@ def exported(folder, tmp_path):
     return path
 
 
-def test_every_number_is_in_the_storage_under_its_name(folder, tmp_path, capsys):
+def test_the_storage_file_has_every_number_under_its_name(folder, tmp_path, capsys):
     run = make_run("gait", frames=21, maps=False)
     path = exported(folder, tmp_path)
     table = read_table(path)
@@ -35,10 +35,10 @@ def test_every_number_is_in_the_storage_under_its_name(folder, tmp_path, capsys)
         if name != "status":
             found = table.columns["time" if name == "time_s" else name]
             np.testing.assert_allclose(found, values, rtol=1e-9, err_msg=name)
-    code, fine = table.columns["status"], np.array([words == "ok" for words in run.status])
-    lost = ~fine & np.isnan(run["force_total_N"])
-    np.testing.assert_array_equal(code, np.where(fine, 0, np.where(lost, 2, 1)))
-    assert fine.any() and lost.any() and not (fine | lost).all()
+    code, ok = table.columns["status"], np.array([words == "ok" for words in run.status])
+    failed = ~ok & np.isnan(run["force_total_N"])
+    np.testing.assert_array_equal(code, np.where(ok, 0, np.where(failed, 2, 1)))
+    assert ok.any() and failed.any() and not (ok | failed).all()
     assert "21 frames" in capsys.readouterr().out
 
 
@@ -47,15 +47,15 @@ def test_every_number_is_in_the_storage_under_its_name(folder, tmp_path, capsys)
 )
 def test_opensim_reads_it(folder, tmp_path):
     path = exported(folder, tmp_path)
-    asks = (
+    script = (
         "import sys, opensim; t = opensim.TimeSeriesTable(sys.argv[1]); "
         "print(t.getNumRows(), t.getDependentColumn('force_total_N').to_numpy()[7])"
     )
-    # in a process of its own: it writes opensim.log where it starts
-    found = subprocess.run(
-        [sys.executable, "-c", asks, str(path)], cwd=tmp_path, capture_output=True, check=True
+    # in another process, since opensim writes opensim.log into the working directory
+    process = subprocess.run(
+        [sys.executable, "-c", script, str(path)], cwd=tmp_path, capture_output=True, check=True
     )
-    rows, force = found.stdout.split()[-2:]
+    rows, force = process.stdout.split()[-2:]
     assert int(rows) == 21
     run = make_run("gait", frames=21, maps=False)
     assert float(force) == pytest.approx(run["force_total_N"][7], rel=1e-9)
@@ -65,7 +65,9 @@ def test_opensim_reads_it(folder, tmp_path):
     ("name", "words"),
     [("run.csv", "none of .sto, .mot"), ("there.sto", "exists already"), ("no/run.sto", "no/run")],
 )
-def test_what_cannot_be_written_is_one_line(folder, tmp_path, capsys, name, words):
+def test_a_path_that_cannot_be_written_is_refused_in_one_line(
+    folder, tmp_path, capsys, name, words
+):
     (tmp_path / "there.sto").write_text("mine")
     (tmp_path / "no").write_text("a file")
     assert main(["export", str(folder), "--sto", str(tmp_path / name)]) == 2
@@ -74,6 +76,6 @@ def test_what_cannot_be_written_is_one_line(folder, tmp_path, capsys, name, word
     assert (tmp_path / "there.sto").read_text() == "mine"
 
 
-def test_a_folder_that_holds_no_results_is_one_line(tmp_path, capsys):
+def test_a_folder_without_results_is_refused_in_one_line(tmp_path, capsys):
     assert main(["export", str(tmp_path), "--sto", str(tmp_path / "a.sto")]) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "a.sto").exists()

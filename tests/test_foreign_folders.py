@@ -36,7 +36,7 @@ def refused(capfd, *arguments):
     capfd.readouterr()
     assert main([str(argument) for argument in arguments]) == 2
     message = capfd.readouterr().err
-    assert message.count("\n") == 1 and "not foreseen" not in message
+    assert message.count("\n") == 1 and "unexpected error" not in message
     return message
 
 

@@ -1,4 +1,4 @@
-"""A material of the user's own: [material] of a scene, a file for `press`, and in Python."""
+"""A user's material: [material] of a scene, a file for `press`, and in Python."""
 
 import json
 
@@ -20,7 +20,7 @@ POSE = (-6.9, 30.7, 0.0, 0.0, 0.0, 0.0)
 FEMORAL, INSERT = MODEL / "femoral_component.stl", MODEL / "insert.stl"
 
 
-def test_each_law_follows_its_own_formula():
+def test_each_law_follows_its_formula():
     strain = np.array([-0.05, 0.0, 0.004, 0.05])
     linear = given_material({"young_modulus_MPa": 800, "poisson_ratio": 0.4})
     assert isinstance(linear.law, LinearElastic)
@@ -39,17 +39,17 @@ def test_each_law_follows_its_own_formula():
     assert given_material(doubled).stress(strain) == pytest.approx(2 * table.stress(strain))
 
 
-def test_a_base_keeps_what_is_not_given_and_names_its_sources():
+def test_a_base_gives_the_missing_values_and_the_sources():
     assert given_material({"base": "polyethylene"}) == material("polyethylene")
     stiffer = given_material({"base": "polyethylene", "young_modulus_MPa": 900.0})
-    known = material("polyethylene")
-    assert (stiffer.young_modulus, stiffer.poisson_ratio) == (900e6, known.poisson_ratio)
-    assert stiffer.law == known.law and stiffer.name == "polyethylene (changed)"
+    base = material("polyethylene")
+    assert (stiffer.young_modulus, stiffer.poisson_ratio) == (900e6, base.poisson_ratio)
+    assert stiffer.law == base.law and stiffer.name == "polyethylene (changed)"
     assert any("Halloran" in source for source in stiffer.sources)
     straight = given_material({"base": "polyethylene", "law": "linear"})
     assert isinstance(straight.law, LinearElastic)
-    told = material_as_json(stiffer)
-    assert (told["young_modulus_MPa"], told["law"]) == (900.0, "ramberg-osgood")
+    record = material_as_json(stiffer)
+    assert (record["young_modulus_MPa"], record["law"]) == (900.0, "ramberg-osgood")
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_base_keeps_what_is_not_given_and_names_its_sources():
         ({"young_modulus_MPa": 5, "poisson_ratio": 0.4, "law": "hooke"}, "no law 'hooke'"),
     ],
 )
-def test_what_is_no_material_is_refused(table, words):
+def test_an_impossible_material_is_refused(table, words):
     with pytest.raises(InputError, match=words):
         given_material(table)
 
@@ -81,7 +81,7 @@ def soft(tmp_path_factory):
     return path
 
 
-def test_press_takes_a_file_a_name_or_a_material_and_says_which(soft, capsys):
+def test_press_accepts_a_file_a_name_or_a_material_and_reports_it(soft, capsys):
     command = ["press", str(FEMORAL), str(INSERT), "--load", "1500", "--pose"]
     command += [*map(str, POSE), "--contact", "foundation-linear", "--resolution", "3", "--json"]
     assert main([*command, "--material", str(soft)]) == 0
@@ -92,7 +92,7 @@ def test_press_takes_a_file_a_name_or_a_material_and_says_which(soft, capsys):
     given = {"pose": POSE, "contact": "foundation-linear", "resolution_mm": 3.0}
     again = press_meshes(FEMORAL, INSERT, 1500.0, material=named_material(soft), **given)
     assert again.result.approach * 1e3 == pytest.approx(found["approach_mm"])
-    # the layer's pressure is E over h times the depth: half of E and half of the load, same depth
+    # the pressure is E over h times the depth: load and E in the same ratio give the same depth
     half = press_meshes(
         FEMORAL, INSERT, 1500.0 * 561.5 / 300.0, material="polyethylene-linear", **given
     )
@@ -101,7 +101,7 @@ def test_press_takes_a_file_a_name_or_a_material_and_says_which(soft, capsys):
     assert "no material 'soft.tml'" in capsys.readouterr().err
 
 
-def test_a_scene_s_material_is_pressed_and_told_and_worn(tmp_path):
+def test_contact_summary_and_wear_use_the_scene_s_material(tmp_path):
     own = {"young_modulus_MPa": 300.0, "poisson_ratio": 0.45, "yield_stress_MPa": 12.0}
     changes = {f"material__{key}": value for key, value in own.items()}
     path = write_scene(
@@ -117,8 +117,8 @@ def test_a_scene_s_material_is_pressed_and_told_and_worn(tmp_path):
     plain = simulate(write_scene(tmp_path / "plain", **linear), frames=frames)
     peak = "medial_peak_pressure_MPa"
     assert run[peak][0] < plain[peak][0]
-    told = run.summary["material"]
-    assert (told["name"], told["young_modulus_MPa"], told["law"]) == ("own", 300.0, "linear")
+    record = run.summary["material"]
+    assert (record["name"], record["young_modulus_MPa"], record["law"]) == ("own", 300.0, "linear")
     assert run.summary["yield_stress_MPa"] == 12.0
     assert run.summary["known_error"] == "not measured"
     assert plain.summary["material"]["young_modulus_MPa"] == 561.5
@@ -140,12 +140,12 @@ def test_a_scene_s_material_is_pressed_and_told_and_worn(tmp_path):
         ),
     ],
 )
-def test_two_declarations_of_one_thing_are_refused(tmp_path, changes, words):
+def test_contradicting_declarations_are_refused(tmp_path, changes, words):
     with pytest.raises(InputError, match=words):
         load_scene(write_scene(tmp_path, **changes))
 
 
-def test_wear_keys_change_no_run_and_materials_do(tmp_path):
+def test_materials_change_the_identity_of_a_run_and_wear_keys_do_not(tmp_path):
     plain = load_scene(write_scene(tmp_path / "a"))
     worn = load_scene(write_scene(tmp_path / "b", wear__close="as recorded"))
     other = load_scene(

@@ -1,4 +1,4 @@
-"""Every error is one line for the user: closed streams, odd files, unforeseen exceptions."""
+"""Errors as one line: closed streams, unusual files, unexpected exceptions."""
 
 import json
 import os
@@ -24,13 +24,13 @@ MESHES = [str(MODEL / name) for name in ("femoral_component.stl", "insert.stl")]
 
 
 def shell(command, cwd):
-    """Run a shell line in which TKAMB is the program; return status, stdout and stderr."""
+    """Run a shell command with the program for TKAMB; return status, stdout and stderr."""
     line = command.replace("TKAMB", f"{sys.executable} -m tkamb.cli")
-    kept = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    ran = subprocess.run(
-        ["bash", "-c", line], cwd=cwd, env=kept, capture_output=True, text=True, timeout=120
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    process = subprocess.run(
+        ["bash", "-c", line], cwd=cwd, env=environment, capture_output=True, text=True, timeout=120
     )
-    return ran.returncode, ran.stdout, ran.stderr
+    return process.returncode, process.stdout, process.stderr
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def shell(command, cwd):
         ("TKAMB run $'a\\x1b[31m.toml'", 2, 1),
     ],
 )
-def test_streams(tmp_path, command, status, lines):
+def test_closed_and_full_streams_give_at_most_one_line(tmp_path, command, status, lines):
     ended, _, said = shell(command, tmp_path)
     assert ended == status, said
     assert said.count("\n") == lines and "Traceback" not in said, said
@@ -59,8 +59,7 @@ def test_streams(tmp_path, command, status, lines):
     assert not list(tmp_path.iterdir())
 
 
-def test_texts_of_others_steer_no_terminal(tmp_path):
-    """`mesh check` and all other commands printed names and titles as they were."""
+def test_control_characters_in_names_are_escaped(tmp_path):
     name = tmp_path / "a\x1b[31m\x9b1m\u202e.stl"
     shutil.copy(MESHES[1], name)
     ended, printed, _ = shell("TKAMB mesh check *.stl", tmp_path)
@@ -70,8 +69,7 @@ def test_texts_of_others_steer_no_terminal(tmp_path):
     assert json.loads(f'"{printable(chr(0x9B) + chr(0x7F))}"') == "\x9b\x7f"
 
 
-def test_a_load_that_is_not_carried_is_said_on_standard_error(capfd, monkeypatch):
-    """Status 1, and the reason stood on standard output alone."""
+def test_a_load_that_is_not_carried_is_reported_on_standard_error(capfd, monkeypatch):
     monkeypatch.setattr(PressReport, "carried", False)
     line = ["press", *MESHES, "--load", "10", "--resolution", "9", "--contact", "foundation"]
     assert main(line) == 1
@@ -79,8 +77,7 @@ def test_a_load_that_is_not_carried_is_said_on_standard_error(capfd, monkeypatch
     assert printed and said.count("\n") == 1 and "not carried" in said
 
 
-def test_an_interrupt_while_the_program_is_read_is_one_line(monkeypatch, capsys):
-    """Ctrl-C within the first tenth of a second gave a traceback of imports."""
+def test_an_interrupt_during_the_imports_is_one_line(monkeypatch, capsys):
 
     class Interrupted:
         def find_spec(self, name, path=None, target=None):
@@ -102,7 +99,7 @@ def refused(capfd, *arguments):
 
 
 @pytest.mark.parametrize("kind", ["fifo", "device", "folder", "socketless link", "nul", "long"])
-def test_files_that_are_none(tmp_path, capfd, kind):
+def test_paths_that_are_no_regular_files_are_refused(tmp_path, capfd, kind):
     path = tmp_path / "odd"
     if kind == "fifo":
         os.mkfifo(path)
@@ -130,8 +127,7 @@ def test_files_that_are_none(tmp_path, capfd, kind):
     assert not (tmp_path / "o").exists()
 
 
-def test_large_files_are_not_read(tmp_path, capfd):
-    """Two gigabytes of nothing: the size is looked at before a byte is read."""
+def test_large_files_are_refused_before_they_are_read(tmp_path, capfd):
     for name in ("scene.toml", "motion.csv", "mesh.stl", "leg.urdf"):
         os.truncate(os.open(tmp_path / name, os.O_CREAT | os.O_WRONLY), 2_000_000_000)
     out = ("--out", tmp_path / "o")  # no other process writes there
@@ -142,7 +138,7 @@ def test_large_files_are_not_read(tmp_path, capfd):
         assert "MB large" in refused(capfd, "run", MODEL / "scene.toml", "--set", setting, *out)
 
 
-def test_a_hundred_thousand_columns(tmp_path):
+def test_a_table_with_a_hundred_thousand_columns_is_read(tmp_path):
     path = tmp_path / "wide.csv"
     names = [f"c{k}" for k in range(100_000)]
     path.write_text(",".join(names) + "\n" + ",".join("1" for _ in names) + "\n")
@@ -162,20 +158,20 @@ def test_a_hundred_thousand_columns(tmp_path):
         ('<?xml version="1.0" encoding="no-such"?><robot/>', "not a readable"),
     ],
 )
-def test_xml_that_nests_or_ends(tmp_path, text, words):
+def test_deeply_nested_or_truncated_xml_is_refused(tmp_path, text, words):
     path = tmp_path / "a.xml"
     path.write_text(text)
     with pytest.raises(InputError, match=words):
         read_xml(path)
 
 
-def test_a_scene_that_nests(tmp_path, capfd):
+def test_a_deeply_nested_scene_is_refused(tmp_path, capfd):
     path = tmp_path / "scene.toml"
     path.write_text("a = " + "[" * 100_000)
     assert "nests values" in refused(capfd, "run", path)
 
 
-def test_a_file_that_grows_too_large_by_one_byte(tmp_path):
+def test_a_file_one_byte_above_the_limit_is_refused(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(bytes(11))
     assert len(read_bytes(path, 11)) == 11
@@ -187,14 +183,17 @@ def test_a_file_that_grows_too_large_by_one_byte(tmp_path):
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (ZeroDivisionError("float division"), "not foreseen: ZeroDivisionError: float division"),
+        (
+            ZeroDivisionError("float division"),
+            "unexpected error: ZeroDivisionError: float division",
+        ),
         (MemoryError(), "not enough memory"),
         (RecursionError("too deep"), "RecursionError"),
         (OSError(5, "Input/output error"), "Input/output error"),
         (KeyError("many\nlines"), "KeyError"),
     ],
 )
-def test_what_nobody_foresaw_is_one_line_and_a_log(tmp_path, monkeypatch, capfd, error, words):
+def test_an_unexpected_error_is_one_line_and_a_log(tmp_path, monkeypatch, capfd, error, words):
     def fails(*_):
         raise error
 
@@ -215,8 +214,8 @@ def test_version(capsys):
     assert capsys.readouterr().out.startswith("tkamb ")
 
 
-def test_an_interrupt_within_a_compiled_loop_is_an_interrupt():
-    """Python tells of it as SystemErrors, one caused by the other."""
+def test_an_interrupt_within_a_compiled_loop_is_a_keyboard_interrupt():
+    """Python raises a SystemError with the cause KeyboardInterrupt."""
 
     def loop(cause):
         try:

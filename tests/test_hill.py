@@ -1,4 +1,4 @@
-"""Hill-type strength: the curves' known points, the rigid tendon's geometry, OpenSim's curves."""
+"""Hill-type strength: points of the curves, geometry of the rigid tendon, OpenSim's curves."""
 
 import numpy as np
 import pytest
@@ -24,21 +24,21 @@ def test_the_curves_pass_their_known_points():
     np.testing.assert_allclose(passive_force_length(np.array([0.5, 1.0, 1.6])), [0, 0, 1])
 
 
-def test_the_fibres_keep_their_width_and_pull_along_the_tendon():
+def test_fibres_have_constant_width_and_their_force_is_along_the_tendon():
     lengths = np.linspace(0.21, 0.33, 7)[:, None]
     active, passive = rigid_tendon_strength([PENNATE], lengths, np.zeros_like(lengths))
     along = lengths - PENNATE.tendon_slack_length_m
     width = PENNATE.optimal_fibre_length_m * np.sin(0.4)
     fibre = np.hypot(along, width)
     cosine = along / fibre
-    still = active_force_length(fibre / PENNATE.optimal_fibre_length_m)
-    np.testing.assert_allclose(active, 900.0 * still * cosine, rtol=1e-3)
+    isometric = active_force_length(fibre / PENNATE.optimal_fibre_length_m)
+    np.testing.assert_allclose(active, 900.0 * isometric * cosine, rtol=1e-3)
     stretched = passive_force_length(fibre / PENNATE.optimal_fibre_length_m)
     np.testing.assert_allclose(passive, 900.0 * stretched * cosine)
 
 
-def test_fibres_lengthen_by_the_cosine_of_the_path():
-    """By differences of the fibres' own length."""
+def test_the_fibre_velocity_is_the_path_velocity_times_the_cosine():
+    """The reference is a finite difference of the fibre length."""
     length, speed, h = 0.28, 0.35, 1e-6
     width = PENNATE.optimal_fibre_length_m * np.sin(PENNATE.pennation_rad)
 
@@ -47,12 +47,12 @@ def test_fibres_lengthen_by_the_cosine_of_the_path():
 
     rate = (fibre(length + h * speed) - fibre(length - h * speed)) / (2 * h)
     moving, _ = rigid_tendon_strength([PENNATE], np.array([[length]]), np.array([[speed]]))
-    still, _ = rigid_tendon_strength([PENNATE], np.array([[length]]), np.zeros((1, 1)))
+    isometric, _ = rigid_tendon_strength([PENNATE], np.array([[length]]), np.zeros((1, 1)))
     expected = force_velocity(np.array([rate])) / force_velocity(np.zeros(1))
-    assert (moving / still)[0, 0] == pytest.approx(expected[0], rel=1e-6)
+    assert (moving / isometric)[0, 0] == pytest.approx(expected[0], rel=1e-6)
 
 
-def test_a_path_shorter_than_the_tendon_is_slack_and_too_long_fibres_are_not_known():
+def test_a_path_shorter_than_the_tendon_is_slack_and_too_long_fibres_give_nan():
     lengths = np.array([[0.19, 0.2, 0.45]]).T
     active, passive = rigid_tendon_strength([PENNATE], lengths, np.zeros_like(lengths))
     np.testing.assert_array_equal(active[:2], 0.0)
@@ -69,6 +69,6 @@ def test_the_curves_are_opensims():
     np.testing.assert_allclose(active_force_length(lengths), theirs, atol=1e-12)
     theirs = [curves.calcForceVelocityMultiplier(float(v)) for v in speeds]
     np.testing.assert_allclose(force_velocity(speeds), np.maximum(theirs, 0.0), atol=1e-12)
-    # theirs begins at 0.2 optimal lengths: 0.02 at the optimal one, the same at a strain of 0.6
+    # OpenSim's passive curve begins at 0.2 optimal lengths, and has 0.02 at the optimal length
     theirs = [curves.calcPassiveForceMultiplier(float(x)) for x in lengths]
     np.testing.assert_allclose(passive_force_length(lengths), theirs, atol=0.02)

@@ -1,12 +1,12 @@
-"""When the known error of a contact model is called large."""
+"""Large known errors of a contact model."""
 
 from tkamb.run.known_errors import is_large
 
 EDGE = {"edge": {"peak_pressure": 0.3, "area": 0.2}}
 
 
-def test_the_edge_does_not_decide_whether_an_error_is_large():
-    """Contact at an edge carries a flag of its own."""
+def test_errors_at_an_edge_are_ignored_if_situations_were_measured():
+    """Contact at an edge has its own flag."""
     whole = {"peak_pressure": 0.3, "area": 0.2, "cases": 20}
     smooth = {"interior": {"peak_pressure": 0.02, "area": 0.05}} | EDGE
     assert is_large(whole, ("area",))

@@ -1,4 +1,4 @@
-"""Small inputs that would take hours, gigabytes or the whole disk: refused, or told in one line."""
+"""Inputs that would take hours, gigabytes or the whole disk are refused in one line."""
 
 import os
 import subprocess
@@ -31,24 +31,24 @@ from tkamb.studies.wear.run import kept_state
         ("a = 1\na = 2", "not TOML"),
     ],
 )
-def test_small_toml_that_is_large_to_read(text, words):
+def test_toml_that_takes_long_to_parse_is_refused(text, words):
     with pytest.raises(InputError, match=words):
         parse_toml(text, "scene.toml")
 
 
-def test_text_that_only_looks_like_structure_is_read():
+def test_long_texts_with_brackets_and_dots_are_read():
     text = 'a = "' + "x." * 50 + "[" * 50 + "1" * 200 + '"  # ' + "[" * 50 + "\nb.c = [[1, 2]]"
     assert parse_toml(text, "scene.toml")["b"] == {"c": [[1, 2]]}
     assert _setting("a.b=[1, 2]") == ("a.b", [1, 2])
 
 
 @pytest.mark.parametrize("value", [0, -1.0, float("nan"), float("inf"), 1e300, 1.0])
-def test_a_tolerance_that_is_none(value):
+def test_an_impossible_tolerance_is_refused(value):
     with pytest.raises(InputError, match="tolerance"):
         contact_model("lattice", tolerance=value)
 
 
-def test_a_centre_of_mass_beyond_all_measure():
+def test_an_origin_far_beyond_the_body_is_refused():
     from xml.etree.ElementTree import fromstring
 
     with pytest.raises(InputError, match="millimetres"):
@@ -56,7 +56,7 @@ def test_a_centre_of_mass_beyond_all_measure():
     _check_attributes(fromstring('<origin xyz="0 -0.4 0" rpy="0 0 0"/>'), "leg.urdf")
 
 
-def test_a_terabyte_is_not_hashed(tmp_path):
+def test_a_file_above_the_limit_is_not_hashed(tmp_path):
     path = tmp_path / "large"
     os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), int(HASH_LIMIT) + 1)
     with pytest.raises(InputError, match="MB large"):
@@ -64,13 +64,13 @@ def test_a_terabyte_is_not_hashed(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"x" * 100, bytes(1000)])
-def test_a_damaged_wear_state_is_one_line(tmp_path, content):
+def test_a_damaged_wear_state_is_refused(tmp_path, content):
     (tmp_path / STATE_NAME).write_bytes(content)
     with pytest.raises(InputError, match="damaged"):
         kept_state(tmp_path, "identity", 5)
 
 
-def test_a_wear_state_of_other_arrays_is_damaged(tmp_path):
+def test_a_wear_state_with_wrong_shapes_is_refused(tmp_path):
     arrays = {name: np.zeros(4) for name in ("wear", "creep", "fall")}
     np.savez(tmp_path / "a.npz", identity="identity", rows="[]", **arrays)
     (tmp_path / "a.npz").rename(tmp_path / STATE_NAME)
@@ -99,14 +99,14 @@ except InputError as error:
 
 
 @pytest.mark.parametrize("limit", [100, 5_000, 100_000, 500_000])
-def test_a_full_disk_ends_in_one_line_not_in_a_signal(tmp_path, limit):
-    line = [sys.executable, "-c", WRITER, str(limit), str(tmp_path / "contact.h5")]
-    ran = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert ran.returncode == 3, ran.stderr
-    assert "cannot be written (File too large)" in ran.stdout and not ran.stderr
+def test_a_file_size_limit_ends_the_maps_with_one_line(tmp_path, limit):
+    command = [sys.executable, "-c", WRITER, str(limit), str(tmp_path / "contact.h5")]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert process.returncode == 3, process.stderr
+    assert "cannot be written (File too large)" in process.stdout and not process.stderr
 
 
-def test_what_is_kept_after_a_failed_write_stays_ours(tmp_path):
+def test_a_folder_stays_claimed_after_a_failed_write(tmp_path):
     out = tmp_path / "out"
 
     def fails():
@@ -121,7 +121,7 @@ def test_what_is_kept_after_a_failed_write_stays_ours(tmp_path):
         pass
 
 
-def test_an_interrupt_without_a_reason_has_one(capfd):
+def test_an_interrupt_without_files_states_that_nothing_is_kept(capfd):
     import argparse
 
     def command():
@@ -131,7 +131,7 @@ def test_an_interrupt_without_a_reason_has_one(capfd):
     assert capfd.readouterr().err == "tkamb: interrupted: nothing is kept\n"
 
 
-def test_no_room_is_one_line(capfd):
+def test_a_full_disk_is_one_line(capfd):
     import argparse
     import errno
 
@@ -143,17 +143,17 @@ def test_no_room_is_one_line(capfd):
     assert said.count("\n") == 1 and "results.csv: cannot be written" in said
 
 
-def test_a_worker_whose_parent_has_gone_says_nothing():
-    line = [sys.executable, "-m", "tkamb.run.workers"]
-    ran = subprocess.run(line, input=b"", capture_output=True, check=False)
-    assert (ran.returncode, ran.stderr) == (0, b"")
+def test_a_worker_ends_silently_with_its_parent():
+    command = [sys.executable, "-m", "tkamb.run.workers"]
+    process = subprocess.run(command, input=b"", capture_output=True, check=False)
+    assert (process.returncode, process.stderr) == (0, b"")
 
 
-def test_an_unknown_drawing_backend_is_not_asked(tmp_path):
-    line = [sys.executable, "-m", "tkamb", "check", "--out", str(tmp_path / "a.png")]
+def test_an_unknown_backend_of_matplotlib_is_ignored(tmp_path):
+    command = [sys.executable, "-m", "tkamb", "check", "--out", str(tmp_path / "a.png")]
     from scenes import MODEL
 
     environment = os.environ | {"MPLBACKEND": "no-such-backend"}
-    line.append(str(MODEL / "scene.toml"))
-    ran = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
+    command.append(str(MODEL / "scene.toml"))
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr

@@ -304,7 +304,7 @@ def test_what_nobody_foresaw_of_a_preparation_is_said_to_the_page(knee, monkeypa
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(knee, "_side", lambda request: 1 / 0)
     request = replace(states(knee)["pressed"], resolution_mm=7.0)
-    with pytest.raises(TkambError, match="not foreseen: ZeroDivisionError"):
+    with pytest.raises(TkambError, match="unexpected error: ZeroDivisionError"):
         list(iter(lambda: knee.preparing(request), ""))
 
 

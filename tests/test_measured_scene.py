@@ -15,7 +15,7 @@ LATE_STANCE = 15
 
 @pytest.mark.slow
 @needs_jw
-def test_what_the_report_shows_of_muscles_is_in_the_results():
+def test_the_results_have_muscle_groups_contributions_measured_force_and_emg():
     run = simulate(SCENE, frames=slice(LATE_STANCE, LATE_STANCE + 1))
     groups = run.summary["muscle_groups"]
     assert set(groups["knee extensors"]) == {"recfem", "vasint", "vaslat", "vasmed"}

@@ -1,4 +1,4 @@
-"""The Methods paragraph: what was modelled, with the scene's own numbers."""
+"""The Methods paragraph: the model of a run with the numbers of its scene."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ def test_the_paragraph_needs_only_the_folder(run, capsys):
         "coefficient of 0.05",
         "doi:10.1016/0021-9290(91)90019-J",
         "3 frames were computed; none of them failed.",
-        "Nobody was measured",  # the scene's note: the shipped knee is no person's
+        "Nobody was measured",  # a note of the scene, since the shipped knee is synthetic
     ):
         assert words in text
     assert f"tkamb {tkamb.__version__}" in text
@@ -90,7 +90,7 @@ def test_a_resampled_motion_is_not_called_recorded(run):
         ("contact.model", "hertz", "Hertz's theory", "elastic foundation"),
     ],
 )
-def test_what_the_scene_changes_the_paragraph_says(run, key, value, words, absent):
+def test_the_paragraph_follows_the_scene(run, key, value, words, absent):
     scene = tkamb.load_scene(MODEL / "scene.toml", {"contact.model": "foundation", key: value})
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True)
@@ -99,36 +99,36 @@ def test_what_the_scene_changes_the_paragraph_says(run, key, value, words, absen
     assert absent not in text
 
 
-def test_generic_bundles_are_told_with_their_numbers_and_sources(run):
+def test_generic_bundles_have_numbers_and_sources(run):
     overrides = {"ligament": [], "generic_ligaments": {"ligaments": ["LCL"]}}
     scene = tkamb.load_scene(MODEL / "scene.toml", overrides)
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True)
-    told = methods(summary)
-    text = " ".join(told.sentences)
+    paragraph = methods(summary)
+    text = " ".join(paragraph.sentences)
     assert "LCL k = 72.22 N/mm, strain -0.05" in text and "PCL_" not in text
-    assert any("Ligament-bone interaction" in one for one in told.references)
-    assert any("Abdel-Rahman" in one for one in told.references)
+    assert any("Ligament-bone interaction" in one for one in paragraph.references)
+    assert any("Abdel-Rahman" in one for one in paragraph.references)
 
 
-def test_a_paragraph_cites_only_what_it_names(run):
+def test_the_references_are_those_of_the_used_methods(run):
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     cited = " ".join(methods(summary).references)
     assert "Shin" in cited and "Sharma" in cited
     assert "Lu TW" not in cited and "Hughes" not in cited
 
 
-def test_a_folder_of_an_earlier_version_is_told_what_to_do():
+def test_a_summary_of_an_earlier_version_is_refused():
     with pytest.raises(InputError, match="run the scene again"):
         methods({"frames": 3})
 
 
-def test_the_report_holds_the_paragraph(run):
+def test_the_report_has_the_paragraph(run):
     page = (run / "report.html").read_text(encoding="utf-8")
     assert "Methods paragraph" in page and "Carpentier" in page
 
 
-def test_a_setting_whose_error_was_not_measured_is_said_to_be_so(run):
+def test_the_paragraph_states_that_an_error_was_not_measured(run):
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     summary["known_error"] = "not measured"
     assert "was not measured" in " ".join(methods(summary).sentences)

@@ -162,7 +162,7 @@ def test_quadriceps_that_end_on_the_patella_are_named():
     hip = Sharing(coordinates=("hip_flex_r",), muscles=("psoas_r", "recfem_r"))
     found = solve_trial(chain.model, still(chain, q), {}, sharing=hip)
     assert found.status == ("ok",)
-    with pytest.raises(InputError, match="recfem_r end on the patella; the patellar ligament"):
+    with pytest.raises(InputError, match="recfem_r end on the patella; the force of the patellar"):
         found.knee_reaction()
     chain = kinematics("Rajagopal2016")
     q = chain.coupled({"knee_angle_r": 0.6})[None]

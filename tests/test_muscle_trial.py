@@ -115,7 +115,7 @@ def test_frames_fail_with_a_reason_and_no_numbers():
     sharing = Sharing(coordinates=KNEE, reserve=0.0)
     trial = solve_trial(model, motion, {"foot_r": load}, sharing=sharing)
     assert trial.status[0] == "ok"
-    assert trial.status[1] == "failed: an external load is not known"
+    assert trial.status[1] == "failed: an external load is unknown"
     assert trial.status[2].startswith("failed: no muscle forces within their limits")
     for values in (trial.activation, trial.force_N, trial.reserve, trial.knee_reaction()):
         assert np.isfinite(values[0]).all() and np.isnan(values[1:]).all()

@@ -1,4 +1,4 @@
-"""No command overwrites or mixes another command's output, finished or unfinished."""
+"""No command overwrites the output of another command."""
 
 import json
 
@@ -30,7 +30,7 @@ def content(folder):
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("occupant", WRITTEN)
-def test_a_command_is_refused_anothers_folder_and_nothing_changes(
+def test_a_command_does_not_change_the_folder_of_another_command(
     command, occupant, tmp_path, capsys
 ):
     if command == occupant or occupant in BESIDE.get(command, ()):
@@ -49,8 +49,8 @@ def test_a_command_is_refused_anothers_folder_and_nothing_changes(
     assert content(out) == before
 
 
-def test_a_run_is_not_what_an_uncertainty_run_wrote(tmp_path):
-    """A run would remove the bands beside the results, which took hours."""
+def test_results_with_bands_belong_to_an_uncertainty_run(tmp_path):
+    """A run would remove the bands."""
     for name in ("results.csv", "bands.csv"):
         (tmp_path / name).write_text("time_s\n")
     assert occupants(tmp_path) == {"uncertainty": "bands.csv"}
@@ -64,7 +64,7 @@ def test_a_run_is_not_what_an_uncertainty_run_wrote(tmp_path):
         ({"choice of frames": None, "table of runs": "a"}, "cohort"),
     ],
 )
-def test_what_is_under_way_is_known(identity, whose, tmp_path):
+def test_an_unfinished_run_is_recognised_by_its_identity(identity, whose, tmp_path):
     (tmp_path / ".frames").mkdir()
     (tmp_path / ".frames" / "run.json").write_text(json.dumps(identity))
     assert occupants(tmp_path) == {whose: ".frames/run.json"}
@@ -77,12 +77,12 @@ def test_what_is_under_way_is_known(identity, whose, tmp_path):
         ({"case": "a", "kind": "b"}, "stability"),
     ],
 )
-def test_a_study_that_was_killed_is_known_by_its_rows(row, whose, tmp_path):
+def test_a_killed_study_is_recognised_by_its_rows(row, whose, tmp_path):
     KeptRows(tmp_path, resume=False).put("key", row)
     assert occupants(tmp_path) == {whose: "rows.jsonl"}
 
 
-def test_own_output_is_replaced_and_force_takes_anothers(tmp_path):
+def test_output_of_the_same_command_is_replaced_and_that_of_another_only_with_force(tmp_path):
     write_results(make_run("bend"), tmp_path)
     write_results(make_run("bend"), tmp_path)
     refused = pytest.raises(InputError, match="holds what `tkamb run` wrote")
@@ -92,7 +92,7 @@ def test_own_output_is_replaced_and_force_takes_anothers(tmp_path):
         pass
 
 
-def test_a_page_and_maps_with_names_of_their_own_stand_beside_a_run(tmp_path, capsys):
+def test_compare_and_export_write_beside_a_run_without_changing_it(tmp_path, capsys):
     run = keep(make_run("bend"), tmp_path / "run")
     before = content(run)
     for words in (["compare", run, run], ["export", run, "--vtp"]):
@@ -102,7 +102,7 @@ def test_a_page_and_maps_with_names_of_their_own_stand_beside_a_run(tmp_path, ca
     assert {name: after[name] for name in before} == before
 
 
-def test_wear_stands_beside_its_run_and_the_run_may_be_run_again(tmp_path):
+def test_wear_and_run_may_share_a_folder(tmp_path):
     with claimed_directory(tmp_path):
         for name in ("results.csv", "wear.json"):
             (tmp_path / name).write_text("x")

@@ -1,4 +1,4 @@
-"""Force plates as laboratories write them: unit words, calibration, baselines, drift, gaps."""
+"""Force plates in recordings of laboratories: units, calibration, baselines, drift, gaps."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ PER_UNIT = {"mm": 1e3, "m": 1.0}
 
 
 def wrench():
-    """Return what acts in `pushes`: force and moment about the file's origin (k, 6)."""
+    """Return the wrench of `pushes`: force and moment about the file's origin (k, 6)."""
     force, point, free = pushes()
     moment = np.cross(point, force)
     moment[:, 2] += free
@@ -42,7 +42,7 @@ def recorded(folder, kind=2, units=None, signals=None, markers=None, **more):
 
 @pytest.mark.parametrize("force", ["N", "nt", "Newtons", "newton", " N ", "NT"])
 @pytest.mark.parametrize("moment", ["Nmm", "ntmm", "N-mm", "NMM", "N.mm", "N*mm", "Newton-mm"])
-def test_a_word_for_newtons_and_newton_millimetres(tmp_path, force, moment):
+def test_spellings_of_newtons_and_newton_millimetres_are_read(tmp_path, force, moment):
     path = recorded(tmp_path, units=[force] * 3 + [moment] * 3)
     np.testing.assert_allclose(read_c3d(path).plates[0].wrench, wrench(), atol=1e-3)
 
@@ -68,12 +68,12 @@ def test_a_word_for_newtons_and_newton_millimetres(tmp_path, force, moment):
         *((word, newton_metres, None) for word in ("N", "mm", "V", "", "Nm/kg", "mN", "mN.m")),
     ],
 )
-def test_unit_words(word, read, value):
+def test_a_unit_word_has_its_factor_to_si(word, read, value):
     assert read(word) == (None if value is None else pytest.approx(value))
 
 
 @pytest.mark.parametrize("given", ["moment", "both"])
-def test_an_unknown_word_is_a_unit_where_the_user_says_which(tmp_path, given):
+def test_an_unknown_unit_word_needs_the_option_of_the_unit(tmp_path, given):
     force = "N" if given == "moment" else "kiloponds?"
     path = recorded(tmp_path, units=[force] * 3 + ["huh"] * 3)
     with pytest.raises(InputError, match=r"'(huh|kiloponds\?)'.*--(force|moment)-unit"):
@@ -84,7 +84,7 @@ def test_an_unknown_word_is_a_unit_where_the_user_says_which(tmp_path, given):
         read_c3d(recorded(tmp_path), GivenUnits(moment="Nm")).plate(1)
 
 
-def test_a_unit_of_length_that_is_not_understood_concerns_markers_and_plates(tmp_path):
+def test_an_unknown_unit_of_length_is_refused_for_plates(tmp_path):
     path = recorded(tmp_path, point_unit="furlong", plate={"corners": AMTI_CORNERS * 1e3})
     recording = read_c3d(path)
     assert recording.length_unit is None and len(recording.channels) == 6
@@ -97,7 +97,7 @@ def test_a_unit_of_length_that_is_not_understood_concerns_markers_and_plates(tmp
 @pytest.mark.parametrize("unit", ["mm", "m", "MM", "Meters"])
 @pytest.mark.parametrize("kind", [4, 5])
 def test_a_calibration_gives_moments_in_the_unit_of_length(tmp_path, unit, kind):
-    """Volts of six or eight channels; the matrix has crosstalk, and is stored either way round."""
+    """The calibration matrix of six or eight channels in volts has crosstalk."""
     per_metre = {"mm": 1e3, "m": 1.0}["m" if metres(unit) == 1.0 else "mm"]
     signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
     signals[3:] *= 1e-3 * per_metre
@@ -106,7 +106,7 @@ def test_a_calibration_gives_moments_in_the_unit_of_length(tmp_path, unit, kind)
     volts = np.linalg.pinv(matrix) @ signals
     corners = AMTI_CORNERS * per_metre
     plate = {"matrix": matrix, "corners": corners, "origin": ORIGIN * per_metre}
-    # the writer scales metres to mm and m alone; the unit's word is another
+    # the writer scales metres only for the words mm and m
     path = recorded(
         tmp_path, kind, ["V"] * channels, volts, point_unit=unit, plate=scaled(plate, unit)
     )
@@ -115,13 +115,13 @@ def test_a_calibration_gives_moments_in_the_unit_of_length(tmp_path, unit, kind)
 
 
 def scaled(plate, unit):
-    """Return a plate's lengths as `write_c3d` wants them, which scales by the words mm and m."""
+    """Return a plate with lengths for `write_c3d`, which scales for the words mm and m."""
     by = {"mm": 1e3, "m": 1.0}.get(unit, 1.0)
     return plate | {key: plate[key] / by for key in ("corners", "origin")}
 
 
-def test_channels_that_state_their_moments_are_believed_where_the_foot_is_on_the_plate(tmp_path):
-    """Type 4 with a unit matrix and N·mm channels, in a file in metres: the stated unit counts."""
+def test_the_unit_of_a_moment_channel_precedes_the_unit_of_length(tmp_path):
+    """The plate has type 4, a unit matrix and channels in N·mm in a file in metres."""
     signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
     plate = {"matrix": np.eye(6)}
     path = recorded(tmp_path, 4, None, signals, point_unit="m", plate=plate)
@@ -129,7 +129,7 @@ def test_channels_that_state_their_moments_are_believed_where_the_foot_is_on_the
 
 
 def offset_signals(level=12.0):
-    """Return the plate's channels, unloaded in the first six frames, with an offset each."""
+    """Return channels that are unloaded in the first six frames, without and with offsets."""
     signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
     signals[:, : 6 * RATIO] = 0.0
     return signals, signals + level * np.array([[1.0, -0.5, 1.0, 30.0, -20.0, 10.0]]).T
@@ -138,7 +138,7 @@ def offset_signals(level=12.0):
 @pytest.mark.parametrize(
     ("first_frame", "zero"), [(0, [1, 5]), (0, [0, 5]), (217, [218, 222]), (217, [1, 5])]
 )
-def test_frames_of_zero_give_the_baseline(tmp_path, first_frame, zero):
+def test_the_frames_of_parameter_zero_give_the_baseline(tmp_path, first_frame, zero):
     clean, offset = offset_signals()
     path = recorded(tmp_path, signals=offset, first_frame=first_frame)
     with_zero(path, zero)
@@ -149,14 +149,14 @@ def test_frames_of_zero_give_the_baseline(tmp_path, first_frame, zero):
 
 
 @pytest.mark.parametrize("zero", [[1, 0], [0, 0], [900, 910]])
-def test_frames_of_zero_that_are_none_change_nothing(tmp_path, zero):
+def test_impossible_frames_of_parameter_zero_are_ignored(tmp_path, zero):
     _, offset = offset_signals()
     path = recorded(tmp_path, signals=offset)
     before = read_c3d(path).plates[0].wrench
     np.testing.assert_array_equal(read_c3d(with_zero(path, zero)).plates[0].wrench, before)
 
 
-def test_a_plate_that_is_stood_upon_in_the_frames_of_zero_keeps_its_load(tmp_path):
+def test_a_plate_that_is_loaded_in_the_frames_of_zero_has_no_baseline(tmp_path):
     path = with_zero(recorded(tmp_path), [1, 10])
     plate = read_c3d(path).plates[0]
     np.testing.assert_allclose(plate.wrench, wrench(), atol=1e-3)
@@ -176,7 +176,7 @@ def with_zero(path, zero):
 
 
 def two_plates(folder, level):
-    """Write a foot on plate 1 from frame 6, and plate 2 without a foot; both drift."""
+    """Write two drifting plates, with a foot on plate 1 from frame 6."""
     clean, _ = offset_signals()
     beside = np.zeros_like(clean)
     signals = np.concatenate([clean, beside])
@@ -196,7 +196,7 @@ def two_plates(folder, level):
 
 
 @pytest.mark.parametrize("level", [0.0, 5.0, -7.0, 28.0])
-def test_an_unloaded_plate_does_not_enter_the_sum_and_drift_is_told(tmp_path, level):
+def test_an_unloaded_plate_is_left_out_of_the_sum_and_its_drift_is_reported(tmp_path, level):
     table = GroundReactionTable(
         file=two_plates(tmp_path, level),
         plates=(1, 2),
@@ -205,19 +205,19 @@ def test_an_unloaded_plate_does_not_enter_the_sum_and_drift_is_told(tmp_path, le
     )
     time = read_c3d(table.file).analog_time
     ground = load_ground_reaction(table, time, "right")
-    own = load_ground_reaction(table.model_copy(update={"plates": (1,)}), time, "right")
-    np.testing.assert_allclose(ground.force, own.force, atol=1e-6)
-    np.testing.assert_allclose(ground.moment, own.moment, atol=1e-6)
-    assert np.abs(ground.force[:5]).max() < 1e-9  # nobody stands on either
-    expected = {} if level == 0 else {2: level}  # plate 1 is free for too short to see it
+    first = load_ground_reaction(table.model_copy(update={"plates": (1,)}), time, "right")
+    np.testing.assert_allclose(ground.force, first.force, atol=1e-6)
+    np.testing.assert_allclose(ground.moment, first.moment, atol=1e-6)
+    assert np.abs(ground.force[:5]).max() < 1e-9  # nobody stands on the plates
+    expected = {} if level == 0 else {2: level}  # plate 1 is unloaded for too short a time
     assert ground.drift == pytest.approx(expected, abs=1e-3)
     case = type("Case", (), {"ground": ground})
     questions = [str(one.text) for one in drift_questions(case)]
     assert len(questions) == (level != 0) and all("set to zero" in text for text in questions)
 
 
-def test_light_loads_all_along_are_no_drift(tmp_path):
-    """A plate that bears 25 to 60 N throughout is stood upon: nothing of it is left out."""
+def test_light_loads_in_all_frames_are_no_drift(tmp_path):
+    """A plate with 25 to 60 N in all frames is loaded."""
     signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
     signals *= np.linspace(25.0, 60.0, COUNT * RATIO) / signals[2]
     path = recorded(tmp_path, signals=signals)
@@ -230,10 +230,10 @@ def test_light_loads_all_along_are_no_drift(tmp_path):
 
 
 @pytest.mark.parametrize("where", ["tail", "head", "middle"])
-def test_samples_that_are_no_numbers_matter_only_among_the_frames(tmp_path, where):
+def test_nan_samples_are_refused_only_between_the_frames(tmp_path, where):
     signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
-    lost = {"tail": slice(-40, None), "head": slice(0, 30), "middle": slice(95, 97)}[where]
-    signals[:, lost] = np.nan
+    gap = {"tail": slice(-40, None), "head": slice(0, 30), "middle": slice(95, 97)}[where]
+    signals[:, gap] = np.nan
     table = GroundReactionTable(
         file=recorded(tmp_path, signals=signals),
         plates=(1,),
@@ -262,7 +262,7 @@ BAD_PLATES = {
 
 
 @pytest.mark.parametrize("fault", BAD_PLATES)
-def test_a_bad_plate_concerns_who_needs_it(tmp_path, fault):
+def test_a_bad_plate_is_refused_only_if_it_is_needed(tmp_path, fault):
     path = recorded(tmp_path, plate=BAD_PLATES[fault])
     recording = read_c3d(path)
     assert recording.plates == () and np.isfinite(recording.points).all()
@@ -272,7 +272,7 @@ def test_a_bad_plate_concerns_who_needs_it(tmp_path, fault):
 
 
 @pytest.mark.parametrize("name", ["arm", "", "J:arm"])
-def test_equal_labels_are_refused_only_where_one_is_needed(tmp_path, name):
+def test_equal_labels_are_refused_only_if_they_are_needed(tmp_path, name):
     import ezc3d
 
     from tkamb.io.recordings.markers import marker_trajectories
@@ -292,7 +292,7 @@ def test_equal_labels_are_refused_only_where_one_is_needed(tmp_path, name):
             marker_trajectories(table, [name], 1.0)
 
 
-def test_equal_channels_are_refused_only_where_one_is_needed(tmp_path):
+def test_equal_channels_are_refused_only_if_they_are_needed(tmp_path):
     import ezc3d
 
     time = np.arange(200) / 1000.0

@@ -1,4 +1,4 @@
-"""`tkamb press` on mesh files: what it prints, and that units, axes and side only relabel."""
+"""`tkamb press` on mesh files: output, units, axes, side, adjustment and refused input."""
 
 import argparse
 import base64
@@ -48,11 +48,11 @@ KEYS = [
 ]
 CONDYLE_KEYS = ["force_N", "area_mm2", "mean_pressure_MPa", "peak_pressure_MPa", "cop_mm"]
 TURN = np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
-"""From anatomical axes to a mesh with -x,+y,-z."""
+"""Rotation from anatomical axes to the axes -x,+y,-z of a mesh."""
 
 
 def two_condyles():
-    """Return condyles of different size, so that medial and lateral differ."""
+    """Return condyles of different sizes, so that medial and lateral results differ."""
     medial = graded_sphere(22e-3, (1e-3, 0, -22e-3))
     lateral = graded_sphere(20e-3, (0, -2e-3, 22e-3))
     return joined(medial, lateral)
@@ -69,7 +69,7 @@ def dishes():
 
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory):
-    """Write the pair once; return a function that gives their paths in a unit and axes."""
+    """Return a function that returns the paths of the meshes in a unit and axes."""
     folder = tmp_path_factory.mktemp("meshes")
 
     def write(scale=1e3, turn=None, mirror=False):
@@ -99,7 +99,7 @@ def condyles(report):
 SIDES = ("medial", "lateral")
 
 
-def test_report_has_the_interface_s_keys(meshes, capsys):
+def test_the_json_output_has_the_documented_keys(meshes, capsys):
     femoral, insert = meshes()
     arguments = ["press", str(femoral), str(insert), "--load", "900", "--json"]
     assert main([*arguments, *FOUNDATION, "--resolution", "1.5"]) == 0
@@ -115,7 +115,7 @@ def test_report_has_the_interface_s_keys(meshes, capsys):
     assert 0 < found["approach_mm"] < 1
 
 
-def test_text_names_both_condyles_and_the_map_is_written(meshes, capsys, tmp_path):
+def test_the_text_has_both_condyles_and_the_map_has_the_load(meshes, capsys, tmp_path):
     femoral, insert = meshes()
     pressing = ["press", str(femoral), str(insert), "--load", "900", *FOUNDATION]
     assert main([*pressing, "--out", str(tmp_path / "map.vtp")]) == 0
@@ -128,19 +128,19 @@ def test_text_names_both_condyles_and_the_map_is_written(meshes, capsys, tmp_pat
 
 
 def test_the_lattice_is_the_default(meshes, capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "cache"))
     femoral, insert = meshes()
     arguments = ["press", str(femoral), str(insert), "--load", "900", "--no-cache", "--json"]
     assert main([*arguments, "--resolution", "2"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["contact"] == "lattice"
     assert found["reaction_N"] == pytest.approx(900, rel=1e-5)
-    assert not (tmp_path / "kept").exists()
+    assert not (tmp_path / "cache").exists()
     assert main([*arguments, *FOUNDATION]) == 2
     assert "'foundation' has no cache on disk" in capsys.readouterr().err
 
 
-def test_swapping_the_model_keeps_the_load(meshes):
+def test_each_contact_model_carries_the_load(meshes):
     femoral, insert = meshes()
     for contact in ("foundation", "foundation-linear", "hertz"):
         report = press_meshes(femoral, insert, 600.0, contact=contact)
@@ -148,24 +148,24 @@ def test_swapping_the_model_keeps_the_load(meshes):
         assert report.as_dict()["contact"] == contact
 
 
-def test_unit_axes_and_height_only_relabel(meshes):
+def test_results_do_not_depend_on_unit_axes_and_height(meshes):
     pose = (2.0, 30.0, 0.4, 0.03, 1.0, 15.0)
-    here = condyles(press_meshes(*meshes(), 2000.0, pose=pose))
+    expected = condyles(press_meshes(*meshes(), 2000.0, pose=pose))
     in_metres = (*(1e-3 * np.array(pose[:3])), *pose[3:])
     metres = press_meshes(*meshes(scale=1.0), 2000.0, units="m", pose=in_metres)
-    assert np.allclose(condyles(metres), here, rtol=1e-5, atol=1e-5)
+    assert np.allclose(condyles(metres), expected, rtol=1e-5, atol=1e-5)
     turned = TURN @ Rotation.from_euler("XYZ", pose[3:], degrees=True).as_matrix() @ TURN.T
     angles = Rotation.from_matrix(turned).as_euler("XYZ", degrees=True)
     other = press_meshes(
         *meshes(turn=TURN), 2000.0, axes="-x,+y,-z", pose=(*(TURN @ pose[:3]), *angles)
     )
-    assert np.allclose(condyles(other), here, rtol=1e-5, atol=1e-5)
+    assert np.allclose(condyles(other), expected, rtol=1e-5, atol=1e-5)
     higher = press_meshes(*meshes(), 2000.0, pose=(2.0, 55.0, 0.4, 0.03, 1.0, 15.0))
-    assert np.allclose(condyles(higher), here, rtol=1e-9, atol=1e-6)
+    assert np.allclose(condyles(higher), expected, rtol=1e-9, atol=1e-6)
 
 
 def test_a_left_knee_is_the_mirror_image(meshes):
-    """Same loads on the same condyles; z to the subject's right changes sign."""
+    """The condyles have the same results. Only z, to the subject's right, changes its sign."""
     pose = np.array([2.0, 30.0, 0.4, 0.03, 1.0, 15.0])
     right = condyles(press_meshes(*meshes(), 2000.0, pose=pose))
     mirrored = pose * [1, 1, -1, -1, -1, 1]
@@ -176,14 +176,14 @@ def test_a_left_knee_is_the_mirror_image(meshes):
 
 
 def nodal_forces(path):
-    """Return the nodal forces (n, 3) N of a .vtp that `press` wrote."""
+    """Return the nodal forces (n, 3), N, of a .vtp file."""
     arrays = ElementTree.parse(path).getroot().iter("DataArray")
     (text,) = (one.text for one in arrays if one.get("Name") == "nodal_force_N")
     return np.frombuffer(base64.b64decode(text)[8:]).reshape(-1, 3)
 
 
-def test_a_left_knee_s_map_lies_on_its_own_insert(meshes, tmp_path):
-    """Its forces have the printed centres of pressure; it is the right one's mirror image."""
+def test_the_map_of_a_left_knee_is_on_the_given_insert(meshes, tmp_path):
+    """Its centres of pressure are the printed ones, and it mirrors the map of the right knee."""
     pose, path, forces = np.array([2.0, 30.0, 0.4, 0.03, 1.0, 15.0]), tmp_path / "map.vtp", {}
     for side, flip in (("right", 1), ("left", -1)):
         turned = pose * [1, 1, flip, flip, flip, 1]
@@ -195,22 +195,22 @@ def test_a_left_knee_s_map_lies_on_its_own_insert(meshes, tmp_path):
             centre = load @ points / load.sum() / MILLIMETRE
             assert centre[::2] == pytest.approx(report.as_dict()[name]["cop_mm"][::2], abs=0.02)
         edges = (points[faces[:, k]] - points[faces[:, 0]] for k in (1, 2))
-        assert (np.cross(*edges)[:, 1] > 0).all()  # they look up, as outer faces do
+        assert (np.cross(*edges)[:, 1] > 0).all()  # outward normals of the top are upward
     right, left = (forces[side].sum(axis=0) for side in ("right", "left"))
     assert abs(right[2]) > 1.0
     assert left == pytest.approx(right * [1, 1, -1], abs=1e-3)
 
 
-def test_the_pose_places_the_femoral_mesh_in_the_insert_s_axes(meshes):
-    """A sphere of radius r moved by s in a dish of radius R touches at s R / (R - r)."""
-    still = condyles(press_meshes(*meshes(), 2000.0))
+def test_the_pose_is_that_of_the_femoral_mesh_in_the_insert_s_axes(meshes):
+    """A sphere of radius r that moves by s in a dish of radius R touches at s R / (R - r)."""
+    reference = condyles(press_meshes(*meshes(), 2000.0))
     moved = condyles(press_meshes(*meshes(), 2000.0, pose=(3.0, 0, 0, 0, 0, 0)))
     expected = [3 * 50 / (50 - 22), 3 * 50 / (50 - 20)]
-    assert np.allclose((moved - still)[:, 4], expected, rtol=0.05)
+    assert np.allclose((moved - reference)[:, 4], expected, rtol=0.05)
 
 
-def test_adjustment_evens_out_the_condyles(meshes, capsys):
-    """0.2 deg of recorded varus is within fluoroscopy's error and is taken out."""
+def test_the_adjustment_removes_a_recorded_varus_of_0_2_deg(meshes, capsys):
+    """It is within the error of fluoroscopy."""
     level = press_meshes(*meshes(), 2000.0).result
     centre = level.pose[1, 3] * 1e3 + level.approach * 1e3
     report = press_meshes(*meshes(), 2000.0, pose=(0, centre + 0.05, 0, 0.2, 0, 0), adjust=True)
@@ -225,8 +225,8 @@ KNEE = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 
 
 @pytest.mark.parametrize(("height", "moved"), [(30.5, 0.24), (30.7, 0.04), (31.2, -0.46)])
-def test_the_recorded_height_does_not_undo_the_adjustment(height, moved, capsys):
-    """0.3 deg of adduction on the shipped knee: level condyles share, wherever it was recorded."""
+def test_the_adjusted_split_does_not_depend_on_the_recorded_height(height, moved, capsys):
+    """The pose of the shipped knee has 0.3 deg of adduction."""
     files = [str(KNEE / name) for name in ("femoral_component.stl", "insert.stl")]
     pose = ["--pose", "-6.9", str(height), "0", "0.3", "0", "0"]
     assert main(["press", *files, "--load", "1500", *pose, *FOUNDATION, "--adjust", "--json"]) == 0
@@ -239,8 +239,8 @@ def test_the_recorded_height_does_not_undo_the_adjustment(height, moved, capsys)
     assert found["flags"] == []
 
 
-def test_the_other_reading_restores_where_the_height_was_right(meshes):
-    """Penetration alone undoes it; without --adjust the rule has nothing to say."""
+def test_the_rule_either_restores_the_rotation_at_the_right_height(meshes):
+    """Penetration alone restores it. The rule is refused without an adjustment."""
     bodies = [KNEE / name for name in ("femoral_component.stl", "insert.stl")]
     pose = (-6.9, 30.7, 0, 0.3, 0, 0)
     report = press_meshes(*bodies, 1500.0, pose=pose, adjust=True, restore_when="either")
@@ -250,11 +250,11 @@ def test_the_other_reading_restores_where_the_height_was_right(meshes):
     assert any("whether the recorded rotation is restored" in line for line in report.lines())
     with pytest.raises(InputError, match="needs the femoral adjustment"):
         press_meshes(*bodies, 1500.0, pose=pose, restore_when="either")
-    with pytest.raises(InputError, match="'neither' is no rule"):
+    with pytest.raises(InputError, match="'neither' is not a rule"):
         press_meshes(*bodies, 1500.0, pose=pose, adjust=True, restore_when="neither")
 
 
-def test_single_sphere_is_medial_and_lateral_is_null(tmp_path):
+def test_the_contact_of_a_single_sphere_is_medial(tmp_path):
     graded_sphere(20e-3).mesh.export(tmp_path / "sphere.ply")
     flat_insert(10e-3).mesh.export(tmp_path / "block.ply")
     report = press_meshes(tmp_path / "sphere.ply", tmp_path / "block.ply", 500.0, units="m")
@@ -265,45 +265,44 @@ def test_single_sphere_is_medial_and_lateral_is_null(tmp_path):
     assert any("one condyle: its contact is called medial" in flag for flag in found["flags"])
 
 
-@pytest.mark.parametrize(("turn", "told"), [(20, False), (-45, True), (90, True), (180, True)])
-def test_a_femur_turned_farther_than_any_knee_is_remarked(meshes, turn, told):
-    """Its medial condyle then presses the lateral side of the insert, or neither."""
+@pytest.mark.parametrize(("turn", "noted"), [(20, False), (-45, True), (90, True), (180, True)])
+def test_a_femur_rotated_farther_than_in_any_knee_gets_a_note(meshes, turn, noted):
     pose = [0.0, 0.0, 0.0, 0.0, turn, 0.0]
     report = press_meshes(*meshes(), 500.0, pose=pose, contact="foundation", resolution_mm=3.0)
     flags = report.as_dict()["flags"]
-    assert any(f"by {abs(turn)} deg on the insert" in flag for flag in flags) == told
+    assert any(f"by {abs(turn)} deg on the insert" in flag for flag in flags) == noted
 
 
 @pytest.mark.parametrize("model", contact_names())
-def test_a_bearing_that_slides_yields_more_or_the_press_says_that_it_does_not(meshes, model):
-    """With its bottom free in its plane a body is compressed more by the same load."""
+def test_a_mobile_bearing_has_a_larger_approach_or_a_note(meshes, model):
+    """An insert with a sliding bottom is compressed more by the same load."""
     fixed, mobile = (
         press.press_meshes(*meshes(), 500.0, contact=model, resolution_mm=3.0, bearing=bearing)
         for bearing in ("fixed", "mobile")
     )
     assert not any("bearing" in flag for flag in fixed.as_dict()["flags"])
-    said = any("like a fixed one" in line for line in mobile.lines())
+    noted = any("as a fixed one" in line for line in mobile.lines())
     if contact_class(model).mobile_bearing:
-        assert not said and mobile.result.approach > 1.01 * fixed.result.approach
+        assert not noted and mobile.result.approach > 1.01 * fixed.result.approach
     else:
-        assert said and mobile.result.approach == fixed.result.approach
+        assert noted and mobile.result.approach == fixed.result.approach
 
 
-def test_a_run_says_that_its_model_does_not_let_the_bearing_slide(tmp_path):
+def test_the_assumptions_of_a_run_have_the_note_on_a_mobile_bearing(tmp_path):
     def notes(**changes):
         scene = write_scene(tmp_path, implant__insert__bearing="mobile", **changes)
         return simulate(scene, frames=slice(50, 51)).summary["assumptions"]
 
-    assert any("mobile, but foundation presses it" in note for note in notes())
+    assert any("mobile, but foundation computes it" in note for note in notes())
     lattice = {"contact__model": "lattice-linear", "contact__resolution_mm": 3.0}
     assert not any("bearing" in note for note in notes(**lattice))
 
 
-def test_zero_load_and_too_great_a_load(meshes):
-    nothing = press_meshes(*meshes(), 0.0).as_dict()
-    assert nothing["reaction_N"] == nothing["approach_mm"] == 0
-    assert nothing["medial"] is None
-    assert nothing["status"] == "ok"
+def test_a_zero_load_is_ok_and_too_large_a_load_is_out_of_range(meshes):
+    unloaded = press_meshes(*meshes(), 0.0).as_dict()
+    assert unloaded["reaction_N"] == unloaded["approach_mm"] == 0
+    assert unloaded["medial"] is None
+    assert unloaded["status"] == "ok"
     crushed = press_meshes(*meshes(), 1e5)
     found = crushed.as_dict()
     assert found["status"] == "out_of_range"
@@ -336,7 +335,7 @@ def test_zero_load_and_too_great_a_load(meshes):
         ({"femoral": "nowhere.stl"}, "nowhere.stl"),
     ],
 )
-def test_bad_input_is_an_input_error(meshes, changed, words):
+def test_bad_input_is_refused(meshes, changed, words):
     femoral, insert = meshes()
     arguments = {"femoral": femoral, "insert": insert, "load": 500.0, **changed}
     with pytest.raises(InputError, match=words):
@@ -352,7 +351,7 @@ def test_an_open_insert_is_refused(meshes, tmp_path):
         press_meshes(femoral, tmp_path / "shell.ply", 500.0)
 
 
-def test_pose_file(tmp_path):
+def test_a_pose_file_has_six_numbers(tmp_path):
     path = tmp_path / "pose.txt"
     path.write_text("1.5, 2 3\n0 -5 90\n")
     assert read_pose(path) == (1.5, 2, 3, 0, -5, 90)
@@ -364,8 +363,8 @@ def test_pose_file(tmp_path):
         read_pose(tmp_path / "none.txt")
 
 
-def test_subject_dm_in_stance_has_both_condyles_in_their_dishes():
-    """30 % of the fluoroscopic cycle, adjusted: the pose of models/dm/README.md."""
+def test_both_condyles_of_subject_dm_are_loaded_in_stance():
+    """The pose at 30 % of the cycle is that of models/dm/README.md."""
     geometry = Path(__file__).parents[2] / "shared" / "data" / "dm" / "geometry"
     if not geometry.is_dir():
         pytest.skip("subject DM's data are not beside the project")
@@ -384,7 +383,7 @@ def test_subject_dm_in_stance_has_both_condyles_in_their_dishes():
         assert abs(found[side]["cop_mm"][0]) < 8.0
 
 
-def test_every_unit_that_mesh_check_names_is_one_that_the_commands_take():
+def test_press_and_mesh_lattice_accept_every_unit_of_length():
     parser = argparse.ArgumentParser()
     commands = parser.add_subparsers()
     add_press(commands)
@@ -411,7 +410,7 @@ SHIPPED = (STARTER / "femoral_component.stl", STARTER / "insert.stl")
     ],
 )
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_a_femoral_component_whose_condyles_face_away_is_refused(turns, fault, side):
+def test_a_femoral_component_upside_down_or_on_its_side_is_refused(turns, fault, side):
     with pytest.raises(InputError, match=fault):
         press_meshes(*SHIPPED, 500.0, pose=(0, 0, 0, *turns), resolution_mm=3.0, side=side)
 
@@ -428,14 +427,14 @@ def test_a_femoral_component_whose_condyles_face_away_is_refused(turns, fault, s
         ((0, 90, 0), "+x,+y,+z", "by 90 deg"),
     ],
 )
-def test_a_pose_that_no_knee_takes_gets_a_remark(turns, axes, remark):
-    """From 20 deg of hyperextension to 140 deg of flexion nothing is said."""
+def test_a_pose_beyond_those_of_knees_gets_a_note(turns, axes, remark):
+    """Poses from 20 deg of hyperextension to 140 deg of flexion get no note."""
     report = press_meshes(*SHIPPED, 500.0, pose=(0, 0, 0, *turns), axes=axes, resolution_mm=3.0)
-    said = "\n".join(report.as_dict()["flags"])
-    about_pose = [w for w in ("faces the insert", "points backward", "turns the") if w in said]
-    assert (remark in said) if remark else not about_pose
+    notes = "\n".join(report.as_dict()["flags"])
+    about_pose = [w for w in ("faces the insert", "points backward", "turns the") if w in notes]
+    assert (remark in notes) if remark else not about_pose
 
 
-def test_exchanged_meshes_are_named():
+def test_exchanged_meshes_are_refused():
     with pytest.raises(InputError, match="shape of a femoral component"):
         press_meshes(*reversed(SHIPPED), 500.0)

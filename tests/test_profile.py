@@ -1,4 +1,4 @@
-"""`tkamb run --profile`: what a run touched, and only that."""
+"""`tkamb run --profile`: times, files and modules of a run."""
 
 import json
 
@@ -16,7 +16,7 @@ def profiled(folder, drop, capsys, *options):
     return json.loads(capsys.readouterr().out)["profile"]
 
 
-def test_a_run_says_what_it_touched(tmp_path, capsys):
+def test_the_profile_has_files_frames_and_times(tmp_path, capsys):
     found = profiled(tmp_path, (), capsys, "--contact", "foundation")
     names = {path.rsplit("/", 1)[-1] for path in found["files"]}
     assert {"scene.toml", "patient.urdf", "motion.csv", "insert.stl"} <= names
@@ -26,7 +26,7 @@ def test_a_run_says_what_it_touched(tmp_path, capsys):
     assert abs(sum(parts.values()) - found["seconds"]["all"]) < 1e-6
 
 
-def test_files_outside_the_scenes_folder_count(tmp_path, capsys):
+def test_the_profile_lists_files_outside_the_scene_s_folder(tmp_path, capsys):
     out, scene = tmp_path / "out", write_scene(tmp_path / "scene")
     (tmp_path / "elsewhere").mkdir()
     (scene.parent / "insert.stl").rename(tmp_path / "elsewhere" / "insert.stl")
@@ -39,7 +39,7 @@ def test_files_outside_the_scenes_folder_count(tmp_path, capsys):
     assert all(path.startswith(str(tmp_path)) for path in found)
 
 
-def test_a_minimal_scene_touches_nothing_more(tmp_path, capsys):
+def test_a_minimal_scene_reads_only_its_files(tmp_path, capsys):
     muscles = ("quadriceps", "patellar_ligament", "patella")
     drop = ("contact", "implant", "ligament", "tibia", "ground_reaction", *muscles)
     found = profiled(tmp_path, drop, capsys)
@@ -49,10 +49,10 @@ def test_a_minimal_scene_touches_nothing_more(tmp_path, capsys):
     assert "femorotibial contact" in found["not_modelled"]
 
 
-def test_only_files_that_are_read_count(tmp_path):
+def test_the_profile_lists_only_files_that_are_read(tmp_path):
     profile = Profile()
     (tmp_path / "written").write_text("x")
     (tmp_path / "read").write_text("x")
     (tmp_path / "read").read_text()
-    own = [path for path in profile.opened if path.parent == tmp_path]
-    assert own == [tmp_path / "read"]
+    opened = [path for path in profile.opened if path.parent == tmp_path]
+    assert opened == [tmp_path / "read"]

@@ -1,4 +1,4 @@
-"""Results in Python: what a reader of a notebook sees, data frames, PyVista and ParaView."""
+"""Results in Python: representation in notebooks, data frames, PyVista and ParaView."""
 
 import importlib
 import sys
@@ -25,13 +25,13 @@ def test_the_package_lists_its_public_names_and_its_version():
         _ = tkamb.simulat
 
 
-def test_a_run_is_one_line():
+def test_the_representation_of_a_run_is_one_line():
     text = repr(make_run("bend", frames=5, maps=False))
     assert "5 frames, synthetic" in text and "no maps" in text and "\n" not in text
     assert f"maps of {len(RUN.maps.points_m)} points" in repr(RUN)
 
 
-def test_the_data_frame_holds_the_columns():
+def test_the_data_frame_has_the_columns():
     pandas = pytest.importorskip("pandas", reason="pandas is not installed")
     frame = RUN.to_dataframe()
     assert isinstance(frame, pandas.DataFrame)
@@ -44,13 +44,13 @@ def test_the_data_frame_holds_the_columns():
     ("package", "call"),
     [("pandas", RUN.to_dataframe), ("pyvista", RUN.maps.to_pyvista)],
 )
-def test_an_extra_that_is_absent_is_one_line(monkeypatch, package, call):
+def test_a_missing_extra_is_refused_with_its_installation(monkeypatch, package, call):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(InputError, match=r"not installed; pip install 'tkamb\[notebook\]'"):
         call()
 
 
-def test_pyvista_gets_one_block_a_frame_with_the_load():
+def test_pyvista_has_one_block_per_frame_with_the_pressure():
     pytest.importorskip("pyvista", reason="PyVista is not installed")
     blocks = RUN.maps.to_pyvista()
     assert len(blocks) == 11
@@ -60,9 +60,9 @@ def test_pyvista_gets_one_block_a_frame_with_the_load():
     assert block.field_data["time_s"][0] == RUN["time_s"][4]
 
 
-def test_the_time_series_for_paraview_names_a_file_for_each_map(tmp_path, capsys):
+def test_the_time_series_for_paraview_has_a_file_for_each_map(tmp_path, capsys):
     maps = make_run("gait", frames=11).maps
-    maps.pressure_Pa[3] = np.nan  # as a failed frame's
+    maps.pressure_Pa[3] = np.nan  # like a failed frame
     keep(RUN, tmp_path / "run", maps)
     out = tmp_path / "vtk"
     assert main(["export", str(tmp_path / "run"), "--vtp", "--out", str(out)]) == 0
@@ -91,7 +91,7 @@ def test_options_that_do_not_belong_together_are_refused(tmp_path, capsys, argum
 
 
 def test_titles_legends_and_plots_do_not_overlap():
-    """However many rows a legend has: the forces have two, beside what was measured."""
+    """With measured forces the legend has several rows."""
     measured = {
         f"measured_{name}_N": RUN["force_total_N"] for name in ("total", "medial", "lateral")
     }
@@ -109,11 +109,11 @@ def test_titles_legends_and_plots_do_not_overlap():
 
 
 def touches(one, other):
-    """Whether two boxes share no more than an edge."""
+    """Return whether two boxes share an edge only."""
     return min(one.y1, other.y1) - max(one.y0, other.y0) < 0.5
 
 
-def test_what_one_meets_first_says_itself_in_a_line():
+def test_representations_of_reports_results_maps_and_scenes_are_short():
     from tkamb.run.press import press_meshes
 
     files = Path(tkamb.__file__).parent / "io" / "starter" / "files"

@@ -246,7 +246,7 @@ def test_why_there_is_no_band_says_what_to_do(bend):
         run = replace(bend, bands=bands, summary=bend.summary | {"uncertainty": table})
         return next(c.detail for c in cards(run, horizontal_axis(run)) if "Uncertainty" in c.title)
 
-    assert "fewer than 20 samples have it, take more" in told(0.15)
+    assert "fewer than 20 samples have it, use more" in told(0.15)
     assert "most often: no ellipse" in told(0.15)
     assert "more than half of the samples failed" in told(0.6)
 

@@ -1,4 +1,4 @@
-"""results.csv, summary.json and contact.h5: exact round trip, whole files, a kill."""
+"""results.csv, summary.json and contact.h5: exact round trip, complete files, killed writers."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from tkamb.run.results_folder import read_results, write_results
 ROOT = Path(__file__).parents[1]
 
 
-def test_round_trip_is_bit_for_bit(tmp_path):
+def test_written_and_read_results_are_identical(tmp_path):
     run = make_run("gait", frames=21)
     run.columns["force_ap_N"][3] = np.nextafter(0.1, 1)
     run.columns["force_ap_N"][4] = 5e-324
@@ -43,7 +43,7 @@ def test_round_trip_is_bit_for_bit(tmp_path):
     assert again.maps.attributes["units"].startswith("SI")
 
 
-def test_columns_stand_in_the_order_of_the_table():
+def test_columns_have_the_order_of_the_table():
     run = make_run(frames=5, maps=False)
     fixed = [one.name for one in COLUMNS if "<" not in one.name and not one.optional]
     written = [name for name in run.columns if not is_ligament(name)]
@@ -54,7 +54,7 @@ def test_columns_stand_in_the_order_of_the_table():
     assert names.index(ligaments[0]) == names.index("external_adduction_moment_Nm") + 1
 
 
-def test_what_is_not_modelled_is_an_empty_cell():
+def test_a_column_that_is_not_modelled_is_empty():
     run = Results({"time_s": [0.0, 0.5], "flexion_deg": [0.0, 60.0], "status": ["ok", "singular"]})
     assert "force_total_N" in run.not_modelled
     assert "flexion_deg" not in run.not_modelled
@@ -63,8 +63,8 @@ def test_what_is_not_modelled_is_an_empty_cell():
     assert row["force_total_N"] == ""
     assert row["flexion_deg"] == "60.0"
     assert row["status"] == "singular"
-    left_out = sum("<" in column.name or column.optional for column in COLUMNS)
-    assert len(first.split(",")) == len(COLUMNS) - left_out
+    absent = sum("<" in column.name or column.optional for column in COLUMNS)
+    assert len(first.split(",")) == len(COLUMNS) - absent
 
 
 def test_a_column_of_an_earlier_release_is_read_under_its_new_name(tmp_path):
@@ -81,12 +81,12 @@ def test_a_column_of_an_earlier_release_is_read_under_its_new_name(tmp_path):
         ({"time_s": [0.0]}, "'status' is missing"),
     ],
 )
-def test_columns_are_checked(columns, complaint):
+def test_unknown_missing_or_uneven_columns_are_refused(columns, complaint):
     with pytest.raises(InputError, match=complaint):
         Results(columns)
 
 
-def test_damaged_csv_is_one_clear_line(tmp_path):
+def test_a_damaged_csv_is_refused_with_the_line_or_column(tmp_path):
     write_results(make_run(frames=5, maps=False), tmp_path)
     path = tmp_path / "results.csv"
     text = path.read_text()
@@ -115,7 +115,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.glob(".*")] == [".tkamb"]
 
 
-def test_claiming_a_folder(tmp_path):
+def test_a_claimed_folder_is_created_and_a_file_is_refused(tmp_path):
     assert claim_directory(tmp_path / "a" / "b").is_dir()
     assert not list((tmp_path / "a" / "b").iterdir())
     (tmp_path / "file").write_text("")
@@ -125,14 +125,14 @@ def test_claiming_a_folder(tmp_path):
         claim_directory(tmp_path / "file" / "below")
 
 
-def test_stale_maps_do_not_pass_for_this_run(tmp_path):
+def test_maps_of_an_earlier_run_are_removed(tmp_path):
     write_results(make_run(frames=5), tmp_path)
     assert (tmp_path / "contact.h5").exists()
     write_results(make_run(frames=5, maps=False), tmp_path)
     assert read_results(tmp_path).maps is None
 
 
-def test_maps_are_read_only_when_asked(tmp_path):
+def test_maps_are_read_on_first_access(tmp_path):
     run = make_run(frames=5)
     write_maps(run.maps, tmp_path / "contact.h5")
     maps = ContactMaps(tmp_path / "contact.h5")
@@ -145,7 +145,7 @@ def test_maps_are_read_only_when_asked(tmp_path):
         read_maps(tmp_path / "text.h5")
 
 
-def test_failed_frame_is_nan_in_the_maps(tmp_path):
+def test_a_failed_frame_is_nan_in_the_maps(tmp_path):
     points = np.zeros((4, 3))
     with MapWriter(tmp_path / "contact.h5", points, [[0, 1, 2]], {}) as writer:
         writer.append(0.0, np.ones(4), np.zeros(4), np.zeros((4, 3)), np.eye(4))
@@ -173,7 +173,7 @@ with MapWriter(sys.argv[1], np.zeros((n, 3)), [[0, 1, 2]], {"model": "kill"}) as
 
 
 @pytest.mark.parametrize("frames", [1, 7, 40, 111])
-def test_a_kill_leaves_a_readable_part(tmp_path, frames):
+def test_flushed_maps_are_readable_after_a_kill(tmp_path, frames):
     path = tmp_path / "contact.h5"
     process = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, cwd=ROOT
@@ -194,15 +194,14 @@ def test_a_kill_leaves_a_readable_part(tmp_path, frames):
         assert file.attrs["model"] == "kill"
 
 
-def test_documentation_lists_every_column():
+def test_the_documentation_lists_every_column():
     page = ROOT / "docs" / "results.md"
     advice = "run scripts/make_results_page"
     assert columns_as_markdown() in page.read_text(encoding="utf-8"), advice
 
 
 @pytest.mark.parametrize("error", [OSError, RuntimeError, KeyError])
-def test_whatever_h5py_says_of_a_damaged_file_is_one_line(tmp_path, monkeypatch, error):
-    """Its objects raise other errors than its files do: a flipped bit may hit either."""
+def test_any_error_of_h5py_on_a_damaged_file_is_an_input_error(tmp_path, monkeypatch, error):
     write_maps(make_run("bend", frames=3).maps, tmp_path / "contact.h5")
 
     def broken(*_):

@@ -1,4 +1,4 @@
-"""A run that is killed or interrupted: whole files, a readable part, and the same end."""
+"""Killed or interrupted runs: complete files, readable results, and resumed runs."""
 
 import json
 import random
@@ -35,7 +35,7 @@ def start(scene, out, *more):
 
 
 def wait_for_frames(process, out, count):
-    """Wait until that many frames are there or the run has ended."""
+    """Wait until a number of frames is written or the run has ended."""
     while process.poll() is None and len(list((out / ".frames").glob("*.frame"))) < count:
         time.sleep(0.002)
 
@@ -46,7 +46,7 @@ def kill(process):
 
 
 def check_whole(out):
-    """Every file that stands in the folder can be read, and says what it holds."""
+    """Check that every visible file in the folder can be read and is complete."""
     names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
     assert names <= {"results.csv", "summary.json", "contact.h5", "report.html"}
     if "contact.h5" in names:
@@ -55,10 +55,10 @@ def check_whole(out):
     if names >= {"results.csv", "summary.json"}:
         results = read_results(out)
         assert len(results) == TOTAL
-        done = [not status.startswith("failed: not computed") for status in results.status]
-        assert done == sorted(done, reverse=True)
-        assert np.isfinite(results["force_si_N"][done]).all()
-        assert np.isnan(results["force_si_N"][np.invert(done)]).all()
+        computed = [not status.startswith("failed: not computed") for status in results.status]
+        assert computed == sorted(computed, reverse=True)
+        assert np.isfinite(results["force_si_N"][computed]).all()
+        assert np.isnan(results["force_si_N"][np.invert(computed)]).all()
 
 
 def check_same(found: Results, undisturbed: Results, tolerance=0.0):
@@ -82,7 +82,7 @@ def undisturbed():
 
 
 def kill_and_resume(out, waits):
-    """Kill a run once for each wait (frames, s), going on each time; return the results."""
+    """Kill and resume a run for each wait (frames, s); return the final results."""
     for count, seconds in waits:
         process = start(fast_scene(), out, "--resume")
         wait_for_frames(process, out, count)
@@ -98,8 +98,10 @@ def kill_and_resume(out, waits):
 
 
 @pytest.mark.slow
-def test_killed_again_and_again_the_run_ends_as_the_undisturbed_one(tmp_path, undisturbed):
-    """While it starts, at its first frames, in between and at the end; see scripts/study_kills."""
+def test_a_run_that_is_killed_repeatedly_has_the_results_of_an_undisturbed_run(
+    tmp_path, undisturbed
+):
+    """It is killed at its start, at the first frames, in between and at the end."""
     waits = [(0, 0.5), (1, 0.0), (3, 0.01), (8, 0.03), (14, 0.0), (TOTAL, 0.02)]
     found = kill_and_resume(tmp_path / "out", waits)
     check_same(found, undisturbed)
@@ -107,7 +109,7 @@ def test_killed_again_and_again_the_run_ends_as_the_undisturbed_one(tmp_path, un
 
 
 @pytest.mark.slow
-def test_killed_at_twenty_random_moments_likewise(tmp_path, undisturbed):
+def test_a_run_killed_at_random_times_has_the_results_of_an_undisturbed_run(tmp_path, undisturbed):
     chance = random.Random(7)
     moments = [(chance.randrange(1, TOTAL + 1), chance.random() ** 2) for _ in range(20)]
     check_same(kill_and_resume(tmp_path / "out", sorted(moments)), undisturbed)
@@ -117,7 +119,7 @@ def test_killed_at_twenty_random_moments_likewise(tmp_path, undisturbed):
     ("workers", "stops"), [(1, (4,)), pytest.param(2, (2, 5), marks=pytest.mark.slow)]
 )
 def test_a_lattice_depends_on_its_warm_start_within_the_stated_tolerance(workers, stops):
-    """Broken off, and by two workers; scripts/study_interruptions does it 50 times."""
+    """The run is interrupted and resumed, with one and two workers."""
     options = {"contact": "lattice", "resolution_mm": 4.0, "frames": slice(20, 44, 2)}
     whole = simulate(fast_scene(), **options)
     found = interrupted(fast_scene(), stops, workers=workers, **options)
@@ -126,7 +128,7 @@ def test_a_lattice_depends_on_its_warm_start_within_the_stated_tolerance(workers
 
 
 @pytest.mark.slow
-def test_released_coordinates_go_on_where_they_were(tmp_path):
+def test_a_resumed_run_with_released_coordinates_has_the_same_results(tmp_path):
     scene = write_scene(tmp_path / "scene", contact__released=["adduction"])
     options = {"frames": slice(30, 40, 2)}
     whole = simulate(scene, **options)
@@ -137,7 +139,7 @@ def test_released_coordinates_go_on_where_they_were(tmp_path):
 
 
 def stop_after(directory, count, scene=None, **options):
-    """Interrupt a run after that many frames."""
+    """Interrupt a run after a number of frames."""
 
     def progress(indices):
         for number, k in enumerate(indices):
@@ -145,12 +147,12 @@ def stop_after(directory, count, scene=None, **options):
                 raise KeyboardInterrupt
             yield k
 
-    given = scene or fast_scene()
+    scene = scene or fast_scene()
     with pytest.raises(KeyboardInterrupt, match=f"{count} of "):
-        simulate(given, directory=directory, progress=progress, **options)
+        simulate(scene, directory=directory, progress=progress, **options)
 
 
-def test_an_interrupt_leaves_a_readable_part_and_says_so(tmp_path):
+def test_an_interrupted_run_leaves_readable_results_and_states_their_number(tmp_path):
     out = tmp_path / "out"
     process = start(fast_scene(), out)
     wait_for_frames(process, out, 4)
@@ -158,16 +160,16 @@ def test_an_interrupt_leaves_a_readable_part_and_says_so(tmp_path):
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130
     lines = said.decode().strip().splitlines()
-    done = int(re.fullmatch(r"tkamb: interrupted: (\d+) of 20 frames .*--resume", lines[-1])[1])
-    assert 4 <= done < TOTAL
+    count = int(re.fullmatch(r"tkamb: interrupted: (\d+) of 20 frames .*--resume", lines[-1])[1])
+    assert 4 <= count < TOTAL
     check_whole(out)
     results = read_results(out)
-    assert len(results.maps) == done
-    assert results.summary["unfinished_frames"] == TOTAL - done
-    assert [s.startswith("failed: not computed") for s in results.status].index(True) == done
+    assert len(results.maps) == count
+    assert results.summary["unfinished_frames"] == TOTAL - count
+    assert [s.startswith("failed: not computed") for s in results.status].index(True) == count
 
 
-def test_without_contact_a_run_goes_on_too(tmp_path):
+def test_a_run_without_contact_is_resumed(tmp_path):
     scene = write_scene(tmp_path / "scene", ("contact",))
     out = tmp_path / "out"
     out.mkdir()
@@ -185,7 +187,7 @@ def test_without_contact_a_run_goes_on_too(tmp_path):
         ({"resolution_mm": 2.0}, "another scene"),
     ],
 )
-def test_another_run_is_not_resumed(tmp_path, change, word):
+def test_a_run_with_another_identity_is_not_resumed(tmp_path, change, word):
     options = {"frames": slice(0, 8)}
     stop_after(tmp_path, 2, **options)
     with pytest.raises(InputError, match=word):
@@ -193,37 +195,37 @@ def test_another_run_is_not_resumed(tmp_path, change, word):
     assert (tmp_path / ".frames").exists()
 
 
-def test_a_changed_file_is_another_run(tmp_path, capsys):
+def test_a_run_with_a_changed_file_is_not_resumed(tmp_path, capsys):
     scene = write_scene(tmp_path / "scene", ("contact",))
     out = tmp_path / "out"
     out.mkdir()
     stop_after(out, 2, scene=scene, frames=slice(0, 8))
     motion = scene.parent / "motion.csv"
     motion.write_text(motion.read_text() + "\n")
-    given = ["run", str(scene), "--out", str(out), "--frames", "0:8", "--resume"]
-    assert main(given) == 2
+    command = ["run", str(scene), "--out", str(out), "--frames", "0:8", "--resume"]
+    assert main(command) == 2
     said = capsys.readouterr().err
     assert "another content of a file" in said and said.count("\n") == 1
 
 
 def test_a_finished_run_is_not_computed_again(tmp_path, capsys):
-    given = ["run", str(fast_scene()), "--out", str(tmp_path), "--frames", "0:3"]
-    assert main(given) == 0
+    command = ["run", str(fast_scene()), "--out", str(tmp_path), "--frames", "0:3"]
+    assert main(command) == 0
     before = (tmp_path / "results.csv").read_bytes()
-    assert main([*given, "--resume"]) == 0
+    assert main([*command, "--resume"]) == 0
     assert (tmp_path / "results.csv").read_bytes() == before
-    assert main([*given[:-1], "0:4", "--resume"]) == 2
+    assert main([*command[:-1], "0:4", "--resume"]) == 2
     assert "another choice of frames" in capsys.readouterr().err
 
 
-def test_nothing_to_resume_begins_at_the_beginning(tmp_path):
+def test_resume_in_an_empty_folder_computes_all_frames(tmp_path):
     found = simulate(fast_scene(), frames=slice(0, 2), directory=tmp_path, resume=True)
     assert len(found) == 2
-    with pytest.raises(InputError, match="no folder"):
+    with pytest.raises(InputError, match="needs the folder"):
         simulate(fast_scene(), frames=slice(0, 2), resume=True)
 
 
-def test_a_torn_shard_counts_as_absent(tmp_path):
+def test_a_truncated_frame_counts_as_absent(tmp_path):
     shards = Shards(tmp_path, {"scene": "a"}, resume=False)
     shards.put(3, Shard({"time_s": 0.1, "x": float("nan")}, {"pressure": np.arange(4.0)}))
     found = shards.get(3)
@@ -247,8 +249,7 @@ def test_a_torn_shard_counts_as_absent(tmp_path):
         Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.array(["x"])}),
     ],
 )
-def test_a_frame_that_somebody_forged_is_refused(tmp_path, forged):
-    """Its digest is right."""
+def test_a_forged_frame_with_the_right_hash_is_refused(tmp_path, forged):
     frames = slice(0, 8)
     stop_after(tmp_path, 3, frames=frames)
     assert (tmp_path / ".frames" / "000002.frame").exists()
@@ -262,14 +263,14 @@ def test_a_frame_that_somebody_forged_is_refused(tmp_path, forged):
     assert np.isfinite(found["force_si_N"]).all()
 
 
-def test_an_interrupt_waits_until_a_frame_is_written():
-    reached = []
+def test_an_interrupt_is_delayed_until_a_frame_is_written():
+    written = []
 
     def write():
         with interrupt_later():
             signal.raise_signal(signal.SIGINT)
-            reached.append(True)
+            written.append(True)
 
     with pytest.raises(KeyboardInterrupt):
         write()
-    assert reached
+    assert written

@@ -1,4 +1,4 @@
-"""`tkamb run --workers`: the frames over processes, and the answers of one."""
+"""`tkamb run --workers`: results with several processes, and errors of workers."""
 
 import functools
 from contextlib import suppress
@@ -28,7 +28,7 @@ def numbers(results):
     return {name: results[name] for name in results.columns if KINDS.get(name) != "text"}
 
 
-def test_answers_are_those_of_one_process(serial, tmp_path):
+def test_two_workers_have_the_results_of_one_process(serial, tmp_path):
     shared = simulate(SCENE, frames=slice(0, 101, 8), directory=tmp_path / "out", workers=2)
     assert list(shared["status"]) == list(serial["status"])
     for name, values in numbers(shared).items():
@@ -41,13 +41,13 @@ def test_answers_are_those_of_one_process(serial, tmp_path):
     assert np.nanmax(np.abs(shared.maps.pressure_Pa - serial.maps.pressure_Pa)) < 1e-5 * largest
 
 
-def test_workers_are_counted_before_anything_is_touched(tmp_path, capsys):
+def test_a_bad_number_of_workers_is_refused_before_the_folder_is_created(tmp_path, capsys):
     assert main(["run", str(SCENE), "--workers", "0", "--out", str(tmp_path / "out")]) == 2
     assert "--workers" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_of_two_is_resumed_by_one(tmp_path, monkeypatch):
+def test_a_run_with_two_workers_is_resumed_with_one(tmp_path, monkeypatch):
     stopped = []
 
     def stop_after(frames):
@@ -65,20 +65,20 @@ def test_a_run_of_two_is_resumed_by_one(tmp_path, monkeypatch):
     assert np.isfinite(read_results(out)["force_total_BW"]).all()
 
 
-def test_a_team_prepares_before_it_is_asked_and_ends_with_its_block():
-    task, wanted = Task(functools.partial, (max,)), [(n, 10 - n) for n in range(10)]
-    with PoolOptions(2).team(task, len(wanted)) as team:
-        found = dict(team.answers(wanted))
-    assert found == {n: max(n, 10 - n) for n in range(10)}
-    with suppress(RuntimeError), PoolOptions(2).team(task, len(wanted)) as team:
+def test_a_pool_starts_its_workers_at_once_and_ends_them_with_the_block():
+    task, jobs = Task(functools.partial, (max,)), [(n, 10 - n) for n in range(10)]
+    with PoolOptions(2).team(task, len(jobs)) as team:
+        answers = dict(team.answers(jobs))
+    assert answers == {n: max(n, 10 - n) for n in range(10)}
+    with suppress(RuntimeError), PoolOptions(2).team(task, len(jobs)) as team:
         assert [process.poll() for process in team.processes] == [None, None]
         raise RuntimeError
     assert all(process.poll() is not None for process in team.processes)
-    with PoolOptions(1).team(task, len(wanted)) as team:
-        assert not team.processes and dict(team.answers(wanted)) == found
+    with PoolOptions(1).team(task, len(jobs)) as team:
+        assert not team.processes and dict(team.answers(jobs)) == answers
 
 
-def test_what_a_worker_cannot_use_is_the_callers_error(tmp_path, capfd):
+def test_an_error_in_the_preparation_is_raised_by_the_caller(tmp_path, capfd):
     missing = tmp_path / "scene.toml"
     with pytest.raises(InputError, match="no such scene file") as caught:
         list(PoolOptions(2).answers(Task(load_scene, (missing,)), [(0, None), (1, None)]))
@@ -86,14 +86,14 @@ def test_what_a_worker_cannot_use_is_the_callers_error(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_what_a_job_refuses_is_the_callers_error():
+def test_an_error_in_a_job_is_raised_by_the_caller():
     with pytest.raises(InputError, match="0 is not within"):
         list(
             PoolOptions(2).answers(Task(functools.partial, (PoolOptions,)), [(0, None), (0, None)])
         )
 
 
-def test_workers_do_not_repeat_what_was_said(tmp_path, caplog, capfd):
+def test_workers_do_not_repeat_warnings(tmp_path, caplog, capfd):
     scene = write_scene(tmp_path / "knee")
     mesh = scene.parent / "insert.stl"
     content, record = mesh.read_bytes(), 50

@@ -1,4 +1,4 @@
-"""Settings of the algorithms: each has a documented meaning, and a run records changed ones."""
+"""Settings of the algorithms: documented meanings, and a record of changed settings."""
 
 import ast
 from dataclasses import dataclass, fields
@@ -24,7 +24,7 @@ def settings_classes():
                 yield module, node.name
 
 
-def test_every_field_of_every_settings_object_says_what_it_is():
+def test_every_field_of_every_settings_object_has_a_meaning():
     listed = {(row.module, row.name.split(".")[1]): row for row in all_settings()}
     for module, name in settings_classes():
         for field in fields(getattr(import_module(module), name)):
@@ -45,7 +45,7 @@ class SearchSettings:
     steps: int = 5
 
 
-def test_a_run_records_only_what_differs_from_the_default(monkeypatch):
+def test_only_settings_that_differ_from_the_default_are_recorded(monkeypatch):
     module = ModuleType("tkamb.invented")
     monkeypatch.setattr(SearchSettings, "__module__", "tkamb.invented")
     monkeypatch.setitem(__import__("sys").modules, "tkamb.invented", module)
@@ -58,6 +58,6 @@ def test_a_run_records_only_what_differs_from_the_default(monkeypatch):
 
 
 @pytest.mark.parametrize("words", [[], ["no-such-word"]])
-def test_the_command_prints_them(words, capsys):
+def test_the_command_prints_the_matching_settings(words, capsys):
     assert main(["settings", *words]) == 0
     assert ("=" in capsys.readouterr().out) == (not words and bool(all_settings()))

@@ -129,7 +129,7 @@ def test_a_missing_ground_reaction_is_asked_about(knee):
     ground = slice(text.index("[ground_reaction]"), text.index("[implant.femoral]"))
     knee.write_text(text[: ground.start] + text[ground.stop :])
     asked = check_scene(knee, {}, lambda name: None).questions
-    assert any("[ground_reaction] left out" in str(one) for one in asked)
+    assert any("[ground_reaction] missing" in str(one) for one in asked)
 
 
 def mirrored_force(case):
@@ -255,7 +255,7 @@ def test_a_length_unit_or_a_clock_that_cannot_be_is_asked_about(knee):
 def test_a_centre_of_pressure_behind_the_ankle_is_asked_about(knee):
     turn(knee.parent / "ground_reaction.csv", "point_x_mm")
     asked = [one.text for one in foot_questions(load_case(load_scene(knee)))]
-    assert any("behind the ankle in the mean" in text for text in asked)
+    assert any("behind the ankle, not under" in text for text in asked)
 
 
 @pytest.mark.parametrize(("cutoff", "asked"), [(6.0, False), ("none", True)])

@@ -1,4 +1,4 @@
-"""Stages of a run: named on a terminal, silent in a pipe."""
+"""Stages of a run: printed on a terminal, not in a pipe."""
 
 import io
 import re
@@ -19,12 +19,12 @@ def run_through(stream):
     return stream.getvalue()
 
 
-def test_a_terminal_sees_each_stage_once_with_its_time_and_the_frames_time_left():
-    told = run_through(Terminal())
-    assert re.search(r"1/3 reading … \d+\.\d s\n", told)
-    assert re.search(r"2/3 computing frames: 100%.*4/4 \[\d\d:\d\d<\d\d:\d\d", told)
-    assert re.search(r"3/3 writing results and report: 100%.*2/2 \[\d\d:\d\d<", told)
+def test_a_terminal_shows_each_stage_with_its_time_or_a_progress_bar():
+    output = run_through(Terminal())
+    assert re.search(r"1/3 reading … \d+\.\d s\n", output)
+    assert re.search(r"2/3 computing frames: 100%.*4/4 \[\d\d:\d\d<\d\d:\d\d", output)
+    assert re.search(r"3/3 writing results and report: 100%.*2/2 \[\d\d:\d\d<", output)
 
 
-def test_a_pipe_sees_nothing():
+def test_a_pipe_gets_no_output():
     assert run_through(io.StringIO()) == ""

@@ -1,4 +1,4 @@
-"""Static optimisation against closed forms, the optimality conditions and another solver."""
+"""Static optimisation: comparison with closed forms, optimality conditions and SLSQP."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ FREE = np.inf
 
 
 def joint(arms, strength, moment, **changes):
-    """Return muscles about one joint whose moment (N·m) they must carry exactly."""
+    """Return the problem of muscles that balance the moment of one joint, N·m."""
     count = len(arms)
     problem = {
         "weight": np.ones(count),
@@ -30,29 +30,29 @@ def joint(arms, strength, moment, **changes):
     return LoadSharing(**(problem | changes))
 
 
-def test_one_muscle_carries_the_moment():
+def test_one_muscle_balances_the_moment():
     found = share_load(joint([0.04], [1000.0], 20.0))
     assert found.activation == pytest.approx([0.5])
     assert found.others == pytest.approx([0.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("exponent", [2.0, 3.0, 5.0])
-def test_two_muscles_share_as_lagrange_says(exponent):
+def test_two_muscles_share_by_lagrange_s_condition(exponent):
     arms, strength, moment = np.array([0.04, 0.02]), np.array([900.0, 1500.0]), 30.0
     found = share_load(joint(arms, strength, moment, exponent=exponent)).activation
-    # p a_i^(p-1) = lambda r_i F_i, and the moment
+    # p a_i^(p-1) = lambda r_i F_i, and the sum of r_i F_i a_i is the moment
     shape = (arms * strength) ** (1 / (exponent - 1))
     expected = shape * moment / (arms * strength @ shape)
     np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
-def test_a_muscle_at_its_limit_leaves_the_rest_to_the_others():
+def test_a_muscle_at_full_activation_leaves_the_remaining_moment_to_the_other():
     arms, strength = [0.04, 0.02], [500.0, 1500.0]
     found = share_load(joint(arms, strength, 48.0)).activation  # unbounded: 0.74 and 1.11
     np.testing.assert_allclose(found, [(48.0 - 30.0) / 20.0, 1.0], rtol=1e-9)
 
 
-def test_a_reserve_takes_what_its_price_says():
+def test_the_moment_of_a_reserve_follows_its_cost():
     r, strength, moment, reserve = 0.04, 1000.0, 20.0, 5.0
     free = {"lower": np.array([-FREE]), "upper": np.array([FREE])}
     problem = joint([r], [strength], moment, reserve=np.array([reserve]), **free)
@@ -62,7 +62,7 @@ def test_a_reserve_takes_what_its_price_says():
     assert a == pytest.approx(arm * (moment / reserve) / (1 + arm**2))
 
 
-def test_an_optimum_inside_all_bounds_is_judged_by_the_terms_that_cancel():
+def test_the_residual_of_an_interior_optimum_is_relative_to_the_terms_of_the_gradient():
     free = {"lower": np.array([-FREE]), "upper": np.array([FREE]), "reserve": np.array([3.0])}
     problem = joint([0.0266], [50.0], 7.2, **free)
     found = share_load(problem)
@@ -72,15 +72,15 @@ def test_an_optimum_inside_all_bounds_is_judged_by_the_terms_that_cancel():
     assert kkt_residual(problem, moved) > 1e-7
 
 
-def test_emg_pulls_by_its_spread():
+def test_the_effect_of_emg_follows_its_standard_deviation():
     e, s = 0.8, 0.25
     emg = {"expected": np.array([e, 0.0]), "spread": np.array([s, FREE])}
-    known = share_load(joint([0.04, 0.04], [1000.0, 1000.0], 40.0, **emg)).activation
+    activation = share_load(joint([0.04, 0.04], [1000.0, 1000.0], 40.0, **emg)).activation
     # a1 + a2 = 1: a1 (1 + 1/s^2) + (a1 - 1) = e / s^2
-    assert known[0] == pytest.approx((1 + e / s**2) / (2 + 1 / s**2))
+    assert activation[0] == pytest.approx((1 + e / s**2) / (2 + 1 / s**2))
 
 
-def test_what_no_muscle_can_carry_is_said():
+def test_a_moment_beyond_all_muscles_is_refused():
     with pytest.raises(ComputationError, match="within their limits"):
         share_load(joint([0.04], [1000.0], 60.0))
     with pytest.raises(ComputationError, match="within their limits"):
@@ -88,7 +88,7 @@ def test_what_no_muscle_can_carry_is_said():
 
 
 def random_problem(seed, exponent=2.0):
-    """Return a leg-sized problem that is feasible, some bounds of y active."""
+    """Return a feasible problem of the size of a leg with some active bounds of y."""
     rng = np.random.default_rng(seed)
     n, m = 20, 9
     a = rng.uniform(0, 1, n)
@@ -105,22 +105,22 @@ def random_problem(seed, exponent=2.0):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([2.0, 3.0]))
-def test_conditions_of_the_optimum_hold(seed, exponent):
+def test_the_optimality_conditions_are_satisfied(seed, exponent):
     problem = random_problem(seed, exponent)
     found = share_load(problem)
     assert found.kkt_residual < 1e-8
     np.testing.assert_allclose(found.others, problem.others(found.activation))
-    # an optimum: no feasible neighbour on the way to any other feasible point is cheaper
+    # the cost does not decrease towards any other feasible point
     rng = np.random.default_rng(seed)
     feasible = np.clip(found.activation + 0.01 * rng.normal(size=20), 0, 1)
     slope = problem.gradient(found.activation) @ (feasible - found.activation)
-    carried = problem.gain @ (feasible - found.activation)
-    assert slope + found.other_multiplier @ carried >= -1e-9 * np.abs(slope).max(initial=1.0)
+    change = problem.gain @ (feasible - found.activation)
+    assert slope + found.other_multiplier @ change >= -1e-9 * np.abs(slope).max(initial=1.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("exponent", [2.0, 3.0])
-def test_slsqp_finds_the_same(seed, exponent):
+def test_slsqp_has_the_same_optimum(seed, exponent):
     problem = random_problem(seed, exponent)
     equal = problem.lower == problem.upper
     bounded = np.isfinite(problem.lower) & ~equal

@@ -42,7 +42,7 @@ def test_steps_that_are_all_measured_are_asked_nothing():
 
 def test_a_step_beside_the_plates_is_asked_about_in_its_frames():
     (question,) = step_questions(walk(1.0, 0.0))
-    assert "bears nothing" in question.text and question.flag
+    assert "without a measured force" in question.text and question.flag
     assert {k for k in range(len(TIME)) if question.concerns(k)} == set(
         np.flatnonzero((TIME > 1.2) & (TIME < 1.8))
     )

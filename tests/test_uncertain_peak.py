@@ -109,7 +109,7 @@ def test_a_recorded_patella_without_equilibrium_is_flagged(tmp_path, band, flagg
     across = np.abs(run["patellofemoral_tangential_N"])
     assert (across > 100).all() == flagged
     for status in run.status:
-        assert ("recorded patella is not held by its lines" in status) == flagged
+        assert ("recorded patella is not in equilibrium with its lines" in status) == flagged
 
 
 def test_the_summary_compares_the_nominal_peak_with_the_samples(tmp_path):

@@ -1,4 +1,4 @@
-"""Results that can be verified: what was changed, mixed or lost since a run is said."""
+"""Verification of results: changed, exchanged or missing files are reported."""
 
 import json
 import shutil
@@ -15,7 +15,7 @@ from tkamb.run.results_folder import read_results
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A scene and its results."""
+    """Return a folder with a scene and its results."""
     folder = tmp_path_factory.mktemp("finished")
     scene = write_scene(folder / "scene", contact__resolution_mm=3.0, contact__model="foundation")
     assert main(["run", str(scene), "--out", str(folder / "out"), "--frames", "0:9:4"]) == 0
@@ -24,7 +24,7 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def run(finished, tmp_path):
-    """A copy of the results; the scene stays where it was read."""
+    """Return the folder of the scene and that of a copy of the results."""
     shutil.copytree(finished / "out", tmp_path / "out")
     return finished / "scene", tmp_path / "out"
 
@@ -36,7 +36,7 @@ def verified(out, capfd):
     return status, said.out + said.err
 
 
-def test_untouched_results_are_fine(run, capfd):
+def test_unchanged_results_are_verified(run, capfd):
     status, said = verified(run[1], capfd)
     assert status == 0 and "input file(s) have not changed" in said
     assert main(["report", str(run[1])]) == 0
@@ -72,7 +72,7 @@ CHANGES = [
 ]
 
 
-def test_the_base_that_a_scene_stands_on_is_an_input(tmp_path, capfd):
+def test_the_base_of_a_scene_is_an_input(tmp_path, capfd):
     base = write_scene(tmp_path, contact__resolution_mm=3.0, contact__model="foundation")
     own, out = tmp_path / "own.toml", tmp_path / "out"
     own.write_text('base = "scene.toml"\n[patient]\nmass_kg = 80.0\n')
@@ -84,20 +84,21 @@ def test_the_base_that_a_scene_stands_on_is_an_input(tmp_path, capfd):
 
 
 @pytest.mark.parametrize(("change", "words"), CHANGES)
-def test_what_differs_is_said_by_all_who_read(run, capfd, change, words):
+def test_every_command_reports_changed_results(run, capfd, change, words):
     scene, out = run
     change(out)
     status, said = verified(out, capfd)
     assert status == 1 and words in said
-    again = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
-    for command in (["report", str(out)], again, ["view", str(out), "--html", str(out / "v.html")]):
+    resume = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
+    view = ["view", str(out), "--html", str(out / "v.html")]
+    for command in (["report", str(out)], resume, view):
         assert main(command) == 2
         assert words in capfd.readouterr().err
     with pytest.raises(InputError, match=words):
         read_results(out)
 
 
-def test_inputs_that_changed_are_named(finished, tmp_path, capfd):
+def test_changed_input_files_are_named(finished, tmp_path, capfd):
     shutil.copytree(finished, tmp_path / "moved")
     out, motion = tmp_path / "moved" / "out", finished / "scene" / "motion.csv"
     before = motion.read_text()
@@ -112,7 +113,7 @@ def test_inputs_that_changed_are_named(finished, tmp_path, capfd):
         motion.write_text(before)
 
 
-def test_other_code_is_a_note(run, capfd, monkeypatch):
+def test_results_of_another_code_get_a_note(run, capfd, monkeypatch):
     monkeypatch.setattr("tkamb.run.results_folder.code_identity", lambda: "other")
     status, said = verified(run[1], capfd)
     code = json.loads((run[1] / "summary.json").read_text())["identity"]["code of tkamb"]
@@ -120,15 +121,15 @@ def test_other_code_is_a_note(run, capfd, monkeypatch):
     assert f", {code[:12]}; this is " in said and ", other)" in said
 
 
-def test_other_code_is_not_resumed(run, capfd, monkeypatch):
+def test_a_run_of_another_code_is_not_resumed(run, capfd, monkeypatch):
     monkeypatch.setattr("tkamb.run.identity.code_identity", lambda: "other")
     scene, out = run
-    given = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
-    assert main(given) == 2
+    command = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
+    assert main(command) == 2
     assert "another code of tkamb" in capfd.readouterr().err
 
 
-def test_what_is_no_result_folder(tmp_path, capfd):
+def test_a_folder_without_results_is_refused(tmp_path, capfd):
     for name, text in (("summary.json", "{}"), ("summary.json", "[1]"), ("notes.txt", "x")):
         folder = tmp_path / f"{name}{len(text)}"
         folder.mkdir()
@@ -138,7 +139,7 @@ def test_what_is_no_result_folder(tmp_path, capfd):
     assert verified(tmp_path / "nothing", capfd)[0] == 2
 
 
-def test_results_without_a_record_cannot_be_verified(run, capfd):
+def test_results_without_hashes_cannot_be_verified(run, capfd):
     path = run[1] / "summary.json"
     content = json.loads(path.read_text())
     path.write_text(json.dumps({k: v for k, v in content.items() if k != "files"}))
@@ -146,36 +147,36 @@ def test_results_without_a_record_cannot_be_verified(run, capfd):
     assert status == 1 and "no SHA-256" in said
 
 
-def test_frames_of_another_run_or_place_count_as_absent(tmp_path):
-    mine, other = (Shards(tmp_path / name, {"scene": name}, False) for name in "ab")
-    for shards in (mine, other):
+def test_a_frame_of_another_run_or_number_counts_as_absent(tmp_path):
+    first_run, other = (Shards(tmp_path / name, {"scene": name}, False) for name in "ab")
+    for shards in (first_run, other):
         shards.folder.parent.mkdir()
         for frame in range(2):
             shards.put(frame, Shard({"time_s": float(frame)}, {"pressure": np.ones(3)}))
-    first, second = (mine.folder / f"00000{k}.frame" for k in range(2))
-    assert mine.get(0) is not None
+    first, second = (first_run.folder / f"00000{k}.frame" for k in range(2))
+    assert first_run.get(0) is not None
     shutil.copy(other.folder / first.name, first)
-    assert mine.get(0) is None
+    assert first_run.get(0) is None
     shutil.copy(second, first)
-    assert mine.get(0) is None and mine.get(1) is not None
+    assert first_run.get(0) is None and first_run.get(1) is not None
 
 
-def test_a_frames_folder_that_is_a_link_is_not_followed(tmp_path):
-    precious = tmp_path / "precious"
-    precious.mkdir()
-    (precious / "000000.frame").write_text("mine")
+def test_a_symbolic_link_in_place_of_the_frames_folder_is_refused(tmp_path):
+    target = tmp_path / "target"
+    target.mkdir()
+    (target / "000000.frame").write_text("mine")
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / ".frames").symlink_to(precious)
+    (tmp_path / "out" / ".frames").symlink_to(target)
     with pytest.raises(InputError, match="symbolic link"):
         Shards(tmp_path / "out", {}, False)
-    assert (precious / "000000.frame").read_text() == "mine"
+    assert (target / "000000.frame").read_text() == "mine"
 
 
-def test_one_of_two_runs_at_once_is_refused(run, capfd):
+def test_a_second_run_in_a_folder_at_the_same_time_is_refused(run, capfd):
     from tkamb.io import claim
 
     scene, out = run
-    descriptor = claim._acquire_lock(out)  # as another process would hold it
+    descriptor = claim._acquire_lock(out)  # stands for the lock of another process
     try:
         assert main(["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:1"]) == 2
     finally:
@@ -185,9 +186,11 @@ def test_one_of_two_runs_at_once_is_refused(run, capfd):
     assert verified(out, capfd)[0] == 0
 
 
-def test_a_foreign_folder_is_not_written_into(finished, tmp_path, capfd, monkeypatch):
+def test_a_folder_with_other_files_is_written_only_with_force(
+    finished, tmp_path, capfd, monkeypatch
+):
     (tmp_path / "results.csv").write_text("mine\n")
-    given = [
+    command = [
         "run",
         str(finished / "scene" / "scene.toml"),
         "--frames",
@@ -195,15 +198,15 @@ def test_a_foreign_folder_is_not_written_into(finished, tmp_path, capfd, monkeyp
         "--out",
         str(tmp_path),
     ]
-    assert main(given) == 2
+    assert main(command) == 2
     assert "--force" in capfd.readouterr().err
     assert (tmp_path / "results.csv").read_text() == "mine\n"
     (tmp_path / "results.csv").rename(tmp_path / "other.csv")
-    assert main([*given, "--force"]) == 0
+    assert main([*command, "--force"]) == 0
     assert (tmp_path / "other.csv").read_text() == "mine\n"
 
 
-def test_an_unknown_link_leaves_nothing(finished, tmp_path, capfd):
+def test_a_refused_scene_leaves_no_output_folder(finished, tmp_path, capfd):
     link = ("--set", "quadriceps.origin.link=nowhere")
     out = tmp_path / "out"
     scene = str(finished / "scene" / "scene.toml")

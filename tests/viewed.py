@@ -1,4 +1,4 @@
-"""A short run to look at, and what is read back from the scene graph of its page."""
+"""A short run for tests of the 3D view, and access to the scene graph of its page."""
 
 import shutil
 import tempfile
@@ -13,30 +13,30 @@ from tkamb.run.simulation import simulate
 
 MODELS = Path(__file__).parents[1] / "models"
 SCENE = fast_scene()
-HELD = []
-"""Folders that go when the tests end."""
+TEMPORARY = []
+"""Temporary folders, which are removed at the end of the tests."""
 
 
 def copied_scene(folder):
-    """Return the shipped scene's file in a folder of its own."""
+    """Return the path of a copy of the shipped scene in a folder."""
     shutil.copytree(SCENE.parent, folder, dirs_exist_ok=True)
     return folder / "scene.toml"
 
 
-def short_results(folder, scene, every=20, **given):
-    """Run some frames and write the results."""
-    results = simulate(scene, frames=slice(0, 101, every), **given)
+def short_results(folder, scene, every=20, **options):
+    """Run every `every`-th frame, write the results, and return them."""
+    results = simulate(scene, frames=slice(0, 101, every), **options)
     write_results(results, folder)
     return results
 
 
 @cache
 def shipped_run():
-    """Return the folder of a short run of the shipped scene, the same for all tests."""
-    held = tempfile.TemporaryDirectory(prefix="tkamb-tests-")
-    short_results(Path(held.name), SCENE)
-    HELD.append(held)
-    return Path(held.name)
+    """Return the folder of a short run of the shipped scene, which all tests share."""
+    folder = tempfile.TemporaryDirectory(prefix="tkamb-tests-")
+    short_results(Path(folder.name), SCENE)
+    TEMPORARY.append(folder)
+    return Path(folder.name)
 
 
 def matrix(browser, path):
@@ -49,7 +49,7 @@ def matrix(browser, path):
 
 
 def levels(browser, view=0):
-    """Return the level of every point of the map that is drawn."""
+    """Return the colour level at every point of the drawn pressure map."""
     found = browser.evaluate(
         f"Array.from(tkamb.node('/tkamb/{view}/pressure map/map/<object>')"
         ".object.geometry.attributes.level.array)"
@@ -58,7 +58,7 @@ def levels(browser, view=0):
 
 
 def force(browser, name, view=0):
-    """Return the force (3,) N that an arrow's shaft and head stand for; zero if hidden."""
+    """Return the force (3,), N, of an arrow from its shaft and head; zero if it is hidden."""
     found = browser.evaluate(
         f"""(() => {{
         const view = tkamb.views[{view}], node = tkamb.node(`${{view.root}}/forces/{name}`).object;
@@ -75,7 +75,7 @@ def force(browser, name, view=0):
 
 
 def move_slider(browser, frame):
-    """Move the slider as a hand does."""
+    """Set the slider of the frames and send its input event."""
     browser.evaluate(
         f"(() => {{ const s = document.getElementById('frame'); s.value = {frame};"
         "s.dispatchEvent(new Event('input')); })()"

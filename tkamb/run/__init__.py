@@ -1,1 +1,1 @@
-"""A motion through a knee: frames, recording, resuming, statuses, columns, results."""
+"""Simulation of a scene: frames, contact, muscles, statuses, results, resumed runs."""

@@ -1,12 +1,11 @@
-"""The columns of results.csv: one ordered table, from which the documentation is made too."""
+"""The columns of results.csv in their order. The page of the documentation is made from them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 WITHOUT_MUSCLES = "Without [muscles]"
-"""How a note begins that holds only while the scene has no table [muscles]; `tkamb import` writes
-one."""
+"""Beginning of the notes that hold only for a scene without the table [muscles]."""
 
 Kind = Literal["number", "integer", "text"]
 
@@ -16,12 +15,11 @@ class Column:
     """One column of results.csv.
 
     Args:
-        name: the column's name in the file, with its unit.
-        meaning: one line; vectors are in the insert frame unless the line says otherwise.
+        name: name of the column in the file, ends with the unit.
+        meaning: one line. Vectors are in the insert frame unless the line names another.
         needs: scene tables without which the column is empty.
-        kind: how its cells are written.
-        optional: whether the column is left out of the file, instead of empty, where it is not
-        needed.
+        kind: type of the cells.
+        optional: True if a scene without `needs` has no such column. Otherwise it is empty.
     """
 
     name: str
@@ -45,10 +43,10 @@ _RECORDED = "[contact] with adduction not released"
 _MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 _MEASURED = "[measured]"
-_POST = "[contact] post; then there is no such column"
+_POST = "[contact] post; without it there is no such column"
 
 LIGAMENT = "ligament_<name>_N"
-"""Stands for one column per [[ligament]], in the scene's order."""
+"""Family of columns: one per [[ligament]], in the order of the scene."""
 MUSCLE_FORCE = "muscle_<name>_N"
 ACTIVATION = "activation_<name>"
 RESERVE = "reserve_<coordinate>_Nm"
@@ -59,38 +57,41 @@ FAMILIES = (
     *(LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT, ENVELOPE),
     *CONTRIBUTIONS.values(),
 )
-"""Each stands for one column per ligament, muscle or coordinate."""
+"""Each family has one column per ligament, muscle or coordinate."""
 
 COLUMNS: tuple[Column, ...] = (
     Column("time_s", "time of the frame"),
     Column("flexion_deg", "knee flexion (Grood-Suntay)"),
-    Column("adduction_deg", "knee adduction, positive: varus; as solved where released"),
+    Column("adduction_deg", "knee adduction, positive: varus; by equilibrium where released"),
     Column(
         "axial_rotation_deg",
-        "positive: the femur rotates externally on the tibia; as solved where released",
+        "positive: the femur rotates externally on the tibia; by equilibrium where released",
     ),
     Column(
         "force_si_N",
-        "contact force on the insert, a modelled post's among it, no residuals: along -y, "
-        "compression > 0",
+        "contact force on the insert along -y, positive in compression; it includes the force on "
+        "a modelled post, but no residuals",
     ),
-    Column("force_ap_N", "the same, insert x"),
-    Column("force_ml_N", "the same, insert z"),
-    Column("force_total_N", "magnitude of that force"),
-    Column("force_total_BW", "the same in body weights (mass x 9.80665 m/s²)"),
+    Column("force_ap_N", "contact force on the insert, insert x"),
+    Column("force_ml_N", "contact force on the insert, insert z"),
+    Column("force_total_N", "magnitude of the contact force on the insert"),
+    Column("force_total_BW", "force_total_N in body weights (mass x 9.80665 m/s²)"),
     Column("medial_force_N", "normal force on the medial condyle, by deformation", _CONTACT),
     Column("lateral_force_N", "normal force on the lateral condyle, by deformation", _CONTACT),
-    Column("medial_share_equilibrium", "medial / (medial + lateral), by coronal equilibrium"),
+    Column(
+        "medial_share_equilibrium",
+        "medial / (medial + lateral) of the condylar forces by coronal equilibrium",
+    ),
     Column("medial_area_mm2", "area in contact, medial", _CONTACT),
     Column("lateral_area_mm2", "area in contact, lateral", _CONTACT),
     Column(
         "medial_mean_pressure_MPa",
-        "medial force / area: the magnitude of the summed forces over the area",
+        "magnitude of the resultant contact force on the medial condyle over medial_area_mm2",
         _CONTACT,
     ),
     Column(
         "lateral_mean_pressure_MPa",
-        "lateral force / area: the magnitude of the summed forces over the area",
+        "magnitude of the resultant contact force on the lateral condyle over lateral_area_mm2",
         _CONTACT,
     ),
     Column("medial_peak_pressure_MPa", "largest pressure of the map, medial", _CONTACT),
@@ -99,21 +100,29 @@ COLUMNS: tuple[Column, ...] = (
     Column("medial_cop_ml_mm", "medial centre of pressure, insert z", _CONTACT),
     Column("lateral_cop_ap_mm", "lateral centre of pressure, insert x", _CONTACT),
     Column("lateral_cop_ml_mm", "lateral centre of pressure, insert z", _CONTACT),
-    Column("approach_mm", "travel of the femoral component since first touch", _CONTACT),
+    Column("approach_mm", "travel of the femoral component along -y since first touch", _CONTACT),
     Column("medial_force_equilibrium_N", "normal force on the medial condyle, by equilibrium"),
     Column("lateral_force_equilibrium_N", "normal force on the lateral condyle, by equilibrium"),
     Column("quadriceps_N", "quadriceps tension", _MUSCLE),
     Column("patellar_ligament_N", "patellar-ligament tension", _MUSCLE),
     Column("patellofemoral_N", "patellofemoral force along the contact normal", _MUSCLE),
-    Column("patellofemoral_tangential_N", "the same across the normal; near zero", _MUSCLE),
+    Column(
+        "patellofemoral_tangential_N",
+        "patellofemoral force across the contact normal; near zero",
+        _MUSCLE,
+    ),
     Column("quadriceps_wrap_deg", "angle over which the quadriceps wraps the femur", _MUSCLE),
     Column(
         "quadriceps_per_dome_mm_N",
-        "change of quadriceps_N if the button, and its dome, sits 1 mm higher on the patella, "
-        "and the patella stays where it is",
+        "change of quadriceps_N if the button is mounted 1 mm higher on the patella, at the same "
+        "pose of the patella",
         _MUSCLE,
     ),
-    Column("patellofemoral_per_dome_mm_N", "the same, of patellofemoral_N", _MUSCLE),
+    Column(
+        "patellofemoral_per_dome_mm_N",
+        "change of patellofemoral_N if the button is mounted 1 mm higher",
+        _MUSCLE,
+    ),
     Column("hip_force_ap_N", "intersegmental force on the femur at the hip, insert x"),
     Column("hip_force_si_N", "the same, insert y"),
     Column("hip_force_ml_N", "the same, insert z"),
@@ -131,50 +140,63 @@ COLUMNS: tuple[Column, ...] = (
     Column(
         "external_adduction_moment_Nm",
         "external moment that adducts the knee, about the floating axis (normal to the femoral "
-        "ML and the tibial SI axis); both at the femoral origin",
+        "ML and the tibial SI axis); both moments are about the femoral origin",
         _GROUND,
     ),
     Column(LIGAMENT, "tension of the ligament bundle <name>", "[[ligament]]"),
     Column(
         "medial_slip_mm",
-        "slip of the medial condyle since the first frame, by arc lengths, without what axial "
-        "rotation "
-        "alone would do",
+        "slip of the medial condyle since the first frame, from arc lengths; the slip that axial "
+        "rotation alone would cause is subtracted",
         _SLIP,
     ),
     Column(
         "lateral_slip_mm",
-        "slip of the lateral condyle since the first frame, by arc lengths, without what axial "
-        "rotation "
-        "alone would do",
+        "slip of the lateral condyle since the first frame, from arc lengths; the slip that axial "
+        "rotation alone would cause is subtracted",
         _SLIP,
     ),
     Column("adjust_translation_mm", "femoral adjustment along insert y", _ADJUST),
     Column("adjust_coronal_deg", "femoral adjustment in the coronal plane", _ADJUST),
     Column("adjust_restored", "1: the adjustment was undone after the contact", _ADJUST, "integer"),
-    Column("residual_ap_N", "force that balance needs beyond the modelled loads, insert x"),
+    Column("residual_ap_N", "force that equilibrium needs beyond the modelled loads, insert x"),
     Column("residual_ml_N", "the same, insert z"),
-    Column("residual_axial_Nm", "moment that balance needs beyond them, about insert y"),
+    Column(
+        "residual_axial_Nm",
+        "moment that equilibrium needs beyond the modelled loads, about insert y",
+    ),
     Column("medial_area_above_yield", "share of the medial area above the yield stress", _CONTACT),
-    Column("lateral_area_above_yield", "share of the lateral area above yield", _CONTACT),
-    Column("medial_thickness_mm", "insert under the medial centre of pressure", _CONTACT),
-    Column("lateral_thickness_mm", "insert under the lateral centre of pressure", _CONTACT),
+    Column(
+        "lateral_area_above_yield", "share of the lateral area above the yield stress", _CONTACT
+    ),
+    Column(
+        "medial_thickness_mm",
+        "thickness of the insert under the medial centre of pressure",
+        _CONTACT,
+    ),
+    Column(
+        "lateral_thickness_mm",
+        "thickness of the insert under the lateral centre of pressure",
+        _CONTACT,
+    ),
     Column(
         "condition_number",
-        "of the equilibrium system with scaled columns: how much a relative error of the inputs "
-        "may grow in the solution",
+        "condition number of the equilibrium equations with scaled columns: the largest factor by "
+        "which a relative error of the inputs grows in the solution",
     ),
     Column("body_seconds", "computing time of the rigid-body equations"),
     Column("query_seconds", "computing time of the closest points on the meshes", _IMPLANT),
     Column("contact_seconds", "computing time of the contact", _CONTACT),
-    Column("iterations", "of the contact solver", _CONTACT, "integer"),
+    Column("iterations", "iterations of the contact solver", _CONTACT, "integer"),
     Column("status", "ok, or reason words joined by ;", kind="text"),
     Column(
         "cycle_percent",
-        "per cent of the cycle; NaN outside it",
+        "per cent of the cycle; NaN outside the cycle",
         "[motion] cycle_s, [output] cycle_s or two foot strikes",
     ),
-    Column("residual_coronal_Nm", "residual moment about insert x, where one condyle is off"),
+    Column(
+        "residual_coronal_Nm", "residual moment about insert x, where one condyle has lifted off"
+    ),
     Column("residual_flexion_Nm", "residual moment about insert z, where no quadriceps acts"),
     Column(
         "residual_sensitivity_N",
@@ -183,137 +205,171 @@ COLUMNS: tuple[Column, ...] = (
     *(
         Column(f"{side}_{name}_velocity_mm_per_s", meaning.replace("<side>", side), needs)
         for name, meaning, needs in (
-            ("slip", "rate of <side>_slip_mm, by arcs; positive: femur slides forwards", _SLIP),
-            ("sliding", "the same by rigid-body velocity at the <side> contact point", _PRESSED),
-            ("normal", "<side> contact point leaves the insert; zero: touch is kept", _PRESSED),
+            ("slip", "rate of <side>_slip_mm; positive: the femur slides forwards", _SLIP),
+            (
+                "sliding",
+                "sliding velocity from the rigid-body velocity at the <side> contact point",
+                _PRESSED,
+            ),
+            (
+                "normal",
+                "velocity at which the femur leaves the insert at the <side> contact point; zero: "
+                "contact is maintained",
+                _PRESSED,
+            ),
         )
         for side in ("medial", "lateral")
     ),
-    Column("ap_mm", "femoral origin, insert x, at which the contact holds", _CONTACT),
+    Column("ap_mm", "femoral origin of the pose of the contact, insert x", _CONTACT),
     Column("si_mm", "the same, insert y", _CONTACT),
     Column("ml_mm", "the same, insert z", _CONTACT),
-    Column("coupling_iterations", "iterations until body and contact agreed", _COUPLED, "integer"),
+    Column(
+        "coupling_iterations",
+        "iterations between the equations of the body and the contact until convergence",
+        _COUPLED,
+        "integer",
+    ),
     Column("coupling_change_N", "change of the contact force by the last iteration", _COUPLED),
-    Column("coupling_change_mm", "the same, of the centres of pressure", _POINTS),
-    Column("contact_trials", "contacts computed to find the released pose", _FREE, "integer"),
+    Column(
+        "coupling_change_mm",
+        "largest change of a centre of pressure by the last iteration",
+        _POINTS,
+    ),
+    Column(
+        "contact_trials",
+        "poses at which contact was evaluated to find the released coordinates",
+        _FREE,
+        "integer",
+    ),
     Column(
         "smallest_stiffness_N_per_mm",
-        "smallest stiffness of the released pose (lever 25 mm)",
+        "smallest stiffness of the equilibrium of the released coordinates; rotations count with "
+        "a lever of 25 mm",
         _FREE,
     ),
     Column(
         "adjust_force_change_BW",
-        "force_total_BW less what the equations give at the recorded pose",
+        "force_total_BW minus its value at the recorded pose",
         _ADJUST,
     ),
-    Column("adjust_share_change", "the same, of medial_share_equilibrium", _ADJUST),
+    Column(
+        "adjust_share_change",
+        "medial_share_equilibrium minus its value at the recorded pose",
+        _ADJUST,
+    ),
     Column(
         "medial_force_per_adduction_N_per_deg",
-        "change of medial_force_N with adduction at constant load, the foundation's tangent, or a "
-        "finite difference; zero where one condyle carries all, until the other touches",
+        "change of medial_force_N with adduction at constant load; zero while only one condyle "
+        "is in contact",
         _RECORDED,
     ),
     Column(
         "split_determined",
-        "1: the recorded adduction determines medial_force_N and lateral_force_N; 0: not, 0.5 deg "
-        "moves more than a quarter of the load, or one condyle carries all and equilibrium "
-        "says otherwise",
+        "1: the recorded adduction determines medial_force_N and lateral_force_N. 0: it does not; "
+        "either 0.5 deg of adduction shifts more than a quarter of the load, or contact loads one "
+        "condyle only, and coronal equilibrium loads both",
         _RECORDED,
         "integer",
     ),
     Column(
         "marker_rms_segments_mm",
-        "root mean square distance of shank and thigh markers, each segment fitted rigidly",
+        "root mean square residual of the markers of shank and thigh, each segment fitted by "
+        "itself",
         _MARKERS,
     ),
-    Column("marker_rms_chain_mm", "the same of all segments held together by joints", _MARKERS),
-    Column("flexion_segments_deg", "flexion by rigid fits, unfiltered", _MARKERS),
-    Column("flexion_chain_deg", "flexion by the chain, unfiltered", _MARKERS),
+    Column(
+        "marker_rms_chain_mm",
+        "root mean square residual of all markers, the segments joined by the model's joints",
+        _MARKERS,
+    ),
+    Column("flexion_segments_deg", "flexion by fits of single segments, unfiltered", _MARKERS),
+    Column("flexion_chain_deg", "flexion by the fit of the jointed segments, unfiltered", _MARKERS),
     Column(
         "knee_centre_distance_mm",
-        "distance of the knee centre by the shank's markers from that by the thigh's",
+        "distance between the knee centre of the thigh's markers and that of the shank's markers",
         _MARKERS,
     ),
     Column(
         "muscle_lines_turned_deg",
-        "by how much the knee is turned from the model's pose at which the muscles' ends on shank "
-        "and thigh were found; they stay on their links, so that lines which wrap err by up to it",
+        "rotation of the knee from the pose of the model at which the ends of the muscle lines on "
+        "shank and thigh were computed; the direction of a line that wraps errs by up to this "
+        "angle",
         _MUSCLES,
     ),
     Column(MUSCLE_FORCE, "force of the muscle <name> of the model", _MUSCLES),
-    Column(ACTIVATION, "its activation, 0 to 1", _MUSCLES),
+    Column(ACTIVATION, "activation of the muscle <name>, 0 to 1", _MUSCLES),
     Column(
         RESERVE,
-        "moment about <coordinate> that no muscle carries; the knee's acts on the tibia about "
-        "insert z, beside residual_flexion_Nm",
+        "reserve: moment about <coordinate> that the muscles lack; the knee's reserve acts on the "
+        "tibia about insert z, in addition to residual_flexion_Nm",
         _MUSCLES,
     ),
     Column(
         JOINT_MOMENT,
-        "moment about <coordinate> that muscles and reserve carry together; the knee's about the "
-        "axis on which contact and patella leave it",
+        "moment about <coordinate> of muscles and reserve together; for the knee, the equivalent "
+        "moment on the tibia about insert z",
         _MUSCLES,
     ),
     *(
         Column(
             family,
-            f"what the muscle <name> adds to {side}_force_equilibrium_N with pose, contact points "
-            "and lines held; also of quadriceps, ligaments, external (weight, inertia, ground): "
-            "they sum up to it",
+            f"contribution of the muscle <name> to {side}_force_equilibrium_N with fixed pose, "
+            "contact points and lines; <name> may also be quadriceps, ligaments or external "
+            f"(weight, inertia, ground); the contributions sum to {side}_force_equilibrium_N",
             _MUSCLES,
         )
         for side, family in CONTRIBUTIONS.items()
     ),
     Column(ENVELOPE, "normalised EMG envelope of the muscle <name>", "[muscles.emg]"),
-    Column("measured_total_N", "axial force that was measured, as force_si_N", _MEASURED),
-    Column("measured_medial_N", "the same of the medial condyle", _MEASURED),
-    Column("measured_lateral_N", "the same of the lateral condyle", _MEASURED),
+    Column("measured_total_N", "measured axial force, to compare with force_si_N", _MEASURED),
+    Column("measured_medial_N", "measured axial force on the medial condyle", _MEASURED),
+    Column("measured_lateral_N", "measured axial force on the lateral condyle", _MEASURED),
     *(
         Column(f"post_{name}", meaning, _POST, optional=True)
         for name, meaning in (
-            ("force_N", "normal force of the cam on the insert's post, zero where apart"),
+            ("force_N", "normal force of the cam on the insert's post, zero without contact"),
             ("force_ap_N", "the same, insert x"),
             ("force_si_N", "the same, along -y"),
             ("force_ml_N", "the same, insert z"),
             ("area_mm2", "area in contact of cam and post"),
-            ("peak_pressure_MPa", "largest pressure there"),
+            ("peak_pressure_MPa", "largest pressure of cam and post"),
             ("cop_si_mm", "centre of pressure on the post, insert y"),
             ("cop_ml_mm", "the same, insert z"),
             (
                 "gap_mm",
-                "clearance of cam and post along insert x; negative: they overlap; empty where "
-                "the cam is not behind the post",
+                "gap of cam and post along insert x; negative: penetration; empty where the cam "
+                "is not behind the post",
             ),
         )
     ),
 )
 
 RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}
-"""Name in results of earlier releases -> name of this release."""
+"""Name of a column in results of earlier releases -> its name in this release."""
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
 
 
 def _ends(family: str) -> tuple[str, str]:
-    """Return the text before and after the name in the columns of a family."""
+    """Return the parts of a family's column names before and after the inserted name."""
     return family[: family.index("<")], family[family.index(">") + 1 :]
 
 
 def belongs(column: str, family: str) -> bool:
-    """Return whether a column is one of a family's."""
+    """Return whether a column belongs to a family."""
     before, after = _ends(family)
     inside = len(column) > len(before) + len(after)
     return inside and column.startswith(before) and column.endswith(after)
 
 
 def family_column(family: str, name: str) -> str:
-    """Return the column of a family that stands for `name`."""
+    """Return the column of a family for one ligament, muscle or coordinate."""
     before, after = _ends(family)
     return f"{before}{name}{after}"
 
 
 def name_in(column: str, family: str) -> str:
-    """Return the name in a family's column."""
+    """Return the ligament, muscle or coordinate of a family's column."""
     before, after = _ends(family)
     return column.removeprefix(before).removesuffix(after)
 
@@ -324,7 +380,7 @@ def is_ligament(name: str) -> bool:
 
 
 def in_a_family(name: str) -> bool:
-    """Return whether the column is one of a family's."""
+    """Return whether the column belongs to any family."""
     return any(belongs(name, family) for family in FAMILIES)
 
 
@@ -334,24 +390,27 @@ def ligament_column(name: str) -> str:
 
 
 def ligament_of(column: str) -> str:
-    """Return the bundle's name of a ligament column."""
+    """Return the bundle of a ligament's column."""
     return name_in(column, LIGAMENT)
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:
-    """Return every fixed column in order, with families' and optional ones of `present`."""
-    given = list(present)
+    """Return the columns of a file in order: all fixed ones, and from `present` the others.
+
+    The others are members of families and optional columns.
+    """
+    present = list(present)
     names: list[str] = []
     for column in COLUMNS:
         if column.name in FAMILIES:
-            names.extend(name for name in given if belongs(name, column.name))
-        elif column.name in given or not column.optional:
+            names.extend(name for name in present if belongs(name, column.name))
+        elif column.name in present or not column.optional:
             names.append(column.name)
     return tuple(names)
 
 
 def columns_as_markdown() -> str:
-    """Return the table of the columns for the documentation."""
+    """Return the table of columns in docs/results.md."""
     lines = ["| column | meaning | empty without |", "| --- | --- | --- |"]
     for column in COLUMNS:
         lines.append(f"| `{column.name}` | {column.meaning} | {column.needs} |")

@@ -1,16 +1,15 @@
-"""Body and contact together: the only file where both meet in the computation.
+"""Coupling of the rigid-body equations and the contact model in each frame.
 
-- `coupling = "none"`: the body's equations give the superior-inferior contact force, with
-  contact points from the undeformed meshes, and the contact model presses that load in at
-  the recorded rotation.
-- `coupling = "points"`: each condyle's resultant then takes the place of point and normal in
-  the equations, and this is repeated until load and centres of pressure no longer change.
-- `released = [...]`: these coordinates find their own equilibrium under contact, ligaments
-  and muscle line (`tkamb.knee.released`); the equations then use the resultants found.
+- `coupling = "none"`: the equations give the superior-inferior contact force, with contact points
+  on the undeformed meshes. The contact model presses with that load at the recorded rotation.
+- `coupling = "points"`: the resultant of each condyle then replaces point and normal in the
+  equations. Equations and press are repeated until load and centres of pressure converge.
+- `released = [...]`: these coordinates are found by equilibrium of contact, ligaments and muscle
+  line (`tkamb.knee.released`). The equations then use the resultants at that pose.
 
-`contact_arrays` returns what a folder keeps of a frame's contact; a resumed run begins from it with
-`recalled`. The lattice's displacements, and the forces from which a released knee begins, are not
-kept: the results differ within the solver's tolerance.
+`contact_arrays` returns the arrays of a frame's contact that the results folder stores. A resumed
+run takes its warm start from them (`recalled`). They do not include the displacements of the
+lattice: a resumed run differs from a single one within the tolerance of the solver.
 """
 
 import time as clock
@@ -47,39 +46,39 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class CouplingSettings:
-    """The iteration between contact and muscles of one frame."""
+    """Convergence of the coupling of body and contact in one frame."""
 
     force_tolerance: float = 0.1
-    """N; the iteration has converged when the load changes by less. Chosen: a ten-thousandth of a
-    body weight is not resolved by any contact model."""
+    """N: largest change of the load in a converged iteration. Chosen because no contact model
+    resolves a ten-thousandth of a body weight."""
     point_tolerance: float = 1e-6
-    """m; and when the centres of pressure move by less. Chosen: far below what changes a force."""
+    """m: largest travel of a centre of pressure in a converged iteration. Chosen because it is too
+    small to change a force."""
     max_iterations: int = 20
-    """Iterations after which a frame without convergence gets a status. Chosen: frames that
-    converge need fewer."""
+    """1: iterations after which a frame fails. Chosen because frames that converge need fewer."""
     stiffness_error: float = 0.02
-    """Share of the stiffness of the muscles that a converged search may neglect. Chosen: the search
-    converges nevertheless."""
+    """1: relative error of the knee's compliance to muscles above which a released frame gets a
+    flag. Chosen because the search converges with such an error."""
 
 
 COUPLING = CouplingSettings()
 
 
 class ContactSide:
-    """The contact model of a knee, prepared once, and the body that it has to agree with.
+    """The contact model of a knee, coupled with the rigid-body equations.
 
     Args:
-        mechanics: the body side of a knee with contact.
-        coupled: whether the contact's resultants take the place of the contact points.
-        released: the coordinates that find their own equilibrium.
-        post: cam and post, if they are modelled.
-        sensitivity: whether each frame tells how its split changes with the adduction, which
-            takes one more press of a model without a tangent.
-        prepare_seconds: what preparing the contact took.
+        mechanics: rigid-body mechanics of a knee with contact.
+        coupled: whether the contact's resultants replace the contact points in the equations.
+        released: names of the released coordinates.
+        post: cam and post; None: not modelled.
+        sensitivity: whether to compute the change of the medial force with adduction. It takes one
+            more press with a contact model that has no tangent.
+        prepare_seconds: computing time of the preparation of the contact model, s.
 
     Attributes:
-        model: the contact model.
-        state: what it has prepared.
+        model: contact model.
+        state: state that the contact model has prepared.
     """
 
     def __init__(
@@ -108,12 +107,11 @@ class ContactSide:
             self.starts = InitialPoses(self.released, self.state.pair, post)
 
     def frame(self, k: int, before: Sequence[FrameContact] = ()) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact of frame k, coupled as the scene asks.
+        """Return loads and contact of frame k, coupled as the scene states.
 
         Args:
             k: frame.
-            before: contacts of the earlier frames. The last one's warm start saves time, and the
-                search for released coordinates begins at the last that were found.
+            before: contacts of the earlier frames, for warm start and initial guess.
         """
         if self.released is None:
             body, contact = self._press_recorded(k, before)
@@ -134,31 +132,33 @@ class ContactSide:
     def _press_recorded(
         self, k: int, before: Sequence[FrameContact]
     ) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact at the recorded rotation."""
+        """Return loads and contact at the recorded rotation."""
         begin, pose = before[-1].start if before else None, self.mechanics.poses[k]
-        # The body's equations do not need the place of first touch, but every press does.
+        # The press needs the pose of first touch: it is computed during the body's equations.
         body, _ = both(lambda: self.mechanics.frame(k), lambda: self.state.pair.touch_at(pose))
-        contact = self.carry(body, self.mechanics.poses[k], begin)
+        contact = self.press_load(body, self.mechanics.poses[k], begin)
         if contact.adjustment and contact.adjustment.restored:
             body = self.mechanics.frame(k, contact.adjustment)
-            contact = self.carry(body, self.mechanics.poses[k], contact.start)
+            contact = self.press_load(body, self.mechanics.poses[k], contact.start)
         if not self._coupled and self.post is None:
             return body, contact
         return self._couple(k, body, contact)
 
-    def carry(self, body: FrameLoads, pose: Array, begin: WarmStart | None) -> FrameContact:
-        """Press with the load of the body side, at the measured (or adjusted) rotation.
+    def press_load(self, body: FrameLoads, pose: Array, begin: WarmStart | None) -> FrameContact:
+        """Return the contact under the load of the body's equations.
+
+        The rotation is the recorded one or, with an adjustment, the adjusted one.
 
         Args:
-            body: the body side of the frame.
-            pose: (4, 4) measured pose_femoral_in_insert.
-            begin: the previous frame's warm start, which may save time.
+            body: loads of the frame by the equations.
+            pose: recorded pose_femoral_in_insert, (4, 4).
+            begin: warm start of the previous frame; None: no warm start.
         """
         load = float(body.loads.contact_force[1])
         if not np.isfinite(load):
-            return self.nothing("no load from the equations")
+            return self.failed("no load from the equations")
         if load <= 0:
-            return self.nothing("no compressive load")
+            return self.failed("no compressive load")
         began = clock.perf_counter()
         adjustment, query = body.adjustment, self.mechanics.query
         if adjustment is None or query is None:
@@ -173,7 +173,10 @@ class ContactSide:
     def _couple(
         self, k: int, body: FrameLoads, contact: FrameContact
     ) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact after the contact's resultants and post force act on the body."""
+        """Iterate between equations and contact; return loads and contact.
+
+        The resultants of the contact (if coupled) and the post force act on the body.
+        """
         seconds, instant = contact.seconds, self.mechanics.instant(k)
         place, coupled = instant.coordinates, self._coupled
         for iteration in range(1, COUPLING.max_iterations + 1):
@@ -190,19 +193,19 @@ class ContactSide:
             geometry = replace(body.geometry, condyles=body.geometry.condyles | result, post=pushed)
             geometry, loads = instant.solved(geometry)
             body = replace(body, geometry=geometry, loads=loads)
-            contact = self.carry(body, self.mechanics.poses[k], contact.start)
+            contact = self.press_load(body, self.mechanics.poses[k], contact.start)
             seconds += contact.seconds
             change = abs(float(body.loads.contact_force[1] - load))
-            moved = _travel(points, _points(body))
+            travel = _travel(points, _points(body))
             contact = replace(
                 contact,
                 seconds=seconds,
                 iterations=iteration,
                 load_change=change,
-                point_change=moved if coupled else NAN,
+                point_change=travel if coupled else NAN,
                 post=post,
             )
-            if change < COUPLING.force_tolerance and moved < COUPLING.point_tolerance:
+            if change < COUPLING.force_tolerance and travel < COUPLING.point_tolerance:
                 return body, contact
         problem = "the iteration of body and contact does not converge"
         return replace(body, loads=unsolved([problem])), replace(
@@ -210,12 +213,12 @@ class ContactSide:
         )
 
     def _release(self, k: int, before: Sequence[FrameContact]) -> tuple[FrameLoads, FrameContact]:
-        """Return body and contact with the released coordinates in equilibrium.
+        """Return loads and contact with the released coordinates in equilibrium.
 
         Args:
             k: frame.
-            before: contacts of the earlier frames; the search begins where the last three that
-                were found extrapolate to.
+            before: contacts of the earlier frames. The initial guess extrapolates the last three
+                equilibria.
         """
         released, began, mechanics = self.released, clock.perf_counter(), self.mechanics
         assert released is not None
@@ -228,20 +231,20 @@ class ContactSide:
         try:
             knee = self.starts.rest(instant, [c.equilibrium for c in good if c.equilibrium], points)
         except ComputationError as error:
-            contact = self.nothing(error.what)
+            contact = self.failed(error.what)
             body = mechanics.frame(k)
             return replace(body, loads=unsolved([contact.problem])), contact
-        result, contact = None, self.nothing(knee.problem)
+        result, contact = None, self.failed(knee.problem)
         if not knee.problem:
             pose, pair = knee_pose(knee.coordinates), self.state.pair
-            # The check that follows asks where the bodies first touch.
+            # `within_insert` needs the pose of first touch: it is computed at the same time.
             (result, start), _ = both(
                 lambda: self.model.evaluate_from(self.state, pose, begin),
                 lambda: pair.touch_at(pose),
             )
             result = within_insert(self.state, result)
             contact = self._contact(result, start, None, 0.0)
-            flags = (*contact.flags, *_doubts(knee))
+            flags = (*contact.flags, *_equilibrium_flags(knee))
             post = post_contact(self.post, result.pose, self._names)
             contact = replace(contact, flags=flags, post=post)
         contact = replace(
@@ -298,21 +301,21 @@ class ContactSide:
             start=start, triangles=self.state.triangles,
         )  # fmt: skip
 
-    def nothing(self, problem: str) -> FrameContact:
-        """Return a contact that could not be computed, and why."""
+    def failed(self, problem: str) -> FrameContact:
+        """Return a contact without a result, with the reason."""
         none = np.zeros(len(self.state.points), bool)
         return FrameContact(None, none, None, 0.0, problem, ())
 
 
-def _doubts(knee: "KneeEquilibrium") -> tuple[str, ...]:
-    """Return what a reader must know of a search: a second equilibrium, a response left open."""
+def _equilibrium_flags(knee: "KneeEquilibrium") -> tuple[str, ...]:
+    """Return the flags of an equilibrium: a second equilibrium, an inaccurate compliance."""
     second = (knee.second,) if knee.second else ()
     if knee.doubt <= COUPLING.stiffness_error:
         return second
     return (
         *second,
         "the response of the knee's coordinates to the muscles has not converged "
-        f"({100 * knee.doubt:.0f} % of it is open): from other initial guesses such frames "
+        f"(relative error {100 * knee.doubt:.0f} %): with other initial guesses such frames "
         "differed by up to 3 % in the total force and 60 N in the force of one condyle",
     )
 
@@ -322,22 +325,22 @@ def _points(body: FrameLoads) -> dict[str, Array]:
 
 
 def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
-    """Return the farthest (m) that a contact point has moved."""
+    """Return the largest distance, m, by which a contact point has moved."""
     return max(float(np.linalg.norm(after[side] - before[side])) for side in after)
 
 
 RESULT_ARRAYS = ("pose", "pressure", "gap", "nodal_force")
-"""What the map of a run and the start of a resumed one need of a result."""
+"""Arrays of a contact result that pressure maps and warm starts of resumed runs need."""
 
 
 def contact_arrays(
     contact: FrameContact | None, geometry: "KneeGeometry"
 ) -> dict[str, Array] | None:
-    """Return the arrays to keep of a frame's contact, by name; None without a result.
+    """Return the arrays of a frame's contact to store, by name; None without a result.
 
     Args:
-        contact: of the frame.
-        geometry: what the equations worked on.
+        contact: contact of the frame.
+        geometry: geometry of the frame in the equations.
     """
     if contact is None or contact.result is None:
         return None
@@ -362,7 +365,7 @@ def contact_arrays(
 def recalled(
     side: ContactSide, mechanics: Mechanics, frame: int, arrays: Mapping[str, Array] | None
 ) -> FrameContact:
-    """Return a frame's warm start from its arrays, in a contact that holds no result."""
+    """Return a contact with the warm start of a stored frame and without a result."""
     none = np.zeros(len(side.state.points), bool)
     if arrays is None:
         return FrameContact(None, none, None, 0.0, "not recalled", ())

@@ -1,16 +1,16 @@
-"""Contact problems as input files of CalculiX and FEBio 4, in mm, N and MPa.
+"""Input files (decks) of CalculiX and FEBio 4 for a contact problem, in mm, N and MPa.
 
-Both decks hold the insert's hexahedra and a rigid patch of the femoral component that moves along
-y only.
+Both decks contain the hexahedra of the insert and a rigid patch of the femoral component that moves
+along y only.
 
-CalculiX: contact is node to surface by penalty, so that a node has its pressure times its share of
-the deformed faces around it. The patch is a layer of wedges. It begins at a guessed depth in the
-insert, under the whole load, and CalculiX finds the equilibrium.
+CalculiX: contact is node to surface by penalty. The force on a node is its pressure times its
+tributary area of the deformed faces. The patch is a layer of wedges. Its initial position is at a
+guessed depth in the insert, under the whole load, and CalculiX finds the equilibrium.
 
-FEBio: the insert is an isotropic elastic (St. Venant-Kirchhoff) solid in finite deformation, at
-small strain Hooke's law. Contact is sliding-elastic, frictionless, by augmented Lagrangian. The
-patch begins at first touch, where a load would meet no stiffness. It is lowered by the approach
-that tkamb found, and FEBio returns the force.
+FEBio: the insert is an isotropic elastic (St. Venant-Kirchhoff) solid in finite deformation.
+Contact is sliding-elastic and frictionless, by augmented Lagrangian. The patch is displaced from
+first touch by the approach of the run, and FEBio returns the force. A load is not prescribed, since
+the stiffness is zero at first touch.
 
 Reference: FEBio User Manual 4.0, chapter 3, the input file format.
 """
@@ -40,17 +40,17 @@ class CalculixDeckSettings:
     """Numbers of a deck for CalculiX."""
 
     penalty: float = 1e5
-    """N/mm³; contact stiffness. Chosen: at 30 MPa surfaces overlap by 0.3 µm."""
+    """N/mm³: contact stiffness. Chosen because the penetration is then 0.3 µm at 30 MPa."""
 
 
 CALCULIX_DECK = CalculixDeckSettings()
 
 PATCH_THICKNESS = np.array([0.0, 1e-3, 0.0])
-"""m: of the layer of wedges that stands for the rigid femoral component."""
+"""m: thickness of the layer of wedges that models the rigid femoral component."""
 
 
 ELEMENT = "C3D8I"
-"""Fully integrated with incompatible modes: does not lock as nu nears 0.5 in bending."""
+"""Hexahedra with full integration and incompatible modes, which do not lock in bending."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +59,13 @@ class Deck:
 
     Args:
         lattice: nodes and hexahedra of the insert.
-        patch: the part of the femoral component that can touch, insert frame, where it begins.
-        material: of the insert.
-        bearing: how the bottom is held.
-        load: N, along -y.
-        element: "C3D8" (fully integrated, locks as nu nears 0.5), "C3D8I" (incompatible modes).
-        comments: lines for the reader of the deck.
+        patch: part of the femoral component that can touch, at its initial pose, insert frame.
+        material: material of the insert.
+        bearing: boundary condition of the insert's bottom.
+        load: load along -y, N.
+        element: "C3D8" (full integration, locks as nu approaches 0.5) or "C3D8I" (incompatible
+            modes).
+        comments: lines at the top of the deck.
     """
 
     lattice: Lattice
@@ -77,10 +78,10 @@ class Deck:
 
     @property
     def text(self) -> str:
-        """The input in mm, N and MPa.
+        """The deck in mm, N and MPa.
 
         Raises:
-            InputError: the material's law or the bearing is not one of CalculiX's here.
+            InputError: the deck does not support the material's law or the bearing.
         """
         comments = [f"** {line}" for line in self.comments]
         return "\n".join(
@@ -165,23 +166,22 @@ class FebioDeckSettings:
     """Numbers of a deck for FEBio."""
 
     load_steps: int = 10
-    """Steps in which the displacement is applied. Chosen: FEBio halves them by itself where one
-    fails."""
+    """1: steps of the displacement. Chosen because FEBio divides a step that fails."""
 
 
 FEBIO_DECK = FebioDeckSettings()
 
 FIXED = ("Rx", "Rz", "Ru", "Rv", "Rw")
-"""Freedoms that the femoral component does not have: it moves along y alone."""
+"""Constrained degrees of freedom of the femoral component: it moves along y only."""
 
 
 def febio_text(problem: "PressProblem", approach: float, comments: Iterable[str] = ()) -> str:
-    """Return the .feb file of a press.
+    """Return the .feb file of a contact problem.
 
     Args:
-        problem: the press.
-        approach: m, by which the femoral component is lowered from first touch.
-        comments: lines for the reader of the file.
+        problem: contact problem.
+        approach: displacement of the femoral component along -y from first touch, m.
+        comments: lines at the top of the file.
 
     Raises:
         InputError: a bearing that is not fixed, or a material that is not linear.
@@ -204,7 +204,7 @@ def febio_text(problem: "PressProblem", approach: float, comments: Iterable[str]
 
 
 def contact_quads(lattice: Lattice) -> Index:
-    """Return the outer cell faces (q, 4) over the contact nodes, corners in outward order."""
+    """Return the boundary faces between contact nodes, (q, 4), with outward normals."""
     faces = lattice.cells[:, FACES].reshape(-1, 4)
     inside = np.repeat(lattice.nodes[lattice.cells].mean(axis=1), len(FACES), axis=0)
     _, first, count = np.unique(
@@ -286,11 +286,11 @@ def _mesh(root: Element, problem: "PressProblem") -> None:
 
 
 def _motion(root: Element, travel: float) -> None:
-    """Hold the insert's bottom, and lower the femoral component by the travel (mm)."""
-    held = SubElement(SubElement(root, "Boundary"), "bc", name="held", node_set="bottom")
-    held.set("type", "zero displacement")
+    """Add the boundary conditions: fixed bottom, femoral component displaced by `travel`, mm."""
+    bottom = SubElement(SubElement(root, "Boundary"), "bc", name="held", node_set="bottom")
+    bottom.set("type", "zero displacement")
     for freedom in ("x_dof", "y_dof", "z_dof"):
-        SubElement(held, freedom).text = "1"
+        SubElement(bottom, freedom).text = "1"
     rigid = SubElement(root, "Rigid")
     fixed = SubElement(rigid, "rigid_bc", name="guided", type="rigid_fixed")
     SubElement(fixed, "rb").text = "femur"
@@ -313,7 +313,7 @@ def _contact(root: Element) -> None:
 
 
 def _course_and_output(root: Element) -> None:
-    """Grow the travel linearly; write fields, and the femoral component's place and force."""
+    """Add the linear load curve of the displacement, and the output of fields and force."""
     curve = SubElement(SubElement(root, "LoadData"), "load_controller", id="1", type="loadcurve")
     SubElement(curve, "interpolate").text = "LINEAR"
     points = SubElement(curve, "points")
@@ -328,7 +328,7 @@ def _course_and_output(root: Element) -> None:
 
 
 def _filled(parent: Element, tag: str, **values: object) -> Element:
-    """Return a new child with one leaf per value."""
+    """Return a new child of an element with one subelement per value."""
     element = SubElement(parent, tag)
     for name, value in values.items():
         SubElement(element, name).text = str(value)

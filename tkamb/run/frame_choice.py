@@ -1,11 +1,11 @@
-"""Which frames of a motion are computed, as text says it."""
+"""Choice of frames in text form, such as 0:100:5."""
 
 
 def frames_slice(text: str) -> slice:
-    """Return the slice that A:B or A:B:STEP says.
+    """Return the slice of a text A:B or A:B:STEP.
 
     Raises:
-        ValueError: it says none.
+        ValueError: the text is neither.
     """
     parts = text.split(":")
     if not 2 <= len(parts) <= 3:
@@ -13,4 +13,4 @@ def frames_slice(text: str) -> slice:
     try:
         return slice(*(int(part) if part else None for part in parts))
     except ValueError:
-        raise ValueError(f"'{text}' holds something else than integers") from None
+        raise ValueError(f"'{text}' does not hold integers only") from None

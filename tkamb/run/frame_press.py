@@ -1,8 +1,8 @@
-"""The contact of one frame of a run as a finite-element problem, for another program to solve.
+"""The contact of one frame of a run as a finite-element problem for another program.
 
-The insert is a grid of hexahedra. Its contact nodes lie on the smooth surface that the insert's
-mesh stands for, as in the lattice. The femoral component is a rigid, faceted patch. Nothing of the
-lattice's solution is used: the patch begins where an elastic foundation would bear the load.
+The insert is a grid of hexahedra. Its contact nodes lie on the smooth surface that approximates the
+insert's mesh, as in the lattice. The femoral component is a rigid, faceted patch. Its initial depth
+is the approach of the foundation model under the load. The solution of the run is not used.
 """
 
 from collections.abc import Iterator
@@ -32,14 +32,14 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class DeckSettings:
-    """Which nodes of a deck may touch."""
+    """The parts of insert and femoral component that can touch in a deck."""
 
     touchable_depths: float = 2.0
-    """Multiple of the guessed depth: nodes whose gap at first touch is smaller can be touched.
-    Chosen: the guess is off by less."""
+    """1: nodes with a gap at first touch below this multiple of the guessed depth can touch.
+    Chosen because the error of the guess is smaller."""
     largest_normal_y: float = -0.3
-    """Largest y of a femoral normal that takes part. Chosen: faces that look farther sideways do
-    not press on the insert."""
+    """1: largest y component of the normal of a femoral face in the patch. Chosen because steeper
+    faces do not press on the insert."""
 
 
 DECK = DeckSettings()
@@ -47,19 +47,19 @@ DECK = DeckSettings()
 
 @dataclass(frozen=True, eq=False)
 class PressProblem:
-    """The insert's grid, and the femoral component where a solver begins.
+    """The grid of the insert and the femoral component at its initial pose.
 
     Args:
-        pair: the two bodies.
-        lattice: grid of the insert, its contact nodes on the smooth surface.
-        nodes: (c,) contact nodes.
-        map: contact surface.
-        floor: femoral component from below.
-        pose: (4, 4) at the guessed depth.
-        depth: m, guessed.
-        touchable: (c,) contact nodes over which `patch` lies.
-        patch: femoral triangles, insert frame.
-        load: N, along -y.
+        pair: insert and femoral component.
+        lattice: grid of the insert with contact nodes on the smooth surface.
+        nodes: contact nodes, (c,).
+        map: contact surface of the insert.
+        floor: femoral surface seen from below.
+        pose: pose_femoral_in_insert at the guessed depth, (4, 4).
+        depth: guessed approach, m.
+        touchable: mask of the contact nodes that can touch, (c,).
+        patch: femoral triangles above these nodes, insert frame.
+        load: load along -y, N.
     """
 
     pair: ContactPair
@@ -78,14 +78,14 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
     """Return a press as a finite-element problem.
 
     Args:
-        pair: the two bodies.
-        load: N, along -y.
-        pose: (4, 4) pose_femoral_in_insert; its y does not matter.
-        grid_mm: edge of the hexahedra.
+        pair: insert and femoral component.
+        load: load along -y, N.
+        pose: pose_femoral_in_insert, (4, 4); its y is not used.
+        grid_mm: edge of the hexahedra, mm.
 
     Raises:
         InputError: the insert cannot be meshed.
-        ComputationError: the load presses nothing together.
+        ComputationError: the load is not compressive.
     """
     lattice = whole_lattice(pair.insert, grid_mm * MILLIMETRE)
     nodes, surface = contact_map(lattice, pair.insert)
@@ -107,7 +107,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
 
 
 def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
-    """Return the downward triangles that lie within a cell of points, seen from above."""
+    """Return the downward triangles within one cell of any of the points, seen from above."""
     down = np.flatnonzero(femoral.face_normals[:, 1] < DECK.largest_normal_y)
     middle = femoral.triangles[down].mean(axis=1)[:, ::2]
     away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
@@ -120,16 +120,16 @@ SUFFIX = {"ccx": ".inp", "feb": ".feb"}
 
 @dataclass(frozen=True, eq=False)
 class FramePress:
-    """The contact of one frame as a finite-element problem, and what the run found there.
+    """The contact of one frame as a finite-element problem, with the results of the run.
 
     Args:
-        problem: the pose is the one at which the frame's map holds, the load the vertical sum
-            of its nodal forces.
-        approach: m, of that pose.
-        peak_pressure: Pa, of the map.
-        origin: number of the frame, its run and the contact model, in words.
-        lateral: what insert z points to, "lateral" or "medial".
-        notes: differences between run and deck that matter in a comparison.
+        problem: problem at the pose of the frame, except for its y. The load is the vertical sum
+            of the frame's nodal forces.
+        approach: approach in the run, m.
+        peak_pressure: largest pressure of the map, Pa.
+        origin: text with frame number, folder of the run and contact model.
+        lateral: direction of insert z, "lateral" or "medial".
+        notes: differences between run and deck that affect a comparison.
     """
 
     problem: PressProblem
@@ -140,23 +140,23 @@ class FramePress:
     notes: tuple[str, ...] = ()
 
     def comments(self) -> tuple[str, ...]:
-        """Return the lines for the reader of the deck."""
+        """Return the lines at the top of the deck."""
         problem, millimetres = self.problem, self.approach / MILLIMETRE
         return (
             f"{self.origin}; written by tkamb; mm, N, MPa.",
             f"Insert frame: x anterior, y superior, z {self.lateral}; no friction; the bottom is "
-            "held.",
+            "fixed.",
             f"{len(problem.lattice.cells)} hexahedra; load {problem.load:.6g} N along -y.",
-            f"The run found: approach since first touch {millimetres:.6g} mm, peak pressure "
+            f"Results of the run: approach since first touch {millimetres:.6g} mm, peak pressure "
             f"{self.peak_pressure / MEGAPASCAL:.6g} MPa.",
             *self.notes,
         )
 
     def deck(self, kind: str) -> str:
-        """Return the input of CalculiX ("ccx") or FEBio ("feb").
+        """Return the deck of CalculiX ("ccx") or FEBio ("feb").
 
         Raises:
-            InputError: a material or bearing that the program's deck does not hold.
+            InputError: the deck does not support the material or the bearing.
         """
         problem, text = self.problem, self.comments()
         if kind == "feb":
@@ -167,8 +167,9 @@ class FramePress:
             )
         start = problem.depth / MILLIMETRE
         more = (
-            f"The femoral patch begins {start:.6g} mm below first touch and is let go: its",
-            "approach is that less the U2 of the set NREF; pressures stand in the .dat file, too.",
+            f"The femoral patch begins {start:.6g} mm below first touch and is free to move along",
+            f"y. Its approach is {start:.6g} mm minus U2 of the set NREF. The .dat file has the",
+            "displacements and the contact pressures.",
         )
         pair = problem.pair
         deck = Deck(
@@ -182,14 +183,14 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     """Return the contact of one frame of a folder of results.
 
     Args:
-        folder: that `tkamb run` wrote.
-        frame: row of results.csv; negative ones count from the end.
-        resolution_mm: edge of the hexahedra; None: the run's spacing.
+        folder: results folder of `tkamb run`.
+        frame: row of results.csv; negative numbers count from the end.
+        resolution_mm: edge of the hexahedra, mm; None: the spacing of the run.
 
     Raises:
-        InputError: no results, no such frame, one without a map or without load, or a scene
-            that is no longer what was run.
-        ComputationError: the load presses nothing together.
+        InputError: there are no results, no such frame, no map or no load, or the scene has
+            changed since the run.
+        ComputationError: the load is not compressive.
     """
     results = read_results(folder)
     count = len(results)
@@ -213,7 +214,7 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
 
 
 def _notes(results: Results, frame: int, pair: ContactPair) -> Iterator[str]:
-    """Yield why a deck's answer differs from the run's, apart from the discretisation."""
+    """Yield the differences between deck and run, apart from the discretisation."""
     law, contact = pair.material, results.summary.get("contact") or {}
     yield (
         f"Material '{law.name}', {'linear' if law.is_linear else 'nonlinear'}: "
@@ -225,13 +226,13 @@ def _notes(results: Results, frame: int, pair: ContactPair) -> Iterator[str]:
     if "post_force_N" in results.columns:
         force, peak = (results[name][frame] for name in ("post_force_N", "post_peak_pressure_MPa"))
         yield (
-            f"Without the cam's contact with the post, which is in neither load nor peak: "
-            f"{force:.6g} N, peak {peak:.6g} MPa in the run."
+            "Load and peak pressure exclude the contact of cam and post, which is not in this "
+            f"deck: {force:.6g} N, peak {peak:.6g} MPa in the run."
         )
 
 
 def _pair(results: Results) -> tuple[ContactPair, float]:
-    """Return the two bodies of a run and the spacing of its map points, mm."""
+    """Return femoral component and insert of a run, and the spacing of its map points, mm."""
     case = case_of_results(results)
     table, insert = case.scene.contact, case.scene.implant.insert
     assert table is not None and insert is not None

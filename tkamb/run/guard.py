@@ -1,7 +1,7 @@
-"""Runs a command so that every error reaches the user as one line.
+"""Execution of a command, with each error as one line on standard error.
 
-A command ends with a status: 0 done, 1 nothing computed, 2 bad input, 130 interrupted. An
-unforeseen error is one line too; its traceback goes into a file beside the output.
+Exit statuses: 0 success, 1 failure, 2 bad input, 130 interrupted. An unexpected error is one line
+too. Its traceback is written to a log file.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from tkamb import __version__
 from tkamb.errors import TkambError
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Error numbers of a write when the disk, the quota or the limit of a file is reached."""
+"""Error numbers of a write to a full disk, beyond the quota or beyond the largest file size."""
 
 OPTIONS = {
     "camera": "--camera",
@@ -42,28 +42,28 @@ OPTIONS = {
 
 
 def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
-    """Run a command and return its exit status; an error reaches the user as one line.
+    """Run a command and return its exit status. An error is printed as one line.
 
     Args:
-        command: returns its own status.
-        options: of the command line, as far as they are known when something goes wrong.
+        command: function that returns an exit status.
+        options: parsed options of the command line.
     """
     open_streams()
     try:
         with warnings.catch_warnings():
             if not sys.warnoptions:
-                warnings.simplefilter("ignore")  # they are for whoever writes the code
+                warnings.simplefilter("ignore")  # Python warnings address developers
             try:
                 with interrupt_as_such():
                     return command()
-            finally:  # also when argparse exits: what it printed must have arrived
+            finally:  # also after an exit by argparse, so that a failed write is reported
                 sys.stdout.flush()
     except TkambError as error:
         say(in_options(str(error), error.where))
         if isinstance(error, StreamError):
             _silence(sys.stdout)
         return error.exit_status
-    except BrokenPipeError:  # the reader of a pipe has gone, `tkamb ... | head`
+    except BrokenPipeError:  # the reader of the pipe has ended, as in `tkamb ... | head`
         _silence(sys.stdout)
         return 0
     except KeyboardInterrupt as interrupt:
@@ -71,20 +71,20 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
         return 130
     except OSError as error:
         if error.errno not in NO_ROOM:
-            return _unforeseen(error, options)
+            return _unexpected(error, options)
         where = "" if error.filename is None else f"{error.filename}: "
         say(f"{where}cannot be written ({error.strerror}); make room, then run it again")
         return 1
     except Exception as error:
-        return _unforeseen(error, options)
+        return _unexpected(error, options)
 
 
 def in_options(message: str, where: object = None) -> str:
-    """Return a message that names arguments of Python functions with options of commands instead.
+    """Return a message with options of commands in place of arguments of Python functions.
 
     Args:
-        message: what is printed.
-        where: of the error; it may begin with the name of an argument.
+        message: text of an error.
+        where: place of the error; its first word may be the name of an argument.
     """
     name = where.partition(" ")[0] if isinstance(where, str) else ""
     if name in OPTIONS:
@@ -96,15 +96,12 @@ def in_options(message: str, where: object = None) -> str:
 
 @contextmanager
 def interrupt_as_such() -> Iterator[None]:
-    """Raise KeyboardInterrupt where an interrupt within a compiled loop became a SystemError.
-
-    Python raises the SystemError, caused by the interrupt, where the loop returns its result.
-    """
+    """Raise KeyboardInterrupt for a SystemError that an interrupt in compiled code has caused."""
     try:
         yield
     except SystemError as error:
         cause: BaseException | None = error
-        while isinstance(cause, SystemError):  # one for each layer that it passes
+        while isinstance(cause, SystemError):  # each compiled layer adds one SystemError
             cause = cause.__cause__
         if isinstance(cause, KeyboardInterrupt):
             raise KeyboardInterrupt from None
@@ -112,17 +109,17 @@ def interrupt_as_such() -> Iterator[None]:
 
 
 class StreamError(TkambError):
-    """Standard output cannot be written: what was computed has not arrived."""
+    """Standard output cannot be written."""
 
 
 def say(line: str) -> None:
-    """Print a line on standard error, if that is still open."""
+    """Print a line on standard error if the stream is open."""
     with suppress(OSError, ValueError):
         print(f"tkamb: {printable(line)}", file=sys.stderr, flush=True)
 
 
 def printable(text: str) -> str:
-    """Return a text with characters that could steer a terminal as in JSON; lines and tabs stay."""
+    """Return a text with control characters escaped as in JSON, except line breaks and tabs."""
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
     return "".join(c if _is_harmless(c) else json.dumps(c)[1:-1] for c in text)
@@ -133,41 +130,40 @@ def _is_harmless(character: str) -> bool:
 
 
 class _PrintableFormatter(logging.Formatter):
-    """Escapes what could steer a terminal: messages quote names and texts of others."""
+    """Escapes control characters: messages quote texts from files, which could alter a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
 
 
 def log_to_stderr() -> None:
-    """Have warnings printed on standard error, as tkamb's."""
+    """Print logged warnings on standard error with the prefix "tkamb"."""
     handler = logging.StreamHandler()
     handler.setFormatter(_PrintableFormatter("tkamb: %(levelname)s: %(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
 
 
 def open_streams() -> None:
-    """Open those of the three standard streams that the process was started without.
+    """Open the standard streams that are closed, and make failed writes raise `StreamError`.
 
-    A stream that is closed would leave its number to the next file that is opened, and what is
-    printed would end in it. Standard output is opened for reading then: printing fails, as it
-    should, when there is something to print.
+    The next opened file would get the number of a closed stream, and printed text would be written
+    into it. A closed standard output is opened for reading only, so that printing fails.
     """
     for number in range(3):
         try:
             os.fstat(number)
-        except OSError:  # the lowest free number is given: this one
+        except OSError:  # the system assigns the lowest free number, which is this one
             os.open(os.devnull, os.O_RDONLY if number == 1 else os.O_RDWR)
     if sys.stdout is None:
         sys.stdout = sys.__stdout__ = open(1, "w", encoding="utf-8", closefd=False)  # type: ignore[misc]  # noqa: SIM115
     if sys.stderr is None:
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
     try:
-        os.write(2, b"")  # nothing, but /dev/full says so
+        os.write(2, b"")  # fails if the stream is /dev/full
     except OSError:
         _silence(sys.stderr)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # Names of files may hold what the encoding does not have.
+        # File names may contain characters that the encoding lacks.
         sys.stdout.reconfigure(errors="backslashreplace")
         if sys.stdout is sys.__stdout__ and "write" not in vars(sys.stdout):
             _watch(sys.stdout)
@@ -175,10 +171,7 @@ def open_streams() -> None:
 
 
 def _watch(stream: TextIO) -> None:
-    """Make a stream raise `StreamError` when it cannot be written, as on a full disk.
-
-    What is written is `printable`: commands print names and texts from files of others.
-    """
+    """Make a stream raise `StreamError` if it cannot be written, and escape control characters."""
     for name in ("write", "flush"):
         inner = getattr(stream, name)
 
@@ -195,39 +188,39 @@ def _watch(stream: TextIO) -> None:
 
 
 def _silence(stream: object) -> None:
-    """Redirect a standard stream to the null device, so that the last flush does not fail."""
+    """Redirect a standard stream to the null device, so that its final flush does not fail."""
     with suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # type: ignore[attr-defined]
 
 
-def _unforeseen(error: Exception, options: argparse.Namespace) -> int:
+def _unexpected(error: Exception, options: argparse.Namespace) -> int:
     say(unforeseen_words(error, options))
     return 1
 
 
 def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
-    """Return one line on an error that tkamb does not raise itself; its traceback goes into a file.
+    """Return one line on an unexpected error, and write its traceback to a log file.
 
-    An error of a plug-in names the plug-in.
+    The line names the plug-in that raised the error, if any.
 
     Args:
-        error: what was raised.
-        options: of the command line; its `out` says where the file goes.
+        error: exception that is not a `TkambError`.
+        options: options of the command line; the log file goes to the folder `out`.
     """
     name = type(error).__name__
     reason = " ".join(str(error).split())[:200]
-    what = "not enough memory: take a coarser resolution or fewer frames"
+    what = "not enough memory: choose a coarser resolution or fewer frames"
     if not isinstance(error, MemoryError):
         from tkamb.run.identity import raised_in
 
-        plug_in, told = raised_in(error), f"{name}{': ' if reason else ''}{reason}"
-        what = f"{plug_in} raised {told}" if plug_in else f"this was not foreseen: {told}"
+        plug_in, raised = raised_in(error), f"{name}{': ' if reason else ''}{reason}"
+        what = f"{plug_in} raised {raised}" if plug_in else f"unexpected error: {raised}"
     log = _write_log(error, options)
     return f"{what}; {'no log could be written' if log is None else f'details are in {log}'}"
 
 
 def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
-    """Write the traceback beside the output, else here, else where temporary files go."""
+    """Write the traceback to the first writable folder; None: there is none."""
     text = "".join(
         (
             f"tkamb {__version__}, {datetime.now(UTC).isoformat(timespec='seconds')}\n",
@@ -245,5 +238,6 @@ def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
 
 
 def _log_folders(out: Path | None) -> list[Path]:
+    """Return the output folder and its parent, the working and the temporary directory."""
     beside = [] if out is None else [out, out.parent]
     return [*(path for path in beside if path.is_dir()), Path.cwd(), Path(tempfile.gettempdir())]

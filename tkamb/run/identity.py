@@ -1,7 +1,7 @@
-"""The identity of a run: hashes of its scene, its files and the code; and the run's case again.
+"""Identity of a run: hashes of scene, files and code. `case_of_results` checks it.
 
-Two runs with the same identity compute the same numbers. The code of another package that computes
-contact or wear is part of the identity, since a changed default in it changes numbers.
+Two runs with the same identity compute the same numbers. The identity includes the code of
+plug-ins for contact models, since a change in it may change the numbers.
 """
 
 import hashlib
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 
 
 GROUPS = {"tkamb.contact": "contact model", "tkamb.wear": "wear law"}
-"""Group of entry points -> what a plug-in of that group is."""
+"""Group of entry points -> kind of the plug-ins of the group."""
 
 
 CONTACT_CODE = "code of the contact model"
-"""Its name in a run's identity."""
+"""Key of the identity for the hash of a plug-in."""
 SUFFIXES = (".py", ".so", ".pyd")
 
 
 def contact_code(model: str) -> str | None:
-    """Return the SHA-256 of the package that offers a contact model; None for a built-in one.
+    """Return the SHA-256 of the package of a contact model; None for a built-in model.
 
     Raises:
-        InputError: no such name, or it cannot be loaded.
+        InputError: no such model, or it cannot be loaded.
     """
     from tkamb.contact.registry import BUILT_IN, contact_class  # only where contact is modelled
 
@@ -45,16 +45,16 @@ def contact_code(model: str) -> str | None:
 
 
 def foreign_code(thing: object) -> str | None:
-    """Return the SHA-256 of the package of an object's class; None for one of tkamb's."""
+    """Return the SHA-256 of the package that defines an object's class; None for tkamb."""
     module = type(thing).__module__
     return None if module.partition(".")[0] == "tkamb" else package_code(module)
 
 
 def package_code(module: str) -> str:
-    """Return the SHA-256 of the package of a module: its source, and what is compiled.
+    """Return the SHA-256 of the package of a module: source files and compiled extensions.
 
     Args:
-        module: dotted name; a module without a package stands for its one file.
+        module: dotted name. For a module without a package only its file is hashed.
 
     Raises:
         ImportError: there is no such package.
@@ -83,7 +83,7 @@ def scene_hash(case: "Case") -> str:
 def run_identity(case: "Case", frames: range) -> dict[str, Any]:
     """Return the identity of a run: hashes of scene, files and code, frames and version.
 
-    A contact model of another package adds that package's code.
+    The identity of a run with a plug-in's contact model includes the hash of its package.
     """
     identity = {
         "scene": scene_hash(case),
@@ -98,7 +98,7 @@ def run_identity(case: "Case", frames: range) -> dict[str, Any]:
 
 
 def files_hash(case: "Case") -> str:
-    """Return the SHA-256 of the files that the run reads: no mesh that nothing asks for."""
+    """Return the SHA-256 of the files that the run reads."""
     digest = hashlib.sha256()
     for path in _files_read(case):
         digest.update(path.read_bytes())
@@ -106,7 +106,7 @@ def files_hash(case: "Case") -> str:
 
 
 def input_hashes(case: "Case", scene: Path | None) -> dict[str, str]:
-    """Return path -> SHA-256 of the scene file, if there is one, its base and what it has read."""
+    """Return path -> SHA-256 of the scene file, its base and all files that the run reads."""
     from tkamb.io.scene.scene import scene_files
 
     paths = [*([] if scene is None else scene_files(scene.absolute())), *_files_read(case)]
@@ -121,7 +121,7 @@ def _files_read(case: "Case") -> list[Path]:
 
 
 def files_in(value: Any) -> list[Path]:
-    """Return the paths of files that are there, in nested dictionaries and lists."""
+    """Return the paths of existing files in nested dictionaries and lists."""
     if isinstance(value, Path):
         return [value] if value.is_file() else []
     if isinstance(value, dict):
@@ -133,10 +133,10 @@ RUN_AGAIN = "run it again: tkamb run"
 
 
 def case_of_results(results: "Results") -> "Case":
-    """Return the case of results, whose summary names the scene.
+    """Return the case of a results folder, read from the scene that its summary names.
 
     Raises:
-        InputError: the scene is not there, or no longer what was run.
+        InputError: the scene is missing, or scene or files have changed since the run.
     """
     from tkamb.io.scene.case import load_case
 
@@ -148,24 +148,24 @@ def case_of_results(results: "Results") -> "Case":
         what += "" if has_overrides else ", or was run with --set"
         raise InputError(what, scene, run_again(summary))
     if not same_files(case, summary):
-        what = "a mesh or table that it names has changed since these results were computed"
+        what = "a mesh or table of the scene has changed since these results were computed"
         raise InputError(what, scene, run_again(summary))
     return case
 
 
 def overrides_of_run(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return dotted key -> value that the run's scene had in the place of its file's."""
+    """Return dotted key -> value of the keys that the run changed in its scene (`--set`)."""
     return dict(summary.get("overrides") or {})
 
 
 def preset_of_run(summary: Mapping[str, Any]) -> str | None:
-    """Return the name of the preset that was laid over the run's scene, if any."""
+    """Return the name of the preset that the run applied to its scene; None: no preset."""
     preset = summary.get("preset") or {}
     return preset.get("name")
 
 
 def run_again(summary: Mapping[str, Any]) -> str:
-    """Return the command that computes results like these, for a shell."""
+    """Return the shell command that repeats the run of a summary."""
     options = (f"{key}={json.dumps(value)}" for key, value in overrides_of_run(summary).items())
     preset = preset_of_run(summary)
     study = [] if preset is None else [f"--as {shlex.quote(preset)}"]
@@ -174,13 +174,13 @@ def run_again(summary: Mapping[str, Any]) -> str:
 
 
 def same_files(case: "Case", summary: Mapping[str, Any]) -> bool:
-    """Say whether meshes and tables hold what the run read; a run without a record counts."""
+    """Return whether meshes and tables are unchanged since the run; True if it stored no hash."""
     result = (summary.get("identity") or {}).get("content of a file")
     return result is None or result == files_hash(case)
 
 
 def _scene_of(summary: Mapping[str, Any]) -> "Scene":
-    """Return the scene of results, with the contact model they were run with."""
+    """Return the scene of a results folder with the contact settings of the run."""
     from tkamb.io.scene import load_scene
 
     name = summary.get("scene")
@@ -188,18 +188,18 @@ def _scene_of(summary: Mapping[str, Any]) -> "Scene":
         raise InputError("names no scene file", "summary", "give the scene itself to tkamb view")
     path = Path(name)
     if not os.path.exists(path):
-        what = "the scene of these results is not there"
-        raise InputError(what, path, "put it back, or run it again")
+        what = "the scene of these results does not exist"
+        raise InputError(what, path, "restore the file, or run the scene again")
     contact = summary.get("contact") or {}
     used = {f"contact.{key}": value for key, value in contact.items() if value is not None}
     return load_scene(path, overrides_of_run(summary) | used, preset_of_run(summary))
 
 
 def raised_in(error: BaseException) -> str | None:
-    """Return the plug-in that raised an error, with the line of its code; None: no plug-in did.
+    """Return the plug-in that raised an error, with the line of its code; None: no plug-in.
 
-    The deepest call of the traceback decides that is of tkamb or of a plug-in: a plug-in may have
-    raised the error by way of NumPy, say.
+    Calls of other packages, such as NumPy, are ignored. The deepest of the remaining calls raised
+    the error.
     """
     plug_ins = {
         point.value.partition(":")[0].partition(".")[0]: f"{kind} '{point.name}'"

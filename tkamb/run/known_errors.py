@@ -1,11 +1,11 @@
-"""By how much each contact model is known to err, and what it leaves out of a bearing.
+"""Known errors of the contact models, and their limits for mobile bearings.
 
-The errors are relative, against converged references: the largest over the cases on which a
-setting was measured. They hold for these cases, and are no bound for others. The cases are
-those of the trade-off study and half of the pairs of bodies of `error_cases`. The other half is
-held out: it is used to check which share of new errors stays within the stated ones
-(docs/known_errors.md). `run/known_errors.json` is written by `scripts/make_tradeoff_table`. A
-setting that was not measured is reported as "not measured"; no error is interpolated.
+An error is relative to a converged reference. The stored value is the largest error over the
+measured cases. It is no bound for other cases. The cases are those of the trade-off study and
+half of the pairs of bodies of `scripts/error_cases.py`. The other half is held out to test which
+share of new errors is below the stored ones (docs/known_errors.md). `scripts/make_tradeoff_table`
+writes `run/known_errors.json`. Errors of other settings are not interpolated but reported as "not
+measured".
 """
 
 import json
@@ -23,15 +23,15 @@ class KnownErrorSettings:
     """How known errors of the contact settings are shown."""
 
     notable_share: float = 0.10
-    """1: share of the reference; a known error above it is shown in colour. Chosen: a reader should
-    not miss it."""
+    """1: relative error above which a known error is coloured. Chosen because such an error may
+    change a conclusion."""
 
 
 KNOWN_ERROR = KnownErrorSettings()
 
 NOT_MEASURED = "not measured"
 SAME_ANSWER = ("cache",)
-"""Options that change the time of an answer, not the answer."""
+"""Options that change the computing time of a result, but not the result."""
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,16 @@ class KnownError:
     """Largest relative errors of one setting.
 
     Args:
-        approach: of the travel since first touch.
-        force: of a condyle's force, relative to the load; None where no case had two condyles.
-        mean_pressure: of a condyle.
-        peak_pressure: of a condyle.
-        area: of a condyle.
-        cases: number of cases on which it was measured.
-        situations: where contact lies ("interior", "flank", "edge") -> quantity -> largest error
-            there, of contact that carried no flag but that of the edge.
-        covered: share of the errors on held-out pairs that are within the stated ones; None
-            where none was held out.
+        approach: error of the approach.
+        force: error of a condyle's force, relative to the load; None: no case has two condyles.
+        mean_pressure: error of a condyle's mean pressure.
+        peak_pressure: error of a condyle's peak pressure.
+        area: error of a condyle's contact area.
+        cases: number of measured cases.
+        situations: place of the contact ("interior", "flank", "edge") -> quantity -> largest error
+            at that place. Contacts with other flags than that of the edge are excluded.
+        covered: share of the errors on held-out pairs below the stored errors; None: no pair was
+            held out.
     """
 
     approach: float
@@ -62,14 +62,14 @@ class KnownError:
 
 
 def setting_label(model: str, options: Mapping[str, Any]) -> str:
-    """Return the label of a setting in the trade-off study: the model's name and given options."""
-    own = ",".join(f"{key}={value}" for key, value in options.items() if key not in SAME_ANSWER)
-    return f"{model}[{own}]" if own else model
+    """Return the label of a setting in the trade-off study: name and options of the model."""
+    text = ",".join(f"{key}={value}" for key, value in options.items() if key not in SAME_ANSWER)
+    return f"{model}[{text}]" if text else model
 
 
 @cache
 def known_errors() -> dict[tuple[str, float, str], KnownError]:
-    """Return (label, resolution in mm, material) -> known error."""
+    """Return (label, resolution in mm, name of the material) -> known error."""
     rows = json.loads(STORED.read_text(encoding="utf-8"))
     return {
         (row.pop("contact"), float(row.pop("resolution_mm")), row.pop("material")): KnownError(
@@ -82,37 +82,37 @@ def known_errors() -> dict[tuple[str, float, str], KnownError]:
 def known_error(
     model: str, resolution_mm: float, material: str, options: Mapping[str, Any] | None = None
 ) -> KnownError | None:
-    """Return by how much a setting is known to err; None where it was not measured.
+    """Return the known error of a setting; None: not measured.
 
     Args:
-        model: name of the contact model. Models of other packages were not measured.
-        resolution_mm: spacing of its map points. Only the spacings of the study were measured.
-        material: of the insert; polyethylene and polyethylene-linear were measured.
-        options: the model's own.
+        model: name of the contact model. Plug-ins were not measured.
+        resolution_mm: spacing of the map points, mm. Only the spacings of the study were measured.
+        material: material of the insert. Polyethylene and polyethylene-linear were measured.
+        options: options of the contact model.
     """
     label = setting_label(model, options or {})
     return known_errors().get((label, float(resolution_mm), material))
 
 
 def left_out(model: str, bearing: str) -> tuple[str, ...]:
-    """Return in words what a contact model leaves out of a bearing, "fixed" or "mobile"."""
+    """Return sentences on features of a bearing ("fixed", "mobile") that a contact model lacks."""
     from tkamb.contact.registry import contact_class  # only where contact is modelled
 
     if bearing == "fixed" or contact_class(model).mobile_bearing:
         return ()
-    return (f"The bearing is mobile, but {model} presses it like a fixed one.",)
+    return (f"The bearing is mobile, but {model} computes it as a fixed one.",)
 
 
 def as_json(error: KnownError | None) -> dict[str, Any] | str:
-    """Return what summary.json and `tkamb press --json` say under `known_error`."""
+    """Return the value of the key `known_error` in summary.json and `tkamb press --json`."""
     return NOT_MEASURED if error is None else asdict(error)
 
 
 def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return the errors of some quantities in words.
+    """Return a sentence on the known errors of some quantities.
 
     Args:
-        error: what summary.json holds under `known_error`.
+        error: value of the key `known_error` in summary.json.
         names: quantities, fields of `KnownError`.
     """
     if isinstance(error, str):
@@ -135,10 +135,10 @@ _PLACES = {"interior": "in the interior", "flank": "on a flank", "edge": "at an 
 
 
 def is_large(error: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
-    """Return whether one of the quantities is known to be off by more than 10 %.
+    """Return whether the known error of any of the quantities exceeds `notable_share`.
 
-    Contact at an edge carries its own flag: where situations were measured, the interior and
-    flanks decide.
+    Contact at an edge has a flag of its own. Where situations were measured, only interior and
+    flanks count.
     """
     if isinstance(error, str):
         return False

@@ -1,8 +1,8 @@
-"""The pressure maps of a run: contact.h5, written a few frames at a time, or kept in memory.
+"""The pressure maps of a run, in contact.h5 or in memory.
 
-The maps of some frames are appended and flushed, then their times. `/time_s` is therefore as
-long as the number of whole frames, also when the run was killed. Compressed chunks of one frame
-keep what earlier frames wrote untouched.
+The file is written a few frames at a time: first their maps, then their times. The length of
+`/time_s` is therefore the number of complete frames, even if the run was killed. Each frame is a
+compressed chunk of its own, so that a write does not alter earlier frames.
 """
 
 from collections.abc import Iterator, Mapping
@@ -39,21 +39,21 @@ class MapWriteSettings:
     """How pressure maps are written."""
 
     buffer_bytes: float = 4e6
-    """Bytes of maps that are collected for one write. Chosen: a write costs as much as the maps of
-    a frame."""
+    """bytes: size of the maps that are collected for one write. Chosen because a write takes as
+    long as the maps of one frame."""
 
 
 MAP_WRITE = MapWriteSettings()
 
 
 class MapWriter:
-    """Grows contact.h5 frame by frame; a kill leaves what was flushed readable.
+    """Writes contact.h5 frame by frame. Flushed frames remain readable if the process is killed.
 
     Args:
-        path: the file; an older one is replaced. None: the file is in memory alone.
-        points: (n, 3) m, insert frame.
-        triangles: (k, 3) indices into the points.
-        attributes: frame, model, version, scene hash, ...: text or numbers.
+        path: path of the file, which is replaced if it exists; None: the file is in memory only.
+        points: map points in the insert frame, m, (n, 3).
+        triangles: indices into the points, (k, 3).
+        attributes: texts and numbers, such as frame, model, version and scene hash.
 
     Raises:
         InputError: the file cannot be written.
@@ -80,7 +80,7 @@ class MapWriter:
             with self._written():
                 self._begin(points, np.asarray(triangles, np.int64), attributes)
         except BaseException:
-            self._close_file()  # left open, HDF5 would fail at the interpreter's end
+            self._close_file()  # HDF5 fails at the interpreter's end if the file is open
             raise
 
     def _begin(
@@ -118,17 +118,18 @@ class MapWriter:
         contact_points: ArrayLike = np.nan,
         contact_normals: ArrayLike = np.nan,
     ) -> None:
-        """Add one frame; it is written with the next ones, by `flush` or by `close`.
+        """Add one frame. It is written when the buffer is full, by `flush` or by `close`.
 
         Args:
-            time: s.
-            pressure: (n,) Pa.
-            gap: (n,) m.
-            nodal_force: (n, 3) N on the insert.
-            femoral_pose: (4, 4) pose_femoral_in_insert at which the map holds.
-            contact_points: (3, 3) m, where the medial and the lateral condyle touch the insert
-                and the patella the femoral component; NaN where that is not known.
-            contact_normals: (3, 3) unit, there: out of the insert, into the patella.
+            time: time, s.
+            pressure: pressure at the map points, Pa, (n,).
+            gap: gap at the map points, m, (n,).
+            nodal_force: forces on the insert, N, (n, 3).
+            femoral_pose: pose_femoral_in_insert of the map, (4, 4).
+            contact_points: contact points of medial condyle, lateral condyle and patella in the
+                insert frame, m, (3, 3); NaN: unknown.
+            contact_normals: unit normals at these points, out of the insert or into the patella,
+                (3, 3).
         """
         values = (pressure, gap, nodal_force, femoral_pose, contact_points, contact_normals, time)
         shapes = (dataset.shape[1:] for dataset in self._datasets)
@@ -141,10 +142,10 @@ class MapWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Write the frames that were appended, the times last.
+        """Write the appended frames, their times last.
 
         Raises:
-            InputError: they cannot be written.
+            InputError: the file cannot be written.
         """
         if not self._waiting:
             return
@@ -161,7 +162,7 @@ class MapWriter:
         self._written_frames, self._waiting = end, []
 
     def append_failed(self, time: float) -> None:
-        """Add a frame without a result: NaN everywhere but the time."""
+        """Add a failed frame: a time, and NaN for all else."""
         nan = float("nan")
         self.append(time, nan, nan, nan, nan)
 
@@ -174,7 +175,7 @@ class MapWriter:
 
     @property
     def maps(self) -> "ContactMaps":
-        """What was appended so far."""
+        """The maps of all appended frames."""
         self.flush()
         if self.path is not None:
             return ContactMaps(self.path)
@@ -182,10 +183,10 @@ class MapWriter:
         return ContactMaps(arrays, dict(self._file.attrs))
 
     def close(self) -> None:
-        """Close the file; nothing can be appended after it.
+        """Write the appended frames and close the file.
 
         Raises:
-            InputError: what was appended could not be written.
+            InputError: the file cannot be written.
         """
         with self._written():
             try:
@@ -200,7 +201,7 @@ class MapWriter:
 
     @contextmanager
     def _written(self) -> Iterator[None]:
-        """Turn HDF5's error on a disk that is full or gone into one line."""
+        """Raise an InputError for an error of HDF5, such as on a full disk."""
         try:
             yield
             if self._stream is not None:
@@ -221,26 +222,27 @@ class MapWriter:
         try:
             self.close()
         except InputError:
-            if error is None:  # else the block has said it already
+            if error is None:  # otherwise the error of the block is raised
                 raise
 
 
 @dataclass(frozen=True, eq=False)
 class ContactMaps:
-    """The maps of a run: arrays in memory, or a contact.h5 that is read when first asked.
+    """The pressure maps of a run, from memory or from contact.h5.
 
-    f frames, n points, k triangles; insert frame, SI. A failed frame holds NaN.
+    Each array of the file is read on first access. Shapes are given with f frames, n points and k
+    triangles. All arrays are in SI units and the insert frame. A failed frame is NaN.
 
     Args:
         source: path of contact.h5, or the arrays by their names in the file.
-        given_attributes: only with arrays in memory; a file has its own.
+        given_attributes: attributes of arrays in memory. They are ignored with a file.
     """
 
     source: Path | Mapping[str, ArrayLike]
     given_attributes: Mapping[str, Any] | None = None
 
     def __repr__(self) -> str:
-        """Return one line with the numbers of frames and points."""
+        """Return a line with the numbers of frames and points."""
         return f"<tkamb.ContactMaps: {len(self)} frames of {len(self.points_m)} points>"
 
     @cached_property
@@ -255,7 +257,7 @@ class ContactMaps:
 
     @cached_property
     def time_s(self) -> Array:
-        """(f,) times of the whole frames."""
+        """(f,) times of the complete frames."""
         return self._array("time_s")
 
     @cached_property
@@ -275,25 +277,28 @@ class ContactMaps:
 
     @cached_property
     def femoral_pose(self) -> Array:
-        """(f, 4, 4) pose_femoral_in_insert at which each map holds."""
+        """(f, 4, 4) pose_femoral_in_insert of each map."""
         return self._array("femoral_pose", len(self.time_s))
 
     @cached_property
     def contact_points_m(self) -> Array:
         """(f, 3, 3) contact points of medial condyle, lateral condyle and patella in the equations.
 
-        NaN where there is no contact; NaN throughout in a file of a release that did not keep them.
+        NaN without contact, and in files of early releases.
         """
-        return self._kept_since("contact_points_m")
+        return self._optional_array("contact_points_m")
 
     @cached_property
     def contact_normals(self) -> Array:
-        """(f, 3, 3) unit normals there, out of the insert and into the patella, likewise."""
-        return self._kept_since("contact_normals")
+        """(f, 3, 3) unit normals at these points, out of the insert or into the patella.
+
+        NaN like the contact points.
+        """
+        return self._optional_array("contact_normals")
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """Units, frame, model, version, scene hash."""
+        """Attributes of the file: units, frame, model, version, scene hash."""
         if not isinstance(self.source, Path):
             return {"units": UNITS, **(self.given_attributes or {})}
         with _opened(self.source) as file:
@@ -303,10 +308,10 @@ class ContactMaps:
         return len(self.time_s)
 
     def to_pyvista(self) -> "MultiBlock":
-        """Return the maps for PyVista: one block a frame, "frame 0" first.
+        """Return the maps as a PyVista MultiBlock with one block per frame, "frame 0" first.
 
-        Each is the insert's articular surface (m, insert frame) with pressure_Pa, gap_m,
-        nodal_force_N at its points, and time_s as field data; a failed frame holds NaN.
+        A block is the insert's articular surface (m, insert frame). It has point data pressure_Pa,
+        gap_m and nodal_force_N, and field data time_s. A failed frame is NaN.
 
         Raises:
             InputError: PyVista is not installed.
@@ -329,13 +334,13 @@ class ContactMaps:
         """Return pressure_Pa (n,), gap_m (n,) and nodal_force_N (n, 3) of frame k by name."""
         return {name: getattr(self, name)[k] for name in ("pressure_Pa", "gap_m", "nodal_force_N")}
 
-    def _kept_since(self, name: str) -> Array:
-        """Return an array (f, 3, 3) that early files do not have; NaN for those."""
-        nothing = np.full((len(self.time_s), 3, 3), np.nan)
+    def _optional_array(self, name: str) -> Array:
+        """Return an array (f, 3, 3), or NaN if an early file lacks it."""
+        missing = np.full((len(self.time_s), 3, 3), np.nan)
         if not isinstance(self.source, Path):
-            return np.asarray(self.source.get(name, nothing), float)
+            return np.asarray(self.source.get(name, missing), float)
         with _opened(self.source) as file:
-            return file[name][: len(nothing)] if name in file else nothing
+            return file[name][: len(missing)] if name in file else missing
 
     def _array(self, name: str, frames: int | None = None) -> Any:
         if not isinstance(self.source, Path):
@@ -349,7 +354,7 @@ class ContactMaps:
 
 
 def read_maps(path: str | Path) -> ContactMaps:
-    """Open a contact.h5, finished or left by a kill.
+    """Open a contact.h5 of a finished or killed run.
 
     Raises:
         InputError: no such file, or not an HDF5 file.
@@ -363,7 +368,7 @@ def read_maps(path: str | Path) -> ContactMaps:
 
 
 def write_maps(maps: ContactMaps, path: Path) -> None:
-    """Write maps that are in memory as a whole contact.h5.
+    """Write maps from memory as a complete contact.h5.
 
     Raises:
         InputError: the folder cannot be written.
@@ -380,13 +385,13 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
 
 
 def _is_plain(value: Any) -> bool:
-    """Say whether an attribute is a text or a number, as tkamb writes them."""
+    """Return whether an attribute is a text or a number."""
     return isinstance(value, str | int | float | np.number | np.bool_)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Turn h5py's error on a missing or damaged file into one line; refuse files not of tkamb."""
+    """Open a contact.h5 of tkamb; raise an InputError for any other or damaged file."""
     try:
         with h5py.File(path, "r") as file:
             check_maps_file(file, path)

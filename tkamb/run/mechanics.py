@@ -1,4 +1,4 @@
-"""A knee over the frames of a motion: geometry of each frame in, loads of each frame out."""
+"""Rigid-body mechanics of a knee in the frames of a motion: loads from poses."""
 
 import copy
 import time as clock
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The motion of a model, frame by frame.
+    """The motion of a Pinocchio model in f frames.
 
     Args:
-        time: (f,) s.
-        q: (f, nq) configuration.
-        v: (f, nv) velocity.
-        a: (f, nv) acceleration.
-        coordinates: (f, 6) knee coordinates of q, m and rad.
+        time: times, s, (f,).
+        q: configurations, (f, nq).
+        v: velocities, (f, nv).
+        a: accelerations, (f, nv).
+        coordinates: knee coordinates, m and rad, (f, 6).
     """
 
     time: Array
@@ -52,11 +52,11 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Ground(Sequence[Any]):
-    """The ground reaction, frame by frame, as external forces on the joints of a model.
+    """The ground reaction in each frame as external forces on the joints of a model.
 
     Args:
-        forces: (f,) of `pin.StdVec_Force`, one force per joint in its joint's frame.
-        points: (f, 3) m, where it acts, in the laboratory.
+        forces: one `pin.StdVec_Force` per frame, with a force per joint in the joint's frame.
+        points: points of application in the laboratory, m, (f, 3).
     """
 
     forces: tuple[Any, ...]
@@ -71,16 +71,16 @@ class Ground(Sequence[Any]):
 
 @dataclass(frozen=True, eq=False)
 class FrameLoads:
-    """The body side of one frame.
+    """The loads of one frame by the rigid-body equations.
 
     Args:
-        geometry: what the equations worked on.
-        loads: what they say.
-        adjustment: the femoral adjustment, if asked for and possible.
-        query_seconds: computing time of the closest points on the meshes.
-        seconds: computing time of the equations, contact points given.
-        effect: change of the forces by the adjustment; None without one, or where the recorded
-            pose has no solution.
+        geometry: geometry in the equations.
+        loads: solution of the equations.
+        adjustment: femoral adjustment; None: none, or it is impossible.
+        query_seconds: computing time of the closest points on the meshes, s.
+        seconds: computing time of the rest, s.
+        effect: change of the forces by the adjustment; None without an adjustment, or without a
+            solution at the recorded pose.
     """
 
     geometry: KneeGeometry
@@ -92,19 +92,19 @@ class FrameLoads:
 
 
 class Mechanics:
-    """The rigid-body mechanics of a knee over a motion, frame by frame.
+    """The rigid-body mechanics of a knee in the frames of a motion.
 
     Args:
-        knee: the knee, of a right leg.
-        motion: of its model.
-        ground: external forces; None: not measured.
-        extensor: the patella over the frames; None if not modelled.
-        muscles: those that share the load; None if the quadriceps alone acts.
-        adjust: how the femoral component is adjusted; None: it is not.
-        strains: bundle -> strain at a few flexions, so that a wrong insertion is seen.
+        knee: knee of a right leg.
+        motion: motion of the knee's model.
+        ground: ground reaction; None: not measured.
+        extensor: patella in all frames; None: not modelled.
+        muscles: muscles of [muscles]; None: the quadriceps is the only muscle.
+        adjust: settings of the femoral adjustment; None: no adjustment.
+        strains: name of a ligament bundle -> strains at some flexions, for the summary.
 
     Attributes:
-        poses: (f, 4, 4) recorded pose_femur_in_insert.
+        poses: recorded pose_femur_in_insert, (f, 4, 4).
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Mechanics:
         self._data = knee.create_data_for_kinematics()
 
     def with_contact(self, model: "ContactModel") -> "Mechanics":
-        """Return the same body with another contact model."""
+        """Return the same mechanics with another contact model."""
         other = copy.copy(self)
         other.knee = self.knee.with_contact(model)
         return other
@@ -136,12 +136,12 @@ class Mechanics:
 
     @property
     def ligaments(self) -> "tuple[Ligament, ...]":
-        """The bundles, with their slack lengths, on links of the knee's chain."""
+        """The ligament bundles with their slack lengths."""
         return self.knee.ligaments
 
     @property
     def query(self) -> "ClosestPointQuery | None":
-        """Closest points of the two surfaces; None without contact."""
+        """Query of the closest points of femoral component and insert; None without contact."""
         return None if self.knee.contact is None else self.knee.query
 
     def instant(self, k: int) -> Instant:
@@ -156,7 +156,7 @@ class Mechanics:
             patella=None if self.extensor is None else self.extensor.at(k),
             muscles=None if self.muscles is None else self.muscles.frame(k),
         )
-        # As recorded to the last digit: what is kept stays exactly. Joint placements round.
+        # Joint placements round: restore the recorded coordinates, which must not change.
         joints = instant.motion.joints.copy()
         joints[0, :6] = motion.coordinates[k]
         if self.extensor is not None:
@@ -171,40 +171,41 @@ class Mechanics:
     def geometry(
         self, k: int, coordinates: Array | None = None, patella: "PatellaState | None" = None
     ) -> KneeGeometry:
-        """Return frame k without its contact, see `Instant.geometry`."""
+        """Return the geometry of frame k without contact, see `Instant.geometry`."""
         return self.instant(k).geometry(coordinates, patella)
 
     def frame(self, k: int, adjustment: "Adjustment | None" = None) -> FrameLoads:
-        """Return the loads of frame k; a frame that cannot be solved holds NaN.
+        """Return the loads of frame k; NaN in a frame without a solution.
 
         Args:
             k: frame.
-            adjustment: the femoral adjustment, if it is decided; None: as asked for.
+            adjustment: femoral adjustment; None: computed if the scene has one.
         """
         start, instant = clock.perf_counter(), self.instant(k)
-        begun, problems = clock.perf_counter(), tuple[str, ...]()
+        kinematics_end, problems = clock.perf_counter(), tuple[str, ...]()
         if adjustment is None:
             adjustment, problems = self._adjust(k)
         pose = adjustment.pose if adjustment else self.poses[k]
         points = NO_CONTACT if problems else self._contact_points(instant, pose)
         recorded = self._contact_points(instant, self.poses[k]) if adjustment else None
-        queried = clock.perf_counter()
+        query_end = clock.perf_counter()
         geometry = instant.geometry()
         problems += points.problems + geometry.problems
         geometry = replace(
             geometry, condyles=points.condyles, lifted=points.lifted, problems=problems
         )
         geometry, loads = instant.solved(geometry)
-        done = clock.perf_counter()
+        end = clock.perf_counter()
         effect = self._effect(geometry, loads, recorded) if recorded else None
-        seconds = begun - start + done - queried
-        return FrameLoads(geometry, loads, adjustment, queried - begun, seconds, effect)
+        seconds = kinematics_end - start + end - query_end
+        query_seconds = query_end - kinematics_end
+        return FrameLoads(geometry, loads, adjustment, query_seconds, seconds, effect)
 
     def slips(self, last: int) -> "dict[str, CondyleSlip]":
-        """Return side -> rolling and slipping up to a frame; empty without the two surfaces.
+        """Return side -> rolling and slip of a condyle up to a frame; empty without contact.
 
         Args:
-            last: the last frame whose slip and its rate are wanted: the rate takes one more.
+            last: last frame of the slip. The slip rate uses one more frame.
         """
         if self.knee.contact is None:
             return {}
@@ -217,7 +218,7 @@ class Mechanics:
         return {side: slip for side, slip in sides if slip is not None}
 
     def _adjust(self, k: int) -> "tuple[Adjustment | None, tuple[str, ...]]":
-        """Return the femoral adjustment, if asked for, and why it is not possible."""
+        """Return the femoral adjustment, if the scene has one, and reasons for its failure."""
         if self.query is None or self._adjustment is None:
             return None, ()
         from tkamb.geometry.adjustment import adjust
@@ -228,13 +229,13 @@ class Mechanics:
             return None, (error.what,)
 
     def _contact_points(self, instant: Instant, pose: Array) -> ContactPoints:
-        """Return where the condyles touch at a pose (4, 4), with the rates of an instant."""
+        """Return the contact points of the condyles at a pose (4, 4) and their velocities."""
         return NO_CONTACT if self.query is None else instant.contact_points(self.query, pose)
 
     def _effect(
         self, geometry: KneeGeometry, loads: SolvedLoads, recorded: ContactPoints
     ) -> "AdjustmentEffect | None":
-        """Return what the adjustment changed; None where either pose has no solution."""
+        """Return the change by the adjustment; None: one of the two poses has no solution."""
         if loads.problems or recorded.problems:
             return None
         from tkamb.knee.adjustment import adjustment_effect
@@ -247,6 +248,6 @@ class Mechanics:
 
 
 def _acting_at(point: Array, load: PointForces) -> PointForces:
-    """Return a load at the origin as the same load that acts at a point (3,)."""
+    """Return the equivalent load at a point (3,) of a load at the origin."""
     moment = load.moment - np.asarray(cross(point, load.forces[0]))
     return PointForces(load.link, point[None], load.forces, moment)

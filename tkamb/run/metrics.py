@@ -1,4 +1,4 @@
-"""The few numbers that say what happened in a run."""
+"""Metrics of a run that reports and summaries use."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MetricSettings:
-    """What counts as a jump of a centre of pressure, and as an unloaded quadriceps."""
+    """Limits of a jump of the centre of pressure, and of an unloaded quadriceps."""
 
     jump: float = 8.0 * MILLIMETRE
-    """m; a centre of pressure that moves farther between two frames may have jumped. Chosen: on one
-    dish a contact point moves by less from frame to frame."""
+    """m: least travel of a centre of pressure in a frame that counts as a jump. Chosen because a
+    contact point on one dish moves less in a frame."""
     jump_steps: float = 5.0
-    """Median steps: a centre of pressure that moves by more than these and by more than `jump` from
-    a frame to the next has jumped. Chosen: a movement does not speed up as much."""
+    """1: a jump is also larger than this multiple of the median travel. Chosen because no movement
+    accelerates as much."""
     least_tension: float = 1.0
-    """N: below this quadriceps tension its ratios are not shown. Chosen: a quotient of small
-    numbers says nothing."""
+    """N: quadriceps tension below which ratios to it are not shown. Chosen because ratios of small
+    numbers are meaningless."""
 
 
 METRICS = MetricSettings()
@@ -38,9 +38,9 @@ class Peak:
     """The largest value of a quantity.
 
     Args:
-        value: in the column's unit.
-        frame: where it occurs.
-        side: "medial" or "lateral", or "" when it has no side.
+        value: value in the unit of the column.
+        frame: frame of the value.
+        side: "medial" or "lateral"; "" for a column without sides.
     """
 
     value: float
@@ -61,20 +61,20 @@ def body_weight(results: "Results") -> float:
 
 
 def peak(results: "Results", column: str) -> Peak | None:
-    """Return the largest value of a column, or of its two sides for "<side>_..."."""
+    """Return the largest value of a column, or of the two columns of a name "<side>_..."."""
     sides = SIDES if column.startswith("<side>") else ("",)
-    result = [
+    peaks = [
         Peak(float(np.nanmax(values)), int(np.nanargmax(values)), side)
         for side in sides
         if np.isfinite(values := results[column.replace("<side>", side)]).any()
     ]
-    return max(result, key=lambda one: one.value, default=None)
+    return max(peaks, key=lambda peak: peak.value, default=None)
 
 
 def doubt_of_peak(results: "Results", side: str, frame: int) -> str:
-    """Return in words why the peak pressure of a condyle at a frame is in doubt; "" if it is not.
+    """Return why the peak pressure of a condyle in a frame is uncertain; "" if it is not.
 
-    A run's status has the flags of each frame.
+    The reasons come from the flags in the status of the frame.
     """
     from tkamb.contact.flags import AT_EDGE, TOO_NARROW
 
@@ -88,7 +88,7 @@ def doubt_of_peak(results: "Results", side: str, frame: int) -> str:
 
 
 def peak_pressure(results: "Results") -> dict[str, Any] | None:
-    """Return the largest peak pressure, where it is and what is in doubt; None without contact."""
+    """Return the largest peak pressure, its condyle, frame and doubt; None without contact."""
     largest = peak(results, "<side>_peak_pressure_MPa")
     if largest is None:
         return None
@@ -102,27 +102,27 @@ def peak_pressure(results: "Results") -> dict[str, Any] | None:
 
 
 def medial_share(results: "Results", estimate: str) -> Array:
-    """Return the medial share (f,) by "deformation" or by "equilibrium"."""
+    """Return the medial share of the load (f,) by "deformation" or by "equilibrium"."""
     if estimate == "equilibrium":
         return results["medial_share_equilibrium"]
     medial = results["medial_force_N"]
     lateral = results["lateral_force_N"]
-    both = np.where(np.isnan(medial) & np.isnan(lateral), np.nan, 1.0)
+    valid = np.where(np.isnan(medial) & np.isnan(lateral), np.nan, 1.0)
     total = np.nan_to_num(medial) + np.nan_to_num(lateral)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return both * np.where(total > 0, np.nan_to_num(medial) / total, np.nan)
+        return valid * np.where(total > 0, np.nan_to_num(medial) / total, np.nan)
 
 
 def split_undetermined(results: "Results") -> NDArray[np.bool_]:
-    """Return in which frames (f,) the recorded adduction does not determine the split."""
+    """Return a mask (f,) of frames in which the recorded adduction does not determine the split."""
     return np.asarray(results["split_determined"] == 0)
 
 
 def moved_per_half_degree(results: "Results") -> Array:
-    """Return the force (f,), N, that 0.5 deg of adduction moves between the condyles, by its slope.
+    """Return the force (f,), N, that 0.5 deg of adduction shifts between the condyles.
 
-    Never more than the whole load; NaN where one condyle carries all of it, since that slope
-    holds only until the other touches.
+    The force is linear in the angle and at most the whole load. It is NaN if only one condyle is
+    loaded, since the slope changes when the other condyle touches.
     """
     share = medial_share(results, "deformation")
     shift = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
@@ -131,7 +131,7 @@ def moved_per_half_degree(results: "Results") -> Array:
 
 
 def shares_apart(results: "Results") -> Array:
-    """Return by how much (f,) the two estimates of the medial share differ."""
+    """Return the difference (f,) of the two estimates of the medial share."""
     return np.abs(medial_share(results, "deformation") - medial_share(results, "equilibrium"))
 
 
@@ -149,28 +149,29 @@ def residual_force(results: "Results") -> Array:
 
 
 def residual_share(results: "Results") -> Array:
-    """Return that magnitude relative to the superior-inferior contact force (f,)."""
+    """Return `residual_force` over the superior-inferior contact force (f,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return residual_force(results) / np.abs(results["force_si_N"])
 
 
 def residual_effect(results: "Results") -> Array:
-    """Return how much the total force depends on where the residuals act (f,), same ratio.
+    """Return the sensitivity of the total force to the height of the residuals (f,).
 
-    It is the change of the total by 10 mm higher or lower over the SI contact force.
+    It is the change of the total force if the residuals act 10 mm higher or lower, over the
+    superior-inferior contact force.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         return results["residual_sensitivity_N"] / np.abs(results["force_si_N"])
 
 
 def failed(results: "Results") -> NDArray[np.bool_]:
-    """Return which frames (f,) say that they failed, or are not ok and have no contact force."""
+    """Return a mask (f,) of failed frames: status "failed", or not "ok" and no contact force."""
     marked = np.array([status.startswith("failed") for status in results.status], bool)
     return marked | (~_clean(results) & np.isnan(results["force_total_N"]))
 
 
 def flagged(results: "Results") -> NDArray[np.bool_]:
-    """Return which frames (f,) have numbers and a reason to look at them with care."""
+    """Return a mask (f,) of the frames with numbers and a status other than "ok"."""
     return ~_clean(results) & ~failed(results)
 
 
@@ -179,17 +180,17 @@ def _clean(results: "Results") -> NDArray[np.bool_]:
 
 
 def map_rows(results: "Results") -> dict[int, int]:
-    """Return frame -> row of the maps of the same time, for every frame that has a map."""
+    """Return frame -> index of its map, for every frame with a map."""
     if results.maps is None:
         return {}
-    whole = np.atleast_1d(np.isfinite(results.maps.pressure_Pa).all(axis=1))
-    row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if whole[row]}
+    finite = np.atleast_1d(np.isfinite(results.maps.pressure_Pa).all(axis=1))
+    row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if finite[row]}
     times = [float(time) for time in results["time_s"]]
     return {frame: row_at[time] for frame, time in enumerate(times) if time in row_at}
 
 
 def stretches(points: Array) -> list[slice]:
-    """Return the parts, of two points or more, of a path (n, k) m that neither lacks nor jumps."""
+    """Return the parts of a path (n, k), m, without NaN and jumps, of two points or more."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     finite = steps[np.isfinite(steps)]
     longest = (
@@ -201,5 +202,5 @@ def stretches(points: Array) -> list[slice]:
 
 
 def lateral_axis_name(results: "Results") -> str:
-    """Return what insert z points to: "lateral" unless the summary's `lateral_axis` is "-z"."""
+    """Return the direction of insert z: "medial" if the summary's `lateral_axis` is "-z"."""
     return "lateral" if results.summary.get("lateral_axis", "+z") == "+z" else "medial"

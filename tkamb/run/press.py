@@ -1,4 +1,4 @@
-"""Contact alone: presses two meshes together at a pose with a load, as `tkamb press` does."""
+"""A press of two meshes at a given pose with a given load (`tkamb press`)."""
 
 import math
 import time
@@ -41,22 +41,22 @@ from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class PressLimitSettings:
-    """Which loads are accepted, and which poses get a remark."""
+    """Limits of loads and poses of a press."""
 
     max_load: float = 1e5
-    """N; largest load. Chosen: over a hundred body weights."""
+    """N: largest load. Chosen because it exceeds a hundred body weights."""
     max_turn: float = 30.0 * DEGREE
-    """rad; largest turn of the femoral component about the vertical without a remark. Chosen: no
-    knee turns farther. Beyond it, medial and lateral do not lie over those of the insert."""
+    """rad: largest rotation of the femoral component about the vertical without a note. Chosen
+    because no knee rotates farther."""
     upside_down: tuple[float, float] = (170.0 * DEGREE, 250.0 * DEGREE)
-    """rad; range of the flexion, as the component's shape shows it, in which its bone side faces
-    the insert. Chosen: no knee flexes beyond 160 deg, and the shape shows it within 10 deg."""
+    """rad: range of flexion in which the component is upside down. The flexion is estimated from
+    the shape, with an error of 10 deg. Chosen because no knee flexes beyond 160 deg."""
     min_flexion: float = -60.0 * DEGREE
-    """rad; below this flexion the flange, not the condyles, faces the insert: a remark. Chosen: no
+    """rad: flexion below which the flange faces the insert and a note is given. Chosen because no
     knee extends as far."""
     max_tilt: float = 45.0 * DEGREE
-    """rad; largest angle of the component's medial-lateral axis from the horizontal. Chosen: no
-    knee tilts as far."""
+    """rad: largest angle of the component's medial-lateral axis from the horizontal. Chosen because
+    no knee tilts as far."""
 
 
 PRESS_LIMITS = PressLimitSettings()
@@ -76,18 +76,18 @@ class PressReport:
 
     Args:
         contact: name of the contact model.
-        resolution_mm: spacing of its map points.
-        nodes: of the model (lattice, mesh), or map points where it has none.
-        load: N.
-        result: the contact, in the insert frame (mirrored for a left knee).
-        adjustment: what was done to the pose before contact, if anything.
-        triangles: (k, 3) of neighbouring map points.
-        pair: the two bodies.
-        side: of the knee.
-        prepare_seconds: for the geometry.
-        solve_seconds: for the press.
-        peak_rss_MB: largest resident memory of the process so far.
-        known_error: of the contact model at this resolution; None if it was not measured.
+        resolution_mm: spacing of its map points, mm.
+        nodes: number of nodes of lattice or mesh; of map points for a model without nodes.
+        load: load, N.
+        result: contact result in the insert frame (mirrored for a left knee).
+        adjustment: femoral adjustment before contact; None: without.
+        triangles: indices of neighbouring map points, (k, 3).
+        pair: femoral component and insert.
+        side: side of the knee.
+        prepare_seconds: computing time of the preparation, s.
+        solve_seconds: computing time of the press, s.
+        peak_rss_MB: largest resident memory of the process, MB.
+        known_error: known error of the contact model at this resolution; None: not measured.
     """
 
     contact: str
@@ -105,7 +105,7 @@ class PressReport:
     known_error: KnownError | None = None
 
     def __repr__(self) -> str:
-        """Return in a line what was pressed and what was found."""
+        """Return a line with contact model, load and result."""
         return (
             f"<tkamb.PressReport: {self.contact} at {self.resolution_mm:g} mm, "
             f"{self.load:g} N; {self.result!r}>"
@@ -113,17 +113,16 @@ class PressReport:
 
     @property
     def carried(self) -> bool:
-        """Whether the load was reached."""
+        """Whether the contact carries the load."""
         return self.result.status is ContactStatus.OK
 
     def write_map(self, path: Path) -> None:
         """Write the pressure map as .vtp: metres, insert frame, z to the subject's right.
 
-        A left knee's is mirrored back: it lies on the insert that was given, as the centres of
-        pressure do.
+        The map of a left knee is mirrored back to the side of the given meshes.
 
         Raises:
-            InputError: another format, or a place that cannot be written.
+            InputError: the format is another one, or the file cannot be written.
         """
         from tkamb.io.vtk import write_triangles
 
@@ -161,10 +160,10 @@ class PressReport:
         return [*lines, f"{took}, {self.result.iterations} iterations"]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `tkamb press --json` prints; None stands for what is unknown.
+        """Return the content of `tkamb press --json`; None: unknown.
 
-        Vectors are in the insert frame, z to the subject's right on either side. "adjustment" is
-        there where the femur was adjusted.
+        Vectors are in the insert frame, z to the subject's right for both sides. Only an adjusted
+        pose has the key "adjustment".
         """
         result = self.result
         return {
@@ -193,15 +192,15 @@ class PressReport:
 
 
 def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
-    """Return what makes the words medial and lateral doubtful."""
-    stands = orientation(pair.femoral, pose)
+    """Return notes on poses for which the names medial and lateral are doubtful."""
+    shape = orientation(pair.femoral, pose)
     remarks = []
-    if stands is not None and stands.flexion < PRESS_LIMITS.min_flexion:
+    if shape is not None and shape.flexion < PRESS_LIMITS.min_flexion:
         remarks.append(
             "the flange of the femoral component, not its condyles, faces the insert: check the "
             "axes and the pose"
         )
-    elif stands is not None and stands.forward < 0.0 < pose[2, 2]:
+    elif shape is not None and shape.forward < 0.0 < pose[2, 2]:
         remarks.append(
             "the flange of the femoral component points backward on the insert: check the axes"
         )
@@ -216,19 +215,19 @@ def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
     return [
         *remarks,
         f"the pose turns the femoral component by {turn / DEGREE:.0f} deg on the insert: medial "
-        "and lateral name its own condyles, wherever they lie on the insert",
+        "and lateral are the condyles of this component, wherever they lie on the insert",
     ]
 
 
 def _check_orientation(femoral: Surface, pose: Array, path: str | Path) -> None:
-    """Raise an InputError for a femoral component whose condyles cannot face the insert."""
-    stands = orientation(femoral, pose)
-    if stands is None:
+    """Raise an InputError for a femoral component that lies on its side or is upside down."""
+    shape = orientation(femoral, pose)
+    if shape is None:
         return
     lowest, highest = PRESS_LIMITS.upside_down
-    if stands.tilt > PRESS_LIMITS.max_tilt:
+    if shape.tilt > PRESS_LIMITS.max_tilt:
         fault = "the femoral component lies on its side: its bone side does not open upward"
-    elif lowest < stands.flexion % (2 * math.pi) < highest:
+    elif lowest < shape.flexion % (2 * math.pi) < highest:
         fault = "the femoral component stands upside down: its bone side faces the insert"
     else:
         return
@@ -289,29 +288,29 @@ def press_meshes(
     Args:
         femoral: mesh file of the femoral component.
         insert: mesh file of the insert, closed.
-        load: N, along the insert's bottom normal.
+        load: load along the normal of the insert's bottom, N.
         units: unit of length of both files and of the pose, "mm", "cm", "m" or "inch".
-        pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z): places the femoral mesh in
-            the insert mesh's own axes. None: as the files have them, both about one origin.
-            Height above the insert does not matter: the press moves along the load.
-        contact: a name of `tkamb contact list`.
-        resolution_mm: spacing of the model's map points.
+        pose: pose of the femoral mesh in the axes of the insert's mesh, x, y, z (units), rx, ry, rz
+            (deg, intrinsic x-y-z). The height above the insert is not used. None: both files have
+            one origin.
+        contact: name from `tkamb contact list`.
+        resolution_mm: spacing of the map points, mm.
         bearing: "fixed" or "mobile".
-        material: a name of `tkamb.contact.materials`, a file (.toml) of the keys of a scene's
+        material: name in `tkamb.contact.materials`, path of a .toml file with the keys of
             [material], or a `Material`.
         axes: mesh axes that point anterior, superior and right.
-        side: of the knee; a left one is mirrored.
-        adjust: femoral adjustment before contact (`tkamb.geometry.adjustment`); the pose must then
-            be a recorded one, with a condyle within 3 mm of the insert.
-        restore_when: with `adjust`: the recorded rotation is restored if penetration and coronal
-            angle after the press exceed the adjustment ("both", Sharma 2008, the default), or
-            if "either" does.
-        options: the model's own options.
+        side: side of the knee. A left knee is computed as its mirror image.
+        adjust: whether the femoral component is adjusted before contact
+            (`tkamb.geometry.adjustment`). A condyle of the pose must be within 3 mm of the insert.
+        restore_when: rule of the adjustment to restore the recorded rotation after the press:
+            penetration and coronal angle exceed the adjustment ("both", Sharma 2008, the default),
+            or one of them does ("either").
+        options: options of the contact model.
 
     Raises:
-        InputError: bad file, unit, axes, name or load, or a femoral component that does not
-            lie over the insert, or not near it where it is to be adjusted; or `restore_when`
-            without `adjust`.
+        InputError: a file, unit, axis, name or load cannot be used, the femoral component is not
+            over the insert (with `adjust`: not near it), or `restore_when` is given without
+            `adjust`.
     """
     _check_load(load)
     settings = _adjustment_settings(adjust, restore_when)
@@ -355,10 +354,10 @@ def _check_load(load: float) -> None:
 def _adjustment_settings(
     adjust: bool, restore_when: RestoreRule | None
 ) -> AdjustmentSettings | None:
-    """Return how to adjust; None: not at all."""
+    """Return the settings of the adjustment; None: no adjustment."""
     if restore_when not in (None, *get_args(RestoreRule)):
         raise InputError(
-            f"'{restore_when}' is no rule",
+            f"'{restore_when}' is not a rule",
             "restore_when",
             f"one of {', '.join(get_args(RestoreRule))}",
         )
@@ -399,7 +398,7 @@ def load_pair(
     axes: str,
     side: Side,
 ) -> tuple[ContactPair, Array]:
-    """Return the bodies and pose_femoral_in_insert (4, 4); see `press_meshes`."""
+    """Return femoral component, insert and pose_femoral_in_insert (4, 4); see `press_meshes`."""
     rotation = axes_rotation(axes)
     femoral_pose = mesh_pose(pose, units, rotation)
     femoral_surface = load_surface(femoral, units, axes, name="femoral")
@@ -429,12 +428,12 @@ def load_pair(
 
 
 def mesh_pose(pose: Sequence[float] | None, units: str, rotation: Array) -> Array:
-    """Return the pose (4, 4) between the meshes, turned from mesh to anatomical axes.
+    """Return the pose (4, 4) of the femoral mesh in the insert's mesh, in anatomical axes.
 
     Args:
-        pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z) in mesh axes, or None.
+        pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z) in mesh axes; None: identity.
         units: unit of length.
-        rotation: (3, 3) from mesh to anatomical axes.
+        rotation: rotation from mesh to anatomical axes, (3, 3).
 
     Raises:
         InputError: not six finite numbers.
@@ -451,7 +450,7 @@ def mesh_pose(pose: Sequence[float] | None, units: str, rotation: Array) -> Arra
 
 
 def read_pose(path: str | Path) -> tuple[float, ...]:
-    """Read x y z rx ry rz from a text file: six numbers parted by blanks, commas or lines.
+    """Read x y z rx ry rz from a text file with blanks, commas or line breaks between them.
 
     Raises:
         InputError: no such file, or not six numbers.

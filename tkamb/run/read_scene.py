@@ -1,8 +1,7 @@
-"""A scene as a knee, its motion and its ground reaction: `tkamb.read_scene`.
+"""Knee, motion and ground reaction of a scene (`tkamb.read_scene`).
 
-What is computed of a knee needs these three alone. `mechanics_of` and `contact_side` put them
-together with what else a run asks of a scene: shared muscles, the patella over all frames, femoral
-adjustment, post and coupling.
+`mechanics_of` and `contact_side` add the other parts of a run: muscles of [muscles], patella in all
+frames, femoral adjustment, post and coupling.
 """
 
 import time as clock
@@ -33,19 +32,19 @@ if TYPE_CHECKING:
     from tkamb.run.muscles.shared_muscles import SharedMuscles
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
-"""deg: where the strains of the ligaments are shown."""
+"""deg: flexions at which the summary states the ligaments' strains."""
 
 
 @dataclass(frozen=True, eq=False)
 class SharedState:
-    """State that a sample, a case with changed inputs, shares with the nominal case.
+    """State that a sample (a case with changed inputs) shares with the nominal case.
 
     Args:
-        pair: femoral component and insert, which stay near each other in all samples.
-        muscles: those of [muscles]; their strengths may differ from the nominal ones.
-        extensor: extensor mechanism of the nominal case. Its patella is the initial guess of the
-            search for the patella of the sample.
-        frames: frames in which the patella is searched for. In the others it stays where it is.
+        pair: femoral component and insert.
+        muscles: muscles of [muscles], possibly with other strengths than the nominal ones.
+        extensor: extensor mechanism of the nominal case. Its patella is the initial guess for the
+            patella of the sample.
+        frames: frames with a search for the patella. Other frames keep the nominal pose.
     """
 
     pair: "ContactPair | None"
@@ -55,14 +54,14 @@ class SharedState:
 
 
 def read_scene(scene: Scene | Case | str | Path) -> tuple[Knee, Motion, Ground]:
-    """Return the knee of a scene, its motion and the ground reaction, as arrays.
+    """Return the knee of a scene, its motion and its ground reaction.
 
-    The knee's model is the scene's leg with a free root at the tibia, x forward, y up, z to the
-    right. A left leg is read as its mirror image, a right one, as in every run. The place of a
-    patella whose motion is to be found is found here, frame after frame, and is part of q.
+    The knee's model is the leg of the scene with a free-flyer joint at the tibia, x forward, y up,
+    z to the right. A left leg is read as its mirror image. The pose of a patella with motion
+    "solved" is computed for all frames and is part of q.
 
     Args:
-        scene: a scene, the path of its file, or its case.
+        scene: scene, path of a scene file, or case.
 
     Raises:
         InputError: the scene or a file that it names cannot be used.
@@ -70,12 +69,12 @@ def read_scene(scene: Scene | Case | str | Path) -> tuple[Knee, Motion, Ground]:
     if isinstance(scene, str | Path):
         scene = load_scene(scene)
     case = scene if isinstance(scene, Case) else load_case(scene)
-    if case.scene.muscles is not None:  # they are no part of the knee
+    if case.scene.muscles is not None:  # [muscles] is not part of the knee
         case = replace(case, scene=case.scene.model_copy(update={"muscles": None}))
     mechanics = mechanics_of(case)
     knee, motion, ground = mechanics.knee, mechanics.motion, mechanics.ground
     if knee.contact is not None:
-        knee.contact.state  # noqa: B018  what cannot be prepared shows here
+        knee.contact.state  # noqa: B018  prepare the contact, so that errors occur here
     if ground is None:
         none = pin.StdVec_Force([pin.Force.Zero()] * knee.model.njoints)
         ground = Ground((none,) * len(motion), np.full((len(motion), 3), np.nan))
@@ -88,16 +87,16 @@ def mechanics_of(
     near: bool = False,
     contact: "KneeContact | None" = None,
 ) -> Mechanics:
-    """Return the body side of a case.
+    """Return the rigid-body mechanics of a case.
 
     Args:
-        case: the scene with its files read.
-        shared: what is known already of a case that this one is a sample of.
-        near: whether the condyles are known to be near the insert.
-        contact: the contact model with what it has prepared; None: the scene's.
+        case: scene with its files read.
+        shared: state of the nominal case, for a sample; None: the case is no sample.
+        near: whether to skip the check that the condyles are near the insert.
+        contact: prepared contact model; None: the contact model of the scene.
 
     Raises:
-        InputError: whatever does not fit together.
+        InputError: the parts of the scene do not fit together.
     """
     poses = knee_pose(case.motion.coordinates)
     knee = _knee(case, shared, contact)
@@ -131,13 +130,13 @@ def contact_side(
     sensitivity: bool = True,
     post: "CamPost | None" = None,
 ) -> "ContactSide":
-    """Return the contact side of a case with [contact], prepared.
+    """Return the prepared contact side of a case with [contact].
 
     Args:
         case: the case.
-        mechanics: its body side.
+        mechanics: rigid-body mechanics of the case.
         sensitivity: see `ContactSide`.
-        post: cam and post, if they are prepared already.
+        post: prepared cam and post; None: they are prepared here if the case has them.
     """
     from tkamb.knee.frame_contact import cam_on_post
     from tkamb.run.contact_side import ContactSide
@@ -155,26 +154,26 @@ def contact_side(
 
 
 def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> dict[str, Array]:
-    """Return link -> pose_link_in_insert (f, 4, 4) as recorded, of links with attachments.
+    """Return link -> recorded pose_link_in_insert, (f, 4, 4), for all links with attachments.
 
     Args:
         case: the case.
-        poses: (f, 4, 4) of the femur.
-        extensor: the patella over the frames.
+        poses: recorded pose_femur_in_insert, (f, 4, 4).
+        extensor: patella in all frames; None: not modelled.
     """
     chain, ligament = case.chain, case.patellar_ligament
     shank = np.broadcast_to(inverse(chain.insert_in_tibia), poses.shape)
-    known: dict[str, Array] = {"femur": poses, "tibia": shank}
+    result: dict[str, Array] = {"femur": poses, "tibia": shank}
     if extensor is not None:
         places = [sagittal_pose(extensor.joints(k)[0]) for k in range(len(poses))]
-        known["patella"] = poses @ chain.patella_joint_in_femur @ np.array(places)
+        result["patella"] = poses @ chain.patella_joint_in_femur @ np.array(places)
     ends = [end for line in case.ligaments for end in (line.proximal, line.distal)]
     if ligament is not None:
         ends += [ligament.proximal, ligament.distal]
-    for link in {end.link for end in ends} - set(known):
+    for link in {end.link for end in ends} - set(result):
         carrier = chain.carrier(link)
-        known[link] = known[carrier] @ chain.link_in(link, carrier)
-    return known
+        result[link] = result[carrier] @ chain.link_in(link, carrier)
+    return result
 
 
 def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None") -> Knee:
@@ -194,7 +193,7 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
         if pair is None:
             material = given_material(scene.insert_material)
             pair = ContactPair(case.femoral, case.insert, material, insert.bearing)
-            pair.__dict__["split"] = case.split  # found once
+            pair.__dict__["split"] = case.split  # computed once for case and pair
         model = contact_model(table.model, table.resolution_mm, **table.options)
         contact = KneeContact(model, pair, friction)
     if contact is not None:
@@ -211,7 +210,7 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
 
 
 def _check_near(case: Case, knee: Knee, poses: Array) -> None:
-    """Raise where the condyles are nowhere near the insert, whatever the frame."""
+    """Raise unless a condyle is near the insert in the first, middle or last frame."""
     table = case.scene.contact
     if table is None or table.released:
         return
@@ -225,17 +224,18 @@ def _check_near(case: Case, knee: Knee, poses: Array) -> None:
         f"neither condyle is near the insert (nearest {abs(gap) / MILLIMETRE:.0f} mm "
         f"{'apart' if gap > 0 else 'inside'})",
         "[motion] with [implant.femoral] and [implant.insert]",
-        "check which mesh is which, their units, axes and places, and the motion's",
+        "check whether the meshes are exchanged, and units, axes and positions of meshes and "
+        "motion",
     )
 
 
 def _extensor_frames(
     case: Case, knee: Knee, poses: Array, shared: SharedState | None
 ) -> "ExtensorFrames":
-    """Return the patella of a case with [patella], over all frames.
+    """Return the patella of a case with [patella] in all frames.
 
     Raises:
-        InputError: no patella was recorded, or see `ExtensorFrames`.
+        InputError: no patella was recorded, or a cause of `ExtensorFrames`.
     """
     from tkamb.knee.extensor import ExtensorFrames
 
@@ -259,7 +259,7 @@ def _extensor_frames(
 
 
 def _motion(case: Case, extensor: "ExtensorFrames | None") -> Motion:
-    """Return the motion of the case's model."""
+    """Return the motion of the model of a case."""
     motion, tibia, states = case.motion, case.tibia, []
     still = (np.eye(4), np.zeros(6), np.zeros(6))
     for k, rows in enumerate(

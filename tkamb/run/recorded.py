@@ -1,4 +1,4 @@
-"""Compares what a run predicts with what was recorded: measured force, EMG."""
+"""Comparison of a run with measured forces and EMG."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -21,28 +21,28 @@ PREDICTED = {
     "medial": ("medial_force_N", "medial_force_equilibrium_N"),
     "lateral": ("lateral_force_N", "lateral_force_equilibrium_N"),
 }
-"""Measured quantity -> the columns that predict it; the first that holds a number is used."""
+"""Measured force -> columns that predict it. The first column with a number is used."""
 LAGS = np.arange(-40, 41) * 0.005
-"""s: where the largest cross-correlation is sought, 0.2 s to either side."""
+"""s: lags of the cross-correlation."""
 
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """How predicted and measured courses are compared."""
+    """Comparison of predicted and measured time series."""
 
     least_correlation_rise: float = 1e-6
-    """1: least excess of the largest correlation over those at the ends of the range of lags, from
-    which it is a maximum. Chosen: above rounding."""
+    """1: least difference between the largest correlation and those at the first and last lag.
+    With a smaller difference no lag is given. Chosen because rounding errors are smaller."""
     fewest_frames: int = 8
-    """Frames below which nothing is said of correlation and lag. Chosen: a correlation of fewer
-    means little."""
+    """1: least number of frames for correlation and lag. Chosen because a correlation of fewer
+    values means little."""
 
 
 COMPARISON = ComparisonSettings()
 
 
 def recorded_row(case: Case, k: int) -> dict[str, float]:
-    """Return column -> what was recorded at frame k."""
+    """Return column -> measured value in frame k."""
     row: dict[str, float] = {}
     time = case.motion.time[k : k + 1]
     if case.measured is not None:
@@ -55,7 +55,7 @@ def recorded_row(case: Case, k: int) -> dict[str, float]:
 
 
 def compare_recorded(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the summary's keys `measured` and `emg`, as far as the scene has them."""
+    """Return the summary's keys `measured` and `emg`; a scene without such data lacks them."""
     result: dict[str, Any] = {}
     if case.measured is not None:
         result["measured"] = compare_measured(columns, case.measured.force, case.body_weight)
@@ -72,12 +72,12 @@ def compare_recorded(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def measured_column(name: str) -> str:
-    """Return the column of results.csv that holds what was measured of a force."""
+    """Return the column of results.csv with a measured force."""
     return f"measured_{name}_N"
 
 
 def predicted_columns(columns: Mapping[str, Any]) -> dict[str, str]:
-    """Return force -> the column that predicts it: the first that holds a number."""
+    """Return force -> the first of its columns with a number."""
     labels = {}
     for name, candidates in PREDICTED.items():
         present = [one for one in candidates if one in columns and np.isfinite(columns[one]).any()]
@@ -88,19 +88,19 @@ def predicted_columns(columns: Mapping[str, Any]) -> dict[str, str]:
 def compare_measured(
     columns: Mapping[str, Any], names: Iterable[str], body_weight: float
 ) -> dict[str, dict[str, Any]]:
-    """Return how far a run is from what was measured, of each force that was.
+    """Return measured force -> errors of the run.
 
-    Over the n frames that have both, with predicted p and measured m,
+    The errors are, over the frames with predicted p and measured m,
 
         RMSE = sqrt(mean((p - m)²)),  bias = mean(p - m),  R² = 1 - Σ(p - m)²/Σ(m - mean(m))²,
 
-    Pearson's r and the peaks. Every frame is counted: compared, failed, without measurement or
-    (not failed, but NaN) without prediction.
+    Pearson's r and the peaks. The frames are counted as compared, failed, without measurement, or
+    without prediction (not failed, but NaN).
 
     Args:
-        columns: of results.csv, `measured_<name>_N` among them.
-        names: of the forces that were measured: total, medial, lateral.
-        body_weight: N.
+        columns: columns of results.csv, with `measured_<name>_N`.
+        names: names of the measured forces: total, medial, lateral.
+        body_weight: body weight, N.
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
     missing = np.full(len(failed), np.nan)
@@ -115,15 +115,15 @@ def compare_measured(
 
 
 def _frame_counts(predicted: Array, measured: Array, failed: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return how many frames are compared, why others are not, and what was measured there."""
-    both = np.isfinite(predicted) & np.isfinite(measured)
-    without = np.isnan(measured) & ~failed
-    left_out = measured[np.isfinite(measured) & ~both]
+    """Return numbers of frames, and the range of the measured force in frames not compared."""
+    compared = np.isfinite(predicted) & np.isfinite(measured)
+    unmeasured = np.isnan(measured) & ~failed
+    left_out = measured[np.isfinite(measured) & ~compared]
     return {
-        "frames_compared": int(both.sum()),
-        "frames_failed": int((failed & ~both).sum()),
-        "frames_without_measurement": int(without.sum()),
-        "frames_without_prediction": int((~both & ~failed & ~without).sum()),
+        "frames_compared": int(compared.sum()),
+        "frames_failed": int((failed & ~compared).sum()),
+        "frames_without_measurement": int(unmeasured.sum()),
+        "frames_without_prediction": int((~compared & ~failed & ~unmeasured).sum()),
         "measured_where_not_compared_N": [left_out.min(), left_out.max()] if len(left_out) else [],
     }
 
@@ -131,11 +131,11 @@ def _frame_counts(predicted: Array, measured: Array, failed: NDArray[np.bool_]) 
 def _force_errors(
     time: Array, predicted: Array, measured: Array, body_weight: float
 ) -> dict[str, float]:
-    """Return the errors over the frames that have both; NaN where they say nothing."""
-    both = np.isfinite(predicted) & np.isfinite(measured)
-    if not both.any():
+    """Return the errors over the compared frames. R² and r are NaN for constant forces."""
+    compared = np.isfinite(predicted) & np.isfinite(measured)
+    if not compared.any():
         return {}
-    p, m, t = predicted[both], measured[both], time[both]
+    p, m, t = predicted[compared], measured[compared], time[compared]
     error = p - m
     rmse, bias = float(np.sqrt((error**2).mean())), float(error.mean())
     spread = m - m.mean()
@@ -155,15 +155,15 @@ def _force_errors(
 
 
 def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return how each muscle's activation a and envelope e agree over the computed frames.
+    """Return muscle -> agreement of its activation a with its EMG envelope e.
 
-    Pearson's r and RMSE of a(t) and e(t), and the lag L of the largest r of a(t) and e(t - L):
-    positive where the activation comes after the envelope. The lag is that of frames whose
-    envelope is known 0.2 s to either side; none is given where the largest r lies at an end.
+    The agreement is Pearson's r and RMSE of a(t) and e(t), and the lag L with the largest r of a(t)
+    and e(t - L). The lag is positive if the activation is later than the envelope. It uses frames
+    with an envelope for all `LAGS`, and is NaN if r is largest at the first or last lag.
 
     Args:
-        envelopes: of the muscles.
-        columns: of results.csv.
+        envelopes: EMG envelopes of the muscles.
+        columns: columns of results.csv.
     """
     time = np.asarray(columns["time_s"])
     result = {}
@@ -171,16 +171,16 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
         activation = np.asarray(
             columns.get(family_column(ACTIVATION, muscle), np.full_like(time, np.nan))
         )
-        own = envelopes.at(muscle, time)
-        both = np.isfinite(activation) & np.isfinite(own)
-        error = activation[both] - own[both]
+        envelope = envelopes.at(muscle, time)
+        compared = np.isfinite(activation) & np.isfinite(envelope)
+        error = activation[compared] - envelope[compared]
         result[muscle] = {
             "channel": channel,
-            "frames_compared": int(both.sum()),
-            "frames_left_out": int((~both).sum()),
-            "pearson_r": _pearson(activation[both], own[both]),
-            "rmse": float(np.sqrt((error**2).mean())) if both.any() else np.nan,
-            "lag_s": _lag(envelopes, muscle, time[both], activation[both]),
+            "frames_compared": int(compared.sum()),
+            "frames_left_out": int((~compared).sum()),
+            "pearson_r": _pearson(activation[compared], envelope[compared]),
+            "rmse": float(np.sqrt((error**2).mean())) if compared.any() else np.nan,
+            "lag_s": _lag(envelopes, muscle, time[compared], activation[compared]),
         }
     return result
 
@@ -188,48 +188,44 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
 def fitted_normalisation(
     envelopes: "Envelopes", columns: Mapping[str, Any]
 ) -> dict[str, float | None]:
-    """Return each channel's normalising value with which its envelope e fits the activations a.
+    """Return EMG channel -> normalising value for which its envelope fits the activations best.
 
-    That is v / s, with v the value by which e was divided, and s the scale of least Σ (a - s e)²
-    over the computed frames and the muscles of the channel, Σ a e / Σ e². Without a maximal
-    contraction no better one is known: the course over time is that of the EMG, the size that of
-    the activations. None where s is not above zero.
+    With the current normalising value v, the value is v / s. The scale s = Σ a e / Σ e² minimises
+    Σ (a - s e)² over frames and muscles of the channel. None: s is not positive.
 
     Args:
-        envelopes: of the muscles.
-        columns: of results.csv of a run that the EMG did not guide.
+        envelopes: EMG envelopes e of the muscles.
+        columns: columns of results.csv of a run without guidance by EMG.
     """
     time, result = np.asarray(columns["time_s"]), {}
     for channel, value in envelopes.normalised_by.items():
-        own = [name for name, one in envelopes.channel_of.items() if one == channel]
-        nothing_measured = np.full_like(time, np.nan)
-        a = np.array(
-            [columns.get(family_column(ACTIVATION, name), nothing_measured) for name in own]
-        )
-        e = np.array([envelopes.at(name, time) for name in own])
-        both = np.isfinite(a) & np.isfinite(e)
-        along = float(a[both] @ e[both])
-        result[channel] = value * float(e[both] @ e[both]) / along if along > 0.0 else None
+        names = [name for name, one in envelopes.channel_of.items() if one == channel]
+        missing = np.full_like(time, np.nan)
+        a = np.array([columns.get(family_column(ACTIVATION, name), missing) for name in names])
+        e = np.array([envelopes.at(name, time) for name in names])
+        finite = np.isfinite(a) & np.isfinite(e)
+        product = float(a[finite] @ e[finite])
+        result[channel] = value * float(e[finite] @ e[finite]) / product if product > 0.0 else None
     return result
 
 
 def _pearson(a: Array, b: Array) -> float:
-    """Return Pearson's r; NaN where one of them does not vary or there are few values."""
+    """Return Pearson's r; NaN for constant or few values."""
     return float(_correlations(a, b[None])[0])
 
 
 def _correlations(a: Array, rows: Array) -> Array:
-    """Return Pearson's r (m,) of a (n,) and each row (m, n); NaN as `_pearson`."""
+    """Return Pearson's r (m,) of a (n,) and each row (m, n); NaN as in `_pearson`."""
     if len(a) < COMPARISON.fewest_frames:
         return np.full(len(rows), np.nan)
     varied = (np.ptp(rows, axis=1) > 0.0) & (np.ptp(a) > 0.0)
-    own, others = a - a.mean(), rows - rows.mean(axis=1, keepdims=True)
-    size = np.sqrt((own @ own) * (others**2).sum(axis=1))
-    return np.divide(others @ own, size, out=np.full(len(rows), np.nan), where=varied)
+    deviation, deviations = a - a.mean(), rows - rows.mean(axis=1, keepdims=True)
+    size = np.sqrt((deviation @ deviation) * (deviations**2).sum(axis=1))
+    return np.divide(deviations @ deviation, size, out=np.full(len(rows), np.nan), where=varied)
 
 
 def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
-    """Return the lag (s) of the largest correlation; NaN where it has no maximum inside."""
+    """Return the lag, s, of the largest correlation; NaN without a maximum inside the range."""
     shifted = envelopes.at(muscle, time - LAGS[:, None])
     finite = np.isfinite(shifted).all(axis=0)
     r = _correlations(activation[finite], shifted[:, finite])
@@ -246,10 +242,10 @@ WHY_NOT = {
 
 
 def comparison_words(comparison: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
-    """Return the largest RMSE, all errors and the frames left out; whether any were.
+    """Return the RMSE of the first force, all errors in words, and whether frames are left out.
 
     Args:
-        comparison: force -> what `compare_measured` returns, as in the summary.
+        comparison: force -> errors from `compare_measured`.
     """
     (_, one), *others = comparison.items()
     counts = [_count_words(one)]
@@ -264,7 +260,7 @@ def comparison_words(comparison: Mapping[str, Mapping[str, Any]]) -> tuple[str, 
 
 
 def error_words(name: str, one: Mapping[str, Any]) -> str:
-    """Return one force's errors in words."""
+    """Return the errors of one force in words."""
     if not one["frames_compared"]:
         return f"{name}: no frame"
     shares = "".join(

@@ -1,15 +1,14 @@
-"""Recorders keep the finished frames of a run in memory, or in a folder that survives a kill.
+"""Recorders store the finished frames of a run in memory or in the output folder.
 
-In a folder, every finished frame is a file of its own before the next frame begins. contact.h5
-grows beside these files. Every few seconds a copy of it takes its place together with summary.json
-and results.csv, in which the remaining frames are not computed.
+In the output folder, each finished frame is written to a file in `.frames` before the next frame
+begins. contact.h5 grows beside these files. Every few seconds it is copied to the output folder,
+together with summary.json and results.csv. There the remaining frames have the status "failed: not
+computed". A resumed run reads the files of the frames. They are removed when all results are
+written. Before the first frame is finished, nothing in the output folder changes.
 
-The files of the frames lie in `.frames` of the output folder, beside a file that identifies their
-run. They are removed when the run's results are written. Each has a SHA-256 over the run's
-identity, its number and its content: a frame of another run, or one that cannot be read whole,
-counts as absent. A frame with the right SHA-256 whose content no frame of this run has was forged:
-it is refused. Until the first frame is finished, nothing is written and nothing of an earlier
-run is removed.
+`.frames` also has a file with the identity of the run. Each frame has a SHA-256 over identity,
+frame number and content. A frame with another SHA-256 counts as absent. A frame with the right
+SHA-256 and impossible content was forged, and is refused.
 """
 
 import hashlib
@@ -50,16 +49,17 @@ if TYPE_CHECKING:
 
 
 LARGEST = 2e9
-"""Bytes of a frame; a map of 100,000 points has 5 MB."""
+"""bytes: largest size of a frame. A map of 100,000 points has 5 MB."""
 
 UNREADABLE = (
     *(ValueError, TypeError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError),
     *(MemoryError, BadZipFile, zlib.error),
 )
-"""What numpy, zipfile and json raise for damaged bytes."""
+"""Exceptions of numpy, zipfile and json for damaged files."""
 
 CONTACT_PLACES = ("contact_points", "contact_normals")
-"""(3, 3) m and unit: where medial condyle, lateral condyle and patella touch; NaN without."""
+"""Arrays (3, 3) of contact points, m, and unit normals of medial condyle, lateral condyle and
+patella; NaN without contact."""
 
 Row = dict[str, Any]
 
@@ -70,7 +70,7 @@ class Shard:
 
     Args:
         row: column of results.csv -> value.
-        contact: arrays of the contact result by name; None if it failed or is not modelled.
+        contact: name -> array of the contact result; None: contact failed or is not modelled.
     """
 
     row: Row
@@ -78,7 +78,7 @@ class Shard:
 
 
 ANY = -1
-"""A length of an array that may be any."""
+"""Placeholder for any length in a shape."""
 
 
 def have(arrays: Mapping[str, Array], expected: Mapping[str, tuple[str, tuple[int, ...]]]) -> bool:
@@ -86,49 +86,49 @@ def have(arrays: Mapping[str, Array], expected: Mapping[str, tuple[str, tuple[in
 
     Args:
         arrays: name -> array.
-        expected: name -> allowed letters of `numpy.dtype.kind`, and the shape with `ANY` for a
-            length that is free.
+        expected: name -> allowed letters of `numpy.dtype.kind`, and the shape, with `ANY` for any
+            length.
     """
     return arrays.keys() == expected.keys() and all(
         arrays[name].dtype.kind in kinds
         and arrays[name].ndim == len(shape)
-        and all(wanted in (ANY, n) for n, wanted in zip(arrays[name].shape, shape, strict=True))
+        and all(length in (ANY, n) for n, length in zip(arrays[name].shape, shape, strict=True))
         for name, (kinds, shape) in expected.items()
     )
 
 
 def read_arrays(content: bytes) -> dict[str, Array]:
-    """Return the arrays of a .npz file; nothing of it is unpickled.
+    """Return the arrays of a .npz file without unpickling.
 
     Raises:
         UNREADABLE: the bytes are damaged, or the arrays are larger than `LARGEST`.
     """
     with ZipFile(io.BytesIO(content)) as packed:
         if sum(part.file_size for part in packed.infolist()) > LARGEST:
-            raise ValueError("unpacked, it is too large")
+            raise ValueError("the unpacked arrays are too large")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return dict(arrays)
 
 
 class Shards:
-    """The finished frames in a folder.
+    """The files of the finished frames.
 
     Args:
         directory: output folder of the run.
-        identity: what makes two runs the same: name -> text or numbers.
-        resume: keep what an earlier run with the same identity left; else it is removed with
-            the first frame.
-        name: of the folder in it.
+        identity: identity of the run, name -> text or numbers.
+        resume: whether to continue an earlier run with the same identity. Otherwise its frames are
+            removed when the first frame is written.
+        name: name of the folder of the frames in the output folder.
 
     Raises:
-        InputError: the earlier run was another one, or the folder is a symbolic link.
+        InputError: the earlier run has another identity, or the folder is a symbolic link.
     """
 
     def __init__(
         self, directory: Path, identity: Mapping[str, Any], resume: bool, name: str = FOLDER
     ) -> None:
         self.folder = directory / name
-        self._directory, self._begun = directory, False
+        self._directory, self._is_ready = directory, False
         self._identity = json.dumps(dict(identity), indent=1)
         if self.folder.is_symlink():
             raise InputError("is a symbolic link", self.folder, "remove it")
@@ -138,12 +138,12 @@ class Shards:
             self.resumed = True
 
     def begin(self) -> None:
-        """Make the folder ready to be written into, once.
+        """Create the folder with the identity, once.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the folder cannot be written.
         """
-        if self._begun:
+        if self._is_ready:
             return
         if not self.resumed:
             remove_shards(self._directory, self.folder.name)
@@ -152,10 +152,10 @@ class Shards:
         except OSError as error:
             raise InputError(f"cannot be made ({error.strerror})", self.folder) from None
         write_text(self.folder / IDENTITY_NAME, self._identity)
-        self._begun = True
+        self._is_ready = True
 
     def put(self, frame: int, shard: Shard) -> None:
-        """Write a frame, whole or not at all."""
+        """Write a frame, completely or not at all."""
         self.begin()
         buffer = io.BytesIO()
         row = np.frombuffer(json.dumps(shard.row).encode(), np.uint8)
@@ -168,14 +168,14 @@ class Shards:
     def get(
         self, frame: int, is_whole: Callable[[Shard], bool] = lambda shard: True
     ) -> Shard | None:
-        """Return a frame; None if there is none, or not a whole one of this run.
+        """Return a frame; None: it is absent, incomplete or of another run.
 
         Args:
-            frame: its number.
-            is_whole: whether the content has the names, kinds and shapes of a frame of this run.
+            frame: number of the frame.
+            is_whole: function that returns whether a frame has the content of this run's frames.
 
         Raises:
-            InputError: somebody forged the frame: it has the right SHA-256 and another content.
+            InputError: the frame is forged: it has the right SHA-256, but impossible content.
         """
         path = self._path(frame)
         try:
@@ -185,15 +185,15 @@ class Shards:
         digest, content = packed[:32], packed[32:]
         if self._digest(frame, content) != digest:
             return None
-        try:  # the digest finds accidents; who forged a frame has written its digest too
+        try:  # a forged frame has a valid digest, so that its content is checked too
             arrays = read_arrays(content)
             row = dict(json.loads(arrays.pop("row").tobytes()))
             shard = Shard(row, arrays or None)
-            whole = is_whole(shard)
+            is_valid = is_whole(shard)
         except UNREADABLE:
-            whole = False
-        if not whole:
-            what = "holds what no result of this computation holds: somebody changed it"
+            is_valid = False
+        if not is_valid:
+            what = "has content that no frame of this run has: somebody changed it"
             raise InputError(what, path, "remove it, or leave out resume=True to begin again")
         return shard
 
@@ -212,18 +212,18 @@ class Shards:
         try:
             return dict(read_json(path))
         except (ValueError, TypeError, InputError) as error:
-            what = f"does not say which run the frames beside it belong to ({error})"
+            what = f"does not identify the run of the frames beside it ({error})"
             raise InputError(what, path, "leave out resume=True to begin again") from None
 
 
 def check_same_run(
     earlier: Mapping[str, Any] | None, identity: Mapping[str, Any], directory: Path
 ) -> None:
-    """Raise an InputError when the folder holds another run than the one to go on with.
+    """Raise an InputError if the run in a folder has another identity.
 
     Args:
-        earlier: identity of the run in the folder; None if there is none.
-        identity: of the run to go on with.
+        earlier: identity of the run in the folder; None: no run.
+        identity: identity of the run to resume.
         directory: the folder, for the message.
     """
     if earlier is None:
@@ -243,24 +243,24 @@ MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
 
 @dataclass(frozen=True)
 class RecorderSettings:
-    """How often finished frames are written."""
+    """How often the results of the finished frames are written."""
 
     shortest_pause_seconds: float = 1.0
-    """s to the first copy of the finished frames, and between two copies. Chosen: a killed run
-    loses little."""
+    """s: least time before the first and between later copies of the results. Chosen so that the
+    results of a killed run lack few frames."""
     largest_time_share: float = 0.02
-    """1: share of the computing time that the copies may take. Chosen: a run is not noticeably
-    slower."""
+    """1: largest share of the computing time for these copies. Chosen because it is not
+    noticeable."""
 
 
 RECORDER = RecorderSettings()
 
 
 class Recorder:
-    """Keeps the frames of a run in memory.
+    """Stores the finished frames of a run in memory.
 
     Attributes:
-        rows: frame -> column -> value, of the finished frames.
+        rows: finished frame -> column of results.csv -> value.
     """
 
     def __init__(self) -> None:
@@ -269,19 +269,25 @@ class Recorder:
         self._stack = ExitStack()
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
-        """Prepare to record pressure maps on these points; not called without contact."""
+        """Prepare to record pressure maps. It is not called without contact.
+
+        Args:
+            points: map points, m, (n, 3).
+            triangles: indices of neighbouring map points, (k, 3).
+            labels: attributes of contact.h5.
+        """
         from tkamb.run.maps import MapWriter
 
         self._writer = MapWriter(self._maps_path, points, triangles, labels)
         self._stack.enter_context(self._writer)
 
     def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
-        """Keep a finished frame.
+        """Store a finished frame.
 
         Args:
-            frame: its number.
+            frame: number of the frame.
             row: column of results.csv -> value.
-            contact: the contact's arrays (`tkamb.run.contact_side`); None if it failed or is not
+            contact: arrays of the contact result (`contact_arrays`); None: contact failed or is not
                 modelled.
         """
         self.rows[frame] = row
@@ -293,26 +299,26 @@ class Recorder:
             self._writer.append(float(row["time_s"]), *(contact[name] for name in MAPS))
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
-        """Take over what an earlier run finished; return frame -> the contact's arrays."""
+        """Read the finished frames of an earlier run; return frame -> arrays of its contact."""
         return {}
 
     keeps_files = False
-    """Whether what is finished survives the process."""
+    """Whether finished frames are stored in files."""
 
     def due(self) -> bool:
-        """Say whether it is time to write the finished frames for readers."""
+        """Return whether it is time to publish the results of the finished frames."""
         return False
 
     def publish(self, make_results: "Callable[[], Results]") -> "Results":
-        """Write the finished frames for readers, and return them.
+        """Write the results of the finished frames to the output folder, and return them.
 
         Args:
-            make_results: function that makes the results.
+            make_results: function that returns the results.
         """
         return make_results()
 
     def finish(self) -> None:
-        """Close the maps: every frame is there."""
+        """Close the maps after the last frame."""
 
     @property
     def maps(self) -> "ContactMaps | None":
@@ -320,25 +326,25 @@ class Recorder:
         return None if self._writer is None else self._writer.maps
 
     def close(self) -> None:
-        """Nothing can be recorded after it."""
+        """Close the maps."""
         self._stack.close()
 
     _maps_path: Path | None = None
-    """Where contact.h5 grows; None: in memory."""
+    """Path of the growing contact.h5; None: in memory."""
 
 
 class FolderRecorder(Recorder):
-    """Keeps the frames of a run in its output folder.
+    """Stores the finished frames of a run in its output folder.
 
     Nothing in the folder changes before the first frame is finished.
 
     Args:
-        directory: a folder that this process has claimed (`tkamb.io.claim`).
-        identity: what two equal runs have in common.
-        resume: go on with the frames that an earlier run left there.
+        directory: folder that this process has claimed (`tkamb.io.claim`).
+        identity: identity of the run.
+        resume: whether to continue an earlier run in the folder.
 
     Raises:
-        InputError: the earlier run was another one, or the folder cannot be written.
+        InputError: the earlier run has another identity, or the folder cannot be written.
     """
 
     def __init__(self, directory: Path, identity: Mapping[str, Any], resume: bool) -> None:
@@ -346,15 +352,15 @@ class FolderRecorder(Recorder):
         self._directory = directory
         self._shards = Shards(directory, identity, resume)
         self._maps_path = self._shards.folder / MAPS_NAME
-        self._pause, self._shown = RECORDER.shortest_pause_seconds, clock.perf_counter()
+        self._pause, self._published_at = RECORDER.shortest_pause_seconds, clock.perf_counter()
         self._map_arguments: tuple[Any, ...] | None = None
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
-        """See `Recorder`; the file is made with the first frame."""
+        """See `Recorder`. The file is created with the first frame."""
         self._map_arguments = (points, triangles, labels)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
-        """See `Recorder`; in order, up to the first gap."""
+        """See `Recorder`. Only frames before the first absent frame are read."""
         shards = {}
         points = None if self._map_arguments is None else len(self._map_arguments[0])
         for frame in frames if self._shards.resumed else ():
@@ -366,7 +372,7 @@ class FolderRecorder(Recorder):
         return shards
 
     def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
-        """See `Recorder`; an interrupt waits until the frame is written."""
+        """See `Recorder`. An interrupt is delayed until the frame is written."""
         with interrupt_later():
             self._shards.put(frame, Shard(row, contact))
             self._record(frame, row, contact)
@@ -381,22 +387,22 @@ class FolderRecorder(Recorder):
 
     def due(self) -> bool:
         """See `Recorder`."""
-        return clock.perf_counter() - self._shown > self._pause
+        return clock.perf_counter() - self._published_at > self._pause
 
     @property
     def maps(self) -> "ContactMaps | None":
-        """See `Recorder`; as they stand in the output folder."""
+        """The published pressure maps in the output folder."""
         from tkamb.run.maps import ContactMaps
 
         return None if self._writer is None else ContactMaps(self._directory / MAPS_NAME)
 
     def finish(self) -> None:
-        """See `Recorder`; all frames are then published."""
+        """See `Recorder`."""
         with interrupt_later():
             self.close()
 
     def publish(self, make_results: "Callable[[], Results]") -> "Results":
-        """Put results.csv, summary.json and contact.h5 in place together; remove an old report."""
+        """Replace results.csv, summary.json and contact.h5 together, and remove an old report."""
         start = clock.perf_counter()
         results = make_results()
         with interrupt_later(), replaced_together(self._directory) as files:
@@ -405,19 +411,18 @@ class FolderRecorder(Recorder):
                 shutil.copyfile(self._shards.folder / MAPS_NAME, files.path(MAPS_NAME))
             put_numbers(results, files)
             files.remove(REPORT_NAME)
-        self._shown = clock.perf_counter()
-        self._pause = max(
-            RECORDER.shortest_pause_seconds, (self._shown - start) / RECORDER.largest_time_share
-        )
+        self._published_at = clock.perf_counter()
+        seconds = self._published_at - start
+        self._pause = max(RECORDER.shortest_pause_seconds, seconds / RECORDER.largest_time_share)
         return results
 
 
 def _is_frame(shard: Shard, points: int | None) -> bool:
-    """Return whether what was kept has the kinds and shapes of a frame of this run.
+    """Return whether a stored frame has the types and shapes of this run's frames.
 
     Args:
-        shard: read from a folder that may be somebody else's.
-        points: of the pressure map; None where there is none.
+        shard: stored frame.
+        points: number of map points; None: no contact.
     """
     row = shard.row
     numbers = [value for name, value in row.items() if name != "status"]
@@ -428,34 +433,36 @@ def _is_frame(shard: Shard, points: int | None) -> bool:
         return True
     if points is None:
         return False
-    kept, n = shard.contact, points
+    arrays, n = shard.contact, points
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(CONTACT_PLACES, (3, 3))
     shapes |= {"pressure": (n,), "gap": (n,), "nodal_force": (n, 3), "pose": (4, 4)}
-    whole = all(array.dtype.kind == "f" for array in kept.values())
-    return whole and all(name in kept and kept[name].shape == shapes[name] for name in shapes)
+    are_numbers = all(array.dtype.kind == "f" for array in arrays.values())
+    return are_numbers and all(
+        name in arrays and arrays[name].shape == shapes[name] for name in shapes
+    )
 
 
 @contextmanager
 def interrupt_later() -> Iterator[None]:
-    """Hold Ctrl-C back until the block is done; only the main thread gets it at all."""
-    if threading.current_thread() is not threading.main_thread():
+    """Delay Ctrl-C until the end of the block."""
+    if threading.current_thread() is not threading.main_thread():  # only it receives signals
         yield
         return
-    came: list[Any] = []
-    usual = signal.signal(signal.SIGINT, lambda *seen: came.append(seen))
+    received: list[Any] = []
+    handler = signal.signal(signal.SIGINT, lambda *arguments: received.append(arguments))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, usual)
-    if came and callable(usual):
-        usual(*came[0])
+        signal.signal(signal.SIGINT, handler)
+    if received and callable(handler):
+        handler(*received[0])
 
 
 def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":
-    """Return the results in a folder if they are all of that run's; None if there are none.
+    """Return the complete results of a run in a folder; None: none, or not all frames.
 
     Raises:
-        InputError: they are another run's, or no longer what was written.
+        InputError: the results are of another run, or have changed since they were written.
     """
     if not os.path.exists(directory / SUMMARY_NAME):
         return None

@@ -1,4 +1,4 @@
-"""The results of a run: one row per frame, the contact maps, and their provenance."""
+"""The results of a run: columns with one row per frame, pressure maps, and summary."""
 
 import csv
 import io
@@ -32,10 +32,7 @@ PAGES = {
 
 
 def page(name: str) -> Callable[..., Any]:
-    """Return the function that makes a page.
-
-    Args:
-        name: one of `PAGES`.
+    """Return the function that makes one of `PAGES`.
 
     Raises:
         KeyError: no such page.
@@ -46,17 +43,19 @@ def page(name: str) -> Callable[..., Any]:
 
 
 PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
-"""Ending of a column of bands.csv -> per cent of the samples below it."""
+"""Suffix of a column of bands.csv -> percentile of the samples, per cent."""
 
 
 @dataclass(frozen=True)
 class StatisticsSettings:
-    """When a band of samples is stated."""
+    """Conditions for a band of samples."""
 
     min_samples: int = 20
-    """Number of samples. Chosen: with fewer, the 5th percentile is not between the two smallest."""
+    """1: least number of samples. Chosen because the 5th percentile of 20 samples lies between the
+    two smallest."""
     max_failed_share: float = 0.5
-    """Share of samples. Chosen: where more fail, the others say too little."""
+    """1: largest share of failed samples. Chosen because the rest are not representative if more
+    fail."""
 
 
 STATISTICS_LIMITS = StatisticsSettings()
@@ -64,20 +63,19 @@ STATISTICS_LIMITS = StatisticsSettings()
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The time series, maps and provenance of a run.
+    """The columns, pressure maps and summary of a run.
 
     Args:
-        columns: column name -> one entry per frame: float arrays, and `status` as a list of
-            texts. Columns of the table `COLUMNS` that are not given are not modelled and
-            hold NaN; the order becomes the table's.
-        summary: provenance and notes, JSON-able; the keys that the report reads are listed
-            in docs/results.md.
-        maps: pressure maps per frame; None without contact.
-        directory: where it was written to or read from.
-        bands: columns of bands.csv, where inputs were varied; else empty.
+        columns: name of a column -> float array with one entry per frame; `status` is a list of
+            texts. Missing columns of `COLUMNS` are added as NaN (not modelled), and the order
+            becomes that of `COLUMNS`.
+        summary: content of summary.json (docs/results.md).
+        maps: pressure maps; None without contact.
+        directory: folder of the results; None: in memory only.
+        bands: columns of bands.csv; empty if no inputs were varied.
 
     Raises:
-        InputError: an unknown column, columns of different lengths, or no time or status.
+        InputError: a column is unknown, lengths differ, or time or status is missing.
     """
 
     columns: dict[str, Any]
@@ -93,7 +91,7 @@ class Results:
         return len(self.columns["status"])
 
     def __repr__(self) -> str:
-        """Return one line with the numbers of frames, columns and map points."""
+        """Return a line with the numbers of frames, columns and map points."""
         failures = sum(status.startswith("failed") for status in self.status)
         contact = self.summary.get("contact") or {}
         parts = [
@@ -116,17 +114,17 @@ class Results:
 
     @property
     def status(self) -> list[str]:
-        """Return the status of each frame: "ok" or reason words joined by ;."""
+        """The status of each frame: "ok", or reasons joined by "; "."""
         return self.columns["status"]
 
     @property
     def questions(self) -> list[str]:
-        """Return the questions about inputs that are unlikely, each with the likely mistake."""
+        """The questions about unlikely inputs."""
         return list(self.summary.get("questions") or [])
 
     @property
     def not_modelled(self) -> tuple[str, ...]:
-        """Return the columns that hold no number in any frame."""
+        """The columns without a number in any frame."""
         return tuple(
             name
             for name, values in self.columns.items()
@@ -134,25 +132,25 @@ class Results:
         )
 
     def band(self, name: str) -> Array | None:
-        """Return p05, p50 and p95 (3, f) of a column; None where it has no band."""
+        """Return p05, p50 and p95 (3, f) of a column; None: it has no band."""
         ends = [self.bands.get(f"{name}_{end}") for end in PERCENTILES]
         result = [end for end in ends if end is not None]
         return np.array(result) if len(result) == len(ends) else None
 
     def band_with_discrepancy(self, name: str) -> Array | None:
-        """Return p05 and p95 (2, f) of a column by inputs and discrepancy; None: it has none."""
+        """Return p05 and p95 (2, f) of a column from inputs and discrepancy; None: no such band."""
         ends = [self.bands.get(f"{name}_discrepancy_{end}") for end in ("p05", "p95")]
         finite = [end for end in ends if end is not None]
         return np.array(finite) if len(finite) == len(ends) else None
 
     def why_no_band(self, frame: int) -> str:
-        """Return why a frame's results have no band, in words."""
+        """Return why a frame has no band."""
         if self.bands["failed_share"][frame] > STATISTICS_LIMITS.max_failed_share:
             return "more than half of the samples failed"
-        return f"fewer than {STATISTICS_LIMITS.min_samples} samples have it, take more"
+        return f"fewer than {STATISTICS_LIMITS.min_samples} samples have it, use more"
 
     def to_dataframe(self) -> "DataFrame":
-        """Return the columns as a pandas DataFrame, frames as rows; NaN where there is no number.
+        """Return the columns as a pandas DataFrame with frames as rows.
 
         Raises:
             InputError: pandas is not installed.
@@ -169,10 +167,10 @@ class Results:
         Args:
             names: ids of the report's plots ("forces", "condyles", "pressures", ...);
                 default: forces, condyles, ratios and pressures.
-            axis: "flexion", "cycle" or "time"; default: as the scene asks.
+            axis: "flexion", "cycle" or "time"; None: the axis of the scene.
 
         Raises:
-            InputError: a plot or an axis that does not exist.
+            InputError: no such plot or axis.
         """
 
         figure: Figure = page("plots")(self, names, axis)
@@ -206,10 +204,10 @@ def _complete_columns(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_csv(path: str | Path) -> dict[str, Any]:
-    """Read the columns of a results.csv, of this release or an earlier one.
+    """Read the columns of a results.csv of this or an earlier release.
 
     Raises:
-        InputError: no such file, an unknown column, a row of another length, not a number.
+        InputError: no such file, an unknown column, a row of another length, or a bad number.
     """
     path = Path(path)
     cells = _cells_of(path)
@@ -220,14 +218,14 @@ def read_bands(path: str | Path) -> dict[str, Array]:
     """Read the columns of a bands.csv.
 
     Raises:
-        InputError: no such file, a row of another length, not a number.
+        InputError: no such file, a row of another length, or a bad number.
     """
     path = Path(path)
     return {name: _numbers(name, cells, path) for name, cells in _cells_of(path).items()}
 
 
 def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
-    """Return the cells of a table, column by column, with names of earlier releases made ours."""
+    """Return column -> cells of a table. Column names of earlier releases become the new ones."""
     try:
         rows = list(csv.reader(io.StringIO(read_text(path, FILE_LIMITS.table_bytes))))
     except csv.Error as error:
@@ -243,7 +241,7 @@ def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
 
 
 def csv_text(columns: Mapping[str, Any]) -> str:
-    """Return the text of a results.csv: numbers bit for bit, NaN as an empty cell."""
+    """Return the text of a results.csv: numbers without rounding, NaN as an empty cell."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)

@@ -1,4 +1,4 @@
-"""A folder of results: written as a whole, read back bit for bit, and checked by its hashes."""
+"""Results folders: writing, reading, and verification by SHA-256."""
 
 import hashlib
 import json
@@ -35,32 +35,32 @@ if TYPE_CHECKING:
 FOLDER = ".frames"
 IDENTITY_NAME = "run.json"
 OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
-"""What the folder holds, and all that is ever removed from it."""
+"""Patterns of the files in `.frames`. No other file is removed from it."""
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
 INDICES_NAME = "indices.csv"
 UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
-"""Files beside the results that they belong to; they are removed with them."""
+"""Files of an uncertainty study beside the results. New results without a study remove them."""
 SUMMARY_LIMIT = 256 * MEGABYTE
-"""Bytes of a summary: a line for every failed frame."""
+"""bytes: largest size of summary.json, which has an entry for each failed frame."""
 
 
 def read_results(directory: str | Path, *, check: bool = True) -> Results:
-    """Read what `write_results` wrote; numbers come back bit for bit.
+    """Read results from a folder. The numbers are exactly the written ones.
 
-    Files that a killed run left under temporary names are renamed first.
+    If writing was interrupted, it is completed first.
 
     Args:
-        directory: the folder.
-        check: compare the files with the SHA-256 in summary.json.
+        directory: results folder.
+        check: whether to compare the files with the SHA-256 in summary.json.
 
     Raises:
-        InputError: a file is missing, is not what it should be, or not what was written.
+        InputError: a file is missing, has a wrong format, or has changed since it was written.
     """
     directory = Path(directory)
     settle(directory)
-    if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it raises nothing
+    if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it never raises
         raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
     columns = read_csv(directory / CSV_NAME)
     if not len(next(iter(columns.values()), ())):
@@ -76,7 +76,7 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
         maps = read_maps(directory / MAPS_NAME)
         frames = len(next(iter(columns.values()), ()))
         if len(maps) < frames and not summary.get("unfinished_frames"):
-            what = f"holds {len(maps)} frames, and {CSV_NAME} {frames}"
+            what = f"has {len(maps)} frames, but {CSV_NAME} has {frames}"
             raise InputError(what, directory / MAPS_NAME, "run it again")
     if check and (changes := differences(directory, summary)):
         raise InputError(changes[0], directory, "`tkamb verify` lists all changes; run it again")
@@ -86,23 +86,23 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
-    """Return a folder's summary.json.
+    """Return the content of a folder's summary.json.
 
     Raises:
-        InputError: no such file, not a JSON object, or it holds what tkamb does not write.
+        InputError: no such file, not a JSON object, or a value that tkamb does not write.
     """
     path = directory / SUMMARY_NAME
     summary = read_json(path, SUMMARY_LIMIT, what="summary of a run")
     if not isinstance(summary, dict):
-        raise InputError("is no JSON object", path, "give a folder that `tkamb run` wrote")
+        raise InputError("is not a JSON object", path, "give a folder that `tkamb run` wrote")
     check_summary(summary, path)
     return summary
 
 
 def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Return in words how the files of a folder differ from those written with the summary.
+    """Return messages on files of a folder that have changed since they were written.
 
-    Results of a release that kept no SHA-256 show no difference.
+    There are none for results of a release without SHA-256.
     """
     messages, recorded = [], summary.get("files")
     if not isinstance(recorded, Mapping):
@@ -130,15 +130,15 @@ def write_results(
 ) -> None:
     """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
 
-    Without maps, a contact.h5 of an earlier run in that folder is removed, since it would pass
-    for this run's. The shards of the run (files of single frames) are removed.
+    Files of an earlier run in the folder are replaced or removed, and `.frames` is removed.
 
     Args:
-        results: what to write.
-        directory: the folder; made if it is not there.
-        force: write even into a folder that holds things that are not tkamb's.
-        more: of `UNCERTAINTY_NAMES`, what writes the file at a path; those left out are removed.
-        progress: wraps the plots of the report, a progress bar for example.
+        results: the results.
+        directory: path of the folder, which is created if it does not exist.
+        force: whether to write into a folder with files that are not tkamb's.
+        more: name in `UNCERTAINTY_NAMES` -> function that writes the file at a path. Other files of
+            these names are removed.
+        progress: function that wraps the plots of the report, for a progress bar.
 
     Raises:
         InputError: the folder cannot be claimed (`tkamb.io.claim`) or written.
@@ -146,9 +146,7 @@ def write_results(
     from tkamb.run.results import page
 
     if BANDS_NAME not in (more or {}):
-        results = replace(
-            results, bands={}
-        )  # the page shows only bands that a file beside it holds
+        results = replace(results, bands={})  # the report must not show bands without their file
     with claimed_directory(directory, force, "run") as folder:
         with replaced_together(folder) as files:
             _put_maps(results.maps, files)
@@ -160,12 +158,12 @@ def write_results(
 
 
 def put_numbers(results: Results, files: Replacement) -> None:
-    """Write results.csv and summary.json with the SHA-256 of the files that stand beside it.
+    """Write results.csv, and summary.json with the SHA-256 of the files beside it.
 
     Args:
-        results: what to write.
-        files: with a new contact.h5, else the old one is kept; and with new bands, else the
-            old ones are removed.
+        results: the results.
+        files: replacement of the folder's files. A contact.h5 of the folder is kept if the
+            replacement has none; old files of `UNCERTAINTY_NAMES` are removed.
     """
     write_synced(files.path(CSV_NAME), csv_text(results.columns))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
@@ -174,7 +172,7 @@ def put_numbers(results: Results, files: Replacement) -> None:
     else:
         recorded[MAPS_NAME] = sha256_of(files.current(MAPS_NAME))
     for name in UNCERTAINTY_NAMES:
-        if files.current(name) == files.folder / name:  # of an earlier run
+        if files.current(name) == files.folder / name:  # a file of an earlier run
             files.remove(name)
         else:
             recorded[name] = sha256_of(files.current(name))
@@ -185,13 +183,13 @@ def put_numbers(results: Results, files: Replacement) -> None:
 
 
 def _summary_hash(summary: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a summary without its own hash."""
+    """Return the SHA-256 of a summary without its key `summary_sha256`."""
     content = {key: value for key, value in summary.items() if key != "summary_sha256"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
-    """Return the value with numpy, paths and NaN turned into what JSON has."""
+    """Return a value with numpy objects, paths and NaN converted to JSON types."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -204,7 +202,7 @@ def _plain(value: Any) -> Any:
 
 
 def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
-    """Write maps that are not in their place already."""
+    """Write the maps unless they are the contact.h5 of the folder."""
     if maps is None:
         return
     if (
@@ -219,12 +217,12 @@ def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict on a folder of results.
+    """The verification of a results folder.
 
     Args:
-        differs: what has changed since it was written, a line each.
-        notes: what a reader should know although nothing has changed.
-        inputs: number of input files that were checked.
+        differs: messages on changed files.
+        notes: messages on other facts, such as another version of the code.
+        inputs: number of checked input files.
     """
 
     differs: tuple[str, ...]
@@ -232,18 +230,18 @@ class Verdict:
     inputs: int
 
     def lines(self) -> list[str]:
-        """Return the verdict as lines of text."""
+        """Return the messages as lines of text."""
         end = f"results and {self.inputs} input file(s) have not changed since the run"
         return [*self.differs, *self.notes, *([] if self.differs else [end])]
 
 
 def verify_results(directory: str | Path) -> Verdict:
-    """Compare a folder with the SHA-256 that its summary.json records.
+    """Compare a folder with the SHA-256 in its summary.json.
 
-    Files that a killed run left under temporary names are renamed first.
+    If writing was interrupted, it is completed first.
 
     Raises:
-        InputError: it is not a folder of results.
+        InputError: it is not a results folder.
     """
     directory = Path(directory)
     settle(directory)
@@ -252,7 +250,7 @@ def verify_results(directory: str | Path) -> Verdict:
         raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
     changes = differences(directory, summary)
     if not isinstance(summary.get("files"), Mapping):
-        changes.append("has no SHA-256: written by an earlier tkamb, so nothing can be checked")
+        changes.append("has no SHA-256: an earlier tkamb wrote it, so nothing can be checked")
     try:
         read_results(directory, check=False)
     except InputError as error:
@@ -264,11 +262,9 @@ def verify_results(directory: str | Path) -> Verdict:
 
 
 def _input(path: str, recorded: str) -> str | None:
-    """Return in words what is wrong with an input file; None if it is the one that was read."""
+    """Return a message on an input file; None: it has not changed."""
     try:
-        same = (
-            sha256_of(path, FILE_LIMITS.mesh_bytes) == recorded
-        )  # no larger file is read as input
+        same = sha256_of(path, FILE_LIMITS.mesh_bytes) == recorded  # the limit of input files
     except InputError as error:
         return f"input {error}"
     return None if same else f"input {path} has changed since it was read"
@@ -296,17 +292,17 @@ def _plug_in_note(model: str, code: str) -> list[str]:
     try:
         same = contact_code(model) == code
     except InputError as error:
-        return [f"its code cannot be compared: {error}"]
+        return [f"the code of the contact model cannot be compared: {error}"]
     return [] if same else [f"computed by another code of the contact model '{model}'"]
 
 
 def remove_shards(directory: Path, name: str = FOLDER) -> None:
-    """Remove the finished frames, and first the file that says which run they belong to."""
+    """Remove the files of the finished frames, beginning with the identity of their run."""
     folder = directory / name
     if folder.is_symlink():
         return
     for name in OWN_NAMES:
         for path in folder.glob(name):
             path.unlink(missing_ok=True)
-    with suppress(OSError):  # not there, or somebody else's things are in it
+    with suppress(OSError):  # it does not exist, or it has files that are not tkamb's
         folder.rmdir()

@@ -1,8 +1,8 @@
-"""The settings of tkamb's algorithms: what decides how a number is computed.
+"""The settings of tkamb's algorithms (`tkamb settings`).
 
-A settings object is an instance of a frozen dataclass whose name ends in `Settings`. It stands at
-the top level of the module that uses it, and each field has a docstring: unit, meaning, origin.
-This module finds them; it holds no list of its own.
+A settings object is an instance of a frozen dataclass with a name that ends in `Settings`. It is
+defined at the top level of the module that uses it. Each field has a docstring with unit, meaning
+and origin. This module finds the settings objects in the package.
 """
 
 import argparse
@@ -22,15 +22,15 @@ SUFFIX = "Settings"
 
 @dataclass(frozen=True)
 class Setting:
-    """One number that decides how something is computed.
+    """One setting of an algorithm.
 
     Args:
-        name: dotted, as in "lattice_solver.force_tolerance".
-        value: value of this process.
-        default: value that it has unless somebody changes it.
+        name: dotted name, such as "lattice_solver.force_tolerance".
+        value: value in this process.
+        default: default value.
         meaning: unit, meaning and origin.
-        algorithm: what the settings object belongs to, its docstring's first line.
-        module: where the object stands.
+        algorithm: first line of the docstring of the settings class.
+        module: module of the settings object.
     """
 
     name: str
@@ -42,10 +42,7 @@ class Setting:
 
 
 def all_settings() -> list[Setting]:
-    """Return the settings of all algorithms, in the order of their modules.
-
-    It imports every module that holds one.
-    """
+    """Return the settings of all algorithms in the order of their modules, which are imported."""
     rows: list[Setting] = []
     for path in sorted(PACKAGE.rglob("*.py")):
         text = path.read_text(encoding="utf-8")
@@ -61,7 +58,7 @@ def all_settings() -> list[Setting]:
 def changed_settings() -> dict[str, Any]:
     """Return name -> value of the settings that differ from their defaults in this process.
 
-    Only modules that are imported already are looked at: no other has computed anything.
+    Only imported modules count, since no other module has computed anything.
     """
     changed: dict[str, Any] = {}
     for module_name, module in sorted(sys.modules.items()):
@@ -84,7 +81,7 @@ def _is_settings(value: Any) -> bool:
 
 
 def _instances(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Yield instance and class of each settings object at the top level of a module."""
+    """Yield the names of instance and class of each settings object at the top level."""
     for node in tree.body:
         if (
             isinstance(node, ast.Assign)
@@ -113,7 +110,7 @@ def _rows(module: str, name: str, text: str) -> Iterator[Setting]:
 
 
 def field_docstrings(tree: ast.Module, name: str) -> dict[str, str]:
-    """Return field -> the docstring below it, of a class of a module."""
+    """Return the docstring below each field of a class, by name of the field."""
     body = next((n.body for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name), [])
     texts = {}
     for node, following in pairwise(body):
@@ -131,10 +128,10 @@ def add_settings(commands: Any) -> None:
     """Add `tkamb settings` to the command line."""
     parser = commands.add_parser(
         "settings",
-        help="the numbers that decide how things are computed, with their meaning",
+        help="the settings of the algorithms, with their meaning",
         description="Print the settings of every algorithm: name, value, unit and meaning.",
     )
-    parser.add_argument("words", nargs="*", metavar="WORD", help="only settings that hold a word")
+    parser.add_argument("words", nargs="*", metavar="WORD", help="only settings with all words")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=_settings)
 

@@ -1,4 +1,4 @@
-"""`simulate`: read the scene, compute frame after frame, tabulate the results."""
+"""Simulation of a scene (`simulate`)."""
 
 import logging
 import math
@@ -35,38 +35,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FrameLoopSettings:
-    """How frames are shared and which contacts are kept as guesses."""
+    """How frames are distributed over workers, and initial guesses from earlier frames."""
 
     kept_contacts: int = 20
-    """How many contacts are kept as guesses for the next. Chosen: older ones are farther away than
-    a new search begins."""
+    """1: number of earlier contacts that are stored as initial guesses. Chosen because older ones
+    are no better than a new search."""
     frames_per_chunk: int = 10
-    """Frames that a worker computes in a row; the first of them has no guess from the one before.
-    Chosen: the same for any number of workers, so that their number changes no answer."""
+    """1: successive frames that a worker computes. The first has no initial guess from an earlier
+    frame. Chosen independent of the number of workers, so that it does not affect results."""
 
 
 FRAME_LOOP = FrameLoopSettings()
 
 
 Finished = tuple[int, Row, dict[str, Array] | None]
-"""Frame, its row, and its contact's arrays (`contact_arrays`); None without a contact result."""
+"""Frame, its row of results.csv, and the arrays of its contact (`contact_arrays`) or None."""
 
 
 class FrameSolver:
     """Computes the frames of a case.
 
     Args:
-        case: the scene with its files read.
-        frames: those that are asked for; None: any may be.
-        slips: those of another solver of this case; they are then not computed again.
+        case: scene with its files read.
+        frames: frames to compute; None: all.
+        slips: slips from another solver of this case; None: they are computed.
 
     Attributes:
-        mechanics: the body side.
-        slips: side -> rolling and slipping of the recorded motion.
-        before: contacts of the last frames, guesses for the next.
+        mechanics: rigid-body mechanics of the case.
+        slips: side -> rolling and slip of a condyle in the recorded motion.
+        before: contacts of earlier frames, the initial guesses for the next frame.
 
     Raises:
-        InputError: whatever is wrong with the input.
+        InputError: the input cannot be used.
     """
 
     def __init__(
@@ -76,14 +76,16 @@ class FrameSolver:
         self.mechanics = mechanics_of(case)
         self.plausibility = Plausibility(case, self.mechanics)
         last = max(frames or range(len(case.motion.time)))
-        if slips is None:  # of the recorded motion: released coordinates make another one
+        if (
+            slips is None
+        ):  # slips are those of the recorded motion: none if coordinates are released
             released = case.scene.contact and case.scene.contact.released
             slips = {} if released else self.mechanics.slips(last)
         self.slips = slips
         self.before: list[FrameContact] = []
 
     def solve(self, k: int) -> Finished:
-        """Return frame k."""
+        """Compute frame k."""
         contact = arrays = None
         if self.side is None:
             body = self.mechanics.frame(k)
@@ -93,12 +95,12 @@ class FrameSolver:
             body, contact = self.side.frame(k, self.before)
             self._keep(contact)
             arrays = contact_arrays(contact, body.geometry)
-        doubts = self.plausibility.flags(k, body)
-        status = frame_status(self._case, k, body, contact, doubts)
+        flags = self.plausibility.flags(k, body)
+        status = frame_status(self._case, k, body, contact, flags)
         return k, frame_row(self._case, k, body, contact, self.slips, status), arrays
 
     def _keep(self, contact: "FrameContact") -> None:
-        """Keep a contact; only the last that was found keeps its warm start, which is large."""
+        """Store a contact. Only the last one with a result has a warm start, which is large."""
         if contact.result is not None:
             self.before = [replace(each, start=None) for each in self.before]
         self.before.append(contact)
@@ -106,7 +108,7 @@ class FrameSolver:
 
     @cached_property
     def side(self) -> "ContactSide | None":
-        """The contact side, prepared when it is first asked for; None without [contact]."""
+        """The contact side, prepared on first access; None without [contact]."""
         if self._case.scene.contact is None:
             return None
         return contact_side(self._case, self.mechanics)
@@ -117,29 +119,29 @@ Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
 
 
 @contextmanager
-def _said_already() -> Iterator[None]:
-    """Print no warnings: the process that hands out the work has printed them already."""
+def _without_warnings() -> Iterator[None]:
+    """Print no warnings in a worker, since the parent process prints the same warnings."""
     log = logging.getLogger("tkamb")
-    usual = log.level
+    level = log.level
     log.setLevel(logging.ERROR)
     try:
         yield
     finally:
-        log.setLevel(usual)
+        log.setLevel(level)
 
 
 class ChunkSolver:
-    """The work of a worker process: reads the scene once, and computes chunk after chunk.
+    """Solver of a worker process. It reads the scene once and computes chunks of frames.
 
-    Its contact side waits for the first chunk: by then the process that hands out the work has
-    prepared its own, and has put what takes long into the cache.
+    The contact is prepared with the first chunk. By then the parent process has prepared its
+    contact, and a cache has the parts that take long.
     """
 
-    @_said_already()
+    @_without_warnings()
     def __init__(self, scene: Scene) -> None:
         self._solver = FrameSolver(load_case(scene), slips={})
 
-    @_said_already()
+    @_without_warnings()
     def __call__(self, number: int, chunk: Chunk) -> list[Finished]:
         """Return the frames of a chunk."""
         frames, self._solver.slips = chunk
@@ -150,13 +152,13 @@ class ChunkSolver:
 def finished_in_order(
     team: WorkerPool, slips: "dict[str, CondyleSlip]", indices: range, remaining: Sequence[int]
 ) -> Iterator[Finished]:
-    """Yield frames over worker processes, in order.
+    """Yield frames from worker processes in their order.
 
     Args:
-        team: of workers whose task is a `ChunkSolver`.
-        slips: of the recorded motion, see `FrameSolver`.
-        indices: all frames of the run, which make its chunks.
-        remaining: frames that are not computed yet.
+        team: pool of workers with the task `ChunkSolver`.
+        slips: slips of the recorded motion, see `FrameSolver`.
+        indices: all frames of the run. They determine the chunks.
+        remaining: frames to compute.
 
     Raises:
         ComputationError: a worker was killed.
@@ -165,13 +167,13 @@ def finished_in_order(
     for k in remaining:
         chunks.setdefault(indices.index(k) // FRAME_LOOP.frames_per_chunk, ([], slips))[0].append(k)
     early: dict[int, list[Finished]] = {}
-    turn = iter(chunks)
-    expected: Any = next(turn, None)
+    order = iter(chunks)
+    expected: Any = next(order, None)
     for number, frames in team.answers(list(chunks.items())):
         early[number] = frames
         while expected in early:
             yield from early.pop(expected)
-            expected = next(turn, None)
+            expected = next(order, None)
 
 
 Progress = Callable[[Sequence[int]], Iterable[int]]
@@ -196,40 +198,36 @@ def simulate(
 ) -> Results:
     """Run a scene and return its results.
 
-    Single values of the scene are changed as by `tkamb run --set`: by their dotted names,
-    `overrides={"patient.mass_kg": 80.0}`, or table by table, `patient={"mass_kg": 80.0}`.
+    Values of the scene can be changed, as with `tkamb run --set`, by dotted keys,
+    `overrides={"patient.mass_kg": 80.0}`, or by tables, `patient={"mass_kg": 80.0}`.
 
     Args:
-        scene: a scene, the path of its file, or its case, read already.
-        contact: contact model, instead of the scene's.
-        resolution_mm: spacing of the map points, instead of the scene's.
-        preset: name of a study whose choices are laid over the scene, as by `tkamb run --as`
-            (`tkamb.io.presets`); contact and resolution_mm still hold.
-        frames: which frames, a slice or a range; default all.
-        directory: folder where the finished frames are kept, see `tkamb.run.recorder`; None
-            keeps them in memory.
-        scene_path: where the scene came from, for the summary.
-        progress: wraps the frame indices, a progress bar for example.
-        stage: called with the name of each part that begins before the frames.
-        resume: go on with what an earlier, interrupted run of the same scene and frames left
-            in the folder; needs one.
-        force: write into the folder even if it holds things that are not tkamb's.
-        workers: processes that share the frames; more than one start every tenth frame without
-            a guess from the one before, which moves answers within the solver's tolerance.
+        scene: scene, path of a scene file, or case.
+        contact: name of a contact model; None: that of the scene.
+        resolution_mm: spacing of the map points, mm; None: that of the scene.
+        preset: name of a published study. Its choices replace those of the scene, as with
+            `tkamb run --as` (`tkamb.io.presets`), except for `contact` and `resolution_mm`.
+        frames: frames to compute, a slice or a range; None: all.
+        directory: folder for the finished frames, see `tkamb.run.recorder`; None: in memory.
+        scene_path: path of the scene file, for the summary.
+        progress: function that wraps the frame indices, for a progress bar.
+        stage: function that is called with the name of each stage before the frames.
+        resume: whether to continue an interrupted run of the same scene and frames in `directory`.
+        force: whether to write into a folder with files that are not tkamb's.
+        workers: number of processes. With more than one, every tenth frame has no initial guess
+            from the frame before, which changes results within the tolerance of the solver.
         overrides: dotted key of the scene -> value.
-        tables: name of a table of the scene -> key in it -> value; for the table [contact],
-            whose name chooses the contact model here, use `overrides`.
+        tables: table of the scene -> key -> value. For [contact] use `overrides`, since `contact`
+            is the contact model.
 
     Raises:
-        InputError: the scene or a file that it names cannot be used, a case is given another
-        InputError: the scene or a file that it names cannot be used, a case is given another
-            contact model, resolution, preset or override, no such key, the run to resume is
-            another one, the folder
-            cannot be claimed (`tkamb.io.claim`), or no such number of workers.
+        InputError: the scene, a file, a key or the number of workers cannot be used; a case is
+            given with `contact`, `resolution_mm`, `preset` or changed values; the run to resume is
+            another one; or the folder cannot be claimed (`tkamb.io.claim`).
         ComputationError: a worker was killed.
-        KeyboardInterrupt: with a folder, what was finished is written there first.
+        KeyboardInterrupt: the run was interrupted. The finished frames are in `directory`.
     """
-    crew = PoolOptions(workers)
+    options = PoolOptions(workers)
     changes = _dotted(overrides or {}, tables)
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene, changes)
@@ -243,7 +241,7 @@ def simulate(
     indices = chosen_frames(frames, len(case.motion.time))
     identity = run_identity(case, indices)
     if directory is None and resume:
-        raise InputError("there is no folder to go on in", "resume", "give a directory")
+        raise InputError("needs the folder of the earlier run", "resume", "give a directory")
     if directory is not None and resume:
         finished = finished_results(Path(directory), identity)
         if finished is not None:
@@ -254,9 +252,9 @@ def simulate(
         team, chunks = None, math.ceil(len(indices) / FRAME_LOOP.frames_per_chunk)
         if min(workers, chunks) > 1:
             task = Task(ChunkSolver, (case.scene,))
-            team = stack.enter_context(crew.team(task, chunks))  # prepares meanwhile
+            team = stack.enter_context(options.team(task, chunks))  # workers prepare meanwhile
         stage("preparing body and contact")
-        run.prepare()  # before the folder is touched: bad input leaves it as it was
+        run.prepare()  # before the folder is changed, so that bad input does not change it
         recorder = Recorder()
         if directory is not None:
             folder = stack.enter_context(claimed_directory(directory, force, "run"))
@@ -267,7 +265,7 @@ def simulate(
 
 @dataclass(eq=False)
 class _Run:
-    """One run: computes its frames, hands them to the recorder, and makes the results."""
+    """A run: computes the frames, records them and makes the results."""
 
     case: Case
     indices: range
@@ -277,11 +275,11 @@ class _Run:
     start: float
 
     def prepare(self) -> None:
-        """Build both sides of the equilibrium; errors of the input are raised here."""
+        """Prepare body and contact. Errors of the input are raised here."""
         if self.case.scene.muscles:
             from tkamb.run.muscles.sharing import solver_is_installed, solver_missing
 
-            if not solver_is_installed():  # before minutes of preparation, not at the first frame
+            if not solver_is_installed():  # before the preparation, which may take minutes
                 raise solver_missing()
         self.solver = FrameSolver(self.case, self.indices)
         side = self.solver.side
@@ -291,7 +289,7 @@ class _Run:
             self.seconds["read"] -= side.prepare_seconds
 
     def compute(self, recorder: Recorder, progress: Progress, team: WorkerPool | None) -> Results:
-        """Compute every frame that is not there yet and return the results."""
+        """Compute the remaining frames and return the results."""
         self.recorder = recorder
         if self.solver.side is not None:
             self._begin_maps(self.solver.side)
@@ -314,7 +312,7 @@ class _Run:
         return self.recorder.publish(self.results)
 
     def results(self) -> Results:
-        """Return the results so far; frames that are still to do are failed ones."""
+        """Return the results. Frames that are not computed yet are failed frames."""
         columns = join_rows(self.case, self.indices, self.recorder.rows)
         self.seconds["all"] = clock.perf_counter() - self.start
         strains = self.solver.mechanics.strains
@@ -337,7 +335,7 @@ class _Run:
     def _finished(
         self, remaining: Sequence[int], progress: Progress, team: WorkerPool | None
     ) -> Iterator[Finished]:
-        """Yield the frames that are left, in order, as they are finished."""
+        """Yield the remaining frames in their order."""
         if team is None:
             yield from (self.solver.solve(k) for k in progress(remaining))
             return
@@ -354,7 +352,7 @@ class _Run:
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
 
     def _take_earlier(self) -> None:
-        """Take over the frames of the run that is resumed, the last contacts as guesses."""
+        """Read the frames of the run to resume, the last contacts as initial guesses."""
         earlier, side = self.recorder.take_earlier(self.indices), self.solver.side
         if side is None or not earlier:
             return
@@ -368,23 +366,23 @@ def _dotted(overrides: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[str
     """Return dotted key -> value of all overrides.
 
     Raises:
-        InputError: a keyword that is not a table of values, or a key that is given twice.
+        InputError: a keyword is no table of values, or a key is given twice.
     """
     merged = dict(overrides)
     for name, table in tables.items():
         if not isinstance(table, Mapping):
             hint = f'{name}={{"key": value}}, or overrides={{"{name}.key": value}}'
-            raise InputError("is not an option, nor a table of the scene's values", name, hint)
+            raise InputError("is neither an option nor a table of values", name, hint)
         for key, value in table.items():
             dotted = f"{name}.{key}"
             if dotted in merged:
-                raise InputError("is given twice", dotted, "leave one of them out")
+                raise InputError("is given twice", dotted, "remove one of them")
             merged[dotted] = value
     return merged
 
 
 def _scene_with(scene: Scene | Case, overrides: dict[str, Any]) -> Scene:
-    """Return the scene with overrides laid over it."""
+    """Return the scene with overrides."""
     if isinstance(scene, Case):
         raise InputError("a case has been read already", "overrides", "give its scene instead")
     return with_overrides(scene, overrides)
@@ -393,15 +391,15 @@ def _scene_with(scene: Scene | Case, overrides: dict[str, Any]) -> Scene:
 def _scene_as(
     scene: Scene | Case, preset: str, model: str | None, resolution_mm: float | None
 ) -> Scene:
-    """Return the scene with a preset laid over it, and over that what else was asked for."""
+    """Return the scene with a preset. Contact model and resolution take precedence if given."""
     if isinstance(scene, Case):
         raise InputError("a case has been read already", "preset", "give its scene instead")
-    wishes = {"contact.model": model, "contact.resolution_mm": resolution_mm}
-    return with_preset(scene, preset, {key: v for key, v in wishes.items() if v is not None})
+    choices = {"contact.model": model, "contact.resolution_mm": resolution_mm}
+    return with_preset(scene, preset, {key: v for key, v in choices.items() if v is not None})
 
 
 def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: float | None) -> Case:
-    """Return the case of a scene with another contact model or resolution, where one is given."""
+    """Return the case of a scene, with another contact model or resolution if given."""
     changes = {"model": model, "resolution_mm": resolution_mm}
     changes = {key: value for key, value in changes.items() if value is not None}
     if isinstance(scene, Case):
@@ -417,7 +415,11 @@ def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: fl
 
 
 def chosen_frames(frames: slice | range | None, count: int) -> range:
-    """Return the frames of a slice or range; its ends must lie inside the motion."""
+    """Return the frames of a slice or range.
+
+    Raises:
+        InputError: an end lies outside the motion, or there are no frames.
+    """
     if frames is None:
         return range(count)
     if isinstance(frames, range):
@@ -428,17 +430,17 @@ def chosen_frames(frames: slice | range | None, count: int) -> range:
         raise InputError(
             f"frames {frames.start}:{frames.stop}:{frames.step} are not in the motion",
             "frames",
-            f"it has frames 0 to {count - 1}; 0:{count} are all of them",
+            f"it has frames 0 to {count - 1}; all are 0:{count}",
         )
     return chosen
 
 
 def _frames_of_range(frames: range, count: int) -> range:
-    """Return a range that rises and whose frames lie inside the motion.
+    """Return an increasing range of frames inside the motion.
 
-    Unlike the ends of a slice, negative numbers of a range do not count from the end.
+    Negative numbers do not count from the end, unlike the ends of a slice.
     """
     if frames.step < 0 or len(frames) == 0 or frames[0] < 0 or frames[-1] >= count:
-        hint = f"it has frames 0 to {count - 1}; a range rises"
+        hint = f"it has frames 0 to {count - 1}; a range must increase"
         raise InputError(f"frames {frames} are not in the motion", "frames", hint)
     return frames

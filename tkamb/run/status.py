@@ -1,9 +1,9 @@
-"""The status of a frame in words: "ok", why it failed, or what a reader must know.
+"""The status of a frame: "ok", the reason of its failure, or flags.
 
-Two estimates of the medial/lateral split stand side by side: by deformation (the contact model at
-the recorded rotation) and by coronal equilibrium. A frame is flagged where they differ by much,
-where equilibrium needs a large force that no modelled part gives, or where a condyle has no
-contact force although the equations load it: an input is then wrong or unknown.
+There are two estimates of the medial-lateral split: by deformation (the contact model at the
+recorded rotation), and by coronal equilibrium. A frame is flagged if they differ by much. It is
+flagged too if equilibrium needs a large residual, or if a condyle is loaded by the equations but
+not by the contact model. An input is then wrong or unknown.
 """
 
 from collections.abc import Sequence
@@ -22,22 +22,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AgreementSettings:
-    """When two estimates contradict each other."""
+    """Limits for a contradiction of two estimates."""
 
     share_difference: float = 0.25
-    """Two estimates of the medial share that differ by more contradict each other. Chosen: smaller
+    """1: largest difference of the two medial shares without a flag. Chosen because smaller
     differences are within the errors of both."""
     large_residual_share: float = 0.10
-    """1: share of the superior-inferior contact force; a larger AP and ML residual is flagged.
-    Chosen: a smaller one is within the errors of the forces."""
+    """1: largest AP and ML residual without a flag, as a share of the superior-inferior contact
+    force. Chosen because smaller residuals are within the errors of the forces."""
     unloaded_share: float = 0.01
-    """1: share of the load; a condyle that carries less counts as unloaded. Chosen: it is below the
-    errors of the split."""
+    """1: share of the load below which a condyle counts as unloaded. Chosen because the errors of
+    the split are larger."""
     adduction_error: float = 0.5 * DEGREE
-    """rad: error of the recorded adduction, 0.5 deg. Chosen: that of fluoroscopy."""
+    """rad: error of the recorded adduction, 0.5 deg, that of fluoroscopy."""
     moved_load_share: float = 0.25
-    """1: share of the load; where the adduction's error moves more of it, the recorded pose does
-    not determine the split by deformation. Chosen: a quarter decides which condyle carries more."""
+    """1: share of the load. If the error of adduction shifts more of the load between the condyles,
+    the recorded pose does not determine the split. Chosen because a quarter may decide which
+    condyle carries more."""
 
 
 AGREEMENT = AgreementSettings()
@@ -47,7 +48,7 @@ NAN = float("nan")
 
 
 def contradictions(case: "Case", body: "FrameLoads", contact: "FrameContact | None") -> list[str]:
-    """Return what contradicts itself in a frame, in words; empty for a frame without numbers."""
+    """Return the contradictions in a frame, in words; none for a failed frame."""
     if body.loads.problems:
         return []
     words = []
@@ -63,14 +64,14 @@ def contradictions(case: "Case", body: "FrameLoads", contact: "FrameContact | No
         words.append(
             f"medial share {share:.2f} by deformation contradicts {balanced:.2f} by equilibrium"
         )
-    for side, own in (("medial", share), ("lateral", 1.0 - share)):
-        if own < AGREEMENT.unloaded_share and side not in body.loads.lifted:
+    for side, condyle_share in (("medial", share), ("lateral", 1.0 - share)):
+        if condyle_share < AGREEMENT.unloaded_share and side not in body.loads.lifted:
             words.append(f"{side} condyle carries nothing by deformation")
     return words
 
 
 def share_by_deformation(contact: "FrameContact") -> float:
-    """Return medial / (medial + lateral) of the contact model; NaN where nothing is carried."""
+    """Return medial / (medial + lateral) of the contact model; NaN without load."""
     result = contact.result
     if result is None:
         return NAN
@@ -78,37 +79,37 @@ def share_by_deformation(contact: "FrameContact") -> float:
 
 
 def share_by_equilibrium(body: "FrameLoads") -> float:
-    """Return medial / (medial + lateral) of the equations; NaN where they are not solved."""
+    """Return medial / (medial + lateral) of the equations; NaN without a solution."""
     return share(normal_force(body, "medial"), normal_force(body, "lateral"))
 
 
 def normal_force(body: "FrameLoads", side: str) -> float:
-    """Return a condyle's normal force by the equations, N: zero where it is lifted."""
+    """Return a condyle's normal force by the equations, N; zero if it is lifted off."""
     if side in body.loads.lifted and not np.isnan(body.loads.contact_force).any():
         return 0.0
     return body.loads.values.get(f"{side}_normal", NAN)
 
 
 def share(medial: float, lateral: float) -> float:
-    """Return medial / (medial + lateral); NaN where nothing is carried."""
+    """Return medial / (medial + lateral); NaN without load."""
     total = medial + lateral
     return medial / total if total > 0 else NAN
 
 
 def split_determined(body: "FrameLoads", contact: "FrameContact") -> float:
-    """Return 1 where the recorded adduction determines the split by deformation, else 0.
+    """Return 1 if the recorded adduction determines the split by deformation, else 0.
 
-    It does not where 0.5 deg moves more than a quarter of the load from one condyle to the
-    other, or where one condyle carries all of it and equilibrium says otherwise. NaN where there is
-    no sensitivity.
+    It is 0 if 0.5 deg of adduction shifts more than a quarter of the load between the condyles. It
+    is 0 too if one condyle carries the whole load in contrast to equilibrium. NaN: the sensitivity
+    to adduction is unknown.
     """
     if np.isnan(contact.sensitivity):
         return NAN
-    moved = abs(contact.sensitivity) * AGREEMENT.adduction_error
+    shifted = abs(contact.sensitivity) * AGREEMENT.adduction_error
     load = abs(float(body.loads.contact_force[1]))
     share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
     alone = min(share, 1.0 - share) < AGREEMENT.unloaded_share < abs(share - balanced)
-    return float(moved <= AGREEMENT.moved_load_share * load and not alone)
+    return float(shifted <= AGREEMENT.moved_load_share * load and not alone)
 
 
 def _percent(part: float, whole: float) -> str:
@@ -120,32 +121,30 @@ class StatusSettings:
     """Limits beyond which a frame's status carries a flag."""
 
     filter_translation: float = 0.5 * MILLIMETRE
-    """m; where filtering moves a pose by more, the frame is flagged. Chosen: fluoroscopy errs by
-    less."""
+    """m: largest translation of a recorded pose by the filter without a flag. Chosen because the
+    error of fluoroscopy is smaller."""
     filter_rotation: float = 0.5 * DEGREE
-    """rad; where filtering turns a pose by more (0.5 deg), the frame is flagged. Chosen:
-    fluoroscopy errs by less."""
+    """rad: largest rotation of a recorded pose by the filter without a flag, 0.5 deg. Chosen
+    because the error of fluoroscopy is smaller."""
     flank_angle: float = 20.0 * DEGREE
-    """rad; where the contact normal of a condyle leans by more (20 deg) the frame is flagged.
-    Chosen: the condyle then runs against eminence or lip; check the recorded position, above all
-    ML."""
+    """rad: largest angle of a condyle's contact normal from the vertical without a flag, 20 deg.
+    Chosen because steeper contact is on eminence or lip."""
     adjusted_total_BW: float = 0.01
-    """BW: a femoral adjustment that changes the total force by more is flagged. Chosen: it then
-        decides more than the split."""
+    """BW: largest change of the total force by the femoral adjustment without a flag. Chosen
+    because the adjustment should change the split only."""
     marker_distance: float = 20.0 * MILLIMETRE
-    """m; skin that has moved by more against the other segment's is flagged. Chosen: at 700 N it is
-    14 N·m."""
+    """m: largest distance between the knee centres of shank and thigh markers without a flag.
+    Chosen because it causes 14 N·m at 700 N."""
 
 
 STATUS = StatusSettings()
 
 
 PATELLA_ACROSS = 0.03
-"""Share of the patellofemoral force that may act across the button's normal where the patella's
-place was recorded: 2 deg between that normal and what the lines hold. A place that suits the
-lines leaves 0.002."""
+"""1: largest share of the patellofemoral force across the button's normal without a flag, for a
+recorded patella. It corresponds to an error of 2 deg. A patella in equilibrium has 0.002."""
 PATELLA_LIGHT = 0.01
-"""BW: a smaller force across the normal is not flagged."""
+"""BW: largest force across the normal without a flag."""
 
 FAILED = "failed: "
 
@@ -155,16 +154,16 @@ def frame_status(
     k: int,
     body: "FrameLoads",
     contact: "FrameContact | None",
-    doubts: Sequence[str] = (),
+    question_flags: Sequence[str] = (),
 ) -> str:
-    """Return "ok", or reason words joined by "; ". A frame without force begins with failed.
+    """Return "ok", or reasons joined by "; ". The status of a failed frame begins with "failed".
 
     Args:
         case: the case.
         k: frame.
-        body: its body side.
-        contact: its contact side; None when not modelled.
-        doubts: flags of the questions that concern it (`tkamb.run.plausibility`).
+        body: loads of the frame by the equations.
+        contact: contact of the frame; None: not modelled.
+        question_flags: flags of the questions on the frame (`tkamb.run.plausibility`).
     """
     failures = failures_of(body, contact)
     words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]
@@ -174,17 +173,17 @@ def frame_status(
     if body.loads.slack and body.geometry.share is None:
         words.append("flexors needed, which are not modelled: quadriceps slack")
     if body.loads.ambiguous:
-        words.append("several load states balance: the one that leaves out fewest is taken")
+        words.append("several load states are in equilibrium: the one with most loads is used")
     words += contradictions(case, body, contact)
     words += [*contact.flags, *(contact.post.flags if contact.post else ())] if contact else []
-    words += doubts
+    words += question_flags
     if failures:
         return FAILED + "; ".join([*failures, *words])
     return "; ".join(words) or "ok"
 
 
 def failures_of(body: "FrameLoads", contact: "FrameContact | None") -> list[str]:
-    """Return why a frame has no force, in words; empty if it has."""
+    """Return the reasons of a failed frame; empty if the frame has forces."""
     result = list(body.loads.problems)
     if contact and contact.problem and not result:
         result.append(contact.problem)
@@ -201,7 +200,7 @@ def _lift_off(body: "FrameLoads", side: str, released: bool) -> str:
 
 
 def _flank_flags(body: "FrameLoads") -> list[str]:
-    """Return a flag for each condyle whose contact normal leans far from the vertical."""
+    """Return a flag for each condyle with a contact normal far from the vertical."""
     result = []
     for side, condyle in body.geometry.condyles.items():
         lean = float(np.arccos(np.clip(condyle.normal[1], -1.0, 1.0)))
@@ -222,7 +221,7 @@ def _adjustment_flags(case: "Case", body: "FrameLoads") -> list[str]:
 
 
 def _patella_flags(case: "Case", body: "FrameLoads") -> list[str]:
-    """Return a flag where the lines do not hold a recorded patella at its place."""
+    """Return a flag if the recorded patella is not in equilibrium with its lines."""
     patella = case.scene.patella
     if patella is None or patella.motion != "recorded" or body.loads.problems:
         return []
@@ -232,16 +231,18 @@ def _patella_flags(case: "Case", body: "FrameLoads") -> list[str]:
     if not across > max(PATELLA_ACROSS * normal, PATELLA_LIGHT * case.body_weight):
         return []
     return [
-        f"recorded patella is not held by its lines: {across:.0f} N across the button's normal, "
-        f"beside {normal:.0f} N along it; no part of a knee carries that"
+        f"recorded patella is not in equilibrium with its lines: {across:.0f} N across the "
+        f"button's normal and {normal:.0f} N along it; no part of a knee carries a force across it"
     ]
 
 
 def _motion_flags(case: "Case", k: int) -> list[str]:
     motion = case.motion
-    far = motion.deviation_translation[k] > STATUS.filter_translation
+    translated = motion.deviation_translation[k] > STATUS.filter_translation
     rotated = motion.deviation_rotation[k] > STATUS.filter_rotation
-    result = ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if far or rotated else []
+    result = (
+        ["filter moves the recorded pose beyond 0.5 mm or 0.5 deg"] if translated or rotated else []
+    )
     if motion.markers is not None:
         time = motion.time[k : k + 1]
         if motion.markers.at(motion.markers.missing.astype(float), time)[0] > 0:

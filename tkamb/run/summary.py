@@ -37,35 +37,34 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
     "Residuals are the forces along AP (anterior–posterior) and ML (medial–lateral) and the moment "
-    "about the tibia's long axis that the equilibrium still lacks at the midpoint of the contact "
-    "points; "
-    "an exact model would leave none. "
-    "residual_sensitivity_N is the change of the total force when that point moves by 10 mm in y."
+    "about the tibia's long axis that equilibrium needs beyond the modelled loads. They act at the "
+    "midpoint of the contact points. An exact model has none. residual_sensitivity_N is the "
+    "largest change of the total force if they act 10 mm higher or lower."
 )
 
 POST_HELD = (
-    "Cam and post: the post is held at its anterior face, so that it does not bend at its root; "
-    "friction as of the condyles; the column force_si_N and its like hold the post's force too."
+    "Cam and post: the post is fixed at its anterior face, so that it does not bend at its root. "
+    "Friction is that of the condyles. force_si_N and the other contact forces include the post."
 )
 
 
 @dataclass(frozen=True)
 class SummarySettings:
-    """Limits beyond which a summary warns."""
+    """Limits in the summary."""
 
     notable_reserve: float = 0.05
-    """1: share of a coordinate's largest moment; more reserve than this is a warning. Chosen: less
-    changes no muscle force noticeably."""
+    """1: share of a coordinate's largest moment above which a reserve is counted as large. Chosen
+    because smaller reserves hardly change muscle forces."""
     uneven_share: float = 0.01
-    """1: the largest step of time may exceed the smallest by this share; a motion of more uneven
-    steps has no frame rate. Chosen: clocks and rounded times differ by less."""
+    """1: largest relative difference between longest and shortest time step of a motion with a
+    frame rate. Chosen because clocks and rounding cause smaller differences."""
 
 
 SUMMARY = SummarySettings()
 
 
 SATURATED = 0.99
-"""Activation above which a muscle is said to pull as hard as it can."""
+"""1: activation above which a muscle counts as saturated."""
 
 LIBRARIES = ("pin", "numpy", "scipy", "trimesh", "python-fcl")
 
@@ -77,14 +76,14 @@ def summary_of(
     path: Path | None,
     strains: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
-    """Return the JSON-able summary of a run; docs/results.md lists its keys.
+    """Return the content of summary.json (docs/results.md).
 
     Args:
         case: the case.
-        columns: of results.csv.
-        seconds: part -> computing time.
-        path: of the scene file, if it came from one.
-        strains: ligament bundle -> strain at each of `STRAIN_FLEXIONS`.
+        columns: columns of results.csv.
+        seconds: part of the computation -> computing time, s.
+        path: path of the scene file; None: the scene is not from a file.
+        strains: ligament bundle -> strains at `STRAIN_FLEXIONS`.
     """
     scene = case.scene
     summary = _origin(case, path) | {"seconds": seconds} | _subject(case) | _counts(columns)
@@ -117,7 +116,7 @@ def summary_of(
         error = known_error(table.model, table.resolution_mm, chosen["name"], table.options)
         summary["contact"] = table.model_dump(mode="json")
         if scene.material is not None:
-            del summary["contact"]["material"]  # which [material] is in the place of
+            del summary["contact"]["material"]  # [material] replaces it
         summary["material"] = chosen
         summary["known_error"] = as_json(error)
         summary["split_not_determined_frames"] = int((columns["split_determined"] == 0).sum())
@@ -131,12 +130,14 @@ def summary_of(
 
 
 def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
-    """Return numbers that a Methods section needs and that no table of the scene holds.
+    """Return numbers for a Methods section that are not in the scene.
 
-    They are the frames per second of an evenly sampled motion, the triangles of each mesh with the
-    median of their longest edges, the least and largest thickness of the insert below the centres
-    of pressure of the frames, and the tolerances of the contact solver. A number that is not known
-    is left out.
+    - frame rate of an evenly sampled motion;
+    - number of triangles, and median of their longest edges, of each mesh;
+    - least and largest thickness of the insert below the centres of pressure;
+    - tolerances of the contact solver.
+
+    Unknown numbers are missing.
     """
     time = case.motion.time
     result: dict[str, Any] = {}
@@ -168,7 +169,7 @@ def _thickness(columns: Mapping[str, Any]) -> dict[str, list[float]]:
 
 
 def _tolerances(table: ContactTable) -> dict[str, float]:
-    """Return the relative tolerances of a contact model's solver, as far as they are known."""
+    """Return the relative tolerances of a built-in contact model; empty for a plug-in."""
     if table.model in ("foundation", "foundation-linear"):
         from tkamb.contact.pressing import PRESS
 
@@ -185,7 +186,7 @@ def _tolerances(table: ContactTable) -> dict[str, float]:
 
 
 def _gait(case: Case) -> dict[str, Any]:
-    """Return foot strikes, toe-offs and stances of the force plates, and the gait cycle."""
+    """Return gait events and stances from the force plates, and the gait cycle."""
     inputs: dict[str, Any] = {}
     cycle = case.gait_cycle_s
     if cycle is not None:
@@ -197,19 +198,21 @@ def _gait(case: Case) -> dict[str, Any]:
         or case.motion.cycle_percent is not None
     ):
         return inputs
-    offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
+    toe_offs = [] if cycle is None else [off for off in gait.toe_offs if cycle[0] < off < cycle[1]]
     inputs["gait"] = {
         "foot_strike_s": gait.foot_strikes,
         "toe_off_s": gait.toe_offs,
         "stance_s": gait.spans(),
         "threshold_N": GAIT.contact_force_N,
-        "toe_off_percent": [float(cycle_percent(np.array(off), cycle)) for off in offs if cycle],
+        "toe_off_percent": [
+            float(cycle_percent(np.array(off), cycle)) for off in toe_offs if cycle
+        ],
     }
     return inputs
 
 
 def notes_of(scene: Scene) -> list[str]:
-    """Return the scene's notes, without those on the absence of a part that it now has."""
+    """Return the notes of the scene, without those on missing [muscles] if the scene has them."""
     return [
         note
         for note in scene.output.notes
@@ -218,7 +221,7 @@ def notes_of(scene: Scene) -> list[str]:
 
 
 def _origin(case: Case, path: Path | None) -> dict[str, Any]:
-    """Return which scene was run, when, how and by what."""
+    """Return scene file, overrides, preset, time, command and versions of the run."""
     return {
         "scene": None if path is None else str(path.absolute()),
         "scene_sha256": scene_hash(case),
@@ -231,7 +234,7 @@ def _origin(case: Case, path: Path | None) -> dict[str, Any]:
 
 
 def _subject(case: Case) -> dict[str, Any]:
-    """Return whose knee it is, in which frame, and how it is shown."""
+    """Return patient, frame, yield stress, axis of the plots and activity."""
     patient, output = case.scene.patient, case.scene.output
     words = "lateral (a left knee, computed as its mirror image)"
     lateral = words if patient.side == "left" else "right (lateral)"
@@ -247,7 +250,7 @@ def _subject(case: Case) -> dict[str, Any]:
 
 
 def _counts(columns: dict[str, Any]) -> dict[str, Any]:
-    """Return how many frames there are, which failed, and the largest force."""
+    """Return number of frames, failed and flagged frames, and largest force."""
     statuses, times = columns["status"], columns["time_s"]
     return {
         "frames": len(statuses),
@@ -263,12 +266,12 @@ def _counts(columns: dict[str, Any]) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _versions() -> dict[str, str]:
-    own = {"python": sys.version.split()[0], "tkamb": __version__}
-    return own | {name: version(name) for name in LIBRARIES}
+    versions = {"python": sys.version.split()[0], "tkamb": __version__}
+    return versions | {name: version(name) for name in LIBRARIES}
 
 
 def not_modelled(case: Case) -> list[str]:
-    """Return the parts that the scene leaves out."""
+    """Return the parts of a knee that the scene does not model."""
     scene = case.scene
     parts = {
         "ground reaction": scene.ground_reaction,
@@ -280,10 +283,10 @@ def not_modelled(case: Case) -> list[str]:
 
 
 def assumptions(case: Case) -> list[str]:
-    """Return the assumptions behind the numbers, in plain words."""
+    """Return the assumptions of a run as sentences."""
     scene = case.scene
     sentences = [
-        "Segments are rigid; the hip carries the force and moment of all that crosses it.",
+        "Segments are rigid; hip force and moment are those of all structures across the hip.",
     ]
     if scene.preset is not None:
         sentences += scene.preset.sentences()
@@ -292,11 +295,11 @@ def assumptions(case: Case) -> list[str]:
     else:
         sentences.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
     if case.ground is not None and case.ground.level_assumed:
-        sentences.append("The force plate lies at the laboratory's height 0: no column says where.")
+        sentences.append("The force plate is assumed at height 0 of the laboratory.")
     if case.motion.unrecorded:
         sentences.append(
-            f"{', '.join(case.motion.unrecorded)} were not recorded: they are computed. The rates "
-            "in inertia and in the direction of sliding are those of an initial guess."
+            f"{', '.join(case.motion.unrecorded)} were not recorded but computed. Their rates, for "
+            "inertia and the direction of sliding, are those of an initial guess."
         )
     if scene.motion.motion == "roll-slip":
         sentences.append(
@@ -305,23 +308,21 @@ def assumptions(case: Case) -> list[str]:
         )
     if scene.generic_ligaments:
         sentences.append(
-            f"{', '.join(scene.generic_ligaments.ligaments)}: a generic set scaled to the "
-            "implant, not this patient's; check the strains."
+            f"{', '.join(scene.generic_ligaments.ligaments)}: generic ligaments scaled to the "
+            "implant, not those of the patient; check the strains."
         )
     if case.motion.markers:
         sentences.append(_marker_reading(case))
     elif not scene.tibia:
-        sentences.append("No [tibia]: the shank stands upright and still.")
+        sentences.append("No [tibia]: the shank is vertical and does not move.")
     if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
         sentences.append(
             "The ground reaction acts at the ankle centre, without moment (Sharma 2008)."
         )
     if scene.ground_reaction and scene.ground_reaction.force == "on the plate":
-        sentences.append("The ground reaction is recorded as the force on the plate: signs turned.")
+        sentences.append("The recorded force is that on the plate: its signs are inverted.")
     if not scene.patella:
-        sentences.append(
-            "No muscles: no part carries the knee's flexion moment, which remains as a residual."
-        )
+        sentences.append("No muscles: the knee's flexion moment is a residual.")
     if scene.muscles:
         sentences.append(_sharing(scene.muscles))
         if scene.muscles.emg:
@@ -337,48 +338,50 @@ def assumptions(case: Case) -> list[str]:
 
 
 def _marker_reading(case: Case) -> str:
-    """Return which reading of the skin markers is used, and how far the other one is off."""
+    """Return a sentence on the method for skin markers, and its difference from the other one."""
     markers = case.motion.markers
     assert markers is not None and case.scene.motion.markers is not None
-    used = {"segments": "rigid fits of shank and thigh", "chain": "a chain with joints"}
+    used = {
+        "segments": "separate fits of shank and thigh",
+        "chain": "a fit of segments with joints",
+    }
     names = ", ".join(case.scene.motion.markers.coordinates)
     time = case.motion.time
-    off = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
+    distance = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
     difference = np.abs(markers.flexion["segments"] - markers.flexion["chain"])
     difference = markers.at(np.nan_to_num(difference), time).max() / DEGREE
     return (
-        f"Shank and {names} are those of skin markers, by {used[markers.method]}: the knee "
-        f"centres of shank and thigh markers are up to {off:.0f} mm apart, and the two readings' "
-        f"flexions differ by up to {difference:.1f} deg."
+        f"Shank and {names} come from skin markers, by {used[markers.method]}. The knee "
+        f"centres of shank and thigh markers are up to {distance:.0f} mm apart. The flexions of "
+        f"the two methods (separate fits, fit with joints) differ by up to {difference:.1f} deg."
     )
 
 
 def _sharing(table: MusclesTable) -> str:
-    """Return how the muscles share the load."""
+    """Return a sentence on the static optimisation."""
     weights = "volume-weighted" if table.weights == "volume" else "equally weighted"
     return (
-        f"The muscles of {table.model.name} share the joint moments at the least "
-        f"{weights} sum of "
-        f"activations to the power {table.exponent:g}, with reserves ({table.law} strength); hip "
-        "loads stay the intersegmental ones."
+        f"The muscles of {table.model.name} share the joint moments by static optimisation: the "
+        f"least {weights} sum of activations to the power {table.exponent:g}, with reserves "
+        f"({table.law} strength). Hip loads are intersegmental, without muscles."
     )
 
 
 def _agreement(table: ContactTable) -> str:
-    """Return how body and contact were brought together."""
+    """Return a sentence on the coupling of body and contact."""
     if table.released:
         names = ", ".join(sorted({*table.released, "si"}))
-        return f"{names} are computed, not recorded: body and contact are in equilibrium there."
+        return f"{names} are found by equilibrium of body and contact, not recorded."
     sentence = (
         "The contact model is loaded with the superior-inferior force at the measured rotation; "
     )
     if table.coupling == "points":
-        return sentence + "the deformed contact's resultants act in the body's equations."
+        return sentence + "its resultants act in the equations of the body."
     return sentence + "its result does not change the forces of the body."
 
 
 def _bearing(scene: Scene) -> tuple[str, ...]:
-    """Return what the contact model leaves out of the insert's bearing."""
+    """Return sentences on features of the bearing that the contact model lacks."""
     insert = scene.implant.insert
     if scene.contact is None or insert is None:
         return ()
@@ -386,10 +389,10 @@ def _bearing(scene: Scene) -> tuple[str, ...]:
 
 
 def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return coordinate -> what its muscles leave to a reserve, and how often it is much.
+    """Return coordinate -> largest reserve, and number of frames with a large reserve.
 
     Args:
-        columns: of results.csv, those of the reserves and the joints' moments among them.
+        columns: columns of results.csv.
     """
     result = {}
     for column in columns:
@@ -410,39 +413,39 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
 
 
 def saturated_muscles(columns: Mapping[str, Any]) -> dict[str, int]:
-    """Return muscle -> in how many frames it pulls as hard as it can, of those that do."""
-    found = {}
+    """Return saturated muscle -> number of frames in which it is saturated."""
+    result = {}
     for column, values in columns.items():
         if belongs(column, ACTIVATION):
             frames = int((np.asarray(values) > SATURATED).sum())
             if frames:
-                found[name_in(column, ACTIVATION)] = frames
-    return found
+                result[name_in(column, ACTIVATION)] = frames
+    return result
 
 
 def peaks(columns: Mapping[str, Any], body_weight: float) -> dict[str, dict[str, float]]:
-    """Return force -> its largest value in body weights, with its frame, time and flexion.
+    """Return force -> its largest value, BW, with frame, time and flexion.
 
     Args:
-        columns: of results.csv.
-        body_weight: N.
+        columns: columns of results.csv.
+        body_weight: body weight, N.
     """
-    found = {}
+    result = {}
     for force, name in predicted_columns(columns).items():
         values = columns.get(name)
         if values is not None and np.isfinite(values).any():
             frame = int(np.nanargmax(values))
-            found[force] = {
+            result[force] = {
                 "nominal": float(values[frame]) / body_weight,
                 "frame": frame,
                 "time_s": float(columns["time_s"][frame]),
                 "flexion_deg": float(columns["flexion_deg"][frame]),
             }
-    return found
+    return result
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:
-    """Return the least flexion (deg) of the frames where the quadriceps wraps; None: never."""
+    """Return the least flexion, deg, at which the quadriceps wraps; None: it never wraps."""
     flexion = columns["flexion_deg"][columns["quadriceps_wrap_deg"] > 0.0]
     return float(flexion.min()) if len(flexion) else None
 

@@ -1,7 +1,7 @@
-"""What a summary.json may hold: kinds of values by key, checked before anything reads them.
+"""Types of the values in summary.json, checked before any use.
 
-A folder of results may come from somebody else. A key that no reader knows may hold anything; a
-key of the tables below holds what tkamb writes there, or the folder is refused in one line.
+A results folder may come from someone else. A key of the tables below must have a value as tkamb
+writes it; otherwise the folder is refused. Other keys may have any value.
 """
 
 import math
@@ -12,28 +12,29 @@ from typing import Any
 from tkamb.errors import InputError
 
 Kind = Any
-"""A word of `WORDS`, a list [kind of its items], a dict of kinds by key, or alternatives."""
+"""Type of a value: a word of `WORDS`, a list [kind of the items], a dict key -> kind, or a tuple of
+alternatives."""
 
 WORDS = ("text", "number", "count", "null", "any", "other law")
 ANY_KEY = "*"
-"""In a dict of kinds: every key that is not named, and any number of them."""
+"""Key in a dict of kinds for all other keys. A key that ends in "?" may be missing."""
 
 
 @dataclass(frozen=True)
 class SummaryLimits:
-    """Limits of a summary besides its kinds."""
+    """Limits of the values in a summary."""
 
     largest_number: float = 1e15
-    """Absolute value; no quantity of a run in its unit comes near it, and its square is finite."""
+    """1: largest absolute value. No quantity of a run is as large, and its square is finite."""
     deepest: int = 30
-    """Objects and lists inside one another; tkamb writes seven."""
+    """1: largest depth of nested objects and lists. tkamb writes seven."""
 
 
 LIMITS = SummaryLimits()
 
 
 def optional(kinds: Mapping[str, Kind]) -> dict[str, Kind]:
-    """Return kinds of keys that need not be there, and may be null."""
+    """Return kinds for keys that may be missing or null."""
     return {f"{key}?": (kind, "null") for key, kind in kinds.items()}
 
 
@@ -257,14 +258,14 @@ SUMMARY = optional(
 
 
 def check_summary(summary: object, path: object) -> None:
-    """Raise unless a summary holds under the keys that are read what tkamb writes there.
+    """Raise unless the values of a summary have the types that tkamb writes.
 
     Args:
-        summary: what a summary.json holds.
-        path: of the file, for the message.
+        summary: content of a summary.json.
+        path: path of the file, for the message.
 
     Raises:
-        InputError: names the first key that does not, or a number that is too large.
+        InputError: a value has a wrong type, is too large or nested too deep.
     """
     _check_depth(summary, path)
     wrong = _difference(summary, SUMMARY, "")
@@ -274,21 +275,21 @@ def check_summary(summary: object, path: object) -> None:
 
 def _check_depth(value: object, path: object) -> None:
     """Raise for a number that is too large or values nested too deep, under any key."""
-    waiting: list[tuple[object, int]] = [(value, 0)]
-    while waiting:
-        one, depth = waiting.pop()
+    unchecked: list[tuple[object, int]] = [(value, 0)]
+    while unchecked:
+        one, depth = unchecked.pop()
         if depth > LIMITS.deepest:
             raise InputError(f"nests values more than {LIMITS.deepest} deep", path)
         if isinstance(one, Mapping):
-            waiting += [(item, depth + 1) for item in one.values()]
+            unchecked += [(item, depth + 1) for item in one.values()]
         elif isinstance(one, list):
-            waiting += [(item, depth + 1) for item in one]
+            unchecked += [(item, depth + 1) for item in one]
         elif isinstance(one, int | float) and not abs(one) <= LIMITS.largest_number:
             raise InputError("holds a number that is not finite or beyond 1e15", path)
 
 
 def _difference(value: Any, kind: Kind, where: str) -> str | None:
-    """Return in words where a value is not of a kind; None if it is."""
+    """Return a message on a value that is not of a kind; None: it is."""
     if isinstance(kind, tuple):
         problems = [_difference(value, one, where) for one in kind]
         return None if None in problems else max(filter(None, problems), key=_depth_of_message)
@@ -301,7 +302,7 @@ def _difference(value: Any, kind: Kind, where: str) -> str | None:
         if len(kinds) != len(value):
             return f"'{where}' has {len(value)} items, not {len(kinds)}"
         pairs = zip(value, kinds, strict=True)
-        problems = [_difference(one, own, f"{where}.{k}") for k, (one, own) in enumerate(pairs)]
+        problems = [_difference(one, item, f"{where}.{k}") for k, (one, item) in enumerate(pairs)]
         return next(filter(None, problems), None)
     if kind in WORDS:
         return None if _is(value, kind) else f"'{where}' is {_shown(value)}, not a {kind}"
@@ -311,7 +312,7 @@ def _difference(value: Any, kind: Kind, where: str) -> str | None:
 def _difference_of_keys(value: Any, kinds: Mapping[str, Kind], where: str) -> str | None:
     if not isinstance(value, Mapping):
         return f"'{where or 'content'}' is {_shown(value)}, not an object"
-    rest = kinds.get(ANY_KEY, "any")
+    other_kind = kinds.get(ANY_KEY, "any")
     for name, kind in kinds.items():
         key = name.removesuffix("?")
         if name == ANY_KEY:
@@ -325,7 +326,7 @@ def _difference_of_keys(value: Any, kinds: Mapping[str, Kind], where: str) -> st
             return wrong
     for key, item in value.items():
         if key not in kinds and f"{key}?" not in kinds:
-            wrong = _difference(item, rest, f"{where}.{key}" if where else str(key))
+            wrong = _difference(item, other_kind, f"{where}.{key}" if where else str(key))
             if wrong is not None:
                 return wrong
     return None
@@ -336,11 +337,11 @@ def _depth_of_message(text: str) -> int:
 
 
 def _is(value: Any, word: str) -> bool:
-    whole = isinstance(value, int) and not isinstance(value, bool)
+    is_integer = isinstance(value, int) and not isinstance(value, bool)
     return {
         "text": isinstance(value, str),
-        "number": whole or (isinstance(value, float) and math.isfinite(value)),
-        "count": whole and value >= 0,
+        "number": is_integer or (isinstance(value, float) and math.isfinite(value)),
+        "count": is_integer and value >= 0,
         "null": value is None,
         "other law": isinstance(value, str) and value not in ("ramberg-osgood", "tabulated"),
         "any": True,
@@ -348,7 +349,7 @@ def _is(value: Any, word: str) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """Return a value of any size in at most a few words."""
+    """Return a short text for a value of any size."""
     if isinstance(value, Mapping | list):
         return "an object" if isinstance(value, Mapping) else "a list"
     text = "null" if value is None else repr(value)

@@ -1,4 +1,4 @@
-"""Frames in SI into the rows and columns of results.csv."""
+"""Rows and columns of results.csv from the frames, which are in SI units."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,7 @@ WHY_IT_FAILED = (
     *("body_seconds", "query_seconds", "contact_seconds", "condition_number", "contact_trials"),
     *("coupling_iterations", "smallest_stiffness_N_per_mm"),
 )
-"""Columns that a failed frame keeps: they show how far it was computed."""
+"""Columns of a failed frame with numbers. They show how far the frame was computed."""
 
 Columns = dict[str, Any]
 
@@ -51,15 +51,15 @@ def frame_row(
 ) -> dict[str, Any]:
     """Return the row of results.csv of frame k: column -> number, and the status.
 
-    A frame that failed keeps its motion, and `WHY_IT_FAILED`, alone.
+    A failed frame has numbers only for its motion and `WHY_IT_FAILED`.
 
     Args:
         case: the case.
         k: frame of the motion.
-        body: its body side.
-        contact: its contact side; None when not modelled.
-        slips: side -> slip over the frames up to k and one more, see `Mechanics.slips`.
-        status: text.
+        body: loads of the frame by the equations.
+        contact: contact of the frame; None: not modelled.
+        slips: side -> slip in the frames up to k + 1, see `Mechanics.slips`.
+        status: status of the frame.
     """
     motion = _motion_row(case, k)
     row = motion | _body_row(case, body)
@@ -80,18 +80,18 @@ def frame_row(
 def join_rows(case: Case, frames: range, rows: Mapping[int, dict[str, Any]]) -> Columns:
     """Return the columns of results.csv, one entry per frame.
 
-    A frame without a row holds its motion, NaN and the status "failed: not computed".
+    A frame without a row has its motion, NaN and the status "failed: not computed".
 
     Args:
         case: the case.
-        frames: of the motion.
-        rows: frame -> `frame_row`.
+        frames: frames of the motion.
+        rows: frame -> row from `frame_row`.
     """
     missing = {"status": FAILED + "not computed"}
-    full = [rows[k] if k in rows else _motion_row(case, k) | missing for k in frames]
-    names = dict.fromkeys(name for row in full for name in row if name != "status")
-    columns: Columns = {n: np.array([row.get(n, NAN) for row in full], float) for n in names}
-    return columns | {"status": [row["status"] for row in full]}
+    all_rows = [rows[k] if k in rows else _motion_row(case, k) | missing for k in frames]
+    names = dict.fromkeys(name for row in all_rows for name in row if name != "status")
+    columns: Columns = {n: np.array([row.get(n, NAN) for row in all_rows], float) for n in names}
+    return columns | {"status": [row["status"] for row in all_rows]}
 
 
 def _motion_row(case: Case, k: int) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def _marker_row(markers: "MarkerKinematics", time: Array) -> dict[str, Any]:
 def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
     loads, values, extensor = frame.loads, frame.loads.values, frame.geometry.extensor
     on_insert = -loads.contact_force
-    for push in frame.geometry.post[:1]:  # on the tibia; the second is its opposite
+    for push in frame.geometry.post[:1]:  # the load on the tibia; the second is on the femur
         on_insert = on_insert + push.forces[0]
     total = float(np.linalg.norm(on_insert))
     normal = {side: normal_force(frame, side) for side in SIDES}
@@ -180,7 +180,7 @@ def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
 
 
 def _muscle_row(share: "MuscleShare") -> dict[str, float]:
-    """Return what each muscle carries, and what none does."""
+    """Return forces and activations of the muscles, joint moments and reserves."""
     row: dict[str, float] = {}
     for family, names, values in (
         (MUSCLE_FORCE, share.muscles, share.force),
@@ -195,13 +195,13 @@ def _muscle_row(share: "MuscleShare") -> dict[str, float]:
 def _slip_row(
     case: Case, k: int, side: str, slip: "CondyleSlip", contact: "CondylePoint | None"
 ) -> dict[str, float]:
-    """Return how one condyle moves on the insert at one frame.
+    """Return slip and velocities of a condyle on the insert.
 
-    - slip and its rate, from arcs of successive lowest points (`tkamb.knee.slip`);
-    - the same rate without arcs: the rigid-body velocity of the femur's contact point relative
-      to the insert, forwards, less its axial part;
-    - that velocity along the contact normal. Surfaces that stay in touch have none: what is
-      left is by how much the recorded motion violates the contact constraint.
+    - Slip and slip rate, from the arcs between successive lowest points (`tkamb.knee.slip`).
+    - Sliding velocity: forward rigid-body velocity of the femur's contact point relative to the
+      insert, minus the part from axial rotation.
+    - Normal velocity: the same along the contact normal. It shows by how much the recorded motion
+      violates the contact constraint.
     """
     values = {
         "slip_mm": slip.slip[k],
@@ -236,15 +236,15 @@ def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]
 
 
 def _post_row(post: "PostContact") -> dict[str, float]:
-    """Return what a cam does to the post."""
-    force, centre, disengaged = post.force, post.centre, NAN if post.problem else 1.0
+    """Return force, pressure and gap of cam and post."""
+    force, centre, factor = post.force, post.centre, NAN if post.problem else 1.0
     return {
         "post_force_N": float(np.linalg.norm(force)),
         "post_force_ap_N": force[0],
         "post_force_si_N": -force[1],
         "post_force_ml_N": force[2],
-        "post_area_mm2": disengaged * post.area / MILLIMETRE**2,
-        "post_peak_pressure_MPa": disengaged * post.peak_pressure / MEGAPASCAL,
+        "post_area_mm2": factor * post.area / MILLIMETRE**2,
+        "post_peak_pressure_MPa": factor * post.peak_pressure / MEGAPASCAL,
         "post_cop_si_mm": centre[1] / MILLIMETRE,
         "post_cop_ml_mm": centre[2] / MILLIMETRE,
         "post_gap_mm": post.gap / MILLIMETRE,
@@ -252,7 +252,7 @@ def _post_row(post: "PostContact") -> dict[str, float]:
 
 
 def _pose_row(frame: "FrameContact") -> dict[str, float]:
-    """Return where the contact holds, and how body and contact came to agree there."""
+    """Return the pose of the contact, and the convergence of the coupling."""
     place = knee_coordinates(frame.result.pose) if frame.result else np.full(6, NAN)
     named = dict(zip(KNEE_COORDINATES, place.tolist(), strict=True))
     row = {f"{axis}_mm": named[axis] / MILLIMETRE for axis in ("ap", "si", "ml")}

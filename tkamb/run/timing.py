@@ -1,4 +1,4 @@
-"""Times of a run: the stages on a terminal, and the profile of `tkamb run --profile`."""
+"""Computing times: stages of a run on a terminal, and profile of `tkamb run --profile`."""
 
 import math
 import os
@@ -17,11 +17,12 @@ _T = TypeVar("_T")
 
 
 class Stages:
-    """Says on a stream what is being done; each stage ends when the next begins, or on leaving.
+    """Prints the stages of a run with their times. A stage ends when the next one begins.
 
     Args:
-        count: of the stages.
-        stream: where to; default: standard error. One that is no terminal stays empty.
+        count: number of stages.
+        stream: stream for the output; None: standard error. Nothing is printed unless the stream
+            is a terminal.
     """
 
     def __init__(self, count: int, stream: TextIO | None = None) -> None:
@@ -37,22 +38,22 @@ class Stages:
         self.end()
 
     def begin(self, name: str) -> None:
-        """End the stage before and begin one."""
+        """End the current stage and begin a new one."""
         self.end()
         self._number += 1
         self._began, self._open = clock.perf_counter(), True
         self._write(f"{self._number}/{self._count} {name} …")
 
     def frames(self, indices: Sequence[int]) -> Iterable[int]:
-        """Begin the stage of the frames and return them with a bar that says the time left."""
+        """Begin the stage of the frames, and return them with a progress bar."""
         return self._counted("computing frames", indices, "frame")
 
     def plots(self, drawn: Sequence[_T]) -> Iterable[_T]:
-        """Begin the last stage and return the report's plots, likewise."""
+        """Begin the stage of the report, and return its plots with a progress bar."""
         return self._counted("writing results and report", drawn, "plot")
 
     def end(self) -> None:
-        """End the stage, with the time that it took."""
+        """End the stage and print its time."""
         if self._open:
             self._write(f" {clock.perf_counter() - self._began:.1f} s\n")
         self._open = False
@@ -72,7 +73,7 @@ class Stages:
 
 
 HEAVY = ("pinocchio", "trimesh", "scipy", "fcl", "numba", "h5py", "matplotlib", "pydantic")
-"""Libraries worth naming."""
+"""Libraries that the profile lists if they are imported."""
 CLOCKS = {
     "closest points": "query_seconds",
     "equations of motion": "body_seconds",
@@ -82,7 +83,7 @@ CLOCKS = {
 
 @dataclass(eq=False)
 class Profile:
-    """Watches a run from the moment it is made.
+    """Profile of a run. It records imported modules and opened files from its creation.
 
     Attributes:
         opened: files that were opened for reading, in order.
@@ -92,25 +93,26 @@ class Profile:
 
     def __post_init__(self) -> None:
         self._before = set(sys.modules)
-        sys.addaudithook(self._hear)
+        sys.addaudithook(self._record_opened)
 
     def report(self, results: "Results", scene: Path) -> dict[str, Any]:
-        """Return what was used, JSON-able.
+        """Return times, files, modules and libraries of the run as a JSON object.
 
         Args:
-            results: of the run.
-            scene: its file; files beside or below it count as the scene's, as what it names does.
+            results: results of the run.
+            scene: path of the scene file. Only opened files in its folder and files that the scene
+                names are listed.
         """
         seconds = dict(results.summary["seconds"])
-        whole = seconds.pop("all")
+        total = seconds.pop("all")
         for name, column in CLOCKS.items():
             finite = [float(value) for value in results[column] if math.isfinite(value)]
             if finite:
                 seconds[name] = sum(finite)
-        seconds["all else"] = max(0.0, whole - sum(seconds.values()))
+        seconds["all else"] = max(0.0, total - sum(seconds.values()))
         modules = sorted(set(sys.modules) - self._before)
         return {
-            "seconds": seconds | {"all": whole},
+            "seconds": seconds | {"all": total},
             "frames": len(results),
             "not_modelled": results.summary["not_modelled"],
             "files": [str(path) for path in self._of_scene(scene, results.summary["inputs"])],
@@ -119,12 +121,12 @@ class Profile:
         }
 
     def _of_scene(self, scene: Path, named: Iterable[str]) -> list[Path]:
-        folder, elsewhere = scene.resolve().parent, {Path(name).resolve() for name in named}
+        folder, inputs = scene.resolve().parent, {Path(name).resolve() for name in named}
         opened = dict.fromkeys(path.resolve() for path in self.opened)
-        own = [path for path in opened if path.is_relative_to(folder) or path in elsewhere]
-        return [path for path in own if path.is_file()]
+        listed = [path for path in opened if path.is_relative_to(folder) or path in inputs]
+        return [path for path in listed if path.is_file()]
 
-    def _hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _record_opened(self, event: str, arguments: tuple[Any, ...]) -> None:
         if event != "open" or not isinstance(arguments[0], str):
             return
         if arguments[2] & os.O_ACCMODE == os.O_RDONLY:
@@ -132,14 +134,14 @@ class Profile:
 
 
 def profile_lines(report: dict[str, Any]) -> list[str]:
-    """Return a report as lines to read."""
-    whole, frames = report["seconds"]["all"], report["frames"]
+    """Return a report as lines of text."""
+    total, frames = report["seconds"]["all"], report["frames"]
     lines = ["part                       seconds   share  ms per frame"]
     for name, seconds in report["seconds"].items():
-        share = f"{100 * seconds / whole:5.1f} %"
+        share = f"{100 * seconds / total:5.1f} %"
         lines.append(f"{name:24s} {seconds:9.3f} {share} {1e3 * seconds / frames:13.2f}")
     parts = "; ".join(report["not_modelled"]) or "none"
-    lines.append(f"parts left out: {parts}")
+    lines.append(f"parts not modelled: {parts}")
     lines.append(f"files read ({len(report['files'])}): " + _names(report["files"]))
     modules = [name.removeprefix("tkamb.") for name in report["modules"]]
     lines.append(f"modules imported ({len(modules)}): " + ", ".join(modules))

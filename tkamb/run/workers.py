@@ -1,12 +1,12 @@
-"""Jobs over worker processes or a Dask cluster; each process prepares once what its jobs share.
+"""Distribution of jobs over worker processes or a Dask cluster.
 
-A worker is a Python process that runs this module. It reads pickled jobs from its standard input
-and writes pickled answers to its standard output until the input ends, which it also does when the
-parent is killed. Unlike with multiprocessing, nothing of the calling script runs again.
+A worker is a Python process that runs this module. It prepares the task once, reads pickled jobs
+from its standard input, and writes pickled answers to its standard output. It ends when the input
+ends, also if the parent was killed. Unlike multiprocessing, it does not import the calling script.
 
-Dask is an extra (`pip install 'tkamb[cluster]'`) and imported only when asked for. If a worker of a
-cluster dies, another one repeats its job. A job is a function of its number and content alone, so
-that the answers are the same.
+Dask is an extra (`pip install 'tkamb[cluster]'`). If a worker of a cluster dies, another one
+repeats its job. The answers do not depend on the worker, since a job is a function of its number
+and content only.
 """
 
 import argparse
@@ -33,14 +33,14 @@ LOCAL = "local"
 
 @dataclass(frozen=True)
 class ClusterSettings:
-    """How long a Dask cluster is waited for."""
+    """Limits for a Dask cluster."""
 
     answer_seconds: float = 10.0
-    """s that a scheduler may take to answer. Chosen: an idle scheduler answers within one
-    second."""
+    """s: time limit for the answer of a scheduler. Chosen because an idle scheduler answers within
+    one second."""
     most_deaths: int = 5
-    """Workers that may die under one job. Chosen: after that the job is taken to be what kills
-    them."""
+    """1: workers that may die in one job before the run fails. Chosen because the job is then the
+    likely cause."""
 
 
 CLUSTER = ClusterSettings()
@@ -51,17 +51,18 @@ LOST = "what is finished is kept: go on with resume=True"
 def answers_of_cluster(
     task: "Task", tasks: Sequence["Numbered"], address: str, workers: int
 ) -> Iterator["Numbered"]:
-    """Yield answers with their numbers as they are finished, in any order.
+    """Yield the numbers and answers of jobs in the order in which they finish.
 
     Args:
-        task: what each process of the cluster prepares.
+        task: task of the workers.
         tasks: numbers and contents of the jobs.
-        address: of the scheduler, "tcp://host:8786"; "local": one on this machine.
-        workers: processes of a local one.
+        address: address of the scheduler, such as "tcp://host:8786"; "local": start one on this
+            machine.
+        workers: number of workers of a local scheduler.
 
     Raises:
-        InputError: Dask is not installed, or no scheduler answers there.
-        ComputationError: the scheduler is gone, or a job killed one worker after the other.
+        InputError: Dask is not installed, or no scheduler answers.
+        ComputationError: the scheduler has ended, or a job killed too many workers.
     """
     distributed = _library()
     with ExitStack() as stack:
@@ -82,19 +83,19 @@ def answers_of_cluster(
 
 
 def _own_security(distributed: Any) -> Any:
-    """Return certificates for this process alone.
+    """Return certificates for this process.
 
-    A scheduler without them takes work, which is code, from every user of the machine.
+    A scheduler without certificates executes code from every user of the machine.
     """
     try:
         return distributed.Security.temporary()
     except ImportError:
-        mend = "pip install 'tkamb[cluster]'"
-        raise InputError("cryptography is not installed", "--dask local", mend) from None
+        hint = "pip install 'tkamb[cluster]'"
+        raise InputError("cryptography is not installed", "--dask local", hint) from None
 
 
 def check_cluster(address: str) -> None:
-    """Raise an InputError where Dask is not installed, or no scheduler answers."""
+    """Raise an InputError if Dask is not installed, or no scheduler answers."""
     distributed = _library()
     if address == LOCAL:
         _own_security(distributed)
@@ -118,7 +119,7 @@ def _connected(distributed: Any, place: Any, address: str) -> Any:
     """Return a client of the scheduler."""
     try:
         return distributed.Client(place, timeout=CLUSTER.answer_seconds)
-    except (OSError, ValueError, TypeError) as error:  # no answer; no address
+    except (OSError, ValueError, TypeError) as error:  # no answer, or an invalid address
         raise InputError(
             f"no Dask scheduler answers at '{address}' ({type(error).__name__})",
             "--dask",
@@ -136,28 +137,29 @@ def _answers(
         }
         for future in distributed.as_completed(futures):
             if future.cancelled():
-                raise ComputationError("the Dask scheduler is gone", "--dask", LOST)
+                raise ComputationError("the Dask scheduler has ended", "--dask", LOST)
             yield futures.pop(future), future.result()
     except distributed.KilledWorker:
         what = f"a job killed {CLUSTER.most_deaths} workers"
         raise ComputationError(
             what, "--dask", f"check that a worker has enough memory; {LOST}"
         ) from None
-    except OSError as error:  # dask's CommClosedError among them
-        raise ComputationError(f"the Dask scheduler is gone ({error})", "--dask", LOST) from None
+    except OSError as error:  # includes Dask's CommClosedError
+        raise ComputationError(f"the Dask scheduler has ended ({error})", "--dask", LOST) from None
 
 
 _one_at_a_time = threading.Lock()
-"""Held while a worker of many threads does a job: what its jobs share does not stand threads."""
+"""Lock for the jobs of a worker with several threads, since their shared state is not
+thread-safe."""
 
 
 def answer(packed: bytes, number: int, job: Any) -> Any:
-    """Do one job on a worker of the cluster.
+    """Return the answer to a job on a worker of the cluster.
 
     Args:
-        packed: pickled `make` and `arguments` of a `tkamb.run.workers.Task`.
-        number: of the job.
-        job: its content.
+        packed: pickled `make` and `arguments` of a `Task`.
+        number: number of the job.
+        job: content of the job.
     """
     with _one_at_a_time:
         return _unpacked(packed)(number, job)
@@ -172,10 +174,10 @@ def _unpacked(packed: bytes) -> Callable[[int, Any], Any]:
 
 @dataclass(frozen=True)
 class WorkerLimitSettings:
-    """How many processes a run may start."""
+    """Limits of worker processes."""
 
     max_workers: int = 256
-    """Number of worker processes. Chosen: no machine for which tkamb is meant has more cores."""
+    """1: largest number of worker processes. Chosen because usual machines have fewer cores."""
 
 
 WORKER_LIMITS = WorkerLimitSettings()
@@ -188,19 +190,19 @@ KEPT = "what is finished is kept: go on with resume=True"
 
 @dataclass(frozen=True)
 class Task:
-    """What every worker prepares, and then does job by job.
+    """The task of a worker: a preparation, and a function for each job.
 
     Args:
-        make: a class or function that can be imported; called once per worker with `arguments`,
-            it returns what is called with the number and the content of each job.
-        arguments: for it.
+        make: importable class or function that prepares a worker. It returns the function of the
+            jobs, which takes number and content of a job.
+        arguments: arguments of `make`.
     """
 
     make: Callable[..., Callable[[int, Any], Any]]
     arguments: tuple[Any, ...] = ()
 
     def prepared(self) -> Callable[[int, Any], Any]:
-        """Return what does the jobs."""
+        """Prepare the task, and return the function of the jobs."""
         return self.make(*self.arguments)
 
 
@@ -209,12 +211,12 @@ class PoolOptions:
     """Where jobs are computed: in this process, in worker processes, or on a Dask cluster.
 
     Args:
-        workers: number of processes; with 1 the jobs are computed in this process.
-        dask: address of a Dask scheduler, or "local" to start one with `workers` workers. None:
-            no cluster.
+        workers: number of worker processes; 1: the jobs are computed in this process.
+        dask: address of a Dask scheduler; "local": start one with `workers` workers; None: no
+            cluster.
 
     Raises:
-        InputError: too few workers, or too many.
+        InputError: too few or too many workers.
     """
 
     workers: int = 1
@@ -227,30 +229,30 @@ class PoolOptions:
             )
 
     def check(self) -> None:
-        """Raise an InputError where a cluster that is asked for is not there."""
+        """Raise an InputError if the cluster of `dask` does not answer."""
         if self.dask is not None:
             check_cluster(self.dask)
 
     def answers(self, task: Task, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
-        """Yield answers with their numbers as they are finished, in any order.
+        """Yield the numbers and answers of jobs in the order in which they finish.
 
         Args:
-            task: what every worker prepares.
+            task: task of the workers.
             tasks: numbers and contents of the jobs.
 
         Raises:
-            ComputationError: a worker was killed, or the scheduler is gone.
+            ComputationError: a worker was killed, or the scheduler has ended.
         """
         with self.team(task, len(tasks)) as team:
             yield from team.answers(tasks)
 
     @contextmanager
     def team(self, task: Task, count: int) -> Iterator["WorkerPool"]:
-        """Give who answers; processes begin to prepare at once, while the caller does other things.
+        """Provide a pool of workers, which begin to prepare at once in the background.
 
         Args:
-            task: what every worker prepares.
-            count: of the jobs, at most.
+            task: task of the workers.
+            count: largest number of jobs.
         """
         processes = self.dask is None and self.workers > 1 and count > 1
         team = WorkerPool(self, task, min(self.workers, count) if processes else 0)
@@ -271,13 +273,13 @@ class WorkerPool:
     """Worker processes that compute the jobs of one task.
 
     Args:
-        crew: options that the pool is made with.
-        task: prepared once by every worker, before its first job.
-        count: number of processes to start. 0: none; the jobs are computed on the cluster of
-            `crew`, or in this process.
+        crew: options of the pool.
+        task: task of the workers.
+        count: number of worker processes; 0: the jobs are computed on the cluster of `crew`, or in
+            this process.
 
     Attributes:
-        processes: the processes that were started.
+        processes: the worker processes.
     """
 
     def __init__(self, crew: PoolOptions, task: Task, count: int) -> None:
@@ -291,16 +293,14 @@ class WorkerPool:
             ).start()
 
     def answers(self, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
-        """Yield answers with their numbers as they are finished, in any order.
-
-        See `PoolOptions.answers`.
+        """Yield the numbers and answers of jobs in the order in which they finish.
 
         Args:
             tasks: numbers and contents of the jobs.
 
         Raises:
-            InputError: what the workers prepare cannot be used.
-            ComputationError: a worker was killed, or the scheduler is gone.
+            InputError: the preparation of a worker fails.
+            ComputationError: a worker was killed, or the scheduler has ended.
         """
         if self._crew.dask is not None and tasks:
             yield from answers_of_cluster(self._task, tasks, self._crew.dask, self._crew.workers)
@@ -317,7 +317,7 @@ class WorkerPool:
             yield answer
 
     def stop(self) -> None:
-        """End the processes."""
+        """Kill the worker processes."""
         for process in self.processes:
             self._jobs.put(None)
             process.kill()
@@ -325,7 +325,7 @@ class WorkerPool:
 
 
 def _start() -> "subprocess.Popen[bytes]":
-    # a session of its own: Ctrl-C is the parent's to handle; one thread: others share the cores
+    # a new session: only the parent receives Ctrl-C; one thread: the workers share the cores
     return subprocess.Popen(
         [sys.executable, "-m", "tkamb.run.workers"],
         env=os.environ | {threads.VARIABLE: "1"},
@@ -341,17 +341,17 @@ def _attend(
     jobs: "queue.SimpleQueue[Numbered | None]",
     answers: "queue.SimpleQueue[Numbered | TkambError]",
 ) -> None:
-    """Hand one worker its jobs until None comes; an error among the answers ends it."""
+    """Send jobs to a worker, and collect its answers, until the job is None or the worker ends."""
     assert process.stdin is not None and process.stdout is not None
     try:
-        # as plain values: the worker's Task is that of the module it was started as
+        # not the Task itself: the worker has its own class Task, in the module __main__
         _send(process.stdin, (task.make, task.arguments))
         while (job := jobs.get()) is not None:
             _send(process.stdin, job)
             answers.put(pickle.load(process.stdout))
     except (OSError, EOFError, ValueError, pickle.UnpicklingError):
-        again = f"is there memory for so many? {KEPT.capitalize()}"
-        answers.put(ComputationError(ENDED, "workers", again))
+        hint = f"check that there is enough memory; {KEPT}"
+        answers.put(ComputationError(ENDED, "workers", hint))
 
 
 def _send(stream: IO[bytes], value: object) -> None:
@@ -360,7 +360,7 @@ def _send(stream: IO[bytes], value: object) -> None:
 
 
 def serve() -> None:
-    """Be a worker until the standard input ends; whatever else is printed goes to stderr."""
+    """Answer jobs from standard input until it ends. Printed text goes to standard error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     open_streams()
     log_to_stderr()
@@ -372,13 +372,13 @@ def serve() -> None:
         while True:
             number, job = pickle.load(jobs)
             _send(answers, _answer(work, number, job))
-    except (EOFError, ConnectionError, pickle.UnpicklingError):  # the parent has gone
-        # what is buffered has no reader, and the interpreter would say so at its end
+    except (EOFError, ConnectionError, pickle.UnpicklingError):  # the parent has ended
+        # buffered output has no reader: a normal exit would print an error about it
         os._exit(0)
 
 
 def _answer(work: Callable[[int, Any], Any], number: int, job: Any) -> Numbered | TkambError:
-    """Return the answer to a job, or why there is none, which is the parent's to tell."""
+    """Return number and answer of a job, or the error, which the parent raises."""
     try:
         return number, work(number, job)
     except TkambError as error:
@@ -388,7 +388,7 @@ def _answer(work: Callable[[int, Any], Any], number: int, job: Any) -> Numbered 
 
 
 def _prepared(task: Task) -> Callable[[int, Any], Any]:
-    """Return what does the jobs; it refuses them all where the preparation fails."""
+    """Return the function of the jobs. If the preparation fails, each job raises its error."""
     try:
         return task.prepared()
     except TkambError as error:
@@ -403,7 +403,7 @@ def _prepared(task: Task) -> Callable[[int, Any], Any]:
 
 
 def __getattr__(name: str) -> Any:
-    """Return a class by its former name, with a warning; until release 0.3."""
+    """Return a class by its former name, with a deprecation warning, until release 0.3."""
     return renamed(__name__, name, {"Crew": PoolOptions, "Team": WorkerPool})
 
 

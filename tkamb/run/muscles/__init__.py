@@ -1,12 +1,10 @@
-"""Muscles of a leg over a whole recording: their forces, and what they do to the bones.
+"""Muscle forces of a leg over a whole recording, by static optimisation.
 
 - `tkamb.run.muscles.trial`: `solve_trial(model, motion, loads)` returns a `MuscleTrial`.
-- `tkamb.run.muscles.sharing`: options, problems of the frames, one frame's quadratic programme.
+- `tkamb.run.muscles.sharing`: options and quadratic programmes of the frames.
 - `tkamb.run.muscles.leg`: coordinates, muscles and Hill-type strength of a leg.
-- `tkamb.run.muscles.knee_trial`: a leg whose knee is tkamb's, read from files.
-- `tkamb.run.muscles.shared_muscles`: the muscles of a run's knee.
-
-These modules are imported only when they are asked for.
+- `tkamb.run.muscles.knee_trial`: a leg with tkamb's knee in place of the OpenSim model's.
+- `tkamb.run.muscles.shared_muscles`: the muscles of a scene with [muscles].
 """
 
 from tkamb.run.muscles.sharing import Sharing

@@ -1,9 +1,9 @@
-"""Static optimisation for a leg whose knee is not the OpenSim model's.
+"""Static optimisation for a leg with tkamb's knee in place of the OpenSim model's knee.
 
-The OpenSim model provides the rows of hip, ankle and subtalar joint. The row of the knee comes from
-the equations of the knee itself, frame by frame: the moment, the arm of the extensor group and
-the arms of the muscles that cross the knee (`tkamb.knee.crossing`). `LegRecording` names the files
-of model, motion and ground reaction; `load_knee_trial` reads them.
+The OpenSim model provides the rows of hip, ankle and subtalar joint. In each frame the equations of
+tkamb's knee provide the row of the knee: the moment, the moment arm of the extensor group and the
+moment arms of the muscles that cross the knee (`tkamb.knee.crossing`). `LegRecording` names the
+files of model, motion and ground reaction. `load_knee_trial` reads them.
 """
 
 from collections.abc import Mapping
@@ -34,15 +34,15 @@ class KneeTrial:
     """The optimisation problems of all frames, and the muscle lines across the knee.
 
     Args:
-        problems: of all frames; their row of the knee's flexion is not used.
-        flexion: place of that row among the coordinates.
-        extensor: (m,) bool, muscles of the extensor group.
-        crossing: (c,) places of the other muscles that cross the knee.
-        shank: (f, c, 3) m, where these leave shank or foot, tibia link.
-        thigh: (f, c, 3) m, where they reach thigh or pelvis, femur link.
-        groups: name of a group -> its muscles, see `muscle_groups`.
-        knee: (f, 4, 4) pose of the femur link in the tibia link at which the ends were found;
-            None: not known.
+        problems: problems of all frames. Their row of the knee's flexion is not used.
+        flexion: index of that row among the coordinates.
+        extensor: mask of the muscles of the extensor group, (m,).
+        crossing: indices of the other muscles that cross the knee, (c,).
+        shank: points where the crossing muscles leave shank or foot, tibia link, m, (f, c, 3).
+        thigh: points where they reach thigh or pelvis, femur link, m, (f, c, 3).
+        groups: name of a group -> names of its muscles, see `muscle_groups`.
+        knee: pose of the femur link in the tibia link for which the points were computed,
+            (f, 4, 4); None: unknown.
     """
 
     problems: FrameProblems
@@ -56,16 +56,16 @@ class KneeTrial:
 
     @property
     def muscles(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the m muscles."""
         return tuple(muscle.name for muscle in self.problems.muscles)
 
     def changed(self, strength: Array, shank: Array, thigh: Array) -> "KneeTrial":
-        """Return the trial with other strengths, and the lines across the knee elsewhere.
+        """Return the trial with changed strengths and shifted lines across the knee.
 
         Args:
-            strength: (m,) factors of each muscle's strength, active and passive.
-            shank: (m, 3) m, shifts of where its line leaves the shank.
-            thigh: (m, 3) m, of where it reaches the thigh.
+            strength: factors of the muscles' active and passive strength, (m,).
+            shank: shifts of the points where lines leave the shank, m, (m, 3).
+            thigh: shifts of the points where lines reach the thigh, m, (m, 3).
         """
         muscles = [
             replace(muscle, max_isometric_force_N=float(factor) * muscle.max_isometric_force_N)
@@ -87,51 +87,53 @@ class KneeTrial:
     def solved(
         self, k: int, moment: float, extensor_arm: float, arms: Array
     ) -> tuple[FrameProblems, tuple[Array, Array, float, str]]:
-        """Return the problem of frame k with the knee's row, and `FrameProblems.solved` of it.
+        """Return the problem of frame k with the knee's row, and its solution.
+
+        The solution is that of `FrameProblems.solved`.
 
         Args:
             k: frame.
-            moment: N·m, what muscles and reserve carry at the knee.
-            extensor_arm: m, of the extensor group.
-            arms: (c,) m, of the crossing muscles.
+            moment: moment of muscles and reserve at the knee, N·m.
+            extensor_arm: moment arm of the extensor group, m.
+            arms: moment arms of the crossing muscles, m, (c,).
         """
-        whole, own = self.problems, slice(k, k + 1)
-        moments, table = whole.moment[own].copy(), whole.arms[own].copy()
+        problems, rows = self.problems, slice(k, k + 1)
+        moments, table = problems.moment[rows].copy(), problems.arms[rows].copy()
         moments[0, self.flexion] = moment
         row = np.where(self.extensor, extensor_arm, 0.0)
         row[self.crossing] = arms
-        # a muscle without a taut path keeps its NaN, so that the frame fails by its name
+        # NaN of a muscle without a taut path remains, so that the status names this muscle
         missing = np.isnan(table[0]).any(axis=1)
         table[0, :, self.flexion] = np.where(missing, np.nan, row)
-        guide = None if whole.guide is None else whole.guide.only(k)
+        guide = None if problems.guide is None else problems.guide.only(k)
         frame = replace(
-            whole,
+            problems,
             moment=moments,
             arms=table,
-            active=whole.active[own],
-            passive=whole.passive[own],
+            active=problems.active[rows],
+            passive=problems.passive[rows],
             guide=guide,
         )
         return frame, frame.solved(0)
 
     def force(self, k: int, activation: Array) -> Array:
-        """Return the muscles' forces (m,) N."""
+        """Return the muscle forces (m,), N, in frame k at activations (m,)."""
         return np.asarray(activation * self.problems.active[k] + self.problems.passive[k])
 
 
 def knee_trial(
     links: Links, motion: CoordinateMotion, loads: Mapping[str, Array], sharing: Sharing
 ) -> KneeTrial:
-    """Return the muscles of a leg over a motion, for a knee with a patella of its own.
+    """Return the muscles of a leg over a motion, for tkamb's knee with its own patella.
 
     Args:
-        links: of the leg.
-        motion: the model's coordinates over time.
-        loads: body -> (f, 6), as in `solve_trial`.
+        links: links of the leg.
+        motion: coordinates of the OpenSim model over time.
+        loads: name of a body -> external wrenches, (f, 6), as in `solve_trial`.
         sharing: options.
 
     Raises:
-        InputError: no muscle ends on or passes the patella, or see `solve_trial`.
+        InputError: no muscle ends on or passes the patella, or a cause of `solve_trial`.
     """
     leg = links.leg
     problems, bones = trial_problems(leg, motion, loads, sharing)
@@ -156,10 +158,10 @@ def knee_trial(
 def _crossing_lines(
     links: Links, bones: Bones, extensor: np.ndarray
 ) -> tuple[np.ndarray, Array, Array]:
-    """Return which muscles cross the knee, and their ends on either side of it.
+    """Return the indices of the muscles across the knee, and their ends on shank and thigh.
 
     Raises:
-        InputError: one crosses it more than once.
+        InputError: a muscle crosses the knee more than once.
     """
     parts = bones.crossings
     below = np.isin(parts.bodies, [bones.index("tibia"), bones.index("foot")])
@@ -177,7 +179,7 @@ def _crossing_lines(
     ends = np.full((2, frames, len(crossing), 3), np.nan)
     column = np.searchsorted(crossing, part.line)
     rows = np.arange(len(chosen))
-    first = np.where(below[chosen, 0], 0, 1)  # which end lies below the knee
+    first = np.where(below[chosen, 0], 0, 1)  # index of the end below the knee
     for side, end, bone, own in (
         (0, first, "tibia", links.tibia),
         (1, 1 - first, "femur", links.femur),
@@ -194,16 +196,17 @@ class LegRecording:
     """The files and options from which a leg and its muscles are read.
 
     Args:
-        model: the .osim file.
-        side: of the knee.
-        coordinates: .mot or .sto of the model's coordinates; None: they are fitted to markers.
-        markers: recording of markers, where they are.
-        laboratory_axes: the markers' axes that point forward, up and right.
-        cutoff: Hz, of the coordinates.
-        ground: what the ground exerts on the foot; None: nothing.
-        insert_placement: (4, 4) of the insert's mesh in the insert frame, see `find_links`; None
-            without an implant.
-        mesh_axes: the mesh's axes that point anterior, superior and right.
+        model: path of the .osim file.
+        side: side of the knee.
+        coordinates: path of a .mot or .sto file of the model's coordinates; None: the coordinates
+            are fitted to the markers.
+        markers: path of a marker recording; None: no markers.
+        laboratory_axes: laboratory axes that point forward, up and right.
+        cutoff: cutoff frequency of the coordinates, Hz.
+        ground: table of the ground reaction on the foot; None: no ground reaction.
+        insert_placement: pose of the insert's mesh in the insert frame, (4, 4), see `find_links`;
+            None: no implant.
+        mesh_axes: axes of the mesh that point anterior, superior and right.
         sharing: options.
     """
 
@@ -220,14 +223,14 @@ class LegRecording:
 
 
 def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial]:
-    """Return where the links stand in the model's bodies, and the trial at some times.
+    """Return the links of a leg in the bodies of its model, and the trial at some times.
 
     Args:
-        source: what is read.
-        time: (f,) s, on the recordings' clock.
+        source: files and options.
+        time: times of the frames on the clock of the recordings, s, (f,).
 
     Raises:
-        InputError: whatever cannot be used.
+        InputError: a file or an option cannot be used.
     """
     leg = _read_leg(source.model, source.side)
     model = leg.model
@@ -235,31 +238,31 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
     motion = _motion(source, Kinematics(model), time)
     loads = {}
     if source.ground is not None:
-        # the model's own side, so that nothing is mirrored
+        # "right" means no mirroring: the model has the leg of the recorded side
         reaction = load_ground_reaction(source.ground, time, "right")
         loads = foot_loads(model, {source.side: reaction})
     return links, knee_trial(links, motion, loads, source.sharing)
 
 
 def group_names(model: Path, side: Side) -> tuple[str, ...]:
-    """Return the names of the groups of a leg's muscles, see `muscle_groups`.
+    """Return the names of the muscle groups of a leg, see `muscle_groups`.
 
     Args:
-        model: the .osim file.
-        side: of the leg.
+        model: path of the .osim file.
+        side: side of the leg.
 
     Raises:
-        InputError: whatever cannot be used.
+        InputError: the model cannot be used.
     """
     leg = _read_leg(model, side)
     return tuple(muscle_groups(leg, [leg.model.muscles[name] for name in leg_muscles(leg)]))
 
 
 def _read_leg(path: Path, side: Side) -> Leg:
-    """Return a leg of a model whose joints and constraints, and this leg's muscles, were read.
+    """Return a leg of a model.
 
     Raises:
-        InputError: one of them was not.
+        InputError: a joint or constraint of the model, or a muscle of the leg, cannot be read.
     """
     leg = find_leg(read_osim(path, partial=True), side)
     bodies = {body for group in leg_bones(leg).values() for body in group}
@@ -282,14 +285,14 @@ def _motion(source: LegRecording, kinematics: Kinematics, time: Array) -> Coordi
         _, fit = fit_model(kinematics.model, recorded, laboratory_axes=source.laboratory_axes)
         if not fit.solved.all():
             raise InputError(
-                f"the model's chain is not found in {int((~fit.solved).sum())} frames",
+                f"the fit of the model to the markers fails in {int((~fit.solved).sum())} frames",
                 source.markers,
                 "give [muscles] coordinates",
             )
         q = fit.state
     if time[0] < stamps[0] - 1e-9 or time[-1] > stamps[-1] + 1e-9:
         raise InputError(
-            f"covers {stamps[0]:g} to {stamps[-1]:g} s, the frames {time[0]:g} to {time[-1]:g} s",
+            f"covers {stamps[0]:g} to {stamps[-1]:g} s, but frames {time[0]:g} to {time[-1]:g} s",
             recorded.path,
         )
     return coordinate_motion(

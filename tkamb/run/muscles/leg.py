@@ -1,18 +1,19 @@
-"""Coordinates and muscles of a leg in an OpenSim model, their strength, and loads on its foot.
+"""Coordinates, muscles, muscle strength and foot loads of a leg in an OpenSim model.
 
-A Hill-type muscle has a rigid tendon. With the path length L, the slack length of the tendon, and
-the constant width w = l_o sin(alpha_o) of the fibres,
+Hill-type muscles have a rigid tendon. With the path length L, the slack length l_slack of the
+tendon and the constant width w = l_o sin(alpha_o) of the fibres,
 
     l cos(alpha) = L - l_slack,   l = sqrt(w² + (L - l_slack)²),   dl/dt = cos(alpha) dL/dt,
 
     F = (a f_l(l/l_o) f_v(dl/dt / (l_o v_max)) + f_p(l/l_o)) F_max cos(alpha).
 
-f_l is a sum of three bells, f_v an arsinh, and f_p exponential beyond the optimal length. A path
-shorter than the tendon is slack and does not pull. Some lines pull over a longer path than muscle
-and tendon, such as past the patella to the tibia: L is then the path length of a twin muscle.
+f_l is a sum of three bell curves, f_v an arsinh, and f_p exponential beyond the optimal length. A
+path shorter than the tendon has no force. Some paths are longer than muscle and tendon, such as a
+path past the patella to the tibia. L is then the path length of the muscle's twin
+(`length_twins`).
 
-Reference: De Groote et al., Ann Biomed Eng 44:2922 (2016), doi:10.1007/s10439-016-1591-9; the
-coefficients are those of the authors' code, with which f_l(1) = f_v(0) = 1.
+Reference: De Groote et al., Ann Biomed Eng 44:2922 (2016), doi:10.1007/s10439-016-1591-9, with the
+coefficients of the authors' code, for which f_l(1) = f_v(0) = 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,28 +33,28 @@ BELLS = (
     (0.433004984392647, 0.716775413397760, -0.029947116970696, 0.200356847296188),
     (0.1, 1.0, 0.353553390593274, 0.0),
 )
-"""Height, place, width at length 0 and its growth, of each bell of the active force."""
+"""Bell curves of f_l: height, centre, width at length 0, and growth of the width with length."""
 VELOCITY = (-0.3211346127989808, -8.149, -0.374, 0.8825327733249912)
 
 
 @dataclass(frozen=True)
 class HillSettings:
-    """Curves of force, length and velocity of a muscle."""
+    """Force-length and force-velocity curves of a Hill-type muscle."""
 
     passive_shape: float = 4.0
-    """Shape of the passive curve (exponent); Thelen (2003) has 4 for adults under 65."""
+    """1: exponent of the passive curve. Thelen (2003) has 4 for adults under 65."""
     passive_strain: float = 0.6
-    """Strain beyond the optimal length at which the passive force is F_max."""
+    """1: strain beyond the optimal length at which the passive force is F_max."""
     longest_fibre_ratio: float = 1.8
-    """Fibre length over the optimal one beyond which the curves do not hold. Chosen: f_p(1.6) is 1
-    already."""
+    """1: largest fibre length over the optimal length for which the curves are valid. Chosen
+    because the passive force at 1.6 is F_max already."""
 
 
 HILL = HillSettings()
 
 
 def active_force_length(length: Array) -> Array:
-    """Return f_l at fibre lengths over the optimal one."""
+    """Return f_l at lengths l/l_o."""
     total = np.zeros_like(length)
     for height, place, width, growth in BELLS:
         total += height * np.exp(-0.5 * ((length - place) / (width + growth * length)) ** 2)
@@ -61,9 +62,9 @@ def active_force_length(length: Array) -> Array:
 
 
 def force_velocity(velocity: Array) -> Array:
-    """Return f_v at fibre velocities over the largest, positive where they lengthen.
+    """Return f_v at velocities relative to the largest velocity, positive if fibres lengthen.
 
-    Held beyond ±1: fibres that shorten faster do not pull.
+    f_v is constant beyond ±1, and zero for fibres that shorten faster.
     """
     scale, slope, shift, level = VELOCITY
     inside = np.clip(velocity, -1.0, 1.0)
@@ -71,7 +72,7 @@ def force_velocity(velocity: Array) -> Array:
 
 
 def passive_force_length(length: Array) -> Array:
-    """Return f_p at fibre lengths over the optimal one."""
+    """Return f_p at lengths l/l_o."""
     growth = HILL.passive_shape * np.maximum(length - 1.0, 0.0) / HILL.passive_strain
     return np.expm1(growth) / np.expm1(HILL.passive_shape)
 
@@ -79,15 +80,15 @@ def passive_force_length(length: Array) -> Array:
 def rigid_tendon_strength(
     muscles: Sequence[OpenSimMuscle], lengths_m: Array, speeds: Array
 ) -> tuple[Array, Array]:
-    """Return the forces (..., m), N, at full activation without the passive one, and the passive.
+    """Return the active forces at full activation and the passive forces, N, (..., m).
 
     Args:
         muscles: m muscles.
-        lengths_m: (..., m) of their paths.
-        speeds: (..., m) m/s, of their paths' lengths.
+        lengths_m: path lengths, m, (..., m).
+        speeds: rates of the path lengths, m/s, (..., m).
 
     Returns:
-        Both NaN where fibres are longer than `HILL.longest_fibre_ratio`.
+        The forces, NaN for fibres longer than `HILL.longest_fibre_ratio`.
     """
     optimal = np.array([muscle.optimal_fibre_length_m for muscle in muscles])
     slack = np.array([muscle.tendon_slack_length_m for muscle in muscles])
@@ -112,51 +113,51 @@ GROUPS = {
     frozenset(["tibia"]): "within the shank",
     frozenset(["foot"]): "within the foot",
 }
-"""Where a muscle's ends lie -> its group's name."""
+"""Regions of a muscle's ends -> name of its group."""
 
 
 @dataclass(frozen=True)
 class ModelMatchSettings:
-    """When two muscle lines are the same."""
+    """Limits below which two muscles of a model are the same muscle."""
 
     tolerance: float = 1e-6
-    """Relative, or m: strengths, lengths and points that differ by less are the same. Chosen: above
-    the rounding of files."""
+    """1 or m: largest relative difference of strength and lengths, and largest distance of points.
+    Chosen because the rounding of files is smaller."""
 
 
 MODEL_MATCH = ModelMatchSettings()
 
 
 def leg_bones(leg: Leg) -> dict[str, tuple[str, ...]]:
-    """Return femur, patella (if there is one), tibia and foot -> bodies, the bone's own first."""
+    """Return bone -> its bodies. The bones are femur, patella (if any), tibia and foot."""
     bones = {"femur": leg.femur, "tibia": leg.tibia, "foot": leg.foot}
     return bones if leg.patella is None else {**bones, "patella": (leg.patella,)}
 
 
 def leg_coordinates(leg: Leg) -> tuple[str, ...]:
-    """Return the coordinates that a leg's muscles balance.
+    """Return the coordinates that the muscles of a leg balance.
 
-    Those of the hip, the knee's flexion, those of the ankle and of the joint next below it
-    (subtalar); none that is locked or follows another.
+    They belong to hip, knee flexion, ankle and the joint below the ankle (subtalar). Locked and
+    dependent coordinates are excluded.
 
     Raises:
-        InputError: a knee that does not bend.
+        InputError: the knee has no flexion.
     """
     if leg.flexion is None:
         raise InputError(f"has a knee '{leg.knee.name}' without flexion", leg.model.name)
     followers = {coupler.dependent for coupler in leg.model.couplers}
 
-    def own(joint: Joint) -> list[str]:
+    def free(joint: Joint) -> list[str]:
         coordinates = leg.model.coordinates.values()
         result = [c for c in coordinates if c.joint == joint.name]
         return [c.name for c in result if not c.locked and c.name not in followers]
 
     below = [joint for joint in leg.model.joints if joint.inboard == leg.ankle.outboard]
-    return (*own(leg.hip), leg.flexion, *own(leg.ankle), *(c for j in below for c in own(j)))
+    return (*free(leg.hip), leg.flexion, *free(leg.ankle), *(c for j in below for c in free(j)))
 
 
 def leg_muscles(leg: Leg) -> tuple[str, ...]:
-    """Return the enabled muscles that lead to or along a leg, twins left out (`length_twins`)."""
+    """Return the enabled muscles with a path point on a leg, without twins (`length_twins`)."""
     bodies = {body for group in leg_bones(leg).values() for body in group}
     names = [
         muscle.name
@@ -168,10 +169,10 @@ def leg_muscles(leg: Leg) -> tuple[str, ...]:
 
 
 def muscle_groups(leg: Leg, muscles: Sequence[OpenSimMuscle]) -> dict[str, tuple[str, ...]]:
-    """Return group -> names of its muscles, by the bones that a muscle's path ends on.
+    """Return group -> names of its muscles.
 
-    The extensors of the knee end on the patella or lead past it; whatever lies above the thigh
-    counts as thigh.
+    The ends of a muscle's path determine its group. Pelvis and thigh are one region. Muscles that
+    end on the patella or pass it are the extensors of the knee.
     """
     bones = leg_bones(leg)
 
@@ -189,26 +190,25 @@ def muscle_groups(leg: Leg, muscles: Sequence[OpenSimMuscle]) -> dict[str, tuple
 
 
 def length_twins(model: OpenSimModel) -> dict[str, str]:
-    """Return muscle -> its twin, where there is one.
+    """Return muscle -> its twin, for the muscles with a twin.
 
-    A twin has another's strength, fibre and tendon length and first point and a shorter path.
-    Models hold such a copy where the path that pulls is longer than muscle and tendon, as one
-    past the patella to the tibia: the twin's length is that of muscle and tendon, and it must
-    not pull beside the other.
+    A twin is a copy of a muscle with the same strength, fibre length, tendon length and first
+    point, but fewer path points. Models contain twins for muscles with a path past the patella to
+    the tibia. The twin's path has the length of muscle and tendon. It must not pull in addition.
     """
     pairs = [p for p in combinations(model.muscles.values(), 2) if _same_muscle(*p)]
     ordered = [sorted(pair, key=lambda muscle: len(muscle.path.points)) for pair in pairs]
-    return {whole.name: twin.name for twin, whole in ordered}
+    return {muscle.name: twin.name for twin, muscle in ordered}
 
 
 def foot_loads(model: OpenSimModel, reactions: Mapping[str, GroundReaction]) -> dict[str, Array]:
-    """Return body -> (f, 6) moment above force on each foot, in ground at ground's origin.
+    """Return body -> wrench (f, 6) on each foot, in ground about its origin, moment first.
 
-    The body is the heaviest below the ankle, so that talus and toes are held through it.
+    The wrench acts on the heaviest body below the ankle.
 
     Args:
-        model: whose ground is the laboratory, x forward, y up, z right.
-        reactions: side -> ground reaction, none of them mirrored (loaded as of a right foot).
+        model: OpenSim model. Its ground is the laboratory, x forward, y up, z right.
+        reactions: side -> ground reaction, not mirrored (loaded with side "right").
     """
     loads = {}
     for side, reaction in reactions.items():
@@ -219,41 +219,41 @@ def foot_loads(model: OpenSimModel, reactions: Mapping[str, GroundReaction]) -> 
 
 
 def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:
-    """Raise where muscles end on a patella that does not follow the knee.
+    """Raise if muscles end on a patella whose pose does not depend on the knee's flexion.
 
-    Their moment about the knee then passes through a patellar ligament, which is no muscle: the
-    patella's equilibrium has to be solved, and -dL/dq about the flexion is near zero.
+    A patellar ligament then transmits their moment to the tibia. It is no muscle, so that the
+    moment arm -dL/dq about the flexion is near zero.
 
     Raises:
-        InputError: names them.
+        InputError: there are such muscles.
     """
     if leg.patella is None:
         return
     model = leg.model
     joint = next((j for j in model.joints if leg.patella in (j.parent, j.child)), None)
-    own = {c.name for c in model.coordinates.values() if joint and c.joint == joint.name}
+    patellar = {c.name for c in model.coordinates.values() if joint and c.joint == joint.name}
     following = {leg.flexion}
-    for coupler in model.couplers:  # each after those that it follows
+    for coupler in model.couplers:  # in the order of their dependence
         following |= {coupler.dependent} if coupler.independent in following else set()
-    if own & following:
+    if patellar & following:
         return
     ending = [n for n in muscles if model.muscles[n].path.points[-1].body == leg.patella]
     if ending:
         raise InputError(
-            f"{', '.join(ending)} end on '{leg.patella}', which does not follow '{leg.flexion}'",
+            f"{', '.join(ending)} end on '{leg.patella}', which is not coupled to '{leg.flexion}'",
             model.name,
-            "couple the patella to the knee, or leave the knee's flexion out of coordinates",
+            "couple the patella to the knee, or exclude the knee's flexion from coordinates",
         )
 
 
 def _same_muscle(one: OpenSimMuscle, other: OpenSimMuscle) -> bool:
-    strong, weak = (
+    values, other_values = (
         np.array([m.max_isometric_force_N, m.optimal_fibre_length_m, m.tendon_slack_length_m])
         for m in (one, other)
     )
     first, second = one.path.points[0], other.path.points[0]
     return (
-        bool((np.abs(strong - weak) <= MODEL_MATCH.tolerance * strong).all())
+        bool((np.abs(values - other_values) <= MODEL_MATCH.tolerance * values).all())
         and isinstance(first, PathPoint)
         and isinstance(second, PathPoint)
         and first.body == second.body

@@ -1,8 +1,8 @@
-"""The muscles of a scene with [muscles]: shared frame by frame, in agreement with the knee.
+"""The muscles of a scene with [muscles]: static optimisation in each frame.
 
-Hip, ankle and subtalar rows of the static optimisation are the OpenSim model's, made once for all
-frames. The flexion row is the knee's own (`tkamb.knee.crossing`), so that the tension of
-the extensor group which the optimisation finds is the one that the knee's equations give back.
+The OpenSim model provides the rows of hip, ankle and subtalar joint for all frames. The equations
+of the knee provide the row of its flexion (`tkamb.knee.crossing`). The tension of the extensor
+group is therefore the same in the optimisation and in the equations of the knee.
 """
 
 from dataclasses import dataclass, replace
@@ -28,28 +28,28 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class SharedMuscleSettings:
-    """Muscles shared between the joints of a leg."""
+    """Muscles of a leg with tkamb's knee."""
 
     max_offset: float = 0.5 * MILLIMETRE
-    """m; how far the insert and the hip of the URDF may lie from those of the muscle model. Chosen:
+    """m: largest distance of insert and hip between URDF and muscle model. Chosen because the
     rounding of the two files is smaller."""
     max_iterations: int = 8
-    """Iterations between muscle forces and the lines that they turn; what is open afterwards is
-    reported. Chosen: frames that converge need fewer."""
+    """1: iterations between muscle forces and lifted condyles, after which a frame fails. Chosen
+    because frames that converge need fewer."""
 
 
 SHARED_MUSCLES = SharedMuscleSettings()
 
 
 class SharedMuscles:
-    """Shares the load of frames among the muscles of a leg.
+    """The muscles of a leg in all frames.
 
     Args:
-        trial: the muscles over the frames.
-        is_left: whether it is a left leg, whose knee is computed as its mirror image.
+        trial: optimisation problems and muscle lines of all frames.
+        is_left: whether the leg is a left one. Its knee is computed as its mirror image.
 
     Attributes:
-        trial: as given.
+        trial: the argument.
     """
 
     def __init__(self, trial: KneeTrial, is_left: bool = False) -> None:
@@ -62,16 +62,17 @@ class SharedMuscles:
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """Group of muscles -> their names (`tkamb.run.muscles.leg.muscle_groups`)."""
+        """Name of a group -> names of its muscles (`tkamb.run.muscles.leg.muscle_groups`)."""
         return dict(self.trial.groups)
 
     def changed(self, strength: Array, shank: Array, thigh: Array) -> "SharedMuscles":
-        """Return the muscles with other strengths, and their lines across the knee elsewhere.
+        """Return the muscles with changed strengths and shifted lines across the knee.
 
         Args:
-            strength: (m,) factors of each muscle's strength.
-            shank: (m, 3) m, shifts of where its line leaves the shank, a right leg's tibia link.
-            thigh: (m, 3) m, of where it reaches the thigh, femur link.
+            strength: factors of the muscles' strength, (m,).
+            shank: shifts of the points where lines leave the shank, tibia link of a right leg, m,
+                (m, 3).
+            thigh: shifts of the points where lines reach the thigh, femur link, m, (m, 3).
         """
         flip = MIRROR if self._left else np.eye(3)
         trial = self.trial.changed(strength, shank @ flip, thigh @ flip)
@@ -85,12 +86,12 @@ class SharedMuscles:
 
 @dataclass(frozen=True, eq=False)
 class FrameMuscles:
-    """Shares the load of one frame among the muscles of a leg.
+    """The muscles of a leg in one frame.
 
     Args:
-        trial: the muscles over the frames.
+        trial: optimisation problems and muscle lines of all frames.
         k: frame.
-        lines: theirs across the knee.
+        lines: muscle lines across the knee in this frame.
     """
 
     trial: KneeTrial
@@ -98,12 +99,12 @@ class FrameMuscles:
     lines: CrossingLines
 
     def share(self, geometry: KneeGeometry, friction: float, lifted: frozenset[str]) -> MuscleShare:
-        """Return what each muscle carries with the knee as it stands.
+        """Return the force of each muscle at fixed pose and contact points.
 
         Args:
-            geometry: the knee, with contact points where contact is modelled.
-            friction: Coulomb coefficient.
-            lifted: sides that carry nothing.
+            geometry: geometry of the knee, with contact points if contact is modelled.
+            friction: Coulomb coefficient of the femorotibial contact.
+            lifted: sides without contact force.
         """
         try:
             return self._shared(flexion_row(geometry, self.lines, friction, lifted))
@@ -113,12 +114,12 @@ class FrameMuscles:
     def share_of_yielding_knee(
         self, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> MuscleShare:
-        """Return what each muscle carries while released coordinates yield to it.
+        """Return the force of each muscle, with released coordinates that depend on the forces.
 
         Args:
-            geometry: the knee; its contact is not looked at.
-            base: N, see `yielding_flexion_row`.
-            per_wrench: (6,), likewise.
+            geometry: geometry of the knee. Its contact is not used.
+            base: tension of the patellar ligament, N, see `yielding_flexion_row`.
+            per_wrench: change of this tension by a wrench on the insert, (6,).
         """
         try:
             row = yielding_flexion_row(geometry, self.lines, base, per_wrench)
@@ -127,7 +128,7 @@ class FrameMuscles:
         return self._shared(row)
 
     def at(self, share: MuscleShare) -> MuscleShare:
-        """Return the forces of a share along the lines of this frame."""
+        """Return muscle forces of another frame along the lines of this frame."""
         return replace(share, lines=self.lines)
 
     def tension(self, share: MuscleShare) -> float:
@@ -135,10 +136,10 @@ class FrameMuscles:
         return float(share.force[self.trial.extensor].sum())
 
     def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
-        """Return the geometry with the muscles' forces in it, and all loads.
+        """Return the geometry with the muscle forces, and all loads.
 
-        Contact points and lines stay, so the sharing is exact at once; again where a condyle
-        turns out to carry nothing.
+        Contact points and lines are fixed, so that one pass is exact. It is repeated if a condyle
+        lifts off.
         """
         lifted = geometry.lifted
         for _ in range(SHARED_MUSCLES.max_iterations):
@@ -163,9 +164,9 @@ class FrameMuscles:
         return self._share(activation, force, problem.moment[0], reserve, "ok")
 
     def _failed(self, status: str) -> MuscleShare:
-        nothing = np.full(len(self.trial.muscles), np.nan)
-        rest = np.full(len(self.trial.problems.coordinates), np.nan)
-        return self._share(nothing, nothing, rest, rest, status)
+        forces = np.full(len(self.trial.muscles), np.nan)
+        moments = np.full(len(self.trial.problems.coordinates), np.nan)
+        return self._share(forces, forces, moments, moments, status)
 
     def _share(
         self, activation: Array, force: Array, moment: Array, reserve: Array, status: str
@@ -186,7 +187,7 @@ class FrameMuscles:
 
 
 def sharing_of(table: MusclesTable) -> Sharing:
-    """Return the options of a scene's [muscles]."""
+    """Return the options of the static optimisation from [muscles]."""
     return Sharing(
         reserve=table.reserve_Nm,
         exponent=table.exponent,
@@ -197,10 +198,10 @@ def sharing_of(table: MusclesTable) -> Sharing:
 
 
 def load_muscles(case: Case) -> SharedMuscles:
-    """Return the muscles of a case with [muscles], checked against its URDF.
+    """Return the muscles of a case with [muscles].
 
     Raises:
-        InputError: files that cannot be used, or a model that is not the URDF's.
+        InputError: a file cannot be used, or the model does not agree with the URDF.
     """
     scene, table = case.scene, case.scene.muscles
     assert table is not None
@@ -231,10 +232,10 @@ def load_muscles(case: Case) -> SharedMuscles:
 
 
 def groups_of(case: Case) -> tuple[str, ...]:
-    """Return the names of the groups of the muscles of a case with [muscles].
+    """Return the names of the muscle groups of a case with [muscles].
 
     Raises:
-        InputError: a model that cannot be used.
+        InputError: the model cannot be used.
     """
     table = case.scene.muscles
     assert table is not None
@@ -242,10 +243,10 @@ def groups_of(case: Case) -> tuple[str, ...]:
 
 
 def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
-    """Return the trial with the scene's EMG in it, where it is more than reported.
+    """Return the trial guided by the scene's EMG, or unchanged if EMG is only reported.
 
     Raises:
-        InputError: a muscle that the model does not have, or frames without EMG.
+        InputError: the model lacks a muscle of the EMG, or a frame has no EMG.
     """
     table, envelopes, time = case.scene.muscles, case.emg, case.motion.time
     assert table is not None and table.emg is not None and envelopes is not None
@@ -260,10 +261,10 @@ def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
         values[:, trial.muscles.index(name)] = envelopes.at(name, time)
         if np.isnan(values[:, trial.muscles.index(name)]).any():
             raise InputError(
-                f"covers {envelopes.time[0]:g} to {envelopes.time[-1]:g} s, the frames "
+                f"covers {envelopes.time[0]:g} to {envelopes.time[-1]:g} s, but the frames "
                 f"{time[0]:g} to {time[-1]:g} s",
                 envelopes.path,
-                "EMG that guides the muscles is needed in every frame",
+                "EMG that guides the muscles must cover every frame",
             )
     size = table.emg.weight if table.emg.use == "target" else table.emg.width
     assert size is not None
@@ -272,7 +273,7 @@ def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
 
 
 def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
-    """Raise unless the model's insert and hip lie where the URDF has them."""
+    """Raise unless insert and hip have the same positions in model and URDF."""
     is_left, table = case.scene.patient.side == "left", case.scene.muscles
     assert table is not None
     insert = mirrored_pose(insert_in_tibia) if is_left else insert_in_tibia
@@ -284,7 +285,7 @@ def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
         apart = float(np.linalg.norm(ours - theirs))
         if apart > SHARED_MUSCLES.max_offset:
             raise InputError(
-                f"has its {name} {apart / MILLIMETRE:.1f} mm from where the URDF has it",
+                f"has its {name} {apart / MILLIMETRE:.1f} mm away from the {name} of the URDF",
                 table.model,
                 "make the URDF from this model with `tkamb import`",
             )

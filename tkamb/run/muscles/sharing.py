@@ -1,22 +1,20 @@
-"""Static optimisation: muscles share the joint moments of one frame at the least cost.
+"""Static optimisation: the muscle activations of least cost for the joint moments of one frame.
 
 For given muscle activations a (n,), the equations of motion are a square system for the other
-unknowns y (m,) (hip, contact, patella, residuals, reserves), so that y is affine in a:
+unknowns y (m,), here the reserves. y is therefore affine in a:
 
     A_d y + A_f F a = b     =>     y = offset + gain a,
     offset = A_d^-1 b,      gain = -A_d^-1 A_f F
 
-with the muscles' strengths F (N at a = 1). The activations
+with the muscle forces F at a = 1, N. The activations
 
     minimise   sum_i w_i a_i^p + sum_j (y_j / r_j)^2 + sum_i ((a_i - e_i) / s_i)^2
     subject to lowest_i <= a_i <= highest_i,   lower_j <= y_j <= upper_j.
 
-The weights w are the muscles' volumes or 1. A reserve or residual of size r costs as much as a
-fully active muscle of weight 1 (inf: nothing). Activations known from EMG are e, their standard
-deviations s (inf: not known). For p = 2 this is one strictly convex quadratic programme; for p > 2
-a sequence of quadratic programmes by Newton's method.
-
-`Sharing` has the options, `FrameProblems` the problems of all frames.
+The weights w are the muscles' relative volumes or 1. A reserve of size r costs as much as a fully
+active muscle of weight 1; r = inf means no cost. EMG gives activations e with standard deviations
+s; s = inf means no EMG. For p = 2 the problem is one strictly convex quadratic programme. For p > 2
+it is solved by a sequence of quadratic programmes (Newton's method).
 
 References: Crowninshield & Brand, J Biomech 14:793 (1981), doi:10.1016/0021-9290(81)90035-X;
 Arnstrom et al., IEEE Trans Autom Control 67:4362 (2022), doi:10.1109/TAC.2022.3176430 (DAQP).
@@ -37,16 +35,16 @@ from tkamb.run.muscles.leg import HILL
 
 @dataclass(frozen=True)
 class StaticOptimisationSettings:
-    """How one frame's quadratic programme ends."""
+    """Stopping criteria of the static optimisation of a frame."""
 
     newton_tolerance: float = 1e-10
-    """Change of the activations at which the sequence for p > 2 has converged. Chosen: far below
-    what changes a force."""
+    """1: change of the activations below which the sequence for p > 2 has converged. Chosen because
+    it is too small to change a force."""
     most_steps: int = 60
-    """Quadratic programmes of the sequence for p > 2. Chosen: sequences that converge need
-    fewer."""
+    """1: largest number of quadratic programmes for p > 2. Chosen because sequences that converge
+    need fewer."""
     solver_tolerance: float = 1e-11
-    """Primal and dual tolerance handed to DAQP. Chosen: rows are scaled to about 1."""
+    """1: primal and dual tolerance of DAQP. Chosen for rows that are scaled to about 1."""
 
 
 STATIC_OPTIMISATION = StaticOptimisationSettings()
@@ -57,19 +55,19 @@ OPTIMAL = 1
 
 @dataclass(frozen=True, eq=False)
 class LoadSharing:
-    """One frame's problem.
+    """The optimisation problem of one frame, in the symbols of the module's docstring.
 
     Args:
-        weight: (n,) cost of full activation, > 0.
-        lowest: (n,) least activation.
-        highest: (n,) largest activation.
-        offset: (m,) the other unknowns without muscles, N or N·m.
-        gain: (m, n) what full activation adds to them.
-        lower: (m,) their least values; equal to `upper` where a value is asked for.
-        upper: (m,) their largest values.
-        reserve: (m,) N or N·m, see r above; inf where a value costs nothing.
-        expected: (n,) activations known from EMG; not looked at where `spread` is inf.
-        spread: (n,) their standard deviations.
+        weight: weights w > 0, (n,).
+        lowest: least activations, (n,).
+        highest: largest activations, (n,).
+        offset: y without muscles, N or N·m, (m,).
+        gain: change of y by full activation, N or N·m, (m, n).
+        lower: least y, (m,); equal to `upper` for a prescribed y.
+        upper: largest y, (m,).
+        reserve: r, N or N·m, (m,); inf: no cost.
+        expected: activations e from EMG, (n,).
+        spread: standard deviations s, (n,); inf: no EMG.
         exponent: p, at least 2.
     """
 
@@ -102,11 +100,11 @@ class LoadSharing:
     def gradient(self, activation: Array) -> Array:
         """Return d cost / d activation (n,)."""
         hessian, gradient, _ = self._quadratic()
-        own = self.exponent * self.weight * np.abs(activation) ** (self.exponent - 1)
-        return np.asarray(own + hessian @ activation + gradient)
+        effort = self.exponent * self.weight * np.abs(activation) ** (self.exponent - 1)
+        return np.asarray(effort + hessian @ activation + gradient)
 
     def _quadratic(self) -> tuple[Array, Array, float]:
-        """Return reserves and EMG as 1/2 a.H a + g.a + constant."""
+        """Return H, g and c of the cost of reserves and EMG, 1/2 a.H a + g.a + c."""
         scaled = self.gain / self.reserve[:, None]
         target = self.offset / self.reserve
         hessian, gradient = 2 * scaled.T @ scaled, 2 * scaled.T @ target
@@ -121,15 +119,15 @@ class LoadSharing:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """The least costly way to carry a frame.
+    """The solution of the optimisation problem of one frame.
 
     Args:
-        activation: (n,).
-        others: (m,) y, N or N·m.
-        own_multiplier: (n,) of the activations' bounds, positive at the upper one.
-        other_multiplier: (m,) likewise of the bounds of y, per N or N·m.
-        kkt_residual: largest violation of the optimality conditions, see `kkt_residual`.
-        steps: quadratic programmes solved.
+        activation: activations, (n,).
+        others: y, N or N·m, (m,).
+        own_multiplier: multipliers of the activations' bounds, positive at the upper bound, (n,).
+        other_multiplier: multipliers of the bounds of y, 1/N or 1/(N·m), (m,).
+        kkt_residual: relative violation of the optimality conditions, see `kkt_residual`.
+        steps: number of quadratic programmes.
     """
 
     activation: Array
@@ -141,12 +139,12 @@ class Shared:
 
 
 def solver_missing() -> InputError:
-    """Return the refusal of a run whose muscles need the solver DAQP, which is not installed."""
+    """Return the error for a scene with [muscles] if the solver DAQP is not installed."""
     return not_installed("the solver DAQP", "[muscles]", "muscles")
 
 
 def solver_is_installed() -> bool:
-    """Say whether the solver DAQP, which the extra `muscles` brings, is installed."""
+    """Return whether the solver DAQP is installed. The extra `muscles` installs it."""
     return find_spec("daqp") is not None
 
 
@@ -154,20 +152,23 @@ def share_load(problem: LoadSharing) -> Shared:
     """Return the activations of least cost.
 
     Raises:
-        ComputationError: no activations within their bounds keep y within its own, or the
-            sequence of programmes does not converge.
+        ComputationError: no activations satisfy all bounds, or the sequence of programmes does not
+            converge.
         InputError: DAQP is not installed.
     """
     p, w = problem.exponent, problem.weight
-    rest, pull, _ = problem._quadratic()
-    a, own, other = _programme(problem, np.diag(2 * w) + rest, pull)
+    hessian, gradient, _ = problem._quadratic()
+    a, own, other = _programme(problem, np.diag(2 * w) + hessian, gradient)
     steps = 1
     while p != 2.0:
-        # Newton: the cost's second-order model about a; a floor keeps idle muscles convex.
-        curved = p * (p - 1) * w * np.maximum(np.abs(a), 1e-3) ** (p - 2)
+        # Newton's method: a quadratic model of the cost about a. The lower limit of the activation
+        # keeps the model strictly convex for idle muscles.
+        curvature = p * (p - 1) * w * np.maximum(np.abs(a), 1e-3) ** (p - 2)
         slope = p * w * np.abs(a) ** (p - 1)
-        aim, own, other = _programme(problem, np.diag(curved) + rest, pull + slope - curved * a)
-        step = _descending(problem, a, aim - a)
+        target, own, other = _programme(
+            problem, np.diag(curvature) + hessian, gradient + slope - curvature * a
+        )
+        step = _descending(problem, a, target - a)
         steps += 1
         change, a = float(np.abs(step).max()), a + step
         if change < STATIC_OPTIMISATION.newton_tolerance:
@@ -179,21 +180,22 @@ def share_load(problem: LoadSharing) -> Shared:
 
 
 def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
-    """Return the largest violation of the conditions of an optimum, relative.
+    """Return the largest relative violation of the optimality conditions.
 
-    Stationarity (gradient + multipliers = 0, over the largest term of the gradient: their sum
-    vanishes where no bound is active), feasibility and complementarity (multiplier times distance
-    from its bound), each over its own scale.
+    The conditions (Karush, Kuhn and Tucker) are stationarity, feasibility and complementarity.
+    Stationarity means that gradient plus multipliers is zero. Its violation is relative to the
+    largest term of the gradient. Complementarity means that multiplier times distance from the
+    bound is zero.
     """
     a, y = shared.activation, shared.others
     slope = problem.gradient(a)
     hessian, pull, _ = problem._quadratic()
-    own = problem.exponent * problem.weight * np.abs(a) ** (problem.exponent - 1)
-    still = slope + shared.own_multiplier + problem.gain.T @ shared.other_multiplier
-    terms = np.concatenate([own, hessian @ a, pull])
+    effort = problem.exponent * problem.weight * np.abs(a) ** (problem.exponent - 1)
+    stationarity = slope + shared.own_multiplier + problem.gain.T @ shared.other_multiplier
+    terms = np.concatenate([effort, hessian @ a, pull])
     size = max(float(np.abs(terms).max(initial=0.0)), 1e-12)
     scale = _row_scale(problem)
-    result = [float(np.abs(still).max(initial=0.0)) / size]
+    result = [float(np.abs(stationarity).max(initial=0.0)) / size]
     for value, low, high, multiplier, unit in (
         (a, problem.lowest, problem.highest, shared.own_multiplier, np.ones_like(a)),
         (y, problem.lower, problem.upper, shared.other_multiplier, scale),
@@ -207,7 +209,7 @@ def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
 
 
 def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[Array, Array, Array]:
-    """Return activations and multipliers of min 1/2 a.H a + g.a within all bounds."""
+    """Return activations and multipliers of the minimum of 1/2 a.H a + g.a within all bounds."""
     try:
         import daqp
     except ImportError:
@@ -224,12 +226,13 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
         np.ascontiguousarray(rows),
         np.concatenate([problem.highest, upper]),
         np.concatenate([problem.lowest, lower]),
-        np.where(equal, 5, 0).astype(np.intc),  # 5: an equality
+        np.where(equal, 5, 0).astype(np.intc),  # DAQP marks an equality by 5
         primal_tol=STATIC_OPTIMISATION.solver_tolerance,
         dual_tol=STATIC_OPTIMISATION.solver_tolerance,
     )
     if flag != OPTIMAL:
-        raise ComputationError("no muscle forces within their limits carry this frame", "muscles")
+        what = "no muscle forces within their limits balance the joint moments"
+        raise ComputationError(what, "muscles")
     multiplier = np.asarray(text["lam"], float)
     other = np.zeros(len(problem.offset))
     count = len(problem.lowest)
@@ -238,13 +241,13 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
 
 
 def _row_scale(problem: LoadSharing) -> Array:
-    """Return the size (m,) of each y that muscles can bring about, to compare its bounds with."""
+    """Return the largest change (m,) of each y by a single muscle, as the scale of its bounds."""
     size = np.maximum(np.abs(problem.gain).max(axis=1, initial=0.0), 1e-12)
     return np.asarray(size)
 
 
 def _descending(problem: LoadSharing, a: Array, step: Array) -> Array:
-    """Return the step, halved until the cost does not rise."""
+    """Return the step, halved until the cost does not increase."""
     before = problem.cost(a)
     for _ in range(30):
         if problem.cost(a + step) <= before * (1 + 1e-12):
@@ -255,15 +258,15 @@ def _descending(problem: LoadSharing, a: Array, step: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class EmgGuide:
-    """What envelopes e ask of the activations a.
+    """Guidance of the activations a by EMG envelopes e.
 
-    - "target" adds Σ_i W (a_i - e_i)² to the cost, W the weight;
-    - "bounds" holds a_i within e_i ± width, as far as that lies within the bounds of all.
+    - "target" adds Σ_i W (a_i - e_i)² to the cost, with the weight W.
+    - "bounds" limits a_i to e_i ± width, within the bounds of all muscles.
 
     Args:
-        envelope: (f, m) normalised; NaN for muscles without EMG.
-        use: which of the two.
-        size: W, or the width.
+        envelope: normalised envelopes, (f, m); NaN for muscles without EMG.
+        use: "target" or "bounds".
+        size: weight W or width.
     """
 
     envelope: Array
@@ -271,11 +274,11 @@ class EmgGuide:
     size: float
 
     def only(self, k: int) -> "EmgGuide":
-        """Return that of frame k alone."""
+        """Return the guidance of frame k alone."""
         return replace(self, envelope=self.envelope[k : k + 1])
 
     def applied(self, problem: LoadSharing, k: int) -> LoadSharing:
-        """Return the problem of frame k with its envelopes in it."""
+        """Return the problem of frame k, guided by its envelopes."""
         finite, expected = np.isfinite(self.envelope[k]), np.nan_to_num(self.envelope[k])
         if self.use == "target":
             spread = np.where(finite, self.size**-0.5, np.inf)
@@ -293,11 +296,11 @@ class EmgGuide:
 
 @dataclass(frozen=True)
 class SharingSettings:
-    """When a solution of the static optimisation is accepted."""
+    """Acceptance of a solution of the static optimisation."""
 
     kkt_tolerance: float = 1e-8
-    """Relative: largest violation of the optimality conditions (Karush, Kuhn and Tucker) with which
-    a frame is kept. Chosen: above what the solver leaves."""
+    """1: largest relative violation of the optimality conditions. Beyond it the frame fails. Chosen
+    because the solver's residuals are smaller."""
 
 
 SHARING = SharingSettings()
@@ -305,18 +308,18 @@ SHARING = SharingSettings()
 
 @dataclass(frozen=True)
 class Sharing:
-    """How muscles share the load.
+    """Options of the static optimisation.
 
     Args:
-        muscles: names; None: those of the leg, see `leg_muscles`.
-        coordinates: those that are balanced; None: hip, knee flexion, ankle, subtalar.
-        reserve: ρ, N·m (N for a translation): the reserve that costs as much as one fully active
-            muscle of weight 1, for all coordinates or by name; inf: free of cost, 0: none.
+        muscles: names of the muscles; None: those of `leg_muscles`.
+        coordinates: names of the balanced coordinates; None: hip, knee flexion, ankle, subtalar.
+        reserve: ρ, N·m (N for a translation), for all coordinates or by name. A reserve of this
+            size costs as much as one fully active muscle of weight 1. inf: no cost, 0: no reserve.
         exponent: p, at least 2.
-        weights: "volume" (optimal fibre length times strength, over the mean), or "equal".
+        weights: "volume" (optimal fibre length times strength, over the mean) or "equal".
         lowest: least activation.
         highest: largest activation.
-        law: "isometric" (F_i the maximal isometric force, nothing passive) or "hill", see
+        law: "isometric" (F_i is the maximal isometric force, without passive force) or "hill", see
             `rigid_tendon_strength`.
     """
 
@@ -330,16 +333,16 @@ class Sharing:
     law: Literal["isometric", "hill"] = "isometric"
 
     def reserves(self, coordinates: Sequence[str]) -> Array:
-        """Return ρ (c,) of some coordinates."""
+        """Return ρ (c,) of c coordinates."""
         if isinstance(self.reserve, Mapping):
             return np.array([float(self.reserve[name]) for name in coordinates])
         return np.full(len(coordinates), float(self.reserve))
 
     def check(self, coordinates: Sequence[str]) -> None:
-        """Raise an InputError for what is out of range."""
+        """Raise an InputError for an option out of range."""
         if isinstance(self.reserve, Mapping) and set(self.reserve) != set(coordinates):
-            odd = sorted(set(self.reserve) ^ set(coordinates))
-            raise InputError(f"reserve and coordinates differ in {', '.join(odd)}", "muscles")
+            unmatched = sorted(set(self.reserve) ^ set(coordinates))
+            raise InputError(f"reserve and coordinates differ in {', '.join(unmatched)}", "muscles")
         if not (self.reserves(coordinates) >= 0.0).all():
             raise InputError("a reserve is negative or no number", "muscles")
         if not (0.0 <= self.lowest < self.highest < np.inf and 2.0 <= self.exponent < np.inf):
@@ -352,9 +355,17 @@ class Sharing:
 
 @dataclass(frozen=True, eq=False)
 class FrameProblems:
-    """All frames' problems; arrays as in `MuscleTrial`, forces as in `rigid_tendon_strength`.
+    """The optimisation problems of f frames, m muscles and c coordinates.
 
-    `guide`: what EMG asks of the activations, if anything.
+    Args:
+        muscles: the m muscles.
+        coordinates: names of the c balanced coordinates.
+        sharing: options.
+        moment: joint moments τ, N·m, (f, c).
+        arms: moment arms, m, (f, m, c).
+        active: forces at full activation without the passive forces, N, (f, m).
+        passive: passive forces, N, (f, m).
+        guide: guidance by EMG; None: without.
     """
 
     muscles: list[OpenSimMuscle]
@@ -378,13 +389,13 @@ class FrameProblems:
                 if shared.kkt_residual < SHARING.kkt_tolerance:
                     return shared.activation, shared.others, shared.kkt_residual, "ok"
                 reason = f"the conditions of the optimum are violated by {shared.kkt_residual:.1g}"
-        nothing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)
-        return *nothing, np.nan, f"failed: {reason}"
+        missing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)
+        return *missing, np.nan, f"failed: {reason}"
 
     def _unknown(self, k: int) -> str | None:
         """Return why frame k cannot be solved; None if it can."""
         if not np.isfinite(self.moment[k]).all():
-            return "an external load is not known"
+            return "an external load is unknown"
         for missing, why in (
             (~np.isfinite(self.arms[k]).all(axis=1), "no taut path of"),
             (
@@ -417,7 +428,7 @@ class FrameProblems:
 
 
 def _weights(muscles: Sequence[OpenSimMuscle], sharing: Sharing) -> Array:
-    """Return w (m,), 1 on average."""
+    """Return the weights w (m,); their mean is 1."""
     if sharing.weights == "equal":
         return np.ones(len(muscles))
     volume = np.array([m.optimal_fibre_length_m * m.max_isometric_force_N for m in muscles])

@@ -1,28 +1,29 @@
 """Muscle forces of a whole recording by inverse dynamics and static optimisation.
 
-Per frame, with the generalised forces τ of the motion (inertia, gravity, external loads) and the
-moment arms R = -dL/dq of the muscles' lines about the balanced coordinates,
+In each frame,
 
     τ_c = Σ_i R_ci (a_i F_i + P_i) + r_c.
 
-F_i is a muscle's force at full activation and P_i its passive force. The reserve r_c is the moment
-that the muscles do not provide. Activations a and reserves minimise
+τ are the generalised forces of the motion (inertia, gravity, external loads), and R = -dL/dq the
+moment arms of the muscle lines about the balanced coordinates c. F_i is a muscle's force at full
+activation, and P_i its passive force. The reserve r_c is the moment that the muscles lack.
+Activations a and reserves minimise, with the options of `Sharing`,
 
     Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
 
-A coordinate that a coupler makes dependent on another adds to τ and R of that other coordinate by
-the chain rule.
+By the chain rule, a dependent coordinate contributes to τ and R of the coordinate on which its
+coupler makes it depend.
 
 A taut muscle line is a chain of straight parts between points on bones and on their wrap objects.
 A part from bone A at p to bone B at q pulls A at p along u = (q - p)/|q - p|, and B at q along -u.
-The line acts on a bone through the straight parts that leave it: these are the effective
-attachments. The virtual work of their wrenches is the moment arm,
+The ends of the parts that leave a bone are the effective attachments of the line. The virtual work
+of the wrenches w on the bones gives the moment arm,
 
     Σ_bones J_boneᵀ w_bone = -dL/dq.
 
-Two parts of these wrenches are in no straight part. A wrap object that yields to a point inside it
-(docs/opensim.md) pushes on its bone. Path points that move within their bone (the quadriceps of
-gait2392) do work that is no wrench on any bone.
+Two effects add to it. A wrap object that is displaced by a point inside it (docs/opensim.md) pushes
+on its bone. Path points that move within their bone (quadriceps of gait2392) do work without a
+wrench on any bone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,11 +51,12 @@ from tkamb.run.muscles.sharing import FrameProblems, Sharing
 
 @dataclass(frozen=True, eq=False)
 class Attachments:
-    """Where muscles pull one bone towards another, in the first one's frame.
+    """Effective attachments of muscles on a bone for pulls towards another bone.
 
     Args:
-        points: (f, m, 3) m; NaN where a muscle has no straight part between the two.
-        directions: (f, m, 3) unit vectors of the pull.
+        points: attachments in the frame of the bone, m, (f, m, 3); NaN for a muscle without a
+            straight part between the two bones.
+        directions: unit vectors of the pulls, (f, m, 3).
     """
 
     points: Array
@@ -63,17 +65,17 @@ class Attachments:
 
 @dataclass(frozen=True, eq=False)
 class Bones:
-    """The bones of a leg and what acts on them.
+    """The b bones of a leg and their loads. Wrenches have the moment first.
 
     Args:
-        names: b bones, such as femur, patella, tibia, foot.
-        muscles: m names.
-        poses: (f, b, 4, 4) of each bone's first body in ground.
-        pulls: (f, m, b, 6) moment above force of unit tension on each bone, in ground at
-            ground's origin.
-        demand: (f, b, 6) what the motion takes beyond gravity and external loads, likewise, N·m
-            above N; see `required_wrenches`.
-        crossings: straight parts from bone to bone, -1 for bodies of none.
+        names: names of the bones, such as femur, patella, tibia, foot.
+        muscles: names of the m muscles.
+        poses: pose of each bone's first body in ground, (f, b, 4, 4).
+        pulls: wrench of unit tension of each muscle on each bone, in ground about its origin,
+            (f, m, b, 6).
+        demand: wrench that the motion of each bone requires beyond gravity and external loads, in
+            ground about its origin, N·m and N, (f, b, 6); see `required_wrenches`.
+        crossings: straight parts between bones; index -1: a body of no bone.
     """
 
     names: tuple[str, ...]
@@ -84,39 +86,38 @@ class Bones:
     crossings: StraightParts
 
     def pull_on(self, bones: Sequence[str], seen_from: str) -> Array:
-        """Return the wrench (f, m, 6) of unit tension on some bones taken together.
+        """Return the wrench (f, m, 6) of unit tension of each muscle on some bones together.
 
-        Moment (N·m per N) above force (N per N), in the frame of bone `seen_from` about its
-        origin.
+        Moment (N·m per N) and force (N per N), in the frame of bone `seen_from` about its origin.
         """
         total = self.pulls[:, :, [self.index(name) for name in bones]].sum(axis=2)
         return self._seen(total, seen_from)
 
     def demand_of(self, bones: Sequence[str], seen_from: str) -> Array:
-        """Return what the motion of some bones takes (f, 6), in the same way."""
+        """Return the wrench (f, 6) that the motion of some bones requires, like `pull_on`."""
         total = self.demand[:, [self.index(name) for name in bones]].sum(axis=1)
         return self._seen(total[:, None], seen_from)[:, 0]
 
     def attachments(self, bone: str, towards: str | None) -> Attachments:
-        """Return where and along what muscles pull a bone towards another.
+        """Return the effective attachments of muscles on a bone, for pulls towards another bone.
 
-        A muscle that leads from the one to the other more than once has its last straight part
-        here; its wrench is the sum of all (`pull_on`).
+        For a muscle with several straight parts between the bones it is the last one. `pull_on`
+        sums over all parts.
 
         Args:
-            bone: whose frame, point and pull.
-            towards: the other bone; None: any body that is no bone of the leg, as the pelvis.
+            bone: name of the bone with the attachments.
+            towards: name of the other bone; None: any body outside the leg, such as the pelvis.
         """
-        here = self.index(bone)
-        there = -1 if towards is None else self.index(towards)
+        bone_index = self.index(bone)
+        other_index = -1 if towards is None else self.index(towards)
         points = np.full((len(self.poses), len(self.muscles), 3), np.nan)
         directions = points.copy()
         for own, other in ((0, 1), (1, 0)):
             bodies = self.crossings.bodies
             part = self.crossings.chosen(
-                np.flatnonzero((bodies[:, own] == here) & (bodies[:, other] == there))
+                np.flatnonzero((bodies[:, own] == bone_index) & (bodies[:, other] == other_index))
             )
-            pose = self.poses[part.frame, here]
+            pose = self.poses[part.frame, bone_index]
             step = part.ends[:, other] - part.ends[:, own]
             step /= np.linalg.norm(step, axis=1, keepdims=True)
             arm = part.ends[:, own] - pose[:, :3, 3]
@@ -126,7 +127,7 @@ class Bones:
         return Attachments(points, directions)
 
     def index(self, name: str) -> int:
-        """Return the place of a bone.
+        """Return the index of a bone.
 
         Raises:
             InputError: no such bone.
@@ -136,7 +137,7 @@ class Bones:
         return self.names.index(name)
 
     def _seen(self, wrench: Array, bone: str) -> Array:
-        """Return wrenches (f, k, 6) of ground at its origin in a bone's frame about its own."""
+        """Transform wrenches (f, k, 6) from ground, about its origin, to a bone's frame."""
         pose = self.poses[:, self.index(bone)]
         moment = wrench[..., :3] - np.cross(pose[:, None, :3, 3], wrench[..., 3:])
         rotation = pose[:, :3, :3]
@@ -145,20 +146,20 @@ class Bones:
 
 @dataclass(frozen=True, eq=False)
 class MuscleTrial:
-    """Muscles over a recording; frames that failed hold NaN.
+    """Muscle forces of a recording; NaN in failed frames.
 
     Args:
-        time: (f,) s.
-        muscles: m names.
-        coordinates: c names of those that are balanced.
-        activation: (f, m).
-        force_N: (f, m).
-        moment_arm_m: (f, m, c) -dL/dq, m per rad.
-        moment: (f, c) τ, N·m, what muscles and reserves carry together.
-        reserve: (f, c) r, N·m.
-        kkt_residual: (f,) largest violation of the optimality conditions, relative.
-        status: (f,) "ok" or "failed: …".
-        bones: what acts on the bones.
+        time: times, s, (f,).
+        muscles: names of the m muscles.
+        coordinates: names of the c balanced coordinates.
+        activation: activations, (f, m).
+        force_N: muscle forces, N, (f, m).
+        moment_arm_m: moment arms -dL/dq, m per rad, (f, m, c).
+        moment: moments τ of muscles and reserves together, N·m, (f, c).
+        reserve: reserves r, N·m, (f, c).
+        kkt_residual: relative violation of the optimality conditions, (f,).
+        status: "ok" or "failed: …" for each frame.
+        bones: bones of the leg and their loads.
     """
 
     time: Array
@@ -174,24 +175,25 @@ class MuscleTrial:
     bones: Bones
 
     def muscle_wrench(self, bones: tuple[str, ...], seen_from: str) -> Array:
-        """Return what all muscles exert on some bones taken together (f, 6).
+        """Return the wrench (f, 6) of all muscles on some bones together.
 
-        Moment (N·m) above force (N), in the frame of bone `seen_from` about its origin. On tibia
-        and foot together that is the muscles which cross the knee: the others pull both ends.
+        Moment (N·m) and force (N), in the frame of bone `seen_from` about its origin. On tibia and
+        foot together, only muscles that cross the knee contribute.
         """
         pull = self.bones.pull_on(bones, seen_from)
         return np.einsum("fm,fmi->fi", self.force_N, pull)
 
     def knee_reaction(self) -> Array:
-        """Return what the femur exerts on the tibia beside the muscles (f, 6), contact above all.
+        """Return the wrench (f, 6) of the femur on the tibia without the muscles, mainly contact.
 
-        Moment (N·m) above force (N), in the tibia's frame about its origin: what the motion of
-        tibia and foot takes, less gravity, external loads and muscles.
+        Moment (N·m) and force (N), in the tibia's frame about its origin. It is the wrench that the
+        motion of tibia and foot requires, minus gravity, external loads and muscles.
 
         Raises:
-            InputError: muscles that reach the tibia through a patellar ligament, which is none.
+            InputError: muscles end on the patella, and the force of the patellar ligament is
+                unknown.
         """
-        own = ("tibia", "foot")
+        shank = ("tibia", "foot")
         if "patella" in self.bones.names:
             patella = self.bones.attachments("patella", "tibia").points
             other = [None, "femur"]
@@ -202,12 +204,12 @@ class MuscleTrial:
             if ends.any():
                 names = [self.muscles[k] for k in np.flatnonzero(ends)]
                 raise InputError(
-                    f"{', '.join(names)} end on the patella; the patellar ligament's force on the "
-                    "tibia is not known here",
+                    f"{', '.join(names)} end on the patella; the force of the patellar ligament on "
+                    "the tibia is unknown",
                     "muscles",
-                    "use a model whose quadriceps lines lead past the patella to the tibia",
+                    "use a model with quadriceps lines past the patella to the tibia",
                 )
-        return self.bones.demand_of(own, "tibia") - self.muscle_wrench(own, "tibia")
+        return self.bones.demand_of(shank, "tibia") - self.muscle_wrench(shank, "tibia")
 
 
 def solve_trial(
@@ -220,15 +222,16 @@ def solve_trial(
     """Return the muscle forces of a leg in every frame of a motion.
 
     Args:
-        model: the model; its locked coordinates stay as the motion has them.
-        motion: its coordinates over time.
-        loads: body -> (f, 6) moment (N·m) above force (N) on it, in ground at ground's origin,
-            such as the ground reaction on either foot. NaN: not known, so that frames fail.
+        model: OpenSim model.
+        motion: coordinates of the model over time, including locked ones.
+        loads: name of a body -> external wrench on it, moment (N·m) first, force (N), in ground
+            about its origin, (f, 6), such as the ground reaction on each foot. A frame with NaN
+            fails.
         side: "right" or "left".
-        sharing: options.
+        sharing: options; None: `Sharing()`.
 
     Raises:
-        InputError: no such side, muscle, coordinate or body, or options out of range.
+        InputError: no such side, muscle, coordinate or body, or an option is out of range.
     """
     sharing = Sharing() if sharing is None else sharing
     leg = find_leg(model, side)
@@ -258,16 +261,16 @@ def solve_trial(
 def trial_problems(
     leg: Leg, motion: CoordinateMotion, loads: Mapping[str, Array], sharing: Sharing
 ) -> tuple[FrameProblems, Bones]:
-    """Return what every frame asks of a leg's muscles, and what acts on the bones.
+    """Return the optimisation problems of all frames, and the bones with their loads.
 
     Args:
-        leg: the leg.
-        motion: as in `solve_trial`, as the others.
-        loads: likewise.
-        sharing: likewise.
+        leg: leg of the model.
+        motion: coordinates of the model over time.
+        loads: name of a body -> external wrench, see `solve_trial`.
+        sharing: options.
 
     Raises:
-        InputError: no such muscle, coordinate or body, or options out of range.
+        InputError: no such muscle, coordinate or body, or an option is out of range.
     """
     model, kinematics = leg.model, Kinematics(leg.model)
     names = leg_muscles(leg) if sharing.muscles is None else sharing.muscles
@@ -276,10 +279,10 @@ def trial_problems(
     q, groups = motion.q, leg_bones(leg)
     bones = kinematics.motion(q)
     needed = required_wrenches(kinematics, bones, q, motion.rates, motion.accelerations, loads)
-    own = kinematics.coupling(q)[:, :, [kinematics.coordinates[name] for name in balanced]]
-    moment = np.einsum("fbin,fbi,fnc->fc", bones.twists, needed, own, optimize=True)
+    coupling = kinematics.coupling(q)[:, :, [kinematics.coordinates[name] for name in balanced]]
+    moment = np.einsum("fbin,fbi,fnc->fc", bones.twists, needed, coupling, optimize=True)
     pulls = LineSet(kinematics, names).pulls(q, list(groups.values()))
-    arms = pulls.moment_arms @ own
+    arms = pulls.moment_arms @ coupling
     active, passive = _strength(kinematics, motion, sharing, pulls)
     muscles = [model.muscles[name] for name in names]
     problem = FrameProblems(muscles, balanced, sharing, moment, arms, active, passive)
@@ -289,7 +292,14 @@ def trial_problems(
 def _bones(
     groups: Mapping[str, Sequence[str]], bones: Motion, needed: Array, pulls: Pulls
 ) -> Bones:
-    """Return the bones, of what each body needs (f, bodies, 6) and the muscles' pulls on groups."""
+    """Return the bones with their loads.
+
+    Args:
+        groups: bone -> names of its bodies.
+        bones: poses of the model's bodies.
+        needed: wrench that the motion of each body requires, (f, bodies, 6).
+        pulls: wrenches of the muscles on the bones.
+    """
     places = [[bones.bodies[name] for name in bodies] for bodies in groups.values()]
     demand = np.stack([needed[:, place].sum(axis=1) for place in places], axis=1)
     poses = bones.poses[:, [place[0] for place in places]]
@@ -299,7 +309,7 @@ def _bones(
 def _strength(
     kinematics: Kinematics, motion: CoordinateMotion, sharing: Sharing, pulls: Pulls
 ) -> tuple[Array, Array]:
-    """Return force at full activation and passive force (f, m), N."""
+    """Return active forces at full activation and passive forces (f, m), N."""
     model = kinematics.model
     muscles = [model.muscles[name] for name in pulls.names]
     if sharing.law == "isometric":
@@ -323,7 +333,7 @@ def _check(
     coordinates: Sequence[str],
     sharing: Sharing,
 ) -> None:
-    """Raise an InputError for what is not there or out of range."""
+    """Raise an InputError for an unknown name, wrong shape or value out of range."""
     where, model = kinematics.model.name, kinematics.model
     for what, names, available in (
         ("body", loads, model.bodies),

@@ -1,9 +1,8 @@
-"""A question: what of a declared case is possible but unlikely, with the likely mistake.
+"""Plausibility of a case: a question for each possible but unlikely input.
 
-What is impossible is refused where it is read. What is only unlikely is run, but nobody shall read
-"ok" beside it: a question stands in the summary, on the report and in the status of every frame
-that it concerns. The limits say where they come from. They are wide: they separate mistakes,
-which err by factors and signs, from rare patients.
+An impossible input is refused when it is read. A case with unlikely input is computed. A question
+then names the likely mistake in summary, report and the status of the frames concerned. The limits
+are wide, since mistakes such as wrong signs and units exceed them by far.
 """
 
 from collections.abc import Sequence
@@ -15,12 +14,12 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What is unlikely about a case.
+    """A question about unlikely input of a case.
 
     Args:
-        text: a plain sentence that ends with the likely mistake as a question.
-        flag: a few words for the status of the frames; empty where each frame's own forces say.
-        frames: (f,) which frames it concerns; None: all.
+        text: sentence with the unlikely input and the likely mistake as a question.
+        flag: short text for the status of the frames; empty: no flag.
+        frames: mask of the frames concerned, (f,); None: all frames.
     """
 
     text: str
@@ -28,11 +27,11 @@ class Question:
     frames: NDArray[np.bool_] | None = None
 
     def concerns(self, k: int) -> bool:
-        """Say whether it concerns frame k."""
+        """Return whether the question concerns frame k."""
         return self.frames is None or bool(self.frames[k])
 
 
 def some(names: Sequence[str], most: int = 3) -> str:
-    """Return the first few names, and how many more there are."""
+    """Return the first `most` names and the number of the remaining names, as text."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

@@ -1,4 +1,4 @@
-"""Questions about lines of action: where they end, how stiff and how far stretched they are."""
+"""Questions about lines of action: attachments, stiffness and strain."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,55 +18,56 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LineLimitSettings:
-    """Which ligaments and muscle lines are plausible."""
+    """Limits of plausible ligaments and muscle lines."""
 
     max_strain: float = 0.15
-    """Strain; ligaments of the knee tear at 12 to 20 % (Kennedy et al. 1976, Butler et al.
-    1986)."""
+    """1: largest strain of a ligament. Ligaments of the knee tear at 0.12 to 0.20 (Kennedy et al.
+    1976, Butler et al. 1986)."""
     min_strain: float = -0.4
-    """Strain. Chosen: a bundle that is never nearer to being taut has no effect in this
-    movement."""
+    """1: least maximum of a ligament's strain over the motion. Chosen because a bundle with smaller
+    strains has no effect in the motion."""
     max_attachment_distance: float = 0.16
-    """m, from the insert's centre. Chosen: the superficial MCL, the farthest, ends 0.06 to 0.12
-    below it."""
+    """m: largest distance of an attachment from the origin of insert or link. Chosen because the
+    superficial MCL, the farthest, ends 0.06 to 0.12 below the insert."""
     max_overlap: float = 0.03
-    """m; of a tibial end above the insert's bottom, or of a femoral end below the flexion axis.
-    Chosen: attachments of a knee overlap by less."""
+    """m: largest height of a tibial end above the insert's bottom, and of a femoral end below the
+    flexion axis. Chosen because the ends in a knee overlap by less."""
     min_anterior_offset: float = 0.01
-    """m; of the quadriceps origin ahead of the line from hip to knee, 0.029 to 0.044 in three
-    models. Vasti begin on the front of a shaft that is bowed forward, the rectus femoris ahead of
-    the hip."""
+    """m: least distance of the quadriceps origin in front of the line from hip to knee. Three
+    models have 0.029 to 0.044."""
     max_patella_distance: float = 0.06
-    """m; of the ends of both lines from the patella's origin. A patella is 0.045 long."""
+    """m: largest distance of quadriceps insertion and patellar ligament from the patella's origin.
+    A patella is 0.045 long."""
     max_tendon_change: float = 0.15
-    """Share of its mean length by which the patellar ligament may change between recorded ends.
-    Chosen: it strains by a few per cent."""
+    """1: largest change of the patellar ligament's length, relative to the mean. Chosen because its
+    strain is a few per cent."""
 
 
 LINE_LIMITS = LineLimitSettings()
 
 STIFFNESS_PER_MM, STIFFNESS_PER_STRAIN = (2.0, 500.0), (20.0, 30000.0)
-"""N/mm and N: from a tenth of a capsule's bundle to more than a whole cruciate ligament
-(347 N/mm: Race & Amis 1994; 18 kN for both PCL bundles: Blankevoort & Huiskes 1996)."""
+"""N/mm and N: limits of a ligament's stiffness, from a tenth of a bundle of the capsule to more
+than a whole cruciate ligament (347 N/mm: Race & Amis 1994; 18 kN for both PCL bundles:
+Blankevoort & Huiskes 1996)."""
 TENDON = (0.025, 0.085)
-"""m, of the patellar ligament's length."""
+"""m: limits of the patellar ligament's length."""
 ORIGIN = (0.08, 0.55)
-"""m, of an extensor's origin above the flexion axis: within the thigh."""
+"""m: limits of the height of an extensor's origin above the flexion axis."""
 TUBEROSITY = (0.01, 0.11)
-"""m, of the patellar ligament's distal end from the insert's centre; it lies below and ahead."""
+"""m: limits of the distance of the patellar ligament's distal end from the insert's centre."""
 PATELLA_HEIGHT, PATELLA_ASIDE = 0.025, 0.025
-"""m: the lines end at least so far apart along it (0.039 to 0.045 in three models), and within
-half its breadth."""
+"""m: least height of the quadriceps insertion above the patellar ligament's end (0.039 to 0.045 in
+three models), and largest distance of both from the sagittal plane of the patella."""
 
 
 def attachment_questions(case: Case) -> Iterator[Question]:
-    """Points in metres called millimetres, and bundles that end far from the knee."""
+    """Ask about attachments in metres instead of millimetres, or far from the knee."""
     ends = [
         (f"{bundle.name} {side}", getattr(bundle, side))
         for bundle in case.ligaments
         for side in ("proximal", "distal")
     ]
-    far = [name for name, end in ends if not _belongs(*_on_carrier(case, end))]
+    far = [name for name, end in ends if not _is_plausible_end(*_on_carrier(case, end))]
     if far:
         yield Question(
             f"{some(far)}: more than {LINE_LIMITS.max_attachment_distance / MILLIMETRE:.0f} mm "
@@ -82,18 +83,18 @@ def attachment_questions(case: Case) -> Iterator[Question]:
             ("[patellar_ligament] proximal", case.patellar_ligament.proximal),
             ("[patellar_ligament] distal", case.patellar_ligament.distal),
         ]
-    tiny = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
-    if tiny:
+    near_origin = [name for name, end in ends if 0.0 < np.abs(end.position).max() < MILLIMETRE]
+    if near_origin:
         yield Question(
-            f"{some(tiny)}: within 1 mm of the link's origin; is point_mm in metres?",
+            f"{some(near_origin)}: within 1 mm of the link's origin; is point_mm in metres?",
             "attachment within 1 mm of its link's origin",
         )
 
 
 def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
-    """Return the link that carries an attachment, and where on it that is (3,) m.
+    """Return the bone of an attachment (femur, tibia or patella), and its position (3,), m.
 
-    On the tibia in the insert frame, on femur or patella in that link's own.
+    The position is in the insert frame for the tibia, else in the frame of the bone's link.
     """
     chain = case.chain
     carrier = chain.carrier(end.link)
@@ -103,8 +104,8 @@ def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
     return carrier, place
 
 
-def _belongs(carrier: str, place: Array) -> bool:
-    """Say whether a ligament may end at a place (3,) m, as `_on_carrier` gives it."""
+def _is_plausible_end(carrier: str, place: Array) -> bool:
+    """Return whether a ligament may end at a position (3,), m, from `_on_carrier`."""
     beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
     return (
         float(np.linalg.norm(place)) <= LINE_LIMITS.max_attachment_distance
@@ -113,7 +114,7 @@ def _belongs(carrier: str, place: Array) -> bool:
 
 
 def stiffness_questions(case: Case) -> Iterator[Question]:
-    """Bundles stiffer or softer than any ligament."""
+    """Ask about a stiffness outside the range of ligaments."""
     for law, (low, high), scale, unit in (
         ("two-line", STIFFNESS_PER_MM, MILLIMETRE, "N/mm"),
         ("quadratic-toe", STIFFNESS_PER_STRAIN, 1.0, "N per unit strain"),
@@ -128,7 +129,7 @@ def stiffness_questions(case: Case) -> Iterator[Question]:
 
 
 def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float]) -> list[str]:
-    """Return the bundles whose tension (N) is above that of the strain they bear."""
+    """Return the bundles with a tension, N, above the tension at `max_strain`."""
     return [
         bundle.name
         for bundle in ligaments
@@ -140,12 +141,12 @@ def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float])
 def strain_questions(
     ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
 ) -> Iterator[Question]:
-    """Bundles that would tear, and bundles that never come near to being taut.
+    """Ask about bundles that would tear, or are slack by far in all frames.
 
     Args:
-        ligaments: the bundles.
-        strains: name -> strain (f,) of the recorded poses.
-        time: (f,) s.
+        ligaments: ligament bundles.
+        strains: name of a bundle -> strain at the recorded poses, (f,).
+        time: times of the frames, s, (f,).
     """
     if not ligaments:
         return
@@ -171,18 +172,18 @@ def strain_questions(
     ]
     if loose:
         yield Question(
-            f"{some(loose)}: never within {-100 * LINE_LIMITS.min_strain:.0f} % of being taut; "
+            f"{some(loose)}: in all frames more than {-100 * LINE_LIMITS.min_strain:.0f} % slack; "
             "is an attachment, slack_length_mm or [motion] length_unit in another unit?",
             "ligament far from taut throughout",
         )
 
 
 def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Question]:
-    """Ends of the muscles on the patella and its ligament, and the length between recorded ends.
+    """Ask about the ends of quadriceps and patellar ligament, and the length of the latter.
 
     Args:
         case: the case.
-        poses: link -> pose_link_in_insert (f, 4, 4).
+        poses: link -> pose_link_in_insert, (f, 4, 4).
     """
     ligament = case.patellar_ligament
     if ligament is None:
@@ -227,7 +228,7 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
 
 
 def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
-    """The patellar ligament's lengths (f,) m between its ends, and the declared one."""
+    """Ask about unlikely lengths (f,), m, of the patellar ligament, or another declared length."""
     if not len(lengths):
         return
     low, high = float(lengths.min()), float(lengths.max())
@@ -240,7 +241,7 @@ def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
         )
     elif (
         abs(declared / mean - 1) > LINE_LIMITS.max_tendon_change
-    ):  # not where none is declared: NaN
+    ):  # False if none is declared (NaN)
         yield Question(
             f"the patellar ligament is {mean / MILLIMETRE:.0f} mm between its ends, but length_mm "
             f"is {declared / MILLIMETRE:g}: which is right?",

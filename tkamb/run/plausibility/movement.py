@@ -1,9 +1,9 @@
-"""Questions about the recorded movement: ranges, rates, odd samples, signs of the pose.
+"""Questions about the recorded movement: ranges, rates, outliers, signs of the pose.
 
-Signs: loaded condyles roll and slide over the dishes and neither leave them nor sink in, so that
-their gaps in the recorded pose vary little. With a wrong sign of AP the femur moves up the lips.
-With a wrong sign of axial rotation or adduction, one condyle rises while the other sinks. The
-check turns each sign in turn, and asks about it if that makes the gaps much steadier.
+Signs: loaded condyles stay in contact with the insert, so that their gaps at the recorded poses
+vary little. With a wrong sign of AP the femur moves up the lips of the insert. With a wrong sign
+of axial rotation or adduction, one condyle rises and the other sinks. The check inverts one sign
+at a time. It asks about a sign if the gaps then vary much less.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,39 +25,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MovementLimitSettings:
-    """Which movements are plausible."""
+    """Limits of plausible movements."""
 
     max_flexion_as_radians: float = 3.3
-    """deg; largest flexion that may be stored in radians but read as degrees. Chosen: a bend of
-    more than 10 deg stays below this."""
+    """deg: largest flexion that suggests radians in the file. Chosen because 190 deg in radians is
+    the number 3.3."""
     max_marker_residual: float = 12.0 * MILLIMETRE
-    """m; root mean square in the median frame. Skin moves by up to 10 mm in a cluster, 5 mm on the
-    stairs of subject JW."""
+    """m: largest root mean square residual of the markers in the median frame. Skin moves by up to
+    10 mm in a cluster, and by 5 mm on the stairs of subject JW."""
     min_duration: float = 0.15
-    """s; no movement of a leg is shorter."""
+    """s: least duration of a motion. No movement of a leg is shorter."""
     odd_sample_window: float = 0.2
-    """s; a sample farther from every frame reaches them through a low-pass of 6 Hz by less than
-    3 % of what its own instant gets."""
+    """s: largest distance of an outlier from the nearest frame. With a low-pass filter of 6 Hz, the
+    effect of an outlier after this time is below 3 % of its largest effect."""
     min_translation: float = 0.1 * MILLIMETRE
-    """m; the femur of a knee that bends by 20 deg moves by more than this on the insert.
-    Millimetres that are metres in the file stay below."""
+    """m: least translation of the femur on the insert in a bend of 20 deg. Metres that are read as
+    millimetres are below."""
 
 
 MOVEMENT_LIMITS = MovementLimitSettings()
 
 LEAN_RADIANS, DEEP = 2.6, 60.0
-"""deg: a shank that leans by up to 150 deg, in radians and called degrees, stays below the first;
-whoever bends the knee by the second leans by ten times as much."""
+"""deg: largest lean of the shank that suggests radians (150 deg are 2.6 rad), and range of flexion
+from which the shank leans by far more."""
 USUAL_DEG = {"flexion": (-15, 160), "adduction": (-12, 12), "axial_rotation": (-40, 40)}
-"""A kneeling, a dislocated and a rotating-platform knee reach these."""
+"""deg: limits of the angles, reached in kneeling, dislocation and a rotating platform."""
 USUAL_RATE = {"flexion": 20.0, "adduction": 6.0, "axial_rotation": 10.0}
-"""rad/s: a kick's flexion; the others in a pivoting jump."""
+"""rad/s: limits of the rates, reached in a kick (flexion) and a pivoting jump."""
 PATELLA_AWAY = (15.0 * MILLIMETRE, 80.0 * MILLIMETRE)
-"""Of a recorded patella's origin from the flexion axis: 26 to 57 mm in eight designs' bends."""
+"""m: limits of the distance from the flexion axis to the patella's origin. It is 0.026 to 0.057 in
+bends of eight designs."""
 
 
 def motion_questions(case: Case) -> Iterator[Question]:
-    """Ranges and rates of the recorded angles, and how long the motion lasts."""
+    """Ask about unlikely angles, rates, translations, patella or duration of the motion."""
     motion = case.motion
     angles = dict(zip(KNEE_COORDINATES, motion.coordinates.T, strict=True))
     rates = dict(zip(KNEE_COORDINATES, motion.velocity.T, strict=True))
@@ -80,14 +81,14 @@ def motion_questions(case: Case) -> Iterator[Question]:
             )
     for name, (low, high) in USUAL_DEG.items():
         angle = angles[name] / DEGREE
-        far = (angle < low) | (angle > high)
-        if far.any():
+        frames = (angle < low) | (angle > high)
+        if frames.any():
             worst = angle[int(np.argmax(np.maximum(low - angle, angle - high)))]
             yield Question(
                 f"{name} reaches {worst:.0f} deg, where few knees go ({low} to {high}): is its "
                 "column, sign ([motion] signs_turned) or axis another one?",
                 f"{name} of {worst:.0f} deg",
-                far,
+                frames,
             )
         fast = np.abs(rates[name]) > USUAL_RATE[name]
         if fast.any():
@@ -100,14 +101,15 @@ def motion_questions(case: Case) -> Iterator[Question]:
             )
     if motion.patella is not None:
         away = np.hypot(motion.patella[:, 0], motion.patella[:, 1])
-        far = (away < PATELLA_AWAY[0]) | (away > PATELLA_AWAY[1])
-        if far.any():
+        frames = (away < PATELLA_AWAY[0]) | (away > PATELLA_AWAY[1])
+        if frames.any():
             nearest, farthest = away.min() / MILLIMETRE, away.max() / MILLIMETRE
             yield Question(
                 f"the patella lies {nearest:.3g} to {farthest:.3g} mm from the flexion axis: are "
-                "its ap and si in millimetres, of the femoral component's origin, of their sign?",
-                "patella where none is",
-                far,
+                "its ap and si in millimetres, from the femoral component's origin, with the right "
+                "sign?",
+                "patella too near to or far from the flexion axis",
+                frames,
             )
     yield from _translation_questions(case)
     if motion.time[0] == 0.0 and motion.time[-1] == 100.0:
@@ -116,15 +118,15 @@ def motion_questions(case: Case) -> Iterator[Question]:
             "seconds; velocities and accelerations follow from it",
             "time may be in per cent",
         )
-    lasting = float(motion.time[-1] - motion.time[0])
-    if lasting < MOVEMENT_LIMITS.min_duration:
+    duration = float(motion.time[-1] - motion.time[0])
+    if duration < MOVEMENT_LIMITS.min_duration:
         yield Question(
-            f"the motion lasts {lasting:.3g} s: is its time in seconds?", "motion too brief"
+            f"the motion lasts {duration:.3g} s: is its time in seconds?", "motion too brief"
         )
 
 
 def _translation_questions(case: Case) -> Iterator[Question]:
-    """Whether recorded translations change by more than nothing; constant ones are given."""
+    """Ask about recorded translations that hardly change. Constant ones are prescribed values."""
     motion = case.motion
     names = ("ap", "si", "ml")
     if motion.unrecorded or motion.markers is not None:
@@ -141,41 +143,41 @@ def _translation_questions(case: Case) -> Iterator[Question]:
 
 
 def marker_questions(case: Case) -> Iterator[Question]:
-    """How far markers lie from their places on the segments that a rigid fit of them gives."""
+    """Ask about large residuals of the markers after a rigid fit of each segment."""
     if case.motion.markers is not None:
-        whose, rms = "shank's and thigh's markers", case.motion.markers.rms["segments"]
+        name, rms = "the markers of shank and thigh", case.motion.markers.rms["segments"]
     elif case.tibia is not None and case.tibia.residual is not None:
-        whose, rms = "the shank's markers", case.tibia.residual
+        name, rms = "the markers of the shank", case.tibia.residual
     else:
         return
     finite = rms[np.isfinite(rms)]
     if len(finite) and (middle := float(np.median(finite))) > MOVEMENT_LIMITS.max_marker_residual:
         yield Question(
-            f"{whose} lie {middle / MILLIMETRE:.0f} mm (rms) from their places: is markers_mm "
-            "another subject's or trial's, or are two of them exchanged?",
+            f"{name} lie {middle / MILLIMETRE:.0f} mm (rms) from their positions on the segments: "
+            "is markers_mm of another subject or trial, or are two markers exchanged?",
             "markers do not fit their segments",
         )
 
 
 def drift_questions(case: Case) -> Iterator[Question]:
-    """Force plates that read a force while nobody stands on them."""
+    """Ask about force plates with a force while nobody stands on them."""
     if case.ground is None:
         return
     drift = [f"plate {number} {level:.1f} N" for number, level in case.ground.drift.items()]
     if drift:
         yield Question(
-            f"force plates drift: while nobody stands on it, {', '.join(drift)}, and as much too "
-            "much under the foot: were they not set to zero before the trial?",
+            f"force plates drift: {', '.join(drift)} while nobody stands on it, and the same error "
+            "under the foot: were they not set to zero before the trial?",
             "force plate drifts",
         )
 
 
 def sample_questions(case: Case) -> Iterator[Question]:
-    """Recorded samples that lie off their neighbours' curve, one question a file."""
+    """Ask about recorded samples off the curve of their neighbours, once for each file."""
     parts = (case.motion, case.tibia, case.ground)
     time = case.motion.time
-    reach = float(np.ptp(time)) / max(len(time) - 1, 1)
-    window = max(3.0 * reach, MOVEMENT_LIMITS.odd_sample_window)
+    step = float(np.ptp(time)) / max(len(time) - 1, 1)
+    window = max(3.0 * step, MOVEMENT_LIMITS.odd_sample_window)
     for part in parts:
         recorded = () if part is None else part.odd
         samples = [one for one in recorded if np.abs(time - one.time).min() <= window]
@@ -184,7 +186,7 @@ def sample_questions(case: Case) -> Iterator[Question]:
         worst = max(samples, key=lambda sample: sample.away)
         near = np.zeros(len(time), bool)
         for sample in samples:
-            near |= np.abs(time - sample.time) <= 3.0 * reach
+            near |= np.abs(time - sample.time) <= 3.0 * step
         text = _odd_text(samples, worst, case.scene.ground_reaction)
         yield Question(text, "recorded sample off its neighbours' curve", near)
 
@@ -192,7 +194,7 @@ def sample_questions(case: Case) -> Iterator[Question]:
 def _odd_text(
     samples: Sequence[OddSample], worst: OddSample, ground: GroundReactionTable | None
 ) -> str:
-    """Return the question about a file's odd samples; a C3D file has no cells."""
+    """Return the question about the outliers of a file."""
     more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
     of_plates = (
         ground is not None
@@ -203,44 +205,40 @@ def _odd_text(
     numbers = ", ".join(map(str, ground.plates)) if ground and of_plates else ""
     what = f"{worst.what} of plates {numbers}" if of_plates else worst.what
     in_c3d = worst.path.suffix.lower() == ".c3d"
-    mistake = "is it a spike" if in_c3d else "is a cell mistyped"
+    mistake = "is it a spike" if in_c3d else "is a cell mistyped"  # a C3D file has no cells
     return (
         f"{worst.path.name}: {what} at {worst.time:.4g} s{more} lies {worst.away:.3g} "
         f"{worst.unit} off its neighbours' curve: {mistake}, or is it noise? cutoff_Hz filters "
-        "noise; anything else is to be mended in the file"
+        "noise; correct anything else in the file"
     )
 
 
 @dataclass(frozen=True)
 class SignSettings:
-    """When a sign is asked about."""
+    """Criteria for a question about the sign of a coordinate."""
 
     frames: int = 15
-    """Number of frames that are checked, evenly spread over the motion. Chosen: more frames change
-        the spreads by some per cent."""
+    """1: number of checked frames, evenly spread over the motion. Chosen because more frames change
+    the standard deviations by a few per cent only."""
     ap_spread: float = 0.6 * MILLIMETRE
-    """m: spread of the mean gap below which AP is not asked about. Fluoroscopy of subject DM has
-    0.3 mm, and 1.3 mm with the sign turned."""
+    """m: standard deviation of the mean gap from which the sign of AP is checked. Fluoroscopy of
+    subject DM has 0.3 mm, and 1.3 mm with the wrong sign."""
     ap_share: float = 0.5
-    """1: largest share of that spread with the sign turned. Chosen: 0.25 for subject DM."""
+    """1: largest ratio of that standard deviation with inverted sign to the recorded one. It is
+    0.25 for subject DM with the wrong sign."""
     turn_spread: float = 0.1 * MILLIMETRE
-    """m: spread of the difference between the condyles' gaps below which rotation is not asked
-    about. Chosen: a mesh of 1 mm facets makes 0.05 mm."""
+    """m: standard deviation of the difference of the condyles' gaps from which the signs of axial
+    rotation and adduction are checked. Chosen because a mesh of 1 mm facets causes 0.05 mm."""
     turn_share: float = 0.7
-    """1: largest share of that spread with the sign turned. Chosen: 0.43 to 0.62 for subject DM;
-    1.6 and more where the signs are right."""
+    """1: largest ratio of that standard deviation with inverted sign to the recorded one. It is
+    0.43 to 0.62 for subject DM with a wrong sign, and at least 1.6 with right signs."""
 
 
 SIGN = SignSettings()
 
 
 def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator[Question]:
-    """Signs of AP, and of axial rotation against adduction, of a recorded pose.
-
-    Args:
-        case: the case.
-        settings: default: `SignSettings()`.
-    """
+    """Ask about the signs of AP, axial rotation and adduction of the recorded poses."""
     settings = SignSettings() if settings is None else settings
     free = _found_by_contact(case)
     if case.femoral is None or case.insert is None or {"ap", "axial_rotation"} <= free:
@@ -286,24 +284,24 @@ def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator
 
 
 def _found_by_contact(case: Case) -> set[str]:
-    """Return the coordinates that are not recorded: contact and equilibrium find them."""
+    """Return the released coordinates; all coordinates for a scene without contact."""
     contact = case.scene.contact
     return set(KNEE_COORDINATES) if contact is None else set(contact.released)
 
 
 def _gaps(clearance: "FirstTouch", coordinates: Array) -> Array:
-    """Return the vertical clearance (f, 2) m of the condyles; NaN where one is off the insert."""
+    """Return the vertical gaps of the condyles (f, 2), m; NaN for a condyle beside the insert."""
     touches = [clearance.at(knee_pose(row)) for row in coordinates]
     return np.array([[np.nan if t is None else t.travel for t in pair] for pair in touches])
 
 
 def _turned_gaps(clearance: "FirstTouch", coordinates: Array, name: str) -> Array:
-    """Return the clearances with the sign of one coordinate turned."""
+    """Return the gaps with the inverted sign of one coordinate."""
     flipped = coordinates.copy()
     flipped[:, KNEE_COORDINATES.index(name)] *= -1.0
     return _gaps(clearance, flipped)
 
 
 def _difference(gaps: Array) -> float:
-    """Return the spread (m) over the frames of the difference between the condyles' gaps."""
+    """Return the standard deviation of the difference between the condyles' gaps, m."""
     return float(np.std(gaps[:, 0] - gaps[:, 1]))

@@ -1,4 +1,4 @@
-"""All questions of a case, and what they say about a frame."""
+"""All questions of a case, and their flags for the status of a frame."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,10 +33,11 @@ ANSWERS = "[output] answers"
 
 @dataclass(frozen=True)
 class ForceLimitSettings:
-    """Which contact forces are plausible."""
+    """Limits of plausible contact forces."""
 
     max_force_BW: float = 8.0
-    """BW; instrumented knees measured 5 to 6 at most, in stumbling (Bergmann et al. 2014)."""
+    """BW: largest contact force. Instrumented knees measured at most 5 to 6, in stumbling (Bergmann
+    et al. 2014)."""
 
 
 FORCE_LIMITS = ForceLimitSettings()
@@ -47,14 +48,14 @@ class Plausibility:
 
     Args:
         case: the case.
-        mechanics: the case's multibody model, prepared.
+        mechanics: mechanics of the case.
 
     Attributes:
-        questions: those that the scene does not answer.
-        answered: question and answer, each in words.
+        questions: questions without an answer in the scene.
+        answered: sentences with a question and its answer.
 
     Raises:
-        InputError: an answer is empty, or answers none of the questions.
+        InputError: an answer is empty, or belongs to no question.
     """
 
     def __init__(self, case: Case, mechanics: "Mechanics") -> None:
@@ -78,7 +79,7 @@ class Plausibility:
         self.questions, self.answered = _answered(result, case.scene.output.answers)
 
     def flags(self, k: int, body: "FrameLoads") -> list[str]:
-        """Return the words for the status of frame k."""
+        """Return the flags for the status of frame k."""
         words = [
             question.flag for question in self.questions if question.flag and question.concerns(k)
         ]
@@ -91,34 +92,32 @@ class Plausibility:
                 )
         force = float(np.linalg.norm(body.loads.contact_force)) / self._case.body_weight
         if force > FORCE_LIMITS.max_force_BW:
-            words.append(
-                f"contact force of {force:.1f} BW, more than any knee was measured to bear"
-            )
+            words.append(f"contact force of {force:.1f} BW, above all forces measured in knees")
         return words
 
 
 def _answered(
     questions: Sequence[Question], answers: Mapping[str, str]
 ) -> tuple[tuple[Question, ...], tuple[str, ...]]:
-    """Return the questions without an answer, and one sentence for each question with one.
+    """Return the questions without an answer, and a sentence for each answered question.
 
     Args:
         questions: all questions of the scene.
-        answers: some words of a question's text -> its answer.
+        answers: some words of a question -> its answer.
     """
     unanswered, text = list(questions), []
     for words, answer in answers.items():
-        own = [
+        matching = [
             question for question in unanswered if words and words.lower() in question.text.lower()
         ]
-        if not own:
-            texts = "; ".join(question.text for question in unanswered) or "there is none"
-            hint = f"leave it out, or take words of one that is asked: {texts}"
+        if not matching:
+            texts = "; ".join(question.text for question in unanswered) or "there are none"
+            hint = f"remove the answer, or quote words of a question: {texts}"
             raise InputError(f"no question holds '{words}'", ANSWERS, hint)
         if not answer.strip():
             raise InputError(f"'{words}' has no answer", ANSWERS, "say why the input is right")
-        text += [f"Answered: {question.text} {answer}" for question in own]
-        unanswered = [question for question in unanswered if question not in own]
+        text += [f"Answered: {question.text} {answer}" for question in matching]
+        unanswered = [question for question in unanswered if question not in matching]
     return tuple(unanswered), tuple(text)
 
 

@@ -1,4 +1,4 @@
-"""Questions about the bodies: masses and shapes of the segments, and the parts of the implant."""
+"""Questions about the masses and shapes of segments and implant parts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,41 +18,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SegmentLimitSettings:
-    """Which masses and positions of the segments of a leg are plausible."""
+    """Limits of plausible masses and positions of the segments of a leg."""
 
     max_mass_ratio: float = 1.6
-    """1: largest ratio, either way, of a segment's mass to that of de Leva for the same body mass.
-    The ratio is up to 1.35 between cadaver studies and up to 1.3 with obesity; pounds read as
-    kilograms give 2.2."""
+    """1: largest ratio of a segment's mass to that of de Leva for the same body mass, and largest
+    reciprocal. The ratio is up to 1.35 between cadaver studies, up to 1.3 with obesity, and 2.2 for
+    pounds that are read as kilograms."""
     max_patella_offset: float = 0.05
-    """m; of the patella's centre of mass from its origin."""
+    """m: largest distance of the patella's centre of mass from its origin. Chosen because a patella
+    is smaller."""
     max_insert_rotation: float = 20.0 * DEGREE
-    """rad; from the tibia's axes. Chosen: the slope is up to 10 deg, and the axis of a shank may be
-    laid through other points."""
+    """rad: largest rotation of the insert in the tibia. Chosen because the slope is up to 10 deg,
+    and definitions of the tibia's axes differ."""
     max_centre_offset: float = 0.12
-    """Share of a segment's length by which its centre of mass may lie beside its axis. Chosen: with
-    the foot, which points forward, twice as much."""
+    """1: largest distance of a segment's centre of mass from its axis, as a share of its length.
+    Twice as much is allowed for the shank, which includes the foot."""
 
 
 SEGMENT_LIMITS = SegmentLimitSettings()
 
 PATELLA_MASS = (0.02, 0.6)
-"""kg, from the bone alone to all that moves with it."""
+"""kg: limits of the patella's mass, from the bone alone to bone and soft tissue."""
 PATELLA_RADII = (0.005, 0.04)
-"""m, of gyration: a bone 45 mm wide and 20 mm thick has 9 to 13 mm."""
+"""m: limits of the patella's radii of gyration. A bone 45 mm wide and 20 mm thick has 9 to 13 mm.
+"""
 
 SHANK_SHARE, THIGH_SHARE = (0.19, 0.30), (0.19, 0.31)
-"""Least and largest length, as shares of body height: 0.246 and 0.245 (Drillis & Contini 1966),
-about a quarter less or more."""
+"""1: limits of the segments' lengths as shares of body height, 0.246 and 0.245 (Drillis & Contini
+1966) minus and plus about a quarter."""
 RADII = ((0.15, 0.45), (0.05, 0.30))
-"""Of gyration over segment length, across and along it: de Leva's are 0.24 to 0.37 and 0.09 to
-0.16; a foot makes the shank's larger."""
+"""1: limits of the radii of gyration across and along a segment over its length. De Leva has 0.24
+to 0.37 and 0.09 to 0.16; a foot increases those of the shank."""
 CENTRE = (0.15, 0.8)
-"""Of a segment's mass, as a share of its length from the distal joint: 0.37 to 0.64 (de Leva)."""
+"""1: limits of the distance from the distal joint to the centre of mass over the segment's length.
+De Leva has 0.37 to 0.64."""
 
 
 def segment_questions(case: Case) -> Iterator[Question]:
-    """Masses, centres and inertias of shank and thigh, and their lengths."""
+    """Ask about masses, centres of mass, inertias and lengths of the segments, and the insert."""
     chain, patient = case.chain, case.scene.patient
     hip = chain.link_in("hip", "femur")[:3, 3]
     knee = chain.insert_in_tibia[:3, 3]
@@ -70,8 +73,8 @@ def segment_questions(case: Case) -> Iterator[Question]:
     ]:
         link = wrong[0]
         yield Question(
-            f"'{link}' of the URDF weighs {masses[link]:.3g} kg, {ratios[link]:.2g} times what it "
-            f"does in a body of {case.body_mass:g} kg: is mass_kg, or the URDF's, in pounds?",
+            f"'{link}' of the URDF weighs {masses[link]:.3g} kg, {ratios[link]:.2g} times the "
+            f"usual mass in a body of {case.body_mass:g} kg: is mass_kg, or the URDF's, in pounds?",
             "masses of URDF and [patient] disagree",
         )
     if case.scene.patella:
@@ -96,12 +99,12 @@ def segment_questions(case: Case) -> Iterator[Question]:
         yield Question(
             f"the insert's axes are turned by {leans.max():.0f} deg from the tibia's: is the rpy "
             "of knee_ap right?",
-            "insert far turned in the tibia",
+            "insert turned far in the tibia",
         )
 
 
 def _of_patella(case: Case) -> Iterator[Question]:
-    """The patella's mass, where its centre is, and its inertia."""
+    """Ask about mass, centre of mass and inertia of the patella."""
     mass, centre, tensor = case.chain.segment("patella")
     radii = np.sqrt(np.linalg.eigvalsh(tensor) / mass)
     if radii[0] < PATELLA_RADII[0] or radii[-1] > PATELLA_RADII[1]:
@@ -123,7 +126,7 @@ def _of_patella(case: Case) -> Iterator[Question]:
 
 
 def _of_inertia(case: Case, link: str, end: Array) -> Iterator[Question]:
-    """One segment's centre and radii of gyration, between its origin and its proximal end."""
+    """Ask about centre of mass and radii of gyration of a segment from its origin to `end` (3,)."""
     mass, centre, tensor = case.chain.segment(link)
     length = float(np.linalg.norm(end))
     along = end / length
@@ -152,42 +155,47 @@ def _of_inertia(case: Case, link: str, end: Array) -> Iterator[Question]:
 
 @dataclass(frozen=True)
 class ImplantShapeLimitSettings:
-    """Which shapes and positions of an implant are plausible."""
+    """Limits of plausible shapes and positions of an implant."""
 
     flange_height_share: float = 0.15
-    """Share of the component's height at which the anterior flange is looked for, above the
-    posterior condyles. Chosen: the flange is the only part there."""
+    """1: share of the femoral component's height, from the top, that is searched for the flange.
+    Chosen because the posterior condyles end below."""
     min_flange_position: float = 0.35
-    """Share of the component's length, from behind. Chosen: eleven components have their top at
-    0.92 to 0.97, one without a flange at 0.5, one back to front below 0.1."""
+    """1: least position of the component's top from its posterior end, as a share of its length.
+    Eleven components have 0.92 to 0.97, one without a flange has 0.5, and a component that is back
+    to front has less than 0.1."""
     min_opening_share: float = 0.05
-    """Share of the largest extent: least distance from the centroid of the surface to the centre of
-    the bounding box. Chosen: 0.09 to 0.14 in ten components, none in a sphere."""
+    """1: least distance from the surface's centroid to the centre of the bounding box, as a share
+    of the largest extent, from which the opening is checked. Ten components have 0.09 to 0.14, a
+    sphere has 0."""
     max_opening_angle: float = 60.0 * DEGREE
-    """rad, from superior. Chosen: the same ten components open within 27 deg of it."""
+    """rad: largest angle between the opening of the component and superior. The same ten components
+    have at most 27 deg."""
     min_flatness_ratio: float = 2.0
-    """Ratio of the flat area of the bone side of a patellar button to that of its joint side.
-    Chosen: 15 at least in real ones."""
+    """1: ratio of the flat area of the largest flat side of a patellar button to that of its
+    anterior side, above which the button may be turned. Real buttons have at least 15."""
     min_notch_share: float = 0.02
-    """Share of an insert's length by which it is cut out more in front than behind. Chosen: ten
-    inserts are cut out more behind, by 0.05 to 0.3."""
+    """1: depth of the notch in front minus that behind, as a share of the insert's length, above
+    which the insert may be back to front. Ten inserts have deeper notches behind, by 0.05 to
+    0.3."""
     max_friction: float = 0.25
-    """Coulomb coefficient of metal on polyethylene. Chosen: lubricated joints have 0.01 to 0.1, dry
-    ones 0.2."""
+    """1: largest Coulomb coefficient of metal on polyethylene. Lubricated joints have 0.01 to 0.1,
+    dry joints 0.2."""
     outline_offset: float = 0.25
-    """Share of an insert's width, to either side, at which its outline is compared. Chosen: it lies
-        under the condyles."""
+    """1: distance from the middle to the compared outlines of an insert, as a share of its width.
+    Chosen because the condyles are there."""
 
 
 IMPLANT_SHAPE_LIMITS = ImplantShapeLimitSettings()
 
 FLAT = np.cos(5.0 * DEGREE)
-"""Of the angle between a flat's normal and an axis of the part."""
+"""1: cosine of the largest angle between the normal of a flat face and an axis of the part."""
 AT_HEIGHTS = (0.15, 0.3, 0.45)
+"""1: heights of the compared outlines as shares of the insert's height."""
 
 
 def implant_questions(case: Case) -> Iterator[Question]:
-    """Whether femoral component, insert and patellar button are turned, and rub too much."""
+    """Ask about implant parts that may be turned, and about too large a friction."""
     if case.femoral is not None:
         yield from _of_femoral(case.femoral)
     if case.insert is not None and case.scene.contact:
@@ -198,13 +206,13 @@ def implant_questions(case: Case) -> Iterator[Question]:
     if contact and contact.friction > IMPLANT_SHAPE_LIMITS.max_friction:
         yield Question(
             f"a friction of {contact.friction:g} is more than metal on polyethylene has, even dry "
-            "(0.2): is it a tenth of that?",
+            f"(0.2): is it {0.1 * contact.friction:g}?",
             "friction above any of metal on polyethylene",
         )
 
 
 def _of_femoral(femoral: "Surface") -> Iterator[Question]:
-    """Whether the flange lies in front, and what the component encloses above."""
+    """Ask about a flange that is not in front, or a component that does not open upward."""
     low, high = femoral.bounds
     vertices = femoral.vertices
     top = vertices[:, 1] > high[1] - IMPLANT_SHAPE_LIMITS.flange_height_share * (high[1] - low[1])
@@ -229,7 +237,7 @@ def _of_femoral(femoral: "Surface") -> Iterator[Question]:
 
 
 def _of_insert(insert: "Surface") -> Iterator[Question]:
-    """Whether its notch lies behind: at mid-width its outline is compared with the condyles'."""
+    """Ask about a notch in front, by comparing the outlines at mid-width and at the condyles."""
     low, high = insert.bounds
     heights, offsets = (
         np.array(AT_HEIGHTS),
@@ -255,7 +263,7 @@ def _of_insert(insert: "Surface") -> Iterator[Question]:
 
 
 def _of_button(button: "Surface") -> Iterator[Question]:
-    """Whether its flat side, which lies on the bone, faces forward."""
+    """Ask about a button with a flat side, the bone side, that does not face forward."""
     ways = np.vstack([np.eye(3), -np.eye(3)])
     flat = np.array([button.areas[button.face_normals @ way > FLAT].sum() for way in ways])
     largest = int(flat.argmax())
@@ -274,7 +282,7 @@ def _centroid(surface: "Surface") -> Array:
 
 
 def _way(direction: Array) -> str:
-    """Return in a word which way of the anatomical axes a direction (3,) points most."""
+    """Return the word for the anatomical direction nearest to a vector (3,)."""
     axis = int(np.abs(direction).argmax())
     return (("backward", "forward"), ("downward", "upward"), ("medially", "laterally"))[axis][
         int(direction[axis] > 0.0)

@@ -215,7 +215,7 @@ def estimate_uncertainty(
             "samples",
         )
     if directory is None and resume:
-        raise InputError("there is no folder to resume from", "resume", "give a directory")
+        raise InputError("needs the folder of the earlier run", "resume", "give a directory")
     crew.check()
     case = load_case(scene)
     chosen = chosen_frames(frames, len(case.motion.time))
