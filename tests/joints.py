@@ -8,7 +8,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import KNEE_COORDINATES
 from tkamb.knee.ligaments import BundleArrays
 from tkamb.knee.released import released_indices
-from tkamb.knee.released_forces import SCALE, JointEquilibrium, ReleasedForces, unit_keeper
+from tkamb.knee.released_forces import SCALE, JointEquilibrium, ReleasedForces, unit_residual
 
 BALL, HALF, HEIGHT = 25e-3, 20e-3, 10e-3
 """Radius of the spheres, half their distance, thickness of the insert under them, m."""
@@ -46,7 +46,7 @@ def demand(external, released=ALL, ligaments=None):
     """Return what a body asks that pushes the shank with `external`; moments keep flexion."""
     rows = released_indices(released)
     keeping = [
-        unit_keeper(name, np.zeros(3)) for i, name in enumerate(KNEE_COORDINATES) if i not in rows
+        unit_residual(name, np.zeros(3)) for i, name in enumerate(KNEE_COORDINATES) if i not in rows
     ]
     chosen = bundles() if ligaments is None else ligaments
     return JointEquilibrium(np.asarray(external, float), chosen, None, np.array(keeping).T, rows)

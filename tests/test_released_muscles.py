@@ -136,7 +136,7 @@ def test_what_keeps_flexion_answers_to_a_wrench_as_the_yielding_knee_does():
         balance = forces.balance()
         contact = forces.contact(balance)
         place = forces.at(balance)
-        return place, contact, float(joint.kept(place, contact.wrench)[-1])
+        return place, contact, float(joint.reactions(place, contact.wrench)[-1])
 
     place, contact, kept = rest(load, start)
     forces = ReleasedForces(demand(load), model.probe(state), place)
@@ -144,7 +144,7 @@ def test_what_keeps_flexion_answers_to_a_wrench_as_the_yielding_knee_does():
     assert forces.tension_at_rest(contact, gain) == pytest.approx(kept, rel=1e-4)
     more = push((1.0, 20.0, 0.5), (0.004, 0.01, -0.01))
     change = rest(load + more, place)[2] - kept
-    rigid = demand(more).kept(place, np.zeros(6))[-1]
+    rigid = demand(more).reactions(place, np.zeros(6))[-1]
     assert gain @ more == pytest.approx(change, rel=0.01)
     assert abs(rigid - change) > 0.05 * abs(change)
     # not quite at rest: what is left counts as one more wrench
