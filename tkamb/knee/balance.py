@@ -171,7 +171,7 @@ class _Search:
         self._forces, self._start, self._downhill = forces, start, downhill
         self._residual_share, self._reach = residual_share, reach
         self._trials, self._steps = 0, 0
-        self._from_differences, self._steps_since, self._force_unknown = False, 0, False
+        self._from_differences, self._steps_since_differences, self._force_unknown = False, 0, False
         self._radius, self._newton_rejected = FIRST_RADIUS, False
         self._work: list[float] = []
         self.x = start
@@ -204,7 +204,7 @@ class _Search:
                 return self._end(BalanceStatus.RUNS_AWAY)
             if self._radius < NARROWEST_RADIUS and (self._exact_tangent or self._from_differences):
                 break
-            if self._model_stiffness is None and self._steps_since > len(self.x):
+            if self._model_stiffness is None and self._steps_since_differences > len(self.x):
                 self._refresh()
             else:
                 self._step()
@@ -216,7 +216,10 @@ class _Search:
     def _step(self) -> None:
         step, part = self._next()
         trial = self._at(self.x + step)
-        self._steps, self._steps_since = self._steps + 1, self._steps_since + 1
+        self._steps, self._steps_since_differences = (
+            self._steps + 1,
+            self._steps_since_differences + 1,
+        )
         length = float(np.linalg.norm(step))
         # Work that the linear model predicts along the step. The forces need not have a potential.
         # The trust region therefore compares work and not energy.
@@ -286,7 +289,7 @@ class _Search:
         return self._differences() if guess is None else guess
 
     def _differences(self) -> Array:
-        self._from_differences, self._steps_since = True, 0
+        self._from_differences, self._steps_since_differences = True, 0
         columns = [
             self._at(self.x + d).force for d in BALANCE.difference_step * np.eye(len(self.x))
         ]
