@@ -1,4 +1,4 @@
-"""Knees of known answer: two rigid spheres on an elastic foundation, plain or dished."""
+"""Knees with known solutions: two rigid spheres on an elastic foundation, flat or dished."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import KNEE_COORDINATES
 from tkamb.knee.ligaments import BundleArrays
 from tkamb.knee.released import released_indices
-from tkamb.knee.released_forces import SCALE, JointEquilibrium, ReleasedForces, unit_keeper
+from tkamb.knee.released_forces import SCALE, JointEquilibrium, ReleasedForces, unit_residual
 
 BALL, HALF, HEIGHT = 25e-3, 20e-3, 10e-3
-"""Radius of the spheres, half their distance, thickness of the insert under them, m."""
+"""m: radius of the spheres, half of their distance, thickness of the insert under the spheres."""
 DISH = 40e-3
 LINEAR = material("polyethylene-linear")
 ALL = ("ap", "si", "ml", "axial_rotation", "adduction")
@@ -33,7 +33,7 @@ def dished_joint(radius=DISH):
 
 
 def bundles(ends=(), stiffness=1e5):
-    """Return two-line bundles between (femoral point, point on the shank), slack as given."""
+    """Return two-line bundles from triples (femoral point, point on the shank, slack length)."""
     femur = np.array([femoral for femoral, _, _ in ends], float).reshape(-1, 3)
     shank = np.array([tibial for _, tibial, _ in ends], float).reshape(-1, 3)
     slack = np.array([length for _, _, length in ends], float)
@@ -43,10 +43,10 @@ def bundles(ends=(), stiffness=1e5):
 
 
 def demand(external, released=ALL, ligaments=None):
-    """Return what a body asks that pushes the shank with `external`; moments keep flexion."""
+    """Return the equations of a joint with an external wrench; a moment balances flexion."""
     rows = released_indices(released)
     keeping = [
-        unit_keeper(name, np.zeros(3)) for i, name in enumerate(KNEE_COORDINATES) if i not in rows
+        unit_residual(name, np.zeros(3)) for i, name in enumerate(KNEE_COORDINATES) if i not in rows
     ]
     chosen = bundles() if ligaments is None else ligaments
     return JointEquilibrium(np.asarray(external, float), chosen, None, np.array(keeping).T, rows)
@@ -58,7 +58,7 @@ def push(force, point=(0.0, 0.0, 0.0)):
 
 
 def settle(model, state, external, start, released=ALL, ligaments=None):
-    """Return coordinates (6,), contact and balance of a joint at rest."""
+    """Return coordinates (6,), contact and balance of a joint in equilibrium."""
     asked = demand(external, released, ligaments)
     forces = ReleasedForces(asked, model.probe(state), np.asarray(start, float))
     balance = forces.balance()
@@ -66,5 +66,5 @@ def settle(model, state, external, start, released=ALL, ligaments=None):
 
 
 def apart(one, other):
-    """Return how far apart two places are, m; rotations by their lever arm."""
+    """Return the distance of two coordinates (6,), m; rotations times the lever arm."""
     return float(np.abs((np.asarray(one) - other) * SCALE).max())

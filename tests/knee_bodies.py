@@ -1,8 +1,8 @@
 """The shipped knee inside a whole body: Pinocchio's sample humanoid with a leg of other names.
 
-The leg hangs from the pelvis, its knee is one free joint, the foot a body of its own, the world's
-z axis is up; a left one is the mirror image. Poses and motion of its bodies are those of the plain
-chain, which stands on its tibia with y up.
+The leg hangs from the pelvis. Its knee is one free joint, and its foot is a separate body. The
+world's z axis points up. A left leg is the mirror image. Poses and motion of the bodies are those
+of the plain chain, which has its root at the tibia and y up.
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ def same(value):
 
 @dataclass
 class Body:
-    """A whole body with the leg, and the state that belongs to a frame of the plain chain."""
+    """A whole body with the leg. It converts states of the plain chain to its own states."""
 
     model: pin.Model
     knee: tkamb.Knee
@@ -71,7 +71,7 @@ class Body:
         root, hip, knee = where["root_joint"], where["hip_ball"], where["knee_free"]
         ankle = where["ankle_hinge"]
         q2[ankle.idx_q] = v2[ankle.idx_v] = a2[ankle.idx_v] = 0.0
-        # the pelvis so that the thigh is where it has to be
+        # the pose of the pelvis that gives the thigh its pose
         turn_hip = pin.SE3(pin.Quaternion(q2[hip.idx_q : hip.idx_q + 4]).matrix(), np.zeros(3))
         hip_id, thigh = model.getJointId("hip_ball"), model.frames[model.getFrameId("thigh_x")]
         to_thigh = model.jointPlacements[hip_id] * turn_hip * thigh.placement
@@ -107,7 +107,7 @@ def whole_body(plain, left=False, leg_first=False):
         root = model.getJointId("root_joint")
     hip = turn(pin.SE3(np.eye(3), (anatomy.hip.placement).translation))
     on_thigh = pin.SE3(pin.utils.rpyToMatrix(0.3, -0.2, 0.5), np.array([0.01, 0.02, -0.03]))
-    # the joint's frame is the hip's; the thigh's frame is turned in it
+    # the joint's frame is at the hip; the thigh's frame is rotated relative to it
     thigh = hip.inverse()
     ball = model.addJoint(
         root, pin.JointModelSpherical(), pin.SE3(np.eye(3), np.array([0, 0.1, -0.1])), "hip_ball"

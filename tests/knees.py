@@ -1,4 +1,4 @@
-"""A small leg for tests: ankle, tibia, knee, femur, patella, hip, all numbers plain."""
+"""A small leg for tests: ankle, tibia, knee, femur, patella and hip, with simple numbers."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -75,7 +75,7 @@ def leg(with_patella: bool = True) -> Chain:
 
 
 def random_motion(chain: Chain, rng: np.random.Generator) -> ChainMotion:
-    """Return a state anywhere within 140 deg of flexion, with brisk rates."""
+    """Return a random motion within 140 deg of flexion, with high rates."""
     k = len(chain.joints)
     scale = np.array([0.02, 0.02, 0.005, 0.2, 0.1, 1.2, 0.03, 0.03, 0.8])[:k]
     centre = np.array([0, 0.02, 0, 0, 0, 1.2, 0.045, 0.0, -0.2])[:k]
@@ -101,7 +101,7 @@ HALF = 0.024
 
 
 def bent_knee():
-    """Return a leg at rest, upright, 30 deg bent, with all its lines and no ground reaction."""
+    """Return a leg without motion, at 30 deg of flexion, with all lines and no ground reaction."""
     chain = leg()
     joints = np.zeros((3, 9))
     joints[0] = [0.0, 0.03, 0.0, 0.0, 0.0, FLEXION, 0.045, 0.01, -0.3]
@@ -129,6 +129,6 @@ def bent_knee():
 
 
 def line(link, start, other, end):
-    """Return a newton of tension between two points."""
+    """Return the loads of one newton of tension between two points."""
     pull = ((end - start) / np.linalg.norm(end - start))[None]
     return PointForces(link, start[None], pull), PointForces(other, end[None], -pull)

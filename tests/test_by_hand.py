@@ -58,7 +58,7 @@ def with_ground(geometry, point, force):
     ((30.0, 0.0, 20.0), (0.02, -0.4, 0.01)),
 ])  # fmt: skip
 def test_external_moments_are_force_times_lever(frame, force, lever):
-    """About the femoral ML axis and the floating axis, through the femoral origin."""
+    """The axes are the femoral ML axis and the floating axis through the femoral origin."""
     geometry, force = frame.geometry, np.array(force)
     femur = geometry.state.pose("femur")
     across, along = femur[:3, 2], np.array([0.0, 1.0, 0.0])
@@ -73,7 +73,7 @@ def test_external_moments_are_force_times_lever(frame, force, lever):
 
 
 def test_a_ground_force_medial_of_the_knee_adducts_and_one_behind_it_flexes(frame):
-    """Right knee: medial is -z, behind is -x; 100 N at 5 cm are 5 N·m, at 8 cm 8 N·m."""
+    """Medial is -z, posterior is -x. 100 N have a moment of 5 N·m at 5 cm, 8 N·m at 8 cm."""
     origin = frame.geometry.state.pose("femur")[:3, 3]
     before = frame.loads
     up = np.array([0.0, 100.0, 0.0])
@@ -106,8 +106,8 @@ def test_sensitivity_is_the_difference_when_the_residuals_act_elsewhere(frame, m
 
 
 @pytest.mark.parametrize("side", ["medial", "lateral"])
-def test_columns_of_area_and_pressure_have_the_units_they_name(results, side):
-    """Against the map: mm² of the triangles' own areas, MPa of the nodes, N of the two."""
+def test_columns_of_area_and_pressure_have_the_units_of_their_names(results, side):
+    """The map gives the triangles' area (mm²), the nodes' pressure (MPa) and the force (N)."""
     maps = results.maps
     corners = maps.points_m[maps.triangles]
     twice = np.linalg.norm(
@@ -126,8 +126,8 @@ def test_columns_of_area_and_pressure_have_the_units_they_name(results, side):
         assert mean * results[f"{side}_area_mm2"][k] == pytest.approx(force, rel=1e-9)
 
 
-def test_bundles_carry_what_the_published_toe_gives():
-    """Blankevoort et al. 1991: eps1 = 0.03; at 6 % both branches give k eps1, at 3 % a quarter."""
+def test_bundles_follow_the_published_toe_law():
+    """Blankevoort et al. 1991, eps1 = 0.03: both branches give k eps1 at 6 %, a quarter at 3 %."""
     assert quadratic_toe_force(1.06, 1.0, 2000.0) == pytest.approx(60.0)
     assert quadratic_toe_force(1.03, 1.0, 2000.0) == pytest.approx(15.0)
     assert quadratic_toe_force(1.10, 1.0, 2000.0) == pytest.approx(140.0)
@@ -152,7 +152,7 @@ def test_the_source_s_rule_divides_by_the_overlap_of_the_undeformed_bodies():
 
 
 def test_friction_opposes_the_sliding_of_the_femur():
-    """Sliding forward at 0.1 m/s with mu 0.2: the femur is held back by 0.2 of the normal force."""
+    """In forward sliding with mu = 0.2, friction pulls back with 0.2 of the normal force."""
     up, forward = np.array([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 0.0])
     force = CondylePoint(np.zeros(3), up, forward, 0.0).direction(0.2)
     np.testing.assert_allclose(force, [-0.2, 1.0, 0.0], atol=2e-5)
@@ -161,7 +161,7 @@ def test_friction_opposes_the_sliding_of_the_femur():
 
 
 def test_sliding_is_the_femur_s_velocity_at_the_contact(mechanics, frame):
-    """By central differences of the recorded poses; the shank's insert is at rest in its frame."""
+    """Central differences of the recorded poses give the velocity in the insert frame."""
     time, poses = mechanics.motion.time, mechanics.poses
     for condyle in frame.geometry.condyles.values():
         on_femur = np.linalg.inv(poses[60]) @ np.append(condyle.point, 1.0)

@@ -14,7 +14,7 @@ from tkamb.knee.unknowns import Unknown, solve
 
 
 def mujoco_twin(chain):
-    """Write the chain for MuJoCo: one body per link, its joints inside it."""
+    """Return the chain as a MuJoCo model: one body per link, with the joints of this link."""
     model = chain.model
     bodies = {"tibia": ("root_joint",), "femur": chain.joints[:6], "patella": chain.joints[6:]}
     text, closing = "", ""
@@ -139,7 +139,7 @@ def test_all_wrenches_close_the_whole_body_balance():
         columns = state.generalised([unknown.loads for unknown in found])
         right = state.inertial - state.generalised([[ground]])[:, 0]
         solution = solve([unknown.name for unknown in found], columns, right)
-        if not solution.regular:  # a random line may pass through its joint
+        if not solution.regular:  # a random line may pass through the joint's axis
             continue
         closed += 1
         loads = [ground]
@@ -180,8 +180,8 @@ def test_every_unknown_equals_its_finite_difference_virtual_work():
         np.testing.assert_allclose(analytic, numeric, rtol=0, atol=2e-8, err_msg=unknown.name)
 
 
-def test_what_acts_within_the_leg_does_not_move_the_whole_of_it():
-    """Action equals reaction: only the hip's loads have a part along the free-flyer."""
+def test_internal_loads_do_not_act_on_the_free_root():
+    """Only the hip's loads have a component along the free root, by action and reaction."""
     chain = leg()
     rng = np.random.default_rng(6)
     state = chain.at(random_motion(chain, rng))
@@ -194,7 +194,7 @@ def test_what_acts_within_the_leg_does_not_move_the_whole_of_it():
 
 
 def _virtual_work(chain, state, load, index, step=1e-6):
-    """Return dW/dq of one load: forces fixed in the laboratory, points fixed in the link."""
+    """Return dW/dq of a load with constant forces in the laboratory at points fixed to the link."""
     model = chain.model
     frame = chain.frame_id(load.link)
     to_laboratory = state.insert_in_laboratory
@@ -226,7 +226,7 @@ def test_insert_frame_is_the_origin_of_knee_ap():
     np.testing.assert_allclose(chain.insert_in_tibia[:3, 3], [-0.005, 0.39, 0.002], atol=1e-12)
 
 
-def test_the_patella_s_joint_is_where_it_stands_at_zero():
+def test_the_patella_joint_is_the_pose_at_zero_coordinates():
     chain = leg()
     motion = random_motion(chain, np.random.default_rng(3))
     motion.joints[0, 6:] = 0.0

@@ -1,5 +1,4 @@
-"""Contributions of muscles to the condyles: their sum, and each one against statics of the
-shank."""
+"""Contributions of muscles to the condyles: their sum, and terms against statics of the shank."""
 
 from dataclasses import replace
 
@@ -24,7 +23,7 @@ PLACES = {"taut": [-0.06, -0.45, 0.0], "slack": [0.06, -0.45, 0.0], "one side": 
 
 
 def solved(where, least=0.05):
-    """Return geometry and loads of the bent knee on 700 N of ground, with pulling ligaments."""
+    """Return geometry and loads of the bent knee with 700 N of ground reaction and ligaments."""
     ground = PointForces("tibia", np.array([PLACES[where]]), 700 * UP[None])
     strap = np.array([0.0, 0.01, 0.04]), 90 * UP
     pull = (
@@ -36,7 +35,7 @@ def solved(where, least=0.05):
 
 
 @pytest.mark.parametrize("where", PLACES)
-def test_they_sum_up_to_the_normal_forces(where):
+def test_contributions_add_up_to_the_normal_forces(where):
     geometry, loads = solved(where, least=0.0 if where == "slack" else 0.05)
     assert loads.slack == (where == "slack")
     assert bool(loads.lifted) == (where == "one side")
@@ -59,7 +58,7 @@ def shank_alone(geometry, wrench):
     return dict(zip(contacts, found[:2], strict=True))
 
 
-def test_a_flexor_presses_as_the_statics_of_the_shank_say():
+def test_a_flexor_contribution_agrees_with_statics_of_the_shank():
     geometry, loads = solved("taut")
     parts = condyle_contributions(geometry, loads, FRICTION)
     share = geometry.share
@@ -75,9 +74,8 @@ def on_link(loads, link):
     return sum(wrench_of(load.points, load.forces).sum(axis=0) for load in own)
 
 
-def test_a_cam_on_the_post_is_a_cause_of_its_own():
-    """With a post the contributions sum up, and that of the post agrees with statics of the
-    shank."""
+def test_a_cam_on_the_post_is_a_separate_contribution():
+    """With a post the terms add up, and the post's term agrees with statics of the shank."""
     place, push = np.array([-0.003, 0.02, 0.004]), np.array([400.0, -60.0, 20.0])
     post = (
         PointForces("tibia", place[None], push[None]),
@@ -96,7 +94,7 @@ def test_a_cam_on_the_post_is_a_cause_of_its_own():
 
 
 def test_the_quadriceps_presses_by_the_patellar_ligament_alone():
-    """The equilibrium of the patella gives the ligament, that of the shank the condyles."""
+    """The patella's equilibrium gives the ligament, the shank's gives the normal forces."""
     geometry, loads = solved("taut")
     parts = condyle_contributions(geometry, loads, FRICTION)
     extensor, femur = geometry.extensor, geometry.state.pose("femur")

@@ -1,4 +1,4 @@
-"""What a millimetre of the button's place does to quadriceps and patellofemoral force."""
+"""Change of quadriceps and patellofemoral force per millimetre of the button's position."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from tkamb.knee.equations import dome_sensitivity, solve_knee
 
 
 def test_quadriceps_follows_the_arms_about_the_shifted_contact(knee):  # noqa: F811
-    """Moments about the contact point: Q a_Q = PL a_PL, the patella's weight left out."""
+    """Moments about the contact point without the patella's weight: Q a_Q = PL a_PL."""
     geometry = loaded(knee, 700 * UP, [-0.06, -0.45, 0.0])
     loads, state, extensor = solve_knee(geometry, FRICTION), geometry.state, geometry.extensor
     ligament = loads.values["patellar_ligament"]
@@ -32,7 +32,7 @@ def test_quadriceps_follows_the_arms_about_the_shifted_contact(knee):  # noqa: F
     assert abs(slope) > 0.005e3 * loads.values["muscle_quadriceps"]  # more than 0.5 % per mm
 
 
-def test_it_is_the_slope_of_the_frame_solved_again(knee):  # noqa: F811
+def test_the_sensitivity_is_the_slope_of_a_shifted_frame(knee):  # noqa: F811
     geometry, step = loaded(knee, 700 * UP, [-0.06, -0.45, 0.0]), 1e-5
     extensor, up = geometry.extensor, geometry.state.pose("patella")[:3, 1]
     ends = []

@@ -1,4 +1,4 @@
-"""tkamb.Knee: the same knee by files, by objects and in a whole body; forces and stiffness."""
+"""tkamb.Knee from files, from objects and in a whole body; its forces and stiffness."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +44,7 @@ def plus(*forces):
 
 
 def columns(loads):
-    """Return the columns of results.csv that loads hold."""
+    """Return the columns of results.csv that loads contain."""
     ap, si, ml = -loads.contact_force
     row = {
         "force_ap_N": ap,
@@ -138,7 +138,7 @@ def test_rnea_with_the_solved_loads_leaves_the_residuals(read):
         q, v, a, external = at(read, k)
         loads = knee.inverse_dynamics(q, v, a, external)
         data = knee.model.createData()
-        # the residuals act on the tibia, their opposites on the femur
+        # the residuals act on the tibia, the opposite loads on the femur
         jacobian, on_tibia = knee.relative_jacobian(q), residual_wrench(knee, loads)
         acting = plus(external, loads.external_forces, loads.hip_forces)
         tau = pin.rnea(knee.model, data, q, v, a, acting)
@@ -238,7 +238,7 @@ def test_stiffness_is_the_slope_of_the_wrench(read, name):
 
 
 def pressed(knee, q, load):
-    """Return q with the femur raised or lowered until it carries a load, N."""
+    """Return q with the femur raised or lowered until the contact carries a load, N."""
     result = knee.press(q, load)
     q = q.copy()
     q[knee.model.joints[knee.model.getJointId("knee_si")].idx_q] += (
@@ -268,17 +268,16 @@ def test_equilibrium_leaves_no_force_and_its_contact_carries_the_loads(read):
     by_deformation = -found.contact.wrench_on_insert[:3]
     frictionless = found.loads.contact_force[1]
     assert by_deformation[1] == pytest.approx(frictionless, rel=2e-3)
-    # the contact at that pose, by its deformation, is what the equations ask for
+    # the deformation at that pose gives the contact forces of the equations
     forces = knee.external_forces(found.q, motion.v[k], found.loads.tensions)
-    weight = 1.0  # N, of the patella, which those forces leave out
+    weight = 1.0  # N: weight of the patella, which these forces ignore
     for place, apart in ((knee.anatomy.tibia, 0.1), (knee.anatomy.femur, 0.1 + weight)):
         asked = found.loads.external_forces[place.joint].vector
         assert forces[place.joint].vector == pytest.approx(asked, abs=apart)
 
 
 def test_files_and_object_find_the_same_equilibrium():
-    """A first frame with released coordinates has the same equilibrium by files and by the
-    object."""
+    """Files and object give the same equilibrium in a first frame with released coordinates."""
     free = ["adduction", "axial_rotation", "ap", "ml"]
     scene = tkamb.load_scene(SCENE, FOUNDATION | {"contact.released": free})
     read = tkamb.read_scene(scene)
@@ -315,7 +314,7 @@ def test_warm_and_cold_calls_agree_and_leave_no_trace(read):
 
 
 def test_an_insert_anywhere_on_the_tibia_gives_the_same_forces(read):
-    """If the mesh of the insert is given in the tibia's axes, its flat bottom is found."""
+    """The flat bottom of an insert mesh in the tibia's axes is found."""
     plain, motion, _ = read
     in_tibia = inverse(plain.anatomy.tibia.placement.homogeneous) @ (
         plain.bridge.insert.placement.homogeneous
@@ -386,7 +385,7 @@ def knee_of(read, **changes):
     return tkamb.Knee(plain.model, **(parts | changes))
 
 
-def test_what_does_not_fit_is_refused_in_one_line(read):
+def test_inconsistent_arguments_are_refused_in_one_line(read):
     plain, motion, _ = read
     q, v = motion.q[60], motion.v[60]
     knee, bare = knee_of(read), tkamb.Knee(plain.model)
@@ -423,7 +422,7 @@ def test_what_does_not_fit_is_refused_in_one_line(read):
         assert "\n" not in str(refused.value)
 
 
-def test_a_pose_out_of_range_is_no_force(read):
+def test_a_pose_out_of_range_raises_an_error(read):
     knee = knee_of(read)
     q = read[1].q[60].copy()
     q[knee.model.joints[knee.model.getJointId("knee_si")].idx_q] -= 0.02

@@ -1,4 +1,4 @@
-"""Forward dynamics with tkamb.Knee: a dropped femur, a simulator that settles, friction."""
+"""Forward dynamics with tkamb.Knee: a dropped femur, a simulator that converges, friction."""
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +19,7 @@ def plain():
 
 
 def on_fixed_insert(plain, joints, coordinates, mass, **parts):
-    """Return a knee whose insert is fixed to the universe; a chain of joints carries the femur."""
+    """Return a knee with its insert fixed to the universe and its femur on a chain of joints."""
     model = pin.Model()
     model.gravity = pin.Motion(np.array([0.0, -9.81, 0.0]), np.zeros(3))
     model.addFrame(pin.Frame("tibia", 0, 0, pin.SE3.Identity(), pin.FrameType.BODY))
@@ -37,8 +37,7 @@ def on_fixed_insert(plain, joints, coordinates, mass, **parts):
 
 
 def drop(plain, step, seconds):
-    """Return the energy (n,), J, of a femur that bounces on the insert, less the energy at the
-    start."""
+    """Return the change of energy (n,), J, of a femur that bounces on the insert."""
     joints = {"slide": pin.JointModelPY()}
     knee = on_fixed_insert(plain, joints, [-6.9e-3, 0, 0, 0, 0, 0.3], MASS)
     touch = knee.contact.pair.first_touch_height(knee.pose(np.zeros(1)).homogeneous)
@@ -58,8 +57,7 @@ def drop(plain, step, seconds):
 
 
 def test_a_dropped_femur_keeps_its_energy_to_the_order_of_the_scheme(plain):
-    """Half of the step gives about a quarter of the error; kinks of the contact make it a little
-    more."""
+    """Half of the step gives about a quarter of the error, and slightly more at kinks."""
     coarse, fine = (np.abs(drop(plain[0], h, 0.1) - 1.0).max() for h in (1e-3, 5e-4))
     assert coarse < 0.15
     assert fine < coarse / 3.0
@@ -71,8 +69,8 @@ def test_a_dropped_femur_keeps_its_energy_over_a_second(plain):
     assert abs(energy[-len(energy) // 4 :].mean() - 1.0) < 1e-3
 
 
-def test_a_simulator_settles_where_the_equilibrium_is(plain):
-    """A force-controlled simulator: flexion held, a load on a fixed line, four free coordinates."""
+def test_a_simulator_converges_to_the_equilibrium(plain):
+    """The simulator has constant flexion, a load on a fixed line, and four free coordinates."""
     read, motion, _ = plain
     bundles = [b for b in read.ligaments if {b.proximal.link, b.distal.link} == {"femur", "tibia"}]
     shift = read.anatomy.tibia.placement.inverse() * read.bridge.insert.placement
@@ -111,14 +109,14 @@ def test_a_simulator_settles_where_the_equilibrium_is(plain):
     assert settled[:3] == pytest.approx(found.coordinates[:3], abs=2e-5)
     assert settled[3:] == pytest.approx(found.coordinates[3:], abs=2e-4)
     assert found.loads.contact_force[1] > 800.0
-    # by the simulator's own forces: nothing but the load is left to carry
+    # the simulator's forces balance all loads except the prescribed load
     forces = knee.external_forces(q, 0 * v)
     tau = pin.rnea(model, model.createData(), q, v, 0 * v, forces)
     assert np.abs(tau).max() == pytest.approx(800.0, rel=1e-3)
 
 
 def shifted(bundle, shift):
-    """Return a bundle whose distal end is given in the insert's frame, which is the universe's."""
+    """Return a bundle with its distal end in the insert's frame, fixed to the universe."""
     from dataclasses import replace
 
     ends = [
@@ -129,7 +127,7 @@ def shifted(bundle, shift):
     return replace(bundle, proximal=ends[0], distal=ends[1])
 
 
-def test_a_linear_step_is_the_whole_one_to_second_order(plain):
+def test_a_linear_step_agrees_with_a_full_step_to_second_order(plain):
     read = plain[0]
     parts = {"implant": read.implant, "contact": read.contact.model, "friction": 0.05}
     knee = tkamb.Knee(read.model, ligaments=read.ligaments, **parts)
@@ -177,7 +175,7 @@ def test_damping_is_the_slope_of_the_friction(plain):
     assert found @ jacobian @ step > 0.0  # on the insert with the femur, on the femur against it
 
 
-def test_a_step_that_is_too_long_says_so(plain):
+def test_a_step_that_is_too_long_is_refused(plain):
     knee = on_fixed_insert(
         plain[0], {"slide": pin.JointModelPY()}, [-6.9e-3, 0, 0, 0, 0, 0.3], MASS
     )

@@ -18,7 +18,7 @@ def read():
 
 
 def without_patella(plain, left=False):
-    """Return the knee on a model of two bodies: the patella's place is found at every q."""
+    """Return the knee on a model of two bodies; equilibrium gives the patella's pose at every q."""
     turn, weigh = (mirrored_se3, mirrored_inertia) if left else (lambda x: x, lambda x: x)
     user, anatomy, model = plain.model, plain.anatomy, pin.Model()
     model.gravity = user.gravity
@@ -58,7 +58,7 @@ def without_patella(plain, left=False):
 
 
 def state_of(read, k):
-    """Return q, v, a and external forces of the model of two bodies, at rest."""
+    """Return q, v, a and external forces of the model of two bodies without motion."""
     plain, motion, ground = read
     data = plain.model.createData()
     pin.forwardKinematics(plain.model, data, motion.q[k])
@@ -70,14 +70,14 @@ def state_of(read, k):
     return q, np.zeros(12), np.zeros(12), external
 
 
-def test_a_model_without_a_patella_finds_its_place(read):
+def test_a_model_without_a_patella_has_one_in_equilibrium(read):
     plain = read[0]
     knee = without_patella(plain)
     q, v, a, external = state_of(read, 60)
     loads = knee.inverse_dynamics(q, v, a, external)
     recorded = plain.inverse_dynamics(*at(read, 60))
     assert not loads.problems
-    # the recorded patella is where it balances, but for its weight and the motion's inertia
+    # the recorded patella is in equilibrium except for its weight and inertia
     assert loads.quadriceps == pytest.approx(recorded.quadriceps, rel=0.01)
     assert loads.contact_total == pytest.approx(recorded.contact_total, rel=0.01)
     assert abs(loads.patellofemoral_tangential) < 1e-3 * loads.patellofemoral
@@ -90,8 +90,8 @@ def test_a_model_without_a_patella_finds_its_place(read):
     assert tau == pytest.approx(0.0, abs=1e-8)
 
 
-def test_a_given_tension_is_the_solved_one(read):
-    """By the massless patella's ratios the tension does what the solved loads do."""
+def test_a_given_tension_has_the_forces_of_the_solved_loads(read):
+    """With the massless patella's ratios a given tension has the forces of the solved loads."""
     knee = without_patella(read[0])
     q, v, a, external = state_of(read, 60)
     loads = knee.inverse_dynamics(q, v, a, external)

@@ -1,4 +1,4 @@
-"""Six load states of one knee: the place of the ground reaction decides which one holds."""
+"""Six load states of one knee: the position of the ground reaction decides on the state."""
 
 from dataclasses import replace
 from itertools import product
@@ -39,9 +39,10 @@ ASIDE = {"none": 0.0, "medial": 0.12, "lateral": -0.12}
 
 
 @pytest.mark.parametrize(("ahead", "lifted"), list(product(AHEAD, ASIDE)))
-def test_each_of_the_six_sets_is_found_where_the_ground_reaction_wants_it(knee, ahead, lifted):
-    """A ground reaction behind the knee needs the quadriceps; one beside the condyles lifts the far
-    one."""
+def test_the_ground_reaction_decides_on_each_of_six_load_states(knee, ahead, lifted):
+    """A ground reaction behind the knee needs the quadriceps. A ground reaction beside the condyles
+    lifts the far condyle.
+    """
     x, z = AHEAD[ahead], ASIDE[lifted]
     loads = solve_knee(loaded(knee, 700 * UP, [x, -0.45, z]), FRICTION)
     assert loads.problems == ()
@@ -50,9 +51,11 @@ def test_each_of_the_six_sets_is_found_where_the_ground_reaction_wants_it(knee, 
     assert not loads.ambiguous
     assert min(loads.values.get(name, 0.0) for name in CARRIED) >= 0.0
     if loads.slack:
-        assert loads.values["residual_flexion"] < 0.0  # on the tibia: flexors
+        assert (
+            loads.values["residual_flexion"] < 0.0
+        )  # a flexion moment on the tibia replaces flexors
     if loads.lifted:
-        # on the tibia, about x forwards: the pull of the lifted condyle at its own side
+        # on the tibia, about x: the moment that a pull of the lifted condyle would have
         assert loads.values["residual_coronal"] * {"medial": -HALF, "lateral": HALF}[lifted] < 0.0
 
 
@@ -74,7 +77,7 @@ def test_a_condyle_that_the_recorded_gap_lifts_stays_lifted(knee, off):
         assert f"{off}_normal" not in loads.values
 
 
-def test_a_knee_that_is_pulled_apart_fails_with_the_reason_of_every_set(knee):
+def test_a_knee_in_traction_fails_with_the_reasons_of_all_load_states(knee):
     loads = solve_knee(loaded(knee, -400 * UP, [-0.01, -0.45, 0.0]), FRICTION)
     (problem,) = loads.problems
     assert "no load state has all signs right" in problem
@@ -85,7 +88,7 @@ def test_a_knee_that_is_pulled_apart_fails_with_the_reason_of_every_set(knee):
 
 
 def test_a_patella_that_would_have_to_pull_fails_the_frame(knee):
-    """The quadriceps is needed: a slack one would balance the signs, without the load."""
+    """A slack quadriceps would give right signs but could not balance the load."""
     turned = replace(knee.extensor, contact_normal=-knee.extensor.contact_normal)
     geometry = replace(loaded(knee, 700 * UP, [-0.06, -0.45, 0.0]), extensor=turned)
     (problem,) = solve_knee(geometry, FRICTION).problems
@@ -93,7 +96,7 @@ def test_a_patella_that_would_have_to_pull_fails_the_frame(knee):
     assert "extension moment" in problem
 
 
-def test_a_knee_without_contact_that_must_be_extended_is_no_slack_one():
+def test_a_knee_without_contact_that_needs_extension_is_not_slack():
     """Without contact the residual flexion moment acts on the femur, with the opposite sign."""
     slack = LoadState(frozenset(), frozenset({"quadriceps"}))
 
@@ -112,8 +115,8 @@ def test_a_knee_without_contact_that_must_be_extended_is_no_slack_one():
     st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
     st.tuples(*[st.floats(-20, 20)] * 3),
 )
-def test_no_random_load_is_answered_with_a_wrong_sign(knee, aside, up, place, moment):
-    """Signs hold, loads that are left out would have the wrong sign, and the shank balances."""
+def test_no_solution_of_a_random_load_has_a_wrong_sign(knee, aside, up, place, moment):
+    """Signs are right, omitted loads would have wrong signs, the shank is in equilibrium."""
     force = np.array([aside[0], up, aside[2]])
     geometry = loaded(knee, force, [place[0], -0.45, place[1]], moment)
     loads = solve_knee(geometry, FRICTION)

@@ -35,7 +35,7 @@ def surface(mesh: trimesh.Trimesh, name: str) -> Surface:
 
 
 def dome() -> Surface:
-    """A spherical cap that faces -x, its sphere about CENTRE in the patella's frame."""
+    """Return a spherical cap that faces -x, with its centre at CENTRE in the patella's frame."""
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=DOME)
     vertices = np.array(mesh.vertices)
     vertices[:, 0] = np.minimum(vertices[:, 0], 0.004)
@@ -53,7 +53,7 @@ def cylinder() -> Surface:
 
 
 def groove(half_angle: float = 1.3) -> Surface:
-    """A V-shaped trochlea: two cones of revolution about z that meet in the groove."""
+    """Return a V-shaped trochlea: two cones of revolution about z that meet in the groove."""
     slope = 1.0 / np.tan(half_angle)
     z = np.array([0.0, 0.02, 0.02, -0.02, -0.02])
     r = np.array([0.02, 0.02 + 0.02 * slope, 0.0, 0.0, 0.02 + 0.02 * slope])
@@ -93,7 +93,7 @@ def knee_at(flexion_deg: float) -> Array:
 
 
 def three_force(flexion_deg: float, guess: Array) -> tuple[Array, float, float]:
-    """Return coordinates, PL/Q and PF/Q of three concurrent forces, in closed form."""
+    """Return the closed-form coordinates, PL/Q and PF/Q of three concurrent forces."""
     tuberosity = transform(inverse(knee_at(flexion_deg)), TUBEROSITY)[:2]
 
     def place(unknown: Array) -> tuple[Array, Array, Array, Array]:
@@ -159,9 +159,8 @@ def test_conditions_hold_and_guess_does_not_matter(mechanism: ExtensorMechanism)
     assert np.linalg.norm(transform(pose, PROXIMAL) - tuberosity) == pytest.approx(LENGTH, abs=1e-7)
 
 
-def test_quadriceps_is_shortest_there(mechanism: ExtensorMechanism) -> None:
-    """By virtual work, rotating the patella with constant contact and ligament lengthens the
-    muscle."""
+def test_the_quadriceps_is_shortest_at_equilibrium(mechanism: ExtensorMechanism) -> None:
+    """By virtual work, a rotation with constant gap and ligament length lengthens the muscle."""
     from tkamb.knee.patella_search import _Search
 
     state = solve_patella(mechanism, knee_at(25.0))
@@ -190,7 +189,7 @@ def test_a_button_may_lie_anywhere_on_its_patella(aside: float) -> None:
 
 
 def test_the_shift_on_a_slope_is_the_yield_times_its_sine() -> None:
-    """A plane that faces forward and 20 deg to the right: n_z = sin 20 deg everywhere."""
+    """A plane that faces forward and 20 deg to the right has n_z = sin 20 deg everywhere."""
     slope = np.deg2rad(20.0)
     wall = trimesh.creation.box([0.02, 0.2, 0.2])
     wall.apply_translation([-0.01, 0.0, 0.0])
@@ -202,7 +201,7 @@ def test_the_shift_on_a_slope_is_the_yield_times_its_sine() -> None:
 
 
 def test_the_point_lies_on_the_line_of_action_of_both_facets() -> None:
-    """A wall across x and one turned by 30 deg, 6 mm higher: the moments about z add up."""
+    """The moments about z add up for a wall across x and a wall rotated by 30 deg, 6 mm higher."""
     size, turns, rises = 0.008, np.deg2rad([0.0, 30.0]), np.array([0.0, 0.006])
     walls, caps = [], []
     for turn, rise, side in zip(turns, rises, (-0.01, 0.01), strict=True):
@@ -224,7 +223,7 @@ def test_the_point_lies_on_the_line_of_action_of_both_facets() -> None:
 
 
 def test_gap_is_the_distance_of_the_closest_points() -> None:
-    """Against python-fcl, apart by 0.2-2 mm, dome on cylinder."""
+    """python-fcl gives the same gap of 0.2 to 2 mm between dome and cylinder."""
     contact = PatellofemoralContact(cylinder(), dome())
     trees = []
     for part in (cylinder(), dome()):
@@ -244,7 +243,7 @@ def test_gap_is_the_distance_of_the_closest_points() -> None:
             assert contact.at(at).normal[:2] == pytest.approx(out, abs=5e-3)
 
 
-def test_a_prepared_contact_that_is_used_again_remembers_nothing() -> None:
+def test_a_prepared_contact_used_again_gives_the_same_result() -> None:
     first, places = (
         PatellofemoralContact(cylinder(), dome()),
         ([0.046, 0.0, 0.1], [0.04, 0.02, 0.0]),
@@ -257,7 +256,7 @@ def test_a_prepared_contact_that_is_used_again_remembers_nothing() -> None:
     np.testing.assert_array_equal(again.normal, fresh.normal)
 
 
-def test_a_place_that_is_none_has_no_gap_and_is_forgotten() -> None:
+def test_coordinates_that_are_nan_have_no_gap_and_are_not_stored() -> None:
     contact = PatellofemoralContact(cylinder(), dome())
     touching = np.array([TROCHLEA + DOME - CENTRE[0], 0.0, 0.0])
     gap = contact.at(touching).gap
@@ -276,7 +275,7 @@ def test_gap_is_smooth_through_touch() -> None:
 
 
 def test_groove_shares_the_force_and_never_jumps() -> None:
-    """Centred: half each, no lateral force. Off centre: the share moves, smoothly."""
+    """A centred button has equal forces on both sides. The share changes smoothly off centre."""
     shares, normals, bodies = [], [], (groove(), dome())
     for beside in np.linspace(-2e-3, 2e-3, 21):
         contact = PatellofemoralContact(*bodies, ml=float(beside))
@@ -305,7 +304,7 @@ def test_ligament_too_short_to_reach_is_not_found(mechanism: ExtensorMechanism) 
 
 
 def test_end_of_the_femoral_mesh_is_reported(mechanism: ExtensorMechanism) -> None:
-    """The trochlea ends at y = -5 mm; contact below is on the edge of the mesh."""
+    """The trochlea ends at y = -5 mm. Contact below this end is on the edge of the mesh."""
     whole = cylinder()
     kept = whole.faces[(whole.triangles[:, :, 1] > -5e-3).all(axis=1)]
     contact = PatellofemoralContact(Surface(whole.vertices, kept, "cut"), dome())
@@ -347,14 +346,14 @@ def test_shipped_contact_moves_superior_until_the_quadriceps_wraps(
 
 
 def test_shipped_patella_moves_smoothly(shipped: tuple[Array, list[PatellaState]]) -> None:
-    """Second differences over 101 frames: only the kink where wrapping starts is above 0.1 deg."""
+    """Second differences over 101 frames exceed 0.1 deg only at the kink where wrapping starts."""
     places = np.array([state.coordinates for state in shipped[1]])
     bend = np.abs(np.diff(places, n=2, axis=0)).max(axis=0)
     assert (bend[:2] < 2e-4).all()
     assert bend[2] < np.deg2rad(0.4)
 
 
-def test_a_patella_that_is_lost_from_a_frame_far_off_is_found_from_its_own():
+def test_a_patella_lost_from_a_distant_guess_is_found_from_its_own_frame():
     """A coarse choice of frames finds the same patella as all frames."""
     starter = Path(starter_package.__file__).parent / "files" / "scene.toml"
     mechanics = mechanics_of(load_case(load_scene(starter)))
@@ -367,7 +366,7 @@ def test_a_patella_that_is_lost_from_a_frame_far_off_is_found_from_its_own():
     np.testing.assert_allclose(found.coordinates, own.coordinates, atol=1e-6)
 
 
-def test_a_recorded_contact_does_not_depend_on_what_was_looked_at_before(
+def test_a_recorded_contact_does_not_depend_on_earlier_evaluations(
     mechanism: ExtensorMechanism,
 ) -> None:
     """A part of a motion has exactly the results of the whole motion."""

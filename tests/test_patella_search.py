@@ -1,4 +1,4 @@
-"""The patella in a whole scene: links with its attachments, initial guesses, and lost frames."""
+"""The patella in a scene: links with its attachments, initial guesses, and lost frames."""
 
 import re
 from dataclasses import replace
@@ -66,7 +66,7 @@ def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are
 
 
 @pytest.mark.parametrize("move", [0.02, 0.3, 3.0, 40.0])
-def test_what_is_known_of_a_place_near_by_shortens_the_search_alone(mechanism, move):  # noqa: F811
+def test_slopes_of_a_similar_pose_only_shorten_the_search(mechanism, move):  # noqa: F811
     """From a degree away the search needs fewer evaluations; from 40 deg away it searches all
     rotations."""
     near = solve_patella(
@@ -88,7 +88,7 @@ def test_what_is_known_of_a_place_near_by_shortens_the_search_alone(mechanism, m
 
 
 @pytest.mark.parametrize("wild", [[0.0, 0.0, 2.5], [0.045, 0.3, -3.0]])
-def test_a_guess_that_leads_nowhere_does_not_lose_the_patella(mechanism, wild):  # noqa: F811
+def test_a_wrong_guess_does_not_lose_the_patella(mechanism, wild):  # noqa: F811
     """If the guess fails, the result is that of a search without a guess."""
     cold = solve_patella(mechanism, knee_at(25.0))
     warm = solve_patella(mechanism, knee_at(25.0), np.array(wild))
@@ -102,7 +102,7 @@ def test_a_guess_inside_the_outline_of_the_femur_does_not_lose_the_patella(mecha
     angle = np.linspace(0.0, 2 * np.pi, 181)[:-1]
     outline = 0.026 * np.column_stack([np.cos(angle), np.sin(angle)])
     wrapped = ExtensorMechanism(**{**vars(mechanism), "femoral_outline": outline})
-    inside = np.append(-INSERTION[:2], 0.0)  # the insertion on the axis of the trochlea
+    inside = np.append(-INSERTION[:2], 0.0)  # this puts the insertion on the axis of the trochlea
     cold, warm = (solve_patella(wrapped, knee_at(25.0), guess) for guess in (None, inside))
     assert warm.status is PatellaStatus.OK
     assert np.allclose(warm.coordinates, cold.coordinates, atol=1e-6)
@@ -123,7 +123,7 @@ def test_the_condition_that_fails_is_named(mechanism, change, conditions):  # no
 
 
 def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeypatch):
-    """Frame 5 of 11 is lost and says why with its flexion; its neighbours change little."""
+    """The status of lost frame 5 names reason and flexion. The adjacent frames change little."""
     scene = load_scene(MODEL / "scene.toml", FEW | {"contact.model": "foundation"})
     seen = []
 
@@ -146,8 +146,8 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
     assert np.allclose(results["quadriceps_N"][others], quadriceps, atol=0.5)
 
 
-def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain):
-    """At the same poses the result is the same; at others it is that of a full search."""
+def test_a_sample_starts_from_the_nominal_patella_and_keeps_its_rates(plain):
+    """At equal poses the result is equal. At other poses it is that of a full search."""
     frames = plain.extensor
     same = frames.moved(frames.lines, plain.poses, range(2, 5))
     for k in range(11):
@@ -164,8 +164,8 @@ def test_a_sample_finds_the_patella_from_where_it_was_and_keeps_its_rates(plain)
     np.testing.assert_array_equal(moved.joints(6), frames.joints(6))
 
 
-def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
-    """A recorded one stays as recorded."""
+def test_a_sample_searches_a_solved_patella_from_the_nominal_one(plain):
+    """A recorded patella does not change."""
     known = SharedState(None, None, SimpleNamespace(moved=lambda *_: "moved"), range(1))
     case = load_case(load_scene(MODEL / "scene.toml", FEW))
     assert _extensor_frames(case, plain.knee, plain.poses, known) == "moved"
@@ -177,9 +177,9 @@ def test_a_sample_looks_for_a_solved_patella_from_where_it_is_known(plain):
 
 
 def test_the_patella_stays_at_its_equilibrium_and_its_rates_are_filtered():
-    """The filter changes no place: the button touches, and the ligament has its length.
+    """The filter does not change coordinates: the gap is zero, and the ligament has its length.
 
-    The scene's own chain, asked without tkamb.Knee, has the same places and inertial forces.
+    The scene's chain without tkamb.Knee has the same coordinates and inertial forces.
     """
     case = load_case(load_scene(MODEL / "scene.toml", FEW | {"motion.cutoff_Hz": 1.0}))
     mechanics, motion, tibia = mechanics_of(case), case.motion, case.tibia
@@ -208,7 +208,7 @@ def test_the_patella_stays_at_its_equilibrium_and_its_rates_are_filtered():
         assert abs(touch.gap) < 1e-7
 
 
-def test_the_moments_of_three_lines_on_the_patella_add_up_to_nothing(plain):
+def test_the_moments_of_three_forces_on_the_patella_add_up_to_zero(plain):
     """The moments of quadriceps, patellar ligament and contact about the femur's z sum to zero."""
     for k in (3, 9):
         state, patella = plain.geometry(k).state, plain.extensor.states[k]

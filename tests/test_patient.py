@@ -1,4 +1,4 @@
-"""The patient's URDF: mirror, default segments, and what is refused."""
+"""The patient's URDF: mirror image, default segments, and refused files."""
 
 import re
 
@@ -23,7 +23,7 @@ def table(tmp_path, text, side="right", **more):
 
 
 def left(text):
-    """Return the same leg as a left one: every number reflected in z."""
+    """Return the URDF of the mirror image (z to -z), a left leg."""
     text = text.replace('axis xyz="0 -1 0"', 'axis xyz="0 1 0"')
     text = text.replace('axis xyz="-1 0 0"', 'axis xyz="1 0 0"')
     return text
@@ -63,7 +63,7 @@ def test_a_left_leg_gives_the_numbers_of_its_mirror_image(tmp_path):
 
 
 def test_mirrored_inertia_is_the_reflected_tensor(tmp_path):
-    """I' = M I M about the reflected centre, also with a turned inertial frame."""
+    """I' = M I M about the reflected centre holds with a rotated inertial frame, too."""
     own = Chain(left(leg_urdf()), True).model
     mended = load_urdf(table(tmp_path, left(leg_urdf()), "left"), True)
     turned = Chain(mended, True).model
@@ -117,7 +117,7 @@ def test_segment_inertia_is_that_of_its_radii():
         (lambda t: t[:-20], "not a readable URDF"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(tmp_path, change, words):
+def test_a_wrong_patient_is_refused_in_one_line(tmp_path, change, words):
     with pytest.raises(InputError, match=words) as caught:
         load_urdf(table(tmp_path, change(leg_urdf())), True)
     assert "\n" not in str(caught.value)

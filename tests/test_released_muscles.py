@@ -1,4 +1,4 @@
-"""Released coordinates and muscles that share the load: one search, one answer."""
+"""Released coordinates together with muscles that share the load."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def side_with_flexors(scene, left=False):
 
 
 def computed(side):
-    """Return body and contact of a few frames, each from the one before."""
+    """Return body and contact of a few frames, each with the previous frame as initial guess."""
     found = []
     for k in FRAMES:
         found.append(side.frame(k, [contact for _, contact in found]))
@@ -61,7 +61,7 @@ def resting(side):
 
 
 def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
-    """Ground, weight, inertia, ligaments, muscles, patellar ligament, contact and residuals."""
+    """The loads are ground, weight, inertia, ligaments, muscles, contact and residuals."""
     for body, _ in resting:
         geometry, values = body.geometry, body.loads.values
         assert geometry.share.force[1:].min() > 15.0
@@ -82,9 +82,10 @@ def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
         np.testing.assert_allclose(total, 0.0, atol=1e-8 * scale)
 
 
-def test_the_sharing_is_that_of_the_released_knee(resting):
-    """The quadriceps of sharing and equations agree to 1 N; residuals of released coordinates are
-    zero."""
+def test_the_muscle_forces_satisfy_the_equations_of_the_released_knee(resting):
+    """Static optimisation and equations give the same quadriceps tension to 1 N. Residuals of
+    released coordinates are zero.
+    """
     for body, contact in resting:
         quadriceps = body.geometry.extensor.tension(body.loads.values)
         assert quadriceps == pytest.approx(body.geometry.share.force[0], abs=1.0)
@@ -94,11 +95,10 @@ def test_the_sharing_is_that_of_the_released_knee(resting):
             assert abs(body.loads.values[name]) < 0.2
 
 
-def test_the_answer_does_not_hang_on_where_the_search_began(side, resting):
+def test_the_result_does_not_depend_on_the_initial_guess(side, resting):
     """The last frame alone has the same pose within the tolerance, and the same muscles to 0.1 N.
 
-    Held at what it was in an early pass, the yielding that decides the muscles' arms made 1 % of
-    the contact force and 8 N of a muscle's 52 N hang on the frames before.
+    The compliance of an early pass would change a muscle force of 52 N by 8 N.
     """
     (body, contact), (series, there) = side.frame(FRAMES[-1]), resting[-1]
     away = (contact.equilibrium.coordinates - there.equilibrium.coordinates) * SCALE
@@ -113,7 +113,7 @@ def test_activations_are_continuous(resting):
     assert np.abs(np.diff(activations, axis=0)).max() < 0.05
 
 
-def test_a_left_leg_with_muscles_gives_the_mirrored_answer(tmp_path, resting):
+def test_a_left_leg_with_muscles_gives_the_mirrored_result(tmp_path, resting):
     mirrored = side_with_flexors(write_mirrored_patient(tmp_path), left=True)
     body, contact = mirrored.frame(FRAMES[0])
     same, there = resting[0]
@@ -123,8 +123,8 @@ def test_a_left_leg_with_muscles_gives_the_mirrored_answer(tmp_path, resting):
     np.testing.assert_allclose(here, there.equilibrium.coordinates, atol=1e-9)
 
 
-def test_what_keeps_flexion_answers_to_a_wrench_as_the_yielding_knee_does():
-    """The tangent against a second search under a little more load."""
+def test_the_tension_per_wrench_is_that_of_a_second_search():
+    """The tangent agrees with a second search under slightly more load."""
     state = ElasticFoundation(resolution=1e-3, law="linear").prepare(dished_joint())
     model, start = ElasticFoundation(resolution=1e-3, law="linear"), np.zeros(6)
     start[1] = state.pair.first_touch_height(np.eye(4)) - 5e-5
@@ -136,7 +136,7 @@ def test_what_keeps_flexion_answers_to_a_wrench_as_the_yielding_knee_does():
         balance = forces.balance()
         contact = forces.contact(balance)
         place = forces.at(balance)
-        return place, contact, float(joint.kept(place, contact.wrench)[-1])
+        return place, contact, float(joint.reactions(place, contact.wrench)[-1])
 
     place, contact, kept = rest(load, start)
     forces = ReleasedForces(demand(load), model.probe(state), place)
@@ -144,10 +144,10 @@ def test_what_keeps_flexion_answers_to_a_wrench_as_the_yielding_knee_does():
     assert forces.tension_at_rest(contact, gain) == pytest.approx(kept, rel=1e-4)
     more = push((1.0, 20.0, 0.5), (0.004, 0.01, -0.01))
     change = rest(load + more, place)[2] - kept
-    rigid = demand(more).kept(place, np.zeros(6))[-1]
+    rigid = demand(more).reactions(place, np.zeros(6))[-1]
     assert gain @ more == pytest.approx(change, rel=0.01)
     assert abs(rigid - change) > 0.05 * abs(change)
-    # not quite at rest: what is left counts as one more wrench
+    # near equilibrium: the residual is treated as an additional wrench
     off = ReleasedForces(demand(load + more), model.probe(state), place)
     assert off.tension_at_rest(contact, gain) == pytest.approx(kept + change, rel=1e-3)
 
@@ -160,7 +160,7 @@ def share_of(force):
 
 
 @pytest.mark.parametrize("slope", [0.2, -0.3, -1.0, -4.0])
-def test_relaxation_settles_what_would_go_round_in_a_circle(slope):
+def test_relaxation_converges_where_plain_iteration_diverges(slope):
     """With f' = 100 + slope f and a slope below -1, plain iteration diverges."""
     mixing = Relaxation()
     held = mixing.mixed(share_of(0.0))
@@ -173,7 +173,7 @@ def test_relaxation_settles_what_would_go_round_in_a_circle(slope):
 
 
 @pytest.mark.parametrize("steepness", [0.5, -0.9, -2.0])
-def test_how_the_knee_yields_settles_where_it_hangs_on_itself(steepness):
+def test_the_compliance_converges_where_plain_iteration_oscillates(steepness):
     """With g' = 1 + steepness (g - 1) and a steepness below -1, plain iteration oscillates."""
     mixing, held = Relaxation(), None
     for _ in range(10):
@@ -185,7 +185,7 @@ def test_how_the_knee_yields_settles_where_it_hangs_on_itself(steepness):
     assert mixing.doubt == 0.0
 
 
-def test_how_the_knee_yields_is_kept_at_last_and_what_is_open_told():
+def test_the_last_compliance_is_constant_and_its_difference_is_reported():
     mixing, held = Relaxation(), None
     for k in range(20):
         held = mixing.yielding(np.full(6, 1.0 if k % 2 else 2.0))
@@ -196,7 +196,7 @@ def test_how_the_knee_yields_is_kept_at_last_and_what_is_open_told():
 @pytest.mark.slow
 @needs_jw
 @pytest.mark.parametrize(("contact", "cell"), [("foundation", 1.5), ("lattice", 2.0)])
-def test_frames_of_gait_run_alone_come_out_as_in_the_whole(contact, cell):
+def test_single_frames_of_gait_equal_those_of_the_whole_run(contact, cell):
     """og3's frames 46 to 52 do not depend on the frame at which the run begins."""
     changes = {"contact.model": contact, "contact.resolution_mm": cell}
     scene = load_scene(OG3.with_name("ngait_og3_measured.toml"), changes)
@@ -209,7 +209,7 @@ def test_frames_of_gait_run_alone_come_out_as_in_the_whole(contact, cell):
 @pytest.mark.slow
 @needs_jw
 def test_activations_in_gait_are_continuous_at_100_Hz():
-    """In the mid-stance of og3 forces jump only where a condyle lands or lifts off."""
+    """In the mid-stance of og3 forces jump only if a condyle lands or lifts off."""
     changes = {
         "muscles.model": str(JW / "JW.osim"),
         "contact.resolution_mm": 1.5,
@@ -227,7 +227,7 @@ def test_activations_in_gait_are_continuous_at_100_Hz():
     np.testing.assert_allclose(heads, columns["quadriceps_N"], atol=2.0)
 
 
-def test_all_results_of_a_left_leg_with_muscles_are_the_right_ones(tmp_path, monkeypatch):
+def test_all_results_of_a_left_leg_equal_those_of_the_right_leg(tmp_path, monkeypatch):
     """Mirrored files give the same columns and the same map."""
 
     def given(case):
@@ -238,7 +238,9 @@ def test_all_results_of_a_left_leg_with_muscles_are_the_right_ones(tmp_path, mon
         return SharedMuscles(trial, left)
 
     monkeypatch.setattr("tkamb.run.muscles.shared_muscles.load_muscles", given)
-    settings = CONTACT | {"muscles.model": "patient.urdf"}  # read by what is replaced here
+    settings = CONTACT | {
+        "muscles.model": "patient.urdf"
+    }  # the reader of this key is replaced here
     left_scene = write_mirrored_patient(tmp_path / "left")
     right, left = (
         simulate(load_scene(path, settings), frames=slice(40, 101, 30))

@@ -1,4 +1,4 @@
-"""One key dropped or changed at a time: whatever is wrong, the error is one of tkamb's own."""
+"""If one key is missing or changed, the error is always an error of tkamb."""
 
 import importlib.machinery
 import importlib.util
@@ -30,7 +30,7 @@ def script():
 
 @pytest.fixture
 def attempt(script, tmp_path, monkeypatch):
-    """Return what tries a scene's content in a folder of its own, meshes read once."""
+    """Return a function that tries a scene's content in a new folder; meshes are read once."""
     keep_meshes(monkeypatch)
     before = signal.signal(signal.SIGPROF, script._too_long)
     yield lambda content: script.attempt(as_toml(content), tmp_path / "scene.toml")
@@ -54,8 +54,8 @@ def test_the_unchanged_scene_runs(script, attempt):
 
 
 @pytest.mark.parametrize("first", range(4))
-def test_no_change_of_one_key_is_unforeseen(script, attempt, first):
-    """Of the shipped scene, one change in fifteen; the script tries all of any scene."""
+def test_every_change_of_one_key_runs_or_is_refused(script, attempt, first):
+    """The test tries every fifteenth change of the shipped scene; the script tries all changes."""
     content = content_of(script)
     for way, words, value in jobs_of(script, content)[first * 7 :: 60]:
         verdict, said = attempt(script.changed(content, way, value))
@@ -65,7 +65,7 @@ def test_no_change_of_one_key_is_unforeseen(script, attempt, first):
 @pytest.mark.slow
 @pytest.mark.parametrize("axes", ["-x,+y,-z", "+z,+y,-x", "+x,-y,-z"])
 @pytest.mark.parametrize("part", ["insert", "patella"])
-def test_a_part_with_other_axes_and_a_patella_that_is_looked_for(script, attempt, part, axes):
+def test_a_part_with_other_axes_and_a_searched_patella(script, attempt, part, axes):
     content = content_of(script)
     content["patella"] = {"motion": "solved"}
     content["implant"][part]["axes"] = axes
@@ -74,7 +74,7 @@ def test_a_part_with_other_axes_and_a_patella_that_is_looked_for(script, attempt
 
 
 def test_a_moment_that_does_not_change_its_sign_is_a_lost_patella(monkeypatch):
-    """Followed from one end, the patella need not come to the place that was found at the other."""
+    """Searches from the two ends of an interval may end at different poses of the patella."""
     here, there = (
         SimpleNamespace(coordinates=np.array([0.0, 0.0, turn]), moment=moment)
         for turn, moment in ((0.0, 1.0), (0.1, -1.0))

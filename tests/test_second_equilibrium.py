@@ -1,4 +1,4 @@
-"""A frame whose released coordinates have more than one equilibrium says so."""
+"""The status of a frame reports a second equilibrium of the released coordinates."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +20,14 @@ RELEASED = ["adduction", "axial_rotation", "ap", "ml"]
 
 
 def equilibrium(place, force=1000.0, problem=""):
-    """Return an equilibrium at a place (6,)."""
+    """Return an equilibrium at coordinates (6,)."""
     contact = SimpleNamespace(wrench=np.array([0.0, force, 0.0, 0.0, 0.0, 0.0]))
     end = SimpleNamespace(status=BalanceStatus.OK)
     return KneeEquilibrium(np.array(place), None, None, contact, end, 1, 1, 0.0, problem)
 
 
 class Wells:
-    """A knee with several equilibria along AP, which finds the nearest one."""
+    """A knee with several equilibria along AP. Its search ends at the nearest equilibrium."""
 
     released = (0, 1)
 
@@ -41,7 +41,7 @@ class Wells:
 
 
 def found(knee, recorded, *previous):
-    """Return the equilibrium of a frame that was recorded at an AP place, m."""
+    """Return the equilibrium of a frame that was recorded at an AP position, m."""
     pair = SimpleNamespace(first_touch_height=lambda pose: 0.0)
     instant = SimpleNamespace(coordinates=np.array([recorded, 0, 0, 0, 0, 0.0]), muscles=None)
     poses = InitialPoses(knee, pair, None)
@@ -54,7 +54,7 @@ def test_a_search_that_follows_the_last_frame_is_not_repeated():
     assert knee.searches == 1
 
 
-def test_another_start_that_leads_elsewhere_is_told():
+def test_a_second_equilibrium_is_reported():
     rest = found(Wells(0.0, 20e-3), 20e-3, 3e-3)
     assert rest.coordinates[0] == 0.0
     assert "20.0 mm and 0.0 deg away, with 3000 N instead of 1000 N" in rest.second
@@ -68,7 +68,7 @@ def test_a_frame_without_earlier_ones_is_searched_from_both_sides():
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's files are not beside the project")
 def test_jw_at_3_275_s_has_two_equilibria(tmp_path, capsys):
-    """466 N from the frame 0.2 s before, 442 N at 17 deg of adduction from the recorded pose."""
+    """The previous frame leads to 466 N, the recorded pose to 442 N at 17 deg of adduction."""
     given = ["--c3d", f"{JW}/motion/jw_ngait_og3.c3d", "--side", "right", "--mass-kg", "66.7"]
     for part, name in (("femoral", "femoral_component"), ("insert", "tibial_insert")):
         given += [f"--{part}", f"{JW}/geometry/{name}.stl"]

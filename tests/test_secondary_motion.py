@@ -1,4 +1,4 @@
-"""The five knee coordinates that were not measured, from contact and ligaments."""
+"""Equilibrium of the five released knee coordinates under contact and ligaments."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +44,7 @@ def bend():
 
 @pytest.fixture(scope="module")
 def resting(bend):
-    """Body and contact of a few frames, each from the one before."""
+    """Return body and contact of a few frames, each with the previous frame as initial guess."""
     contacts, found = [], {}
     for k in (40, 41, 42, 60, 80):
         found[k] = bend.frame(k, contacts)
@@ -78,7 +78,7 @@ def test_equilibrium_and_deformation_are_one_state(resting):
         assert np.allclose(contact.result.pose, knee_pose(contact.equilibrium.coordinates))
 
 
-def test_flexion_stays_as_recorded_and_what_is_kept_too(bend):
+def test_flexion_and_coordinates_that_are_not_released_stay_recorded(bend):
     partly = side_of(BEND, released=["ml", "adduction"])
     _, contact = partly.frame(60)
     kept = np.abs(contact.equilibrium.coordinates - partly.mechanics.motion.coordinates[60])
@@ -97,7 +97,7 @@ def test_flexion_stays_as_recorded_and_what_is_kept_too(bend):
         [-5e-3, 0, 5e-3, np.radians(-5), 0],
     ],
 )
-def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, resting, away):
+def test_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(bend, resting, away):
     home = resting[60][1].equilibrium.coordinates
     start = bend.starts.on_the_insert(home + np.append(away, 0.0))
     again = bend.released.find(bend.mechanics.instant(60), start)
@@ -105,9 +105,10 @@ def test_starts_5_mm_and_5_deg_away_reach_the_same_rest(bend, resting, away):
     assert np.abs((again.coordinates - home) * SCALE).max() < 2e-5
 
 
-def test_a_frame_that_needs_flexors_rests_with_the_quadriceps_slack(bend):
-    """With a ground reaction 0.2 m in front, a ligament that could push would drive the knee off
-    the insert."""
+def test_a_frame_that_needs_flexors_has_a_slack_quadriceps(bend):
+    """The ground reaction is 0.2 m in front of the knee: a patellar ligament that could push would
+    drive the femur off the insert.
+    """
     case = case_of(BEND)
     ground = replace(case.ground, point=case.ground.point + np.array([0.2, 0, 0]))
     case = replace(case, ground=ground)
@@ -124,16 +125,15 @@ def test_a_frame_that_needs_flexors_rests_with_the_quadriceps_slack(bend):
         assert np.abs((again.coordinates - knee.coordinates) * SCALE).max() < 2e-5
 
 
-def test_a_start_over_the_rim_says_that_it_did_not_arrive(bend, resting):
+def test_a_guess_beyond_the_rim_is_reported_as_failed(bend, resting):
     home = resting[60][1].equilibrium.coordinates
     start = bend.starts.on_the_insert(home + np.array([-8e-3, 0, 8e-3, np.radians(-8), 0, 0]))
     ended = bend.released.find(bend.mechanics.instant(60), start)
     assert ended.problem == "released: out of the contact model's range"
 
 
-def test_friction_drags_the_knee_back(bend, resting):
-    """Without friction the equilibrium is another one, and every step of the search does positive
-    work."""
+def test_friction_changes_the_equilibrium(bend, resting):
+    """Without friction the equilibrium differs, and every step of the search has positive work."""
     smooth = side_of(BEND, friction=0.0)
     _, contact = smooth.frame(60)
     away = np.abs(
@@ -143,7 +143,7 @@ def test_friction_drags_the_knee_back(bend, resting):
     assert contact.equilibrium.balance.status is BalanceStatus.OK
 
 
-def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
+def test_a_frame_without_equilibrium_fails_with_the_reason(bend):
     """Without ligaments and far from the insert there is no equilibrium."""
     case = load_case(load_scene(BEND, COARSE | {"contact.released": ALL, "ligament": []}))
     side = contact_side(case, mechanics_of(case))
@@ -156,8 +156,9 @@ def test_without_anything_that_holds_it_a_frame_fails_with_the_reason(bend):
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
 def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishes():
-    """DM at half of the cycle: one condyle carries the whole load on its flank, unless ML and
-    adduction are released."""
+    """In DM's frame at half of the cycle one condyle carries the whole load on its flank, unless ML
+    and adduction are released.
+    """
     few = {"motion.frames": 21}
     body, contact = side_of(DM, few, released=[]).frame(10)
     lean = [np.degrees(np.arccos(c.normal[1])) for c in body.geometry.condyles.values()]

@@ -1,4 +1,4 @@
-"""Muscles across the knee: the sharing and the knee's own equations say the same."""
+"""Muscles across the knee: static optimisation agrees with the knee's equations."""
 
 import subprocess
 import sys
@@ -35,13 +35,13 @@ PLACES = {"behind": [-0.06, -0.45, 0.0], "ahead": [0.06, -0.45, 0.0], "aside": [
 
 
 def stood_upon(place):
-    """Return the bent knee with 700 N of the ground at a place (3,) m, insert frame."""
+    """Return the bent knee with 700 N of ground reaction at a point (3,), m, insert frame."""
     force = PointForces("tibia", np.array([place]), 700 * UP[None])
     return replace(bent_knee(), ground=force)
 
 
 @pytest.mark.parametrize("where", PLACES)
-def test_the_quadriceps_of_the_sharing_is_the_quadriceps_of_the_knee(where):
+def test_static_optimisation_and_equations_give_the_same_quadriceps(where):
     muscles = SharedMuscles(two_flexors(1))
     geometry, loads = muscles.frame(0).solve(stood_upon(PLACES[where]), FRICTION)
     assert loads.problems == ()
@@ -50,8 +50,8 @@ def test_the_quadriceps_of_the_sharing_is_the_quadriceps_of_the_knee(where):
     assert quadriceps == pytest.approx(geometry.share.force[0], abs=1e-6)
 
 
-def test_flexors_carry_what_a_slack_quadriceps_leaves():
-    """Ground ahead of the knee: without them a residual, with them a reserve of 1 % of it."""
+def test_flexors_supply_the_moment_that_a_slack_quadriceps_lacks():
+    """With the ground reaction in front, flexors reduce the missing moment to a reserve of 1 %."""
     knee = stood_upon([0.06, -0.45, 0.0])
     alone = solve_knee(knee, FRICTION)
     geometry, loads = (
@@ -75,13 +75,13 @@ def test_without_strength_of_the_others_nothing_changes():
 
 
 def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
-    """The optimum of one row without reserve: a_i as R_i F_i."""
+    """Without reserve, the optimal activations a_i are proportional to R_i F_i."""
     knee = stood_upon(PLACES["ahead"])
     trial = two_flexors(1, reserve=1e-3, least=0.0)
     share = SharedMuscles(trial).frame(0).share(knee, FRICTION, frozenset())
     force, step = share.force, 1.0
     pulled = []
-    for i in (1, 2):  # the arms by differences of the whole knee's equations
+    for i in (1, 2):  # moment arms by differences of the knee's equations
         more = np.zeros(3)
         more[i] = step
         loaded = replace(knee, share=replace(share, force=more, reserve=np.zeros(1)))
@@ -93,7 +93,7 @@ def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
 
 
 def _taut_quadriceps(geometry):
-    """Return the quadriceps' tension, negative where it would push."""
+    """Return the quadriceps' tension; negative: it would push."""
     from tkamb.knee.equations import KneeSystem
     from tkamb.knee.unknowns import LoadState
 
@@ -102,7 +102,7 @@ def _taut_quadriceps(geometry):
 
 
 def test_the_work_of_a_line_is_that_of_its_shortening():
-    """Generalised force on each knee coordinate: -F dL/dq, by differences of the length."""
+    """The generalised force on each knee coordinate is -F dL/dq, by differences of the length."""
     rng = np.random.default_rng(3)
     shank, thigh = rng.normal(scale=0.1, size=(2, 2, 3))
     force, tibia = np.array([700.0, 300.0]), np.eye(4)
@@ -175,7 +175,7 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
     assert done.stdout.strip() == "[]"
 
 
-def test_columns_of_muscles_stand_in_their_places():
+def test_columns_of_muscles_have_their_positions():
     name = family_column(MUSCLE_FORCE, "soleus_r")
     assert name == "muscle_soleus_r_N"
     assert in_a_family("reserve_knee_angle_r_Nm")
@@ -184,7 +184,7 @@ def test_columns_of_muscles_stand_in_their_places():
     assert names.index("ligament_PCL_N") < names.index(name)
 
 
-def test_the_summary_says_how_much_no_muscle_carries():
+def test_the_summary_reports_the_reserve():
     columns = {
         "reserve_knee_Nm": np.array([0.1, -3.0, np.nan]),
         "joint_moment_knee_Nm": np.array([-40.0, 20.0, np.nan]),
@@ -195,7 +195,7 @@ def test_the_summary_says_how_much_no_muscle_carries():
     assert told["frames_above_5_percent"] == 1
 
 
-def test_how_far_the_knee_is_turned_from_where_the_lines_were_found_is_told():
+def test_the_rotation_since_the_lines_were_computed_is_reported():
     found = pose(Rotation.from_euler("z", -30, degrees=True).as_matrix(), [0.01, 0.4, 0.0])
     now = pose(Rotation.from_euler("zx", (-40, 3), degrees=True).as_matrix(), [0.0, 0.4, 0.0])
     tibia = pose(Rotation.from_euler("y", 25, degrees=True).as_matrix(), [0.1, 0.2, 0.3])

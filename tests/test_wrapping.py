@@ -1,4 +1,4 @@
-"""Taut paths: analytic lengths, moment arms against finite differences, exact balance."""
+"""Taut paths: analytic lengths, moment arms against finite differences, exact equilibrium."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def ellipse(a: float, b: float, n: int = 400) -> np.ndarray:
 
 
 def circle_length(start: np.ndarray, end: np.ndarray, radius: float) -> float:
-    """Geodesic of a circular cylinder, clockwise from start to end."""
+    """Return the geodesic's length on a circular cylinder, clockwise from start to end."""
     a, b = np.linalg.norm(start[:2]), np.linalg.norm(end[:2])
     around = -np.arctan2(start[0] * end[1] - start[1] * end[0], start[:2] @ end[:2])
     sweep = around % (2 * np.pi) - np.arccos(radius / a) - np.arccos(radius / b)
@@ -40,7 +40,7 @@ def between(link: str, start: list[float], other: str, end: list[float]) -> tupl
 
 
 def quadriceps() -> Line:
-    """A femur with an elliptic outline; the patella is carried by the insert frame here."""
+    """Return a line over a femur with an elliptic outline. The patella is fixed to the insert."""
     return Line(
         "quadriceps",
         (
@@ -72,7 +72,7 @@ def test_free_path_is_straight() -> None:
 
 @pytest.mark.parametrize("angle_deg", [-60.0, 0.0, 60.0, 120.0, 170.0, 200.0])
 def test_side_is_anterior_and_wrap_angle_is_the_turn(angle_deg: float) -> None:
-    """The end swept clockwise from straight above the bone, up to past its back."""
+    """The end moves clockwise from above the bone until it is behind the bone."""
     angle = np.pi / 2 - np.deg2rad(angle_deg)
     start = np.array([0.0, 0.2, 0.0])
     end = 0.06 * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -98,9 +98,10 @@ def test_reaction_presses_the_bone_without_friction() -> None:
     assert (np.sum(reaction.forces * reaction.points, axis=1) < 0.0).all()
 
 
-def test_a_via_point_takes_the_turn_of_the_string_to_its_own_link() -> None:
-    """Three stretches, the middle one wrapped, agree with a hand calculation; the sum of loads is
-    zero."""
+def test_the_force_at_a_via_point_acts_on_its_link() -> None:
+    """Three segments (the middle one wrapped) agree with a hand calculation. The loads add up to
+    zero.
+    """
     via = LinkPoint("shank", np.array([0.02, -0.09, 0.01]))
     start, end = between("hip", [-0.03, 0.3, 0.0], "shank", [0.0, -0.3, 0.02])
     origin = LinkPoint("femur", np.array([0.0, 0.2, 0.02]))
@@ -121,7 +122,7 @@ def test_a_via_point_takes_the_turn_of_the_string_to_its_own_link() -> None:
 
 @pytest.mark.parametrize("coordinate", range(6))
 def test_moment_arm_is_derivative_of_length(coordinate: int) -> None:
-    """r = dL/dq by central differences to 1e-5 over 0-140 deg, wrapped and not."""
+    """r = dL/dq holds to 1e-5 by central differences over 0-140 deg, with and without wrapping."""
     line, step = quadriceps(), 2e-7
     worst = 0.0
     wrapped = set()
@@ -153,7 +154,7 @@ def test_moment_arm_is_derivative_of_length(coordinate: int) -> None:
 
 
 def test_moment_arm_has_no_jump_when_wrapping_starts() -> None:
-    """Near the first wrapping frame the flexion moment arm changes by no more than elsewhere."""
+    """At the start of wrapping the flexion moment arm changes as little as in other frames."""
     line = quadriceps()
 
     def arm(flexion: float) -> float:
@@ -176,7 +177,7 @@ def test_inside_start_is_refused() -> None:
         taut_path(np.zeros(3), np.array([0.1, 0.0, 0.0]), CIRCLE)
 
 
-def test_a_point_that_is_none_is_not_inside_and_has_no_length() -> None:
+def test_a_point_that_is_nan_is_not_inside_and_has_no_length() -> None:
     for axis in range(2):
         start = np.array([0.0, 0.1, 0.0])
         start[axis] = np.nan
@@ -212,8 +213,9 @@ def test_outline_stops_below_the_start() -> None:
 
 
 def shipped_lines() -> tuple[Line, Line]:
-    """Quadriceps and patellar ligament about the shipped implant; the ligament's distal end
-    lies under the insert, where no real one does, so that it wraps the insert's lip."""
+    """Return quadriceps and patellar ligament of the shipped implant. The ligament's distal end is
+    under the insert, unlike in a patient, so that it wraps the insert's lip.
+    """
     folder = Path(__file__).parents[1] / "models" / "deep_knee_bend"
     femoral, insert = (
         Surface(np.asarray(mesh.vertices) * 1e-3, np.asarray(mesh.faces), name)
@@ -243,7 +245,7 @@ def shipped_lines() -> tuple[Line, Line]:
 
 
 def leg_poses(q: np.ndarray) -> dict[str, np.ndarray]:
-    """Six knee coordinates, then the patella's three, as the chain has them."""
+    """Return link -> pose from six knee coordinates and three patella coordinates."""
     femur = knee_pose(q[:6])
     c, s = np.cos(q[8]), np.sin(q[8])
     patella = pose([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [q[6], q[7], 0.002])
@@ -252,7 +254,7 @@ def leg_poses(q: np.ndarray) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("which", [0, 1])
 def test_moment_arms_of_both_lines_on_the_shipped_knee(which: int) -> None:
-    """Generalised force of a unit tension = -dL/dq for all nine coordinates, 0-140 deg."""
+    """The generalised force of a unit tension is -dL/dq for all nine coordinates, 0-140 deg."""
     line, step = shipped_lines()[which], 2e-7
     worst, wrapped = 0.0, []
     for degrees in np.arange(0.0, 140.1, 5.0):

@@ -1,5 +1,4 @@
-"""Parts of the passes between muscles and knee: smooth stiffness, tolerance of a pass, and their
-end."""
+"""Passes between muscles and knee: smooth stiffness, tolerance of a pass, and end of the passes."""
 
 from types import SimpleNamespace
 
@@ -19,7 +18,7 @@ CELL = 1e-3
 
 
 def test_the_mean_stiffness_is_the_closed_form_and_does_not_jump():
-    """Two spheres on a layer: dF/dd = 2 pi (M/h) (2 R d - d²), wherever the columns stand."""
+    """Two spheres on a layer have dF/dd = 2 pi (M/h) (2 R d - d²) for any positions of columns."""
     model = LinearFoundation(CELL)
     probe = model.probe(model.prepare(flat_joint()))
     for depth in (0.05e-3, 0.15e-3):
@@ -37,13 +36,13 @@ def test_the_mean_stiffness_is_the_closed_form_and_does_not_jump():
 
 
 def springs(x):
-    """Springs that harden: f = load - K x - c x³."""
+    """Return the forces of hardening springs, f = load - K x - c x³."""
     stiffness = np.array([[3e5, 1e4], [1e4, 5e4]])
     force = np.array([200.0, -150.0]) - stiffness @ x - 1e10 * x**3
     return Trial(force, stiffness + np.diag(3e10 * x**2))
 
 
-def test_a_rough_search_leaves_no_more_than_it_may_and_says_so():
+def test_a_rough_search_meets_its_residual_share_and_reports_it():
     start = np.array([4e-3, 5e-3])
     rest = find_balance(springs, start)
     rough = find_balance(springs, start, residual_share=0.1)
@@ -56,8 +55,8 @@ def test_a_rough_search_leaves_no_more_than_it_may_and_says_so():
     assert find_balance(springs, rest.coordinates, residual_share=0.1).at_rest
 
 
-def test_a_rough_search_does_not_end_where_nothing_holds_it():
-    """At a maximum of the energy a short Newton step leads uphill."""
+def test_a_rough_search_does_not_end_at_an_unstable_state():
+    """At a maximum of the energy a short Newton step increases the energy."""
     hilltop = find_balance(
         lambda x: Trial(1e5 * x, -1e5 * np.eye(1)), np.array([1e-4]), residual_share=0.5
     )
@@ -65,25 +64,25 @@ def test_a_rough_search_does_not_end_where_nothing_holds_it():
 
 
 @pytest.mark.parametrize("ratio", [0.02, 0.3, 0.45])
-def test_what_is_ahead_of_passes_that_shrink_is_their_series(ratio):
+def test_the_remaining_distance_of_converging_passes_is_a_series(ratio):
     ways = 1e-3 * ratio ** np.arange(60)
     for k in range(2, 8):
         assert ahead(ways[k - 2 : k + 1]) * ways[k] == pytest.approx(ways[k + 1 :].sum(), rel=1e-6)
 
 
-def test_what_is_ahead_is_not_guessed_from_passes_that_do_not_settle():
+def test_passes_that_do_not_converge_have_no_extrapolation():
     """One short pass after a long one does not show convergence."""
     short = 1.5 * RELEASED_KNEE.knee_tolerance
     for ways in ([np.inf, np.inf, short], [np.inf, 1e-3, short], [1e-3, 0.9e-3, short]):
         assert ahead(ways) == 1.0
     assert ahead([1e-3, 4e-4, 3e-4]) == 1.0
-    # alternating q = 0.4, 0.02: the greater of both ratios bounds what follows
+    # alternating q = 0.4, 0.02: the larger ratio bounds the remaining distance
     ways = 1e-3 * np.cumprod([1.0, *([0.4, 0.02] * 5)])
     for k in range(2, len(ways) - 1):
         assert ahead(ways[k - 2 : k + 1]) * ways[k] >= ways[k + 1 :].sum()
 
 
-def test_a_search_begins_where_steady_frames_go_on_and_no_farther():
+def test_the_initial_guess_extrapolates_steady_frames_up_to_a_limit():
     step = np.array([3e-4, -1e-4, 2e-4, 4e-3, 1e-3, 0.0])
     steady = [np.zeros(6), step, 2 * step]
     assert carried_on(steady) == pytest.approx(3 * step, abs=1e-15)
@@ -93,8 +92,8 @@ def test_a_search_begins_where_steady_frames_go_on_and_no_farther():
     assert np.linalg.norm(leap * SCALE) == pytest.approx(INITIAL_POSE.max_extrapolation, rel=1e-9)
 
 
-def test_what_a_lost_patella_leaves_unknown_is_asked_for_again(monkeypatch):
-    """The external wrench is stored for a frame, unless a lost patella made it NaN."""
+def test_the_external_wrench_of_a_lost_patella_is_computed_again(monkeypatch):
+    """The external wrench of a frame is stored unless it is NaN because of a lost patella."""
     asked = iter([np.full(6, np.nan), np.ones(6)])
     monkeypatch.setattr(released, "external_wrench", lambda *given: next(asked))
     monkeypatch.setattr(released, "joint_equilibrium", lambda *given: given[-1])

@@ -1,5 +1,5 @@
-"""The knee: chain, loads, ligaments, muscles' lines, patella and the equations of one instant.
+"""The knee: chain, loads, ligaments, muscle lines, patella and the equations of one instant.
 
-`tkamb.Knee` (`tkamb.knee.knee`) is the entry; docs/plug_in.md shows how it is used. Nothing here
-reads a file.
+The public object is `tkamb.Knee` (`tkamb.knee.knee`); docs/plug_in.md shows its use. This package
+reads no files.
 """

@@ -1,23 +1,24 @@
 """The femoral adjustment and the medial-lateral split: pressing, checking, effect and sensitivity.
 
-The recorded femur is adjusted to touch with both condyles, because the split depends on a rotation
-smaller than the error of fluoroscopy. After the press the adjustment is compared with the
-deformation. Sharma (2008), section 4.3, figure 4-8: "If the final femoral penetration and coronal
+The medial-lateral split depends on a rotation that is smaller than the error of fluoroscopy. The
+recorded femur is therefore adjusted until both condyles touch. After the press the adjustment is
+compared with the penetration. Sharma (2008), section 4.3, figure 4-8: "If the final femoral
+penetration and coronal
 angle is more than the adjustments made, the original orientation of the femur is restored and the
 analysis is reconducted." The rule has two readings, `AdjustmentSettings.restore_when`:
 
-- "both" (the wording, and the default): restored if the penetration exceeds the translation
-  and the coronal angle of the penetrations exceeds the turn.
-- "either": restored if one of them does. Penetration then decides almost alone: a femur recorded
-  at the right height is hardly moved, so that nearly every load restores it, and the split jumps
-  where the recorded height changes by a tenth of a millimetre.
+- "both" (Sharma's wording, and the default): the orientation is restored if the penetration
+  exceeds the translation and the coronal angle of the penetrations exceeds the rotation.
+- "either": the orientation is restored if one of the two exceeds its adjustment. Penetration then
+  decides almost alone. The translation of a femur recorded at the right height is small, so nearly
+  every load restores it. The split jumps if the recorded height changes by a tenth of a millimetre.
 
-Where a change of the recorded pose by `AdjustmentSettings.input_change` may change that decision,
-the result has a flag.
+The result has a flag if a change of the recorded pose by `AdjustmentSettings.input_change` may
+change that decision.
 
 The adjustment should leave the total force unchanged (Sharma 2008, 5.2.2: less than 0.001 BW).
-`adjustment_effect` solves the same equations with the recorded contact points; a run flags a frame
-whose total changes.
+`adjustment_effect` compares the loads with those of the recorded contact points. A run flags a
+frame if the total force differs.
 """
 
 from collections.abc import Mapping
@@ -42,12 +43,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SplitSensitivitySettings:
-    """The finite difference of the medial force by adduction."""
+    """The finite difference of the medial force with respect to adduction."""
 
     adduction_step: float = 0.02 * DEGREE
-    """rad: step of the finite difference. Chosen: small against the 0.2 to 0.5 deg that unload a
-    condyle, and it moves some 60 N, thirty times the lattice's tolerance. Steps of 0.005 to 0.1 deg
-    agree within 5 to 15 %."""
+    """rad: step of the finite difference. Chosen because 0.2 to 0.5 deg unload a condyle, and this
+    step shifts about 60 N, thirty times the lattice's tolerance. Results with steps of 0.005 to
+    0.1 deg agree within 5 to 15 %."""
 
 
 SPLIT_SENSITIVITY = SplitSensitivitySettings()
@@ -63,11 +64,11 @@ def split_sensitivity(
 ) -> float:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
-    It is zero if one condyle carries all of the load, until the other condyle touches. It is NaN if
-    the press with more adduction fails.
+    It is zero if one condyle carries all of the load. It is NaN if the press with more adduction
+    fails.
 
     Args:
-        probe: of the contact model.
+        probe: probe of the contact model.
         result: a contact; its load is the force along -y.
         start: warm start that was returned with this contact; None: made from the contact.
     """
@@ -82,11 +83,11 @@ def split_sensitivity(
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:
-    """Return the same as `split_sensitivity`, for a contact model with an exact tangent.
+    """Return the same quantity as `split_sensitivity` from the exact tangent, N/rad.
 
-    Let t be the tangents of the wrenches on the insert. At a constant superior-inferior load an
-    adduction da lowers or lifts the femur by dy = -(sum t_y,a / sum t_y,y) da. The medial force
-    then changes by n . (t_a da + t_y dy).
+    Let t be the tangent of a condyle's force on the insert, and n the medial contact normal. At a
+    constant superior-inferior load an adduction da lowers or lifts the femur by
+    dy = -(sum t_y,a / sum t_y,y) da. The medial force then changes by n . (t_a da + t_y dy).
 
     Args:
         probe: probe of a contact model whose tangent is exact.
@@ -103,7 +104,7 @@ def split_tangent(probe: "Probe", result: ContactResult) -> float:
         if condyle.stiffness is not None
     }
     total = sum(change[1] for change in changes.values())
-    # Adduction of one, and the height that keeps the load constant.
+    # A unit adduction, and the change of height that keeps the load constant.
     follow = np.array([1.0, -total[0] / total[1]])
     return float(-condyles["medial"].normal @ changes["medial"] @ follow)
 
@@ -118,7 +119,7 @@ class AdjustmentEffectSettings:
 
     jump_distance: float = 5.0 * MILLIMETRE
     """m: a contact point that moves farther than this has jumped to or from the eminence or lip.
-    Chosen: on one dish a contact point moves by less from frame to frame."""
+    Chosen because a contact point on one dish moves by less from frame to frame."""
 
 
 ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
@@ -126,12 +127,12 @@ ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
 
 @dataclass(frozen=True)
 class AdjustmentEffect:
-    """Difference of the adjusted frame from the recorded one.
+    """Difference of the adjusted frame from the recorded frame.
 
     Args:
-        force: N, change of the total contact force; NaN if one of the frames has no solution.
-        share: change of medial / (medial + lateral) by coronal equilibrium.
-        cause: the largest change of the contact, in words.
+        force: change of the total contact force, N; NaN if one of the two has no solution.
+        share: change of medial / (medial + lateral) normal force.
+        cause: words that describe the largest change of the contact.
     """
 
     force: float
@@ -149,7 +150,7 @@ def adjustment_effect(
 
     Args:
         adjusted: loads with the contact points of the adjusted pose.
-        recorded: loads with the contact points of the recorded pose, and all else the same.
+        recorded: loads with the contact points of the recorded pose, otherwise equal.
         points_adjusted: side -> contact point of the adjusted pose.
         points_recorded: side -> contact point of the recorded pose.
     """
@@ -178,7 +179,7 @@ def _name_carriers(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> st
 
 
 def _largest_move(now: Mapping[str, CondylePoint], before: Mapping[str, CondylePoint]) -> str:
-    """Return which contact point moved most."""
+    """Return a phrase that names the contact point with the largest displacement."""
     distances = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
     side = max(distances, key=lambda name: distances[name])
     word = "jumps" if distances[side] > ADJUSTMENT_EFFECT.jump_distance else "moves"
@@ -198,10 +199,10 @@ def press_adjusted(
     Args:
         model: any contact model.
         state: state that the model's `prepare` returned.
-        load: N, superior-inferior.
+        load: superior-inferior force, N.
         adjustment: adjustment of the recorded pose, from `tkamb.geometry.adjustment.adjust`.
         query: closest points of the same pair of bodies.
-        start: an earlier result or warm start, to save time.
+        start: an earlier result or a warm start; it saves time.
 
     Returns:
         The contact with the flags of the adjustment added, the checked adjustment, and the warm
@@ -225,7 +226,7 @@ def press_adjusted(
 
 
 def _flagged(result: ContactResult, adjustment: Adjustment) -> ContactResult:
-    """Return the contact with the adjustment's flags after its own."""
+    """Return the contact with the flags of the adjustment appended."""
     if not adjustment.flags:
         return result
     return replace(result, flags=(*result.flags, *adjustment.flags))
@@ -234,7 +235,7 @@ def _flagged(result: ContactResult, adjustment: Adjustment) -> ContactResult:
 def _check(
     query: ClosestPointQuery, adjustment: Adjustment, result: ContactResult
 ) -> tuple[Adjustment, bool, tuple[str, ...]]:
-    """Return the checked adjustment, whether to undo it, and a flag where that is in doubt."""
+    """Return the checked adjustment, whether to undo its rotation, and a flag if that is unsure."""
     settings, distance = adjustment.settings, adjustment.intercondylar_distance
     medial, lateral = touches(query, result.pose)
     penetration, angle = -min(medial, lateral), (medial - lateral) / distance

@@ -1,9 +1,9 @@
 """Finds the knee in a Pinocchio model: its frames, its joints, and the bodies of the shank.
 
-A knee divides the tree of a model in two. The shank is every body on the tibia's side of the knee,
-with the foot. The thigh is the body that the frame "femur" is fixed to. The pelvis acts on the
-thigh by the load at the hip. So the same equations hold for a leg that stands on its foot, a leg
-that hangs from a pelvis, and a whole body.
+The knee divides the tree of a model in two. The shank is every body on the tibia's side of the
+knee, including the foot. The thigh is the body to which the frame "femur" is fixed. The pelvis acts
+on the thigh by the load at the hip. So the same equations hold for a leg that stands on its foot,
+a leg that hangs from a pelvis, and a whole body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,8 +47,8 @@ class Anatomy:
         insert: axes of the insert's mesh, fixed to the tibia.
         hip: hip centre, fixed to the femur.
         patella: frame of a patella that moves against the femur; None: the model has none.
-        plane: the sagittal plane of the patella, fixed to the femur.
-        knee_joints: indices of the joints between tibia and femur, that nearest to the root first.
+        plane: frame of the patella's sagittal plane, fixed to the femur.
+        knee_joints: indices of the joints between tibia and femur, from the root outwards.
         shank: indices of the joints whose bodies are on the tibia's side.
         names: part -> name of its frame, as given by the user.
     """
@@ -96,13 +96,13 @@ def find_anatomy(
     joints: Sequence[str],
     plane: pin.SE3 | None,
 ) -> Anatomy:
-    """Return where the knee is in a model.
+    """Find the frames and joints of the knee in a model.
 
     Args:
         model: any Pinocchio model.
         names: part of `PARTS` -> name of its frame in the model.
-        joints: names of the knee's joints, which are checked; empty: no check.
-        plane: pose of the patella's sagittal plane in the frame "femur"; None: as documented in
+        joints: expected names of the knee's joints; empty: no check.
+        plane: pose of the patella's sagittal plane in the frame "femur"; None: the default of
             `tkamb.knee.parts.Extensor`.
 
     Raises:
@@ -160,7 +160,7 @@ def find_anatomy(
 
 
 def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
-    """Return a frame by name. If several have that name, the frame of a body is taken."""
+    """Return the frame with a name. A body's frame takes precedence over others of that name."""
     if not model.existFrame(name):
         names = [frame.name for frame in model.frames]
         hint = names_near(name, names)
@@ -213,8 +213,8 @@ def _shank(
 ) -> tuple[int, ...]:
     """Return the joints of all bodies that remain connected to the tibia if the knee is cut.
 
-    A body between femur and tibia belongs to the shank. Bodies carried by the femur, the patella or
-    the universe do not.
+    A body between femur and tibia belongs to the shank. Bodies attached to the femur, the patella
+    or the universe do not.
     """
     side = {tibia, *path} - {femur}
     apart = {0, femur} | (set() if patella is None else {patella.joint})
@@ -230,10 +230,7 @@ def _shank(
 
 
 def _hip(femur: Place, path: tuple[int, ...]) -> Place:
-    """Return the frame of the joint that carries the femur.
-
-    Where that joint belongs to the knee, return the femur's own frame.
-    """
+    """Return the frame of the femur's parent joint. If that is a knee joint: the femur's frame."""
     return femur if femur.joint in path else Place(femur.joint, pin.SE3.Identity())
 
 

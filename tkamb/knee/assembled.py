@@ -1,4 +1,4 @@
-"""A knee on a user's model: its parts, and their places at a configuration."""
+"""A knee on a user's model: its parts, and their poses at a configuration."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -50,9 +50,10 @@ class KneeData:
 
     Args:
         data: Pinocchio data of the user's model.
-        probe: probe of the contact model, with the last contact as warm start; None: no contact.
-        patella: the last patella that was found; None: none yet.
-        seen: bytes of the last pose, and the contact there; None: none yet.
+        probe: probe of the contact model, with the last contact as warm start; None: no contact
+            model.
+        patella: state of the patella from the last call; None: not computed yet.
+        seen: bytes of the last pose, and the contact at that pose; None: not computed yet.
     """
 
     data: Any
@@ -62,7 +63,7 @@ class KneeData:
 
 
 class AssembledKnee:
-    """The parts of a knee on a Pinocchio model, and their places; `tkamb.Knee` adds the loads.
+    """The parts of a knee on a Pinocchio model, and their poses; `tkamb.Knee` adds the loads.
 
     The arguments are those of `tkamb.Knee`.
     """
@@ -128,7 +129,7 @@ class AssembledKnee:
 
     @property
     def left(self) -> bool:
-        """Whether it is a left knee."""
+        """Whether this is a left knee."""
         return self.side == "left"
 
     @property
@@ -148,11 +149,11 @@ class AssembledKnee:
 
     @property
     def query(self) -> "ClosestPointQuery":
-        """Closest points of femoral component and insert, prepared at the first use."""
+        """Query for closest points of femoral component and insert, prepared at the first use."""
         return self._need_contact().pair.closest_points
 
     def create_data(self) -> KneeData:
-        """Return an object that a caller passes from call to call to save time."""
+        """Return data that a caller passes from call to call to save time."""
         probe = None if self.contact is None else self.contact.probe()
         return KneeData(self.model.createData(), probe)
 
@@ -174,7 +175,7 @@ class AssembledKnee:
         return self._kinematics(self.create_data_for_kinematics(), q).coordinates
 
     def at(self, q: Array, data: KneeData) -> KneePlace:
-        """Return where the knee is at q, and update the placements in `data`."""
+        """Return the pose of the knee at q, and update the placements in `data`."""
         return self._kinematics(data, q)
 
     def relative_jacobian(self, q: Array, data: KneeData | None = None) -> Array:
@@ -188,15 +189,15 @@ class AssembledKnee:
         return self.bridge.relative_jacobian(data.data, self._check(q, "q", self.model.nq))
 
     def link_poses(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
-        """Return link -> pose (4, 4) in the insert frame, as those of a right knee.
+        """Return link -> pose (4, 4) in the insert frame. A left knee is mirrored to a right one.
 
         Args:
-            q: (nq,) configuration, which places a patella of the model.
-            femur: (4, 4) pose of the femoral component in the insert frame.
+            q: configuration, shape (nq,); it gives the pose of a patella of the model.
+            femur: pose of the femoral component in the insert frame, shape (4, 4).
             data: from `create_data`.
 
         Returns:
-            The poses, and whether the patella was found and is among them.
+            The poses, and whether they include the patella. It is absent if its search failed.
         """
         place, patella = replace(self._kinematics(data, q), pose=femur), None
         if self.extensor is not None:
@@ -207,9 +208,9 @@ class AssembledKnee:
         return self._link_poses(place, patella), patella is not None
 
     def extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
-        """Return the paths (n, 3) m of quadriceps and patellar ligament, insert frame.
+        """Return the paths (n, 3), m, of quadriceps and patellar ligament, insert frame.
 
-        Empty without an extensor mechanism, or if the patella is not among the poses.
+        The result is empty without an extensor mechanism or without a pose of the patella.
         """
         if self.extensor_lines is None or "patella" not in poses:
             return {}
@@ -217,7 +218,7 @@ class AssembledKnee:
         return {self.extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
 
     def nearest_points(self, coordinates: Array) -> dict[str, Array]:
-        """Return side -> point (3,) m where the undeformed condyle is nearest to the insert."""
+        """Return side -> point (3,), m, where the undeformed condyle is nearest to the insert."""
         gaps = self.query.at(knee_pose(coordinates))
         centres = {"medial": gaps.medial.centre}
         return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
@@ -244,7 +245,7 @@ class AssembledKnee:
 
     @property
     def _finds_patella(self) -> bool:
-        """Whether the patella's place follows from equilibrium, because q has none."""
+        """Whether equilibrium determines the patella's pose, because the model has no patella."""
         return self.anatomy.patella is None
 
     @property
@@ -282,12 +283,12 @@ class AssembledKnee:
         return poses
 
     def _with_lines(self, data: KneeData, tensions: Mapping[str, float], forces: Any) -> Any:
-        """Return forces on the joints with the tensions of the muscles' lines added.
+        """Return forces on the joints with the forces of the muscle lines added.
 
         Args:
             data: data with joint placements up to date.
-            tensions: muscle -> N.
-            forces: one per joint; None: zero.
+            tensions: muscle -> tension, N.
+            forces: one force per joint; None: zero.
         """
         pulls = [name for name in self._lines if tensions.get(name, 0.0)]
         if not pulls:

@@ -1,19 +1,19 @@
 """Equilibrium of a few coordinates under forces that depend on them: Newton in a trust region.
 
-With r(q) the force that drives each coordinate and
-K = -dr/dq, a step d solves (K + lambda I) d = r. lambda is the smallest value with which the step
-descends and stays inside the region. A step is judged by the ratio of the work of the forces along
-it, by the trapezoidal rule, to the work that K predicts,
+Let r(q) be the force that drives each coordinate, and K = -dr/dq the stiffness. A step d solves
+(K + lambda I) d = r. lambda is the smallest value with which the step descends and stays inside the
+region. The step is accepted by the ratio W / W_K. W is the work of the forces along the step
+(trapezoidal rule), and W_K is the work that K predicts:
 
-    W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2 :
+    W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2
 
 If the forces have a potential, W is the energy that a step releases. A trial that overshoots into a
 stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric. K may then be stable but
 not positive definite, and work is no measure. In this case the step follows Newton's direction, in
-which |r| falls, and is judged by |r|. A search that does not converge is repeated once. In the
-second search only whole Newton steps are judged by |r|, and shorter ones by work.
+which |r| falls, and |r| decides whether the step is accepted. A search that does not converge is
+repeated once. In the second search |r| decides for whole Newton steps, and work for shorter steps.
 
-Everything is in metres and newtons: rotations are scaled by a lever arm.
+All coordinates are in metres and all forces in newtons: rotations are scaled by a lever arm.
 
 References: Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 4 (2006),
 doi:10.1007/978-0-387-40065-5.
@@ -35,29 +35,29 @@ class BalanceSettings:
 
     force_tolerance: float = 0.05
     """N (moments are divided by the lever arm): residual below which a coordinate has converged. If
-    the noise of the forces is larger, the noise counts instead. Chosen: far below what is
-    reported."""
+    the noise of the forces is larger, the noise replaces this tolerance. Chosen because it is far
+    below the resolution of the reports."""
     step_tolerance: float = 2e-6
-    """m: Newton step below which a coordinate has converged. Chosen: below the size at which a
-    force changes by more than its tolerance."""
+    """m: Newton step below which a coordinate has converged. Chosen because such a step changes no
+    force by more than its tolerance."""
     least_stiffness: float = 100.0
-    """N/m: a state with a smaller stiffness is indeterminate. Chosen: it moves by more than 10 mm
-    per newton."""
+    """N/m: a state with a smaller stiffness is indeterminate. Chosen because such a state moves by
+    more than 10 mm per newton."""
     narrow_radius: float = 1e-6
-    """m: trust radius below which an approximate stiffness is replaced by finite differences.
-    Chosen: an approximation that needs shorter steps no longer reduces the residual."""
+    """m: trust radius below which finite differences replace an approximate stiffness. Chosen
+    because an approximation that needs shorter steps does not reduce the residual."""
     max_travel: float = 20e-3
     """m: largest distance of a coordinate from its initial guess; beyond it the search ends.
-    Chosen: no load holds a coordinate that moves as far."""
+    Chosen because a coordinate that moves as far has no stable equilibrium."""
     difference_step: float = 2e-6
-    """m: step of the finite differences of the force. Chosen: equal to `step_tolerance`."""
+    """m: step of the finite differences of the force. Chosen equal to `step_tolerance`."""
     max_prediction_error: float = 0.5
-    """1: relative difference of the change of force from its prediction above which all corrections
-    of an approximate stiffness are dropped. Chosen: with a larger error a step does not reduce the
+    """1: relative error of the predicted change of force. A larger error discards all corrections
+    of an approximate stiffness. Chosen because with a larger error a step does not reduce the
     residual reliably."""
     max_steps: int = 200
-    """Maximum number of steps. Chosen: a lightly loaded knee that slides 16 mm over lattice cells
-    of 2 mm needs 80."""
+    """Maximum number of steps. Chosen because a lightly loaded knee that slides 16 mm over lattice
+    cells of 2 mm needs 80."""
 
 
 BALANCE = BalanceSettings()
@@ -82,11 +82,11 @@ class Trial:
     """The forces at trial coordinates.
 
     Args:
-        force: (n,) N, positive along each coordinate's positive direction; NaN if unknown.
-        stiffness: (n, n) N/m, -d force / d coordinates; None: by finite differences.
+        force: driving forces, shape (n,), N, positive along the positive coordinates; NaN: unknown.
+        stiffness: -d force / d coordinates, shape (n, n), N/m; None: by finite differences.
         exact: whether `stiffness` is the exact tangent. The search corrects an approximation from
             step to step.
-        force_noise: N, error of the force; a force below it counts as zero.
+        force_noise: error of the force, N; a force below it counts as zero.
     """
 
     force: Array
@@ -97,18 +97,19 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """The end of a search.
+    """The result of a search.
 
     Args:
-        coordinates: (n,) m.
-        force: (n,) N, residual.
-        stiffness: (n, n) N/m.
-        status: how it ended.
-        steps: number of steps, accepted and rejected ones.
+        coordinates: last coordinates, shape (n,), m.
+        force: residual, shape (n,), N.
+        stiffness: stiffness at these coordinates, shape (n, n), N/m.
+        status: how the search ended.
+        steps: number of accepted and rejected steps.
         trials: number of evaluations of the forces.
-        smallest_stiffness: N/m, smallest real part of the stiffness' eigenvalues.
-        work: N·m, work of the forces along each accepted step.
-        at_rest: True: converged to the tolerances. False: converged to `residual_share` alone.
+        smallest_stiffness: smallest real part of the stiffness' eigenvalues, N/m.
+        work: work of the forces along each accepted step, N·m.
+        at_rest: True: converged to the tolerances. False: ended early by `residual_share` or
+            `reach`.
     """
 
     coordinates: Array
@@ -136,19 +137,18 @@ def find_balance(
 
     Args:
         forces: function of coordinates (n,), m, that returns a `Trial`.
-        start: (n,) m, initial guess.
-        stiffness: (n, n) N/m from an earlier search near by. It saves trials if `forces` gives no
-            stiffness.
-        residual_share: for a search that is repeated under other forces: the remaining step, as a
-            share of the distance from the initial guess, at which it ends; 0: the tolerances alone
-            decide.
-        reach: m, for such a search: it ends if a coordinate is farther than this from the initial
-            guess.
+        start: initial guess, shape (n,), m.
+        stiffness: stiffness of an earlier, similar search, shape (n, n), N/m. It saves trials if
+            `forces` gives no stiffness.
+        residual_share: remaining Newton step, relative to the distance from the initial guess, at
+            which the search ends early; 0: the tolerances alone decide. It is for a search that is
+            repeated under other forces.
+        reach: distance of a coordinate from its initial guess, m, at which the search ends early.
     """
     result = _Search(forces, np.array(start, float), stiffness, residual_share, reach).run()
     if result.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
         return result
-    # Newton's direction may lead away from the equilibrium over the facets of a contact; the
+    # Over the facets of a contact Newton's direction may lead away from the equilibrium. The
     # direction of decreasing energy does not.
     again = _Search(
         forces, np.array(start, float), stiffness, residual_share, reach, downhill=True
@@ -169,42 +169,46 @@ class _Search:
         downhill: bool = False,
     ) -> None:
         self._forces, self._start, self._downhill = forces, start, downhill
-        self._left, self._reach = residual_share, reach
+        self._residual_share, self._reach = residual_share, reach
         self._trials, self._steps = 0, 0
-        self._fresh, self._since, self._unknown = False, 0, False
-        self._radius, self._refused = FIRST_RADIUS, False
+        self._from_differences, self._steps_since_differences, self._force_unknown = False, 0, False
+        self._radius, self._newton_rejected = FIRST_RADIUS, False
         self._work: list[float] = []
         self.x = start
         first = self._at(start)
         self.force, self._force_noise = first.force, first.force_noise
         self.known = bool(np.isfinite(first.force).all())
         if self.known:
-            self._own, self._guide = first.stiffness is not None and first.exact, first.stiffness
-            self._missing = np.zeros((len(start), len(start)))
+            self._exact_tangent, self._model_stiffness = (
+                first.stiffness is not None and first.exact,
+                first.stiffness,
+            )
+            self._correction = np.zeros((len(start), len(start)))
             self.stiffness = self._first_stiffness(first, stiffness)
         else:
             self.stiffness = np.full((len(start), len(start)), np.nan)
 
     def run(self) -> Balance:
-        """Return the end of the search."""
+        """Run the search."""
         if not self.known:
             return self._end(BalanceStatus.OUT_OF_RANGE)
         while self._steps < BALANCE.max_steps:
-            if not np.isfinite(self.stiffness).all():  # a neighbour of this place is out of range
+            # A finite difference was out of range.
+            if not np.isfinite(self.stiffness).all():
                 return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
-                return self._end(self._kind())
-            if self._near() or self._travel() > self._reach:
+                return self._end(self._stability())
+            if self._close_enough() or self._travel() > self._reach:
                 return replace(self._end(BalanceStatus.OK), at_rest=False)
             if self._travel() > BALANCE.max_travel:
                 return self._end(BalanceStatus.RUNS_AWAY)
-            if self._radius < NARROWEST_RADIUS and (self._own or self._fresh):
+            if self._radius < NARROWEST_RADIUS and (self._exact_tangent or self._from_differences):
                 break
-            if self._guide is None and self._since > len(self.x):
+            if self._model_stiffness is None and self._steps_since_differences > len(self.x):
                 self._refresh()
             else:
                 self._step()
-        out_of_range = self._radius < NARROWEST_RADIUS and self._unknown
+        out_of_range = self._radius < NARROWEST_RADIUS and self._force_unknown
         return self._end(
             BalanceStatus.OUT_OF_RANGE if out_of_range else BalanceStatus.NOT_CONVERGED
         )
@@ -212,46 +216,59 @@ class _Search:
     def _step(self) -> None:
         step, part = self._next()
         trial = self._at(self.x + step)
-        self._steps, self._since = self._steps + 1, self._since + 1
+        self._steps, self._steps_since_differences = (
+            self._steps + 1,
+            self._steps_since_differences + 1,
+        )
         length = float(np.linalg.norm(step))
-        # Work that the linear model predicts along the step. The forces need not have a potential,
-        # so that the trust region compares work and not energy.
+        # Work that the linear model predicts along the step. The forces need not have a potential.
+        # The trust region therefore compares work and not energy.
         predicted = float(self.force @ step - 0.5 * step @ self.stiffness @ step)
-        # Trapezoidal rule: the work that the forces at both ends say was done.
+        # Work along the step from the forces at its two ends (trapezoidal rule).
         work = float(0.5 * (self.force + trial.force) @ step)
-        self._unknown = not np.isfinite(work)
-        if self._unknown:
-            # Out of the contact model's range: the step is refused and a shorter one tried.
+        self._force_unknown = not np.isfinite(work)
+        if self._force_unknown:
+            # Out of the contact model's range: reject the step and try a shorter step.
             self._radius = 0.25 * length
             return
         # Relative reduction of the residual by the step.
         fall = 1.0 - float(np.linalg.norm(trial.force) / np.linalg.norm(self.force))
-        # A Newton step of length `part` should reduce the residual by that share; half of it is
-        # enough to accept the step whatever the work says.
+        # A share `part` of Newton's step should reduce the residual by the same share. Half of this
+        # reduction is enough to accept the step, whatever its work.
         helps = part > 0 and fall > 0.5 * part
         ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
         accepted = ratio > 0.05
-        self._refused = part > 0 and not accepted  # across a kink |r| may rise: the other step next
-        if not self._own:
+        # |r| may rise across a kink of the contact: the next step is then a bounded step.
+        self._newton_rejected = part > 0 and not accepted
+        if not self._exact_tangent:
             self._learn(step, trial)
         if ratio < 0.25:
             self._radius = 0.25 * length
-            guide_fails = self._guide is None or self._radius < BALANCE.narrow_radius
-            if not (self._own or self._fresh) and guide_fails and ratio < 0.05:
+            approximation_fails = (
+                self._model_stiffness is None or self._radius < BALANCE.narrow_radius
+            )
+            if (
+                not (self._exact_tangent or self._from_differences)
+                and approximation_fails
+                and ratio < 0.05
+            ):
                 self._refresh()
         elif ratio > 0.7 and length > 0.8 * self._radius:
             self._radius = min(2.0 * self._radius, WIDEST_RADIUS)
         if accepted:
             self._work.append(work)
             self.x, self.force, self._force_noise = self.x + step, trial.force, trial.force_noise
-            self._fresh = False
+            self._from_differences = False
             if trial.stiffness is not None:
-                self._guide, self.stiffness = trial.stiffness, trial.stiffness + self._missing
+                self._model_stiffness, self.stiffness = (
+                    trial.stiffness,
+                    trial.stiffness + self._correction,
+                )
 
     def _next(self) -> tuple[Array, float]:
-        """Return the next step, and its share of Newton's step; 0 if work judges the step."""
+        """Return the next step and its share of Newton's step; 0: the work decides."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
-        if symmetric > 0 or smallest_stiffness <= 0 or self._refused:
+        if symmetric > 0 or smallest_stiffness <= 0 or self._newton_rejected:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
         # The stiffness is K = -dr/dx, so that K dx = r is Newton's step.
         newton = newton_step(self.stiffness, self.force)
@@ -272,7 +289,7 @@ class _Search:
         return self._differences() if guess is None else guess
 
     def _differences(self) -> Array:
-        self._fresh, self._since = True, 0
+        self._from_differences, self._steps_since_differences = True, 0
         columns = [
             self._at(self.x + d).force for d in BALANCE.difference_step * np.eye(len(self.x))
         ]
@@ -280,32 +297,36 @@ class _Search:
 
     def _refresh(self) -> None:
         self.stiffness = self._differences()
-        self._missing = self.stiffness - (0.0 if self._guide is None else self._guide)
+        self._correction = self.stiffness - (
+            0.0 if self._model_stiffness is None else self._model_stiffness
+        )
         self._radius = max(self._radius, 1e-2 * FIRST_RADIUS)
 
     def _learn(self, step: Array, trial: Trial) -> None:
         """Correct the stiffness along a step (Broyden 1965, doi:10.2307/2003941).
 
-        With an approximate stiffness at both ends, the update corrects their mean. If a step
-        differs too much from the prediction (contact was made or lost on the way), all updates are
-        dropped, unless finite differences have just been computed.
+        With an approximate stiffness at both ends, the update corrects their mean. If the change of
+        force differs too much from its prediction (contact was made or lost), all updates are
+        discarded. They are kept if finite differences have just been computed.
         """
         expected = self.stiffness @ step
-        if self._guide is not None and trial.stiffness is not None:
-            # With a stiffness at both ends their mean predicts the change of force to second order.
-            expected = expected + 0.5 * (trial.stiffness - self._guide) @ step
-        missing = (self.force - trial.force) - expected
+        if self._model_stiffness is not None and trial.stiffness is not None:
+            # The mean stiffness of the two ends predicts the change of force to second order.
+            expected = expected + 0.5 * (trial.stiffness - self._model_stiffness) @ step
+        unexplained = (self.force - trial.force) - expected
         # Broyden's rank-one update: the smallest change of the stiffness that explains this step.
-        learnt = np.outer(missing, step) / (step @ step)
-        strange = np.linalg.norm(missing) > BALANCE.max_prediction_error * np.linalg.norm(expected)
-        if self._guide is not None and strange and not self._fresh:
-            learnt = -self._missing
-        self._missing, self.stiffness = self._missing + learnt, self.stiffness + learnt
+        update = np.outer(unexplained, step) / (step @ step)
+        poorly_predicted = np.linalg.norm(
+            unexplained
+        ) > BALANCE.max_prediction_error * np.linalg.norm(expected)
+        if self._model_stiffness is not None and poorly_predicted and not self._from_differences:
+            update = -self._correction
+        self._correction, self.stiffness = self._correction + update, self.stiffness + update
 
     def _converged(self) -> bool:
         if np.abs(self.force).max() > max(BALANCE.force_tolerance, self._force_noise):
             return False
-        # A direction without stiffness has no Newton step; `_kind` reports it.
+        # A direction without stiffness has no Newton step; `_stability` reports it.
         left_vectors, values, right_vectors = np.linalg.svd(self.stiffness)
         stiff = values > BALANCE.least_stiffness
         step = right_vectors[stiff].T @ ((left_vectors.T @ self.force)[stiff] / values[stiff])
@@ -314,17 +335,20 @@ class _Search:
     def _travel(self) -> float:
         return float(np.abs(self.x - self._start).max())
 
-    def _near(self) -> bool:
-        """Say whether the remaining step is small against the distance from the initial guess."""
+    def _close_enough(self) -> bool:
+        """Return whether the remaining step is small against the distance from the guess."""
         # Newton's step estimates the remaining distance.
-        way = self._left * float(np.linalg.norm(self.x - self._start))
+        way = self._residual_share * float(np.linalg.norm(self.x - self._start))
         if way == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
             return False
         step = float(np.linalg.norm(np.linalg.solve(self.stiffness, self.force)))
         return step < min(way, self._radius)
 
-    def _kind(self) -> BalanceStatus:
-        if not (self._own or self._fresh) and self._smallest_stiffness() <= BALANCE.least_stiffness:
+    def _stability(self) -> BalanceStatus:
+        if (
+            not (self._exact_tangent or self._from_differences)
+            and self._smallest_stiffness() <= BALANCE.least_stiffness
+        ):
             self._refresh()
         smallest_stiffness = self._smallest_stiffness()
         if np.isnan(smallest_stiffness):
@@ -366,9 +390,9 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
     """Return the Newton step (n,), m, or a shorter, descending step within the radius.
 
     Args:
-        stiffness: (n, n) N/m, need not be symmetric.
-        force: (n,) N.
-        radius: m.
+        stiffness: stiffness, not necessarily symmetric, shape (n, n), N/m.
+        force: driving forces, shape (n,), N.
+        radius: trust radius, m.
     """
     symmetric, smallest_stiffness = smallest_eigenvalues(stiffness)
     identity = np.eye(len(force))
@@ -376,8 +400,8 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
         newton = newton_step(stiffness, force)
         if newton is not None and np.linalg.norm(newton) <= radius:
             return newton
-    # Levenberg's shift: large enough that the shifted matrix is positive definite, and found by
-    # bisection so that the step has the trust region's length.
+    # Levenberg's shift makes the matrix positive definite. Bisection finds the shift with which the
+    # step ends at the edge of the trust region.
     low = 1.0 + 1.001 * max(0.0, -symmetric)
     high = low + float(np.linalg.norm(force)) / radius + 1.0
     for _ in range(50):
@@ -391,7 +415,7 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
 
 
 def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
-    """Return the smallest eigenvalue of the symmetric part, and the smallest real part of all.
+    """Return the smallest eigenvalue of the symmetric part, and the smallest real part.
 
     Follower loads make a stiffness unsymmetric. A state is then stable against divergence if the
     second value is positive.
@@ -401,8 +425,8 @@ def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def _smallest_eigenvalues(entries: bytes, count: int) -> tuple[float, float]:
-    """Return the same for one stiffness, cached: each step of a search needs it several times."""
+    """Return `smallest_eigenvalues`, cached because each step of a search uses it repeatedly."""
     stiffness = np.frombuffer(entries).reshape(count, count)
-    # The symmetric part decides whether a step descends, the eigenvalues decide about stability.
+    # The symmetric part decides whether a step descends. The eigenvalues decide on stability.
     symmetric = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])
     return symmetric, float(np.linalg.eigvals(stiffness).real.min())

@@ -2,17 +2,17 @@
 
     tibia -> (six knee coordinates) -> femur -> (patella's sagittal plane) -> patella
 
-The chain holds the inertia of thigh and patella. The wrench that the knee must exert on the shank,
-and on everything that the shank carries, comes from their equations of motion in the user's model.
-A left knee is mirrored when it is read, and its loads are mirrored back, so that the chain always
-describes a right knee.
+The chain contains the inertia of thigh and patella. The shank and all bodies attached to it stay in
+the user's model: their equations of motion give the wrench that the knee must exert on the shank.
+The chain always describes a right knee: the input of a left knee is mirrored, and its loads are
+mirrored back.
 
-With s the twist of the femur against the tibia and s' its rate in the femur's axes, both from the
-spatial velocities v and accelerations a of the two frames,
+Let v and a be the spatial velocities and accelerations of femur (F) and tibia (T). Let s be the
+twist of the femur relative to the tibia, and s' its rate, in the femur's axes. The equations
 
     s = v_F - X v_T,    s' = a_F - X a_T - v_F x s,    J qd = s,    J qdd = s' - J' qd
 
-give the rates qd and qdd of the knee coordinates, whatever joints the model has there.
+give the rates qd and qdd of the knee coordinates, for any joints of the user's model.
 """
 
 from collections.abc import Sequence
@@ -41,13 +41,13 @@ class KneeSettings:
     """Newton's method for the joint coordinates that put the knee into a given pose."""
 
     pose_tolerance: float = 1e-12
-    """m and rad: pose error below which the iteration has converged. Chosen: near the rounding of
-    double precision."""
+    """m and rad: pose error below which the iteration has converged. Chosen because it is near the
+    rounding error of double precision."""
     accepted_pose_error: float = 1e-8
-    """m and rad: largest pose error that is accepted after the last Newton step. Chosen: far below
-    what changes a force."""
+    """m and rad: largest pose error that is accepted after the last Newton step. Chosen because
+    such an error does not change a force noticeably."""
     max_pose_steps: int = 30
-    """Maximum number of Newton steps. Chosen: poses that converge need fewer."""
+    """Maximum number of Newton steps. Chosen because a pose that converges needs fewer."""
 
 
 KNEE = KneeSettings()
@@ -145,12 +145,12 @@ def _add_body(model: pin.Model, name: str, joint: int, placement: pin.SE3 | None
 
 @dataclass(frozen=True, eq=False)
 class KneePlace:
-    """Where a knee is at one instant; a left knee is described by its mirror image.
+    """The pose of a knee at one instant. A left knee is described by its mirror image.
 
     Args:
-        pose: (4, 4) of the femoral component in the insert frame.
-        coordinates: (6,) knee coordinates, m and rad.
-        patella: (3,) coordinates of the patella, m, m, rad; None where the model has none.
+        pose: pose of the femoral component in the insert frame, shape (4, 4).
+        coordinates: knee coordinates, shape (6,), m and rad.
+        patella: coordinates of the patella, shape (3,), m, m, rad; None: the model has no patella.
     """
 
     pose: Array
@@ -205,10 +205,10 @@ class Bridge:
         )
 
     def place(self, data: Any) -> KneePlace:
-        """Return where the knee is.
+        """Return the pose of the knee.
 
         Args:
-            data: of the user's model, with joint placements up to date.
+            data: Pinocchio data of the user's model, with joint placements up to date.
         """
         insert = data.oMi[self.insert.joint] * self.insert.placement
         femur = data.oMi[self.component.joint] * self.component.placement
@@ -223,10 +223,10 @@ class Bridge:
         return KneePlace(pose, knee_coordinates(pose), patella)
 
     def twist(self, data: Any) -> Array:
-        """Return the femur's twist (6,) against the insert, at the insert's origin, insert frame.
+        """Return the femur's twist (6,) relative to the insert, at the insert's origin and axes.
 
         Args:
-            data: of the user's model, with joint placements and velocities up to date.
+            data: Pinocchio data of the user's model, with placements and velocities up to date.
         """
         insert = data.oMi[self.insert.joint] * self.insert.placement
         total = np.zeros(6)
@@ -237,10 +237,10 @@ class Bridge:
         return mirrored_spatial(total) if self.left else total
 
     def motion(self, data: Any, patella: bool) -> ChainMotion:
-        """Return how the chain moves, after the user's `pin.forwardKinematics(..., q, v, a)`.
+        """Return the motion of the chain.
 
         Args:
-            data: of the user's model.
+            data: Pinocchio data of the user's model, after `pin.forwardKinematics(..., q, v, a)`.
             patella: whether the chain has a patella. If the user's model has none, its coordinates
                 and rates are zero.
         """
@@ -272,12 +272,12 @@ class Bridge:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
         Args:
-            q: (nq,) configuration of the chain, with its root at the neutral pose.
-            place: (n,) the coordinates, m and rad.
+            q: configuration of the chain, with its root at the neutral pose, shape (nq,).
+            place: coordinates between the two bodies, shape (n,), m and rad.
             data: Pinocchio data of the user's model.
-            base: frame on the body that carries the other body.
-            follower: frame on the carried body.
-            own: which of the chain's joint coordinates these are.
+            base: frame on the parent body.
+            follower: frame on the child body.
+            own: slice of these coordinates in the chain's joint coordinates.
         """
         twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data
@@ -291,7 +291,7 @@ class Bridge:
         return np.stack([place, v[columns], acceleration])
 
     def _relative(self, data: Any, base: Place, follower: Place) -> tuple[Array, Array]:
-        """Return s and s' (6,) of the module's equations, in the axes of the carried body."""
+        """Return s and s' (6,) of the module's equations, in the axes of the child body."""
         placement, still = data.oMi[follower.joint] * follower.placement, pin.Motion.Zero()
         own, own_rate = (
             follower.placement.actInv(still if not follower.joint else values[follower.joint])
@@ -310,7 +310,7 @@ class Bridge:
         return mirrored_spatial(pair[0]), mirrored_spatial(pair[1])
 
     def relative_jacobian(self, data: Any, q: Array) -> Array:
-        """Return J (6, nv), see `tkamb.Knee.relative_jacobian`; `data` is brought up to date."""
+        """Return J (6, nv) of `tkamb.Knee.relative_jacobian`, and update `data`."""
         model = self.anatomy.model
         pin.computeJointJacobians(model, data, q)
         insert = data.oMi[self.insert.joint] * self.insert.placement
@@ -325,14 +325,14 @@ class Bridge:
     def configuration(self, q: Array, target: Array) -> Array:
         """Return q with the knee's joints changed so that the femur has a given pose.
 
-        Newton's method on the joints between tibia and femur.
+        Newton's method finds the coordinates of the joints between tibia and femur.
 
         Args:
-            q: (nq,) of the user's model.
+            q: configuration of the user's model, shape (nq,).
             target: pose_femoral_in_insert of a right knee.
 
         Raises:
-            InputError: these joints cannot make that pose.
+            InputError: these joints cannot produce that pose.
         """
         model = self.anatomy.model
         data, placement = model.createData(), self._placed(target)
@@ -346,7 +346,7 @@ class Bridge:
             pin.forwardKinematics(model, data, q)
             insert = data.oMi[self.insert.joint] * self.insert.placement
             femur = data.oMi[self.component.joint] * self.component.placement
-            # Pose error as a twist in the insert frame, which the joints must supply.
+            # Pose error as a twist in the insert frame. The joints must produce this twist.
             error = pin.log6(placement * insert.actInv(femur).inverse()).vector
             if np.abs(error).max() < KNEE.pose_tolerance:
                 return q
@@ -364,13 +364,13 @@ class Bridge:
         )
 
     def shank_needs(self, data: Any) -> Array:
-        """Return the wrench (6,) that motion and weight of the shank need, insert frame.
+        """Return the wrench (6,) for the inertia and weight of the shank, insert frame.
 
         It is the sum over the shank's bodies. If the tibia is fixed to the universe, it is the
         negative of the same sum over all bodies above the knee.
 
         Args:
-            data: of the user's model, after `pin.forwardKinematics(model, data, q, v, a)`.
+            data: Pinocchio data, after `pin.forwardKinematics(model, data, q, v, a)`.
         """
         needs = []
         for joint in self._shank:
@@ -385,7 +385,7 @@ class Bridge:
         If the tibia is fixed to the universe, it is the negative of the sum above the knee.
 
         Args:
-            data: of the user's model, with joint placements up to date.
+            data: Pinocchio data of the user's model, with joint placements up to date.
             external: forces on the joints, each in its joint's frame.
         """
         wrench = self._sum(data, self._shank, [external[joint] for joint in self._shank])
@@ -413,7 +413,7 @@ class Bridge:
         """Return loads on the chain's links as forces on the user's joints.
 
         Args:
-            data: of the user's model, with joint placements up to date.
+            data: Pinocchio data of the user's model, with joint placements up to date.
             loads: link -> wrench (6,) about the insert's origin, insert frame; or point forces.
 
         Returns:
@@ -455,7 +455,7 @@ def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
 def _solved(jacobian: Array, twist: Array) -> Array:
     """Return the joint rates that produce a twist (6,).
 
-    With fewer than six joints it is the least-squares solution. NaN if an input is not finite.
+    With fewer than six joints it is the least-squares solution. It is NaN for inputs that are NaN.
     """
     if not (np.isfinite(jacobian).all() and np.isfinite(twist).all()):
         return np.full(jacobian.shape[1], np.nan)
@@ -471,10 +471,10 @@ def canonical_state(
 
     Args:
         chain: the canonical chain.
-        motion: how it moves.
-        shank: (6,) wrench that motion and weight of the shank need, insert frame.
-        thigh: (6,) external wrench on the thigh, insert frame.
-        patella: (6,) external wrench on the patella, insert frame.
+        motion: motion of the chain.
+        shank: wrench for the inertia and weight of the shank, shape (6,), insert frame.
+        thigh: external wrench on the thigh, shape (6,), insert frame.
+        patella: external wrench on the patella, shape (6,), insert frame.
     """
     state = chain.at(motion)
     needs = [("tibia", shank), ("femur", -thigh)]

@@ -1,7 +1,7 @@
-"""The rigid-body chain in Pinocchio: motion in, inertial forces and load columns out.
+"""The rigid-body chain in Pinocchio: it turns a motion into inertial forces and load columns.
 
-The root is a free joint at the tibia, so that the measured ground reaction enters as a load. Other
-joints of the URDF, such as the ankle, are locked.
+The root is a free joint at the tibia, and the measured ground reaction is a load. Other joints of
+the URDF, such as the ankle, are locked.
 """
 
 import copy
@@ -27,13 +27,13 @@ from tkamb.units import STANDARD_GRAVITY
 
 @dataclass(frozen=True, eq=False)
 class ChainMotion:
-    """Where the chain is at one instant, SI.
+    """The motion of the chain at one instant, SI units.
 
     Args:
-        tibia: (4, 4) pose_tibia_in_laboratory (x forward, y up, z right).
-        tibia_velocity: (6,) spatial velocity (linear, angular) in the tibia's own frame.
-        tibia_acceleration: (6,) spatial acceleration, same frame.
-        joints: (3, 6) or (3, 9): knee (and patella) coordinates, rates, accelerations.
+        tibia: pose_tibia_in_laboratory, shape (4, 4) (x forward, y up, z right).
+        tibia_velocity: spatial velocity (linear, angular) in the tibia's frame, shape (6,).
+        tibia_acceleration: spatial acceleration in the tibia's frame, shape (6,).
+        joints: coordinates, rates and accelerations of knee (and patella), shape (3, 6) or (3, 9).
     """
 
     tibia: Array
@@ -49,7 +49,7 @@ class Chain:
         urdf: text of a checked URDF (`tkamb.io.recordings.patient.load_urdf`).
         with_patella: whether the patella moves. If not, it is fixed to the femur at its neutral
             pose.
-        gravity: m/s², downward in the laboratory.
+        gravity: acceleration, downward in the laboratory, m/s².
     """
 
     def __init__(self, urdf: str, with_patella: bool, gravity: float = STANDARD_GRAVITY) -> None:
@@ -70,12 +70,13 @@ class Chain:
     def changed(
         self, mass_factor: float, insert_shift: Array, insert_turn: Array | None = None
     ) -> "Chain":
-        """Return the chain with other masses, and the insert elsewhere on the tibia.
+        """Return the chain with other masses and another pose of the insert on the tibia.
 
         Args:
             mass_factor: factor on the mass and inertia of every segment.
-            insert_shift: (3,) m, displacement of the insert and the femur, in the insert's axes.
-            insert_turn: (3, 3) their rotation about the insert's origin, in its axes; None: none.
+            insert_shift: displacement of insert and femur, insert axes, shape (3,), m.
+            insert_turn: rotation of insert and femur about the insert's origin, insert axes, shape
+                (3, 3); None: no rotation.
         """
         other, model = copy.copy(self), pin.Model(self.model)
         for joint in range(1, model.njoints):
@@ -134,12 +135,13 @@ class Chain:
 
     @property
     def insert_in_tibia(self) -> Array:
-        """pose_insert_in_tibia (4, 4)."""
+        """The pose of the insert in the tibia, pose_insert_in_tibia (4, 4)."""
         return inverse(self._tibia_in_root) @ self._insert_in_root
 
     @property
     def patella_joint_in_femur(self) -> Array:
-        """pose_joint_in_femur (4, 4) of the joint in whose x-y plane the patella moves."""
+        """The pose (4, 4) of the patella's joint in the femur."""
+        # The patella moves in the x-y plane of this joint.
         return self.model.jointPlacements[self.model.getJointId(PATELLA_JOINT_NAMES[0])].homogeneous
 
     def link_in(self, link: str, base: str) -> Array:
@@ -158,25 +160,26 @@ class Chain:
         raise InputError(f"link '{link}' is fixed to neither tibia, femur nor patella", "URDF")
 
     def segment(self, link: str) -> tuple[float, Array, Array]:
-        """Return the inertia of a link, and of all that is fixed to it, in the link's frame.
+        """Return the inertia of a link and of all links fixed to it, in the link's frame.
 
-        Mass (kg), centre (3,) m, and tensor (3, 3) kg·m² about the centre.
+        Returns:
+            Mass, kg; centre of mass (3,), m; inertia tensor (3, 3) about that centre, kg·m².
         """
         frame = self.model.frames[self.frame_id(link)]
         whole = self.model.inertias[frame.parentJoint].se3Action(frame.placement.inverse())
         return float(whole.mass), np.array(whole.lever), np.array(whole.inertia)
 
     def on_shank(self, link: str) -> bool:
-        """Return whether a link is fixed to the tibia, and not on the femur's side."""
+        """Return whether a link is fixed to the tibia."""
         ends = [self.model.frames[self.frame_id(name)].parentJoint for name in (link, "tibia")]
         return bool(ends[0] == ends[1])
 
     def knee_columns(self) -> list[int]:
-        """Rows of the generalised force that belong to the six knee coordinates."""
+        """Return the rows of the six knee coordinates in the generalised force."""
         return self._columns[:6]
 
     def patella_columns(self) -> list[int]:
-        """Rows of the three patella coordinates; empty if the patella is fixed to the femur."""
+        """Return the rows of the three patella coordinates; empty: it is fixed to the femur."""
         return self._columns[6:]
 
     def at(self, motion: ChainMotion) -> "ChainState":
@@ -189,8 +192,8 @@ class Chain:
         root_in_tibia = pin.SE3(inverse(self._tibia_in_root))
         q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
         q[:7] = pin.SE3ToXYZQUAT(pin.SE3(motion.tibia) * root_in_tibia)
-        # Pinocchio's free joint takes the twist in the root's axes; the recording has it in the
-        # tibia's axes.
+        # The recording has the twist in the tibia's axes. Pinocchio's free joint has it in the
+        # root's axes.
         v[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_velocity)).vector
         a[:6] = root_in_tibia.actInv(pin.Motion(motion.tibia_acceleration)).vector
         for name, column, (x, rate, acceleration) in zip(
@@ -205,14 +208,13 @@ class ChainState:
     """The chain at one instant. Poses and loads are in the insert frame.
 
     Attributes:
-        inertial: (nv,) RNEA(q, v, a), the generalised forces that the sum of all loads equals.
+        inertial: RNEA(q, v, a), shape (nv,): generalised forces that all loads must add up to.
     """
 
     def __init__(self, chain: Chain, q: Array, v: Array, a: Array) -> None:
         self.chain, self.q, self.v, self.a = chain, q, v, a
         self.data = chain.model.createData()
-        # Recursive Newton-Euler: M a + C + gravity. The next call overwrites the data, hence the
-        # copy.
+        # Recursive Newton-Euler: M a + C + gravity. The next call overwrites the data.
         self.inertial: Array = pin.rnea(chain.model, self.data, q, v, a).copy()
         pin.computeJointJacobians(chain.model, self.data, q)
         pin.updateFramePlacements(chain.model, self.data)
@@ -222,7 +224,7 @@ class ChainState:
 
     @cached_property
     def laboratory_in_insert(self) -> Array:
-        """pose_laboratory_in_insert (4, 4)."""
+        """The pose of the laboratory in the insert, pose_laboratory_in_insert (4, 4)."""
         return inverse(self.insert_in_laboratory)
 
     def pose(self, link: str) -> Array:
@@ -235,7 +237,7 @@ class ChainState:
         return transform(self.pose(link), point)
 
     def generalised(self, groups: Sequence[Sequence[PointForces]]) -> Array:
-        """Return the generalised forces (nv, k) of k groups of loads: columns sum J^T w."""
+        """Return the generalised forces (nv, k) of k groups of loads: each column sums J^T w."""
         loads = [load for group in groups for load in group]
         column = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         total = np.zeros((self.chain.model.nv, len(groups)))
@@ -251,11 +253,11 @@ class ChainState:
         return total
 
     def add_need(self, link: str, wrench: Array) -> None:
-        """Add a wrench (6,) to what the sum of all loads must exert on a link.
+        """Add a wrench (6,) to the wrench that the sum of all loads must exert on a link.
 
         Args:
             link: name of the link.
-            wrench: (6,) force (N) and moment about the insert's origin (N·m), insert frame.
+            wrench: force (N) and moment about the insert's origin (N·m), insert frame, shape (6,).
         """
         self.inertial = self.inertial + self._jacobian(link).T @ wrench
 
@@ -263,9 +265,9 @@ class ChainState:
         """Return the ground reaction as a load on the tibia.
 
         Args:
-            force: (3,) N, laboratory axes.
-            point: (3,) m, where it acts, laboratory.
-            moment: (3,) N·m, free moment, laboratory axes.
+            force: force, laboratory axes, shape (3,), N.
+            point: point of application, laboratory frame, shape (3,), m.
+            moment: free moment, laboratory axes, shape (3,), N·m.
         """
         laboratory = self.laboratory_in_insert
         return PointForces(

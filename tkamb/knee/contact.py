@@ -1,7 +1,7 @@
 """The femorotibial contact of a knee at one pose: wrench, friction, stiffness and damping.
 
-Everything is in the insert frame of a right knee; a twist or a small displacement has the
-linear part (m/s or m) of the femoral component's point at the insert's origin, then the rotation.
+All vectors are in the insert frame of a right knee. A twist or small displacement (6,) describes
+the femoral component. Its linear part (m/s or m) is at the insert's origin; the rotation follows.
 """
 
 from collections.abc import Callable
@@ -25,17 +25,17 @@ class DifferenceSettings:
     """Central differences, for the stiffness of a model without an exact tangent."""
 
     step: float = 4e-6
-    """m: step of a translation. Chosen: large against the solver's residual error, small against
-    the radius of the contact."""
+    """m: step of a translation. Chosen because it is large against the solver's residual error, and
+    small against the radius of the contact."""
     exact_step: float = 1e-9
-    """m: step for a model without a solver, whose answers are exact. Chosen: far above rounding,
-    far below the size of a facet."""
+    """m: step of a translation for a model without an iterative solver. Chosen because it is far
+    above rounding errors and far below the size of a facet."""
     arm: float = 0.025
-    """m: lever arm; the step of a rotation is the step of a translation over this arm. Chosen: half
-    the distance of the condyles."""
+    """m: lever arm; the step of a rotation is the step of a translation over this arm. Chosen as
+    half the distance of the condyles."""
     tolerance: float = 1e-6
-    """Solver tolerance of a model that has one, for these evaluations. Chosen: a finite difference
-    divides the solver's error by the step."""
+    """1: solver tolerance for these evaluations, if the model has a tolerance. Chosen because a
+    finite difference divides the solver's error by the step."""
 
 
 CONTACT_DIFFERENCE = DifferenceSettings()
@@ -48,8 +48,7 @@ class KneeContact:
         model: the contact model.
         pair: femoral component and insert.
         friction: Coulomb coefficient.
-        state: state that the model's `prepare` returned for the pair; None: it is prepared at the
-            first use.
+        state: state that the model's `prepare` returned for the pair; None: prepared at first use.
     """
 
     def __init__(
@@ -67,9 +66,9 @@ class KneeContact:
         return self._state
 
     def changed(self, friction: float, modulus_factor: float = 1.0) -> "KneeContact":
-        """Return the same contact with another friction, and perhaps another modulus of the insert.
+        """Return the same contact with another friction and another modulus of the insert.
 
-        The prepared state is shared, unless the modulus differs.
+        The prepared state is shared if the modulus does not change.
         """
         if modulus_factor == 1.0:
             return KneeContact(self.model, self.pair, friction, self._state)
@@ -78,11 +77,11 @@ class KneeContact:
         return KneeContact(self.model, self.pair.of_material(stiffer), friction)
 
     def probe(self, start: Guess | None = None) -> Any:
-        """Return a new probe (`tkamb.contact.model.Probe`), which a caller keeps as warm start."""
+        """Return a new probe (`tkamb.contact.model.Probe`). The caller reuses it as warm start."""
         return self.model.probe(self.state, start)
 
     def precise_probe(self, start: Guess | None = None) -> Any:
-        """Return a new probe whose answers are precise enough for differences."""
+        """Return a new probe that is precise enough for finite differences."""
         names = {field.name for field in fields(self.model)}  # type: ignore[arg-type]
         if "tolerance" not in names:
             return self.probe(start)
@@ -93,7 +92,7 @@ class KneeContact:
         """Return the contact at a pose (4, 4).
 
         Raises:
-            ComputationError: the model is out of its range there, or has not converged.
+            ComputationError: the model is out of its range at the pose, or has not converged.
         """
         if not np.isfinite(place).all():
             raise ComputationError("the pose of the femur is not finite", "contact")
@@ -103,7 +102,7 @@ class KneeContact:
         return contact
 
     def _why(self, place: Array) -> str:
-        """Return in words why there is no contact at a pose (4, 4)."""
+        """Return words that explain why the model failed at a pose (4, 4)."""
         result = self.model.evaluate(self.state, place)
         words = "; ".join(result.flags) or result.status.value.replace("_", " ")
         if result.status is ContactStatus.OK:
@@ -112,11 +111,11 @@ class KneeContact:
         return f"{self.model.name}: {words} (approach {depth * 1e3:.3g} mm)"
 
     def wrench(self, contact: ProbedContact, twist: Array) -> Array:
-        """Return the wrench (6,) on the insert, friction included.
+        """Return the wrench (6,) on the insert, including friction.
 
         Args:
             contact: the contact at the pose.
-            twist: (6,) twist of the femur against the insert.
+            twist: twist of the femur relative to the insert, shape (6,).
         """
         total = np.zeros(6)
         for load in contact.loads:
@@ -132,11 +131,11 @@ class KneeContact:
         return wrench_of(touch.point, touch.normal - touch.direction(self.friction))
 
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
-        """Return the derivative (6, 6) of the wrench on the insert by the femur's twist.
+        """Return the derivative (6, 6) of the wrench on the insert with respect to the twist.
 
-        Only friction depends on the twist. Let v be the sliding velocity of a condyle's point, t
-        its part across the normal, s = sqrt(t.t + v0²) and P the projector across the normal. The
-        friction force mu N t/s changes with v by mu N (P/s - t t^T/s³).
+        Only friction depends on the femur's twist. Let v be the sliding velocity at a contact
+        point, t its tangential part, s = sqrt(t.t + v0²) and P the projector on the tangent plane.
+        The derivative of the friction force mu N t/s by v is mu N (P/s - t t^T/s³).
         """
         total = np.zeros((6, 6))
         for load in contact.loads if self.friction else ():
@@ -147,7 +146,7 @@ class KneeContact:
             speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
             across = np.eye(3) - np.outer(normal, normal)
             slope = across / speed - np.outer(tangential, tangential) / speed**3
-            # Chain rule: the twist moves the contact point, whose velocity decides the friction.
+            # Chain rule: the twist gives the velocity of the contact point, and this the friction.
             total += self.friction * load.force * point_jacobian.T @ slope @ point_jacobian
         return total
 
@@ -158,13 +157,13 @@ class KneeContact:
 
         Args:
             probe: probe of the model, used as warm start.
-            place: (4, 4) pose of the femoral component.
-            contact: the contact there.
-            twist: (6,) twist of the femur, which stays constant.
+            place: pose of the femoral component, shape (4, 4).
+            contact: the contact at this pose.
+            twist: constant twist of the femur, shape (6,).
             exact: True: central differences replace an approximate tangent of the model.
         """
-        # Friction turns with the contact normal, which the tangent of the model does not contain.
-        # With friction the exact stiffness therefore needs differences.
+        # Friction turns with the contact normal. The model's tangent does not contain this effect,
+        # so the exact stiffness with friction needs finite differences.
         rubs = bool(self.friction and np.any(twist) and contact.loads)
         if contact.tangent and not (exact and (rubs or not contact.exact)):
             total = np.zeros((6, 6))
@@ -193,7 +192,7 @@ def _cross_matrix(vector: Array) -> Array:
 def batch_differences(
     wrenches: Callable[[Array], Array], place: Array, settings: DifferenceSettings
 ) -> Array:
-    """Return the same as `differences`, for a function that takes all poses (12, 4, 4) at once."""
+    """Return the result of `differences` for a function of all poses (12, 4, 4) at once."""
     sizes = settings.step * np.array([1.0, 1.0, 1.0, *np.full(3, 1.0 / settings.arm)])
     steps = np.concatenate([np.diag(sizes), -np.diag(sizes)])
     turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
@@ -208,8 +207,8 @@ def differences(
 
     Args:
         wrench: function of a pose (4, 4) that returns a wrench (6,).
-        place: (4, 4) pose at which it is differentiated.
-        settings: step of the differences.
+        place: pose at which the wrench is differentiated, shape (4, 4).
+        settings: steps of the differences.
     """
     columns = []
     for k in range(6):
@@ -222,7 +221,7 @@ def differences(
 def displaced(place: Array, displacement: Array) -> Array:
     """Return a pose (4, 4) moved by a displacement (6,): translation, then rotation vector.
 
-    Both are about the insert's origin, in the insert frame.
+    The rotation is about the insert's origin. All vectors are in the insert frame.
     """
     turn = Rotation.from_rotvec(displacement[3:]).as_matrix()
     return pose(turn @ place[:3, :3], turn @ place[:3, 3] + displacement[:3])

@@ -1,4 +1,4 @@
-"""Contact points of the condyles on the insert, lift-off, and problems of a pose."""
+"""Contact points of the condyles on the insert, lift-off, and misplaced poses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ class ContactPointSettings:
     """m: gap above which a condyle may be lifted off, see `lift_off_angle`. Source: error of
     fluoroscopy (Sharma 2008, 4.3)."""
     max_gap: float = 3e-3
-    """m: a femoral component with a larger gap or penetration is misplaced. Chosen: larger than the
-    errors of fluoroscopy."""
+    """m: a femoral component with a larger gap or penetration is misplaced. Chosen because it is
+    larger than the errors of fluoroscopy."""
     standstill_speed: float = 1e-3
-    """m/s: v0 of the regularised friction, which fades below this sliding speed. Chosen: far below
-    the sliding of a moving knee."""
+    """m/s: v0 of the regularised friction. Friction fades below this sliding speed. Chosen because
+    it is far below the sliding speed of a moving knee."""
 
 
 CONTACT_POINT = ContactPointSettings()
@@ -36,13 +36,13 @@ CONTACT_POINT = ContactPointSettings()
 
 @dataclass(frozen=True, eq=False)
 class CondylePoint:
-    """Where one condyle touches the insert.
+    """The contact point of one condyle on the insert, insert frame.
 
     Args:
-        point: (3,) m.
-        normal: (3,) unit, out of the insert into the femur.
-        sliding: (3,) m/s, velocity of the femur's point relative to the insert's.
-        gap: m, positive when apart.
+        point: position, shape (3,), m.
+        normal: unit normal from the insert to the femur, shape (3,).
+        sliding: velocity of the femur relative to the insert at the point, shape (3,), m/s.
+        gap: gap, positive when apart, m.
     """
 
     point: Array
@@ -53,11 +53,11 @@ class CondylePoint:
     def direction(self, friction: float) -> Array:
         """Return the contact force on the femur (3,) per unit normal force.
 
-        n - mu t, with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
-        friction against the sliding, fading below v0 = 1 mm/s.
+        It is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v. This is Coulomb
+        friction that fades below v0 = 1 mm/s.
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal
-        # Without v0 the direction of the force would jump where the sliding reverses.
+        # Without v0 the direction of the force would jump when the sliding reverses.
         speed = np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2)
         return np.asarray(self.normal - friction * tangential / speed)
 
@@ -67,9 +67,9 @@ class ContactPoints:
     """The femorotibial contact of one pose, as input of the equations.
 
     Args:
-        condyles: side -> contact point; empty when contact is not modelled.
+        condyles: side -> contact point; empty: contact is not modelled.
         lifted: sides that are lifted off the insert.
-        problems: why the pose cannot be used, in words; empty: it can.
+        problems: reasons why the pose cannot be used; empty: it can be used.
     """
 
     condyles: dict[str, CondylePoint]
@@ -78,7 +78,7 @@ class ContactPoints:
 
 
 NO_CONTACT = ContactPoints({}, frozenset(), ())
-"""Contact is not modelled."""
+"""Contact points of a frame in which contact is not modelled."""
 
 
 def contact_points(
@@ -88,9 +88,9 @@ def contact_points(
 
     Args:
         query: closest points of the pair.
-        pose: (4, 4) pose_femoral_in_insert.
-        sliding: function of a point (3,) m, insert frame. It returns the velocity (3,) m/s of the
-            femur against the insert there.
+        pose: pose_femoral_in_insert, shape (4, 4).
+        sliding: function of a point (3,), m, insert frame. It returns the velocity (3,), m/s, of
+            the femur relative to the insert at that point.
     """
     gaps = query.at(pose)
     condyle_gaps = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
@@ -116,10 +116,10 @@ def _find_lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
     if len(condyles) < 2:
         return frozenset()
     medial, lateral = condyles["medial"], condyles["lateral"]
-    # z is medial-lateral, so this is the distance of the condyles in the coronal plane.
+    # z is medial-lateral: this is the distance of the contact points in the coronal plane.
     width = abs(lateral.point[2] - medial.point[2])
     higher = "lateral" if lateral.gap > medial.gap else "medial"
-    # Small angle: the difference of the gaps over the distance of the condyles.
+    # The coronal angle is small: it is the difference of the gaps over that distance.
     tilted = abs(lateral.gap - medial.gap) > CONTACT_POINT.lift_off_angle * width
     return frozenset(
         {higher} if tilted and condyles[higher].gap > CONTACT_POINT.lift_off_gap else ()

@@ -1,34 +1,35 @@
 """Muscles across the knee, other than the extensor group, in the equations of one frame.
 
-A taut line crosses from the shank at p to the thigh, or the pelvis above it, at q. With force F it
-pulls the shank at p along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank are
-one body, so that a line which ends on the foot pulls that body where it leaves the foot. A pull
-from the pelvis acts on the femur here, and the loads across the hip balance it with all other
-loads on the thigh. Both ends are fixed to their links and follow the knee.
+A taut line crosses from the shank at p to the thigh or pelvis at q. A force F pulls the shank at p
+along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank are one body: a line that
+ends on the foot pulls this body at the point where the line leaves the foot. The force of a line
+from the pelvis is applied to the femur, and the hip loads balance it. Both ends are fixed to their
+links and move with them.
 
-The equations are linear in all loads while contact points and lines are fixed. Two things follow.
+The equations are linear in all loads while contact points and lines are fixed. This has two uses.
 
-1. The tension of the extensor group is Q = Q_0 + sum_i g_i F_i + h r, with Q_0 its value without
-   the other muscles, F_i their forces, and r a moment on the tibia about the insert's z. Solved
-   for r this is the knee's row of a static optimisation (`flexion_row`),
+1. The tension of the extensor group is Q = Q_0 + sum_i g_i F_i + h r. Q_0 is the tension without
+   the other muscles, F_i are the forces of the other muscles, and r is a moment on the tibia about
+   the insert's z. Solved for r this is the knee's row of a static optimisation (`flexion_row`),
 
-       -Q_0/h = -(1/h) Q + sum_i (g_i/h) F_i + r,
+       -Q_0/h = -(1/h) Q + sum_i (g_i/h) F_i + r.
 
-   with contact, ligaments, patella and friction in it: -1/h is the arm of the extensor group,
-   -Q_0/h the moment that all muscles together supply. With released coordinates, contact points
-   and the medial-lateral split depend on the muscles. The row then comes from the tension of the
-   patellar ligament, which is linear in the muscle forces by the tangent of contact and ligaments
-   (`ReleasedForces.tension_per_wrench`). A condyle that lifts off changes that row smoothly.
+   The row includes contact, ligaments, patella and friction. -1/h is the moment arm of the extensor
+   group, and -Q_0/h is the moment that all muscles together supply. If coordinates are released,
+   contact points and the medial-lateral split depend on the muscles. The row then comes from the
+   tension of the patellar ligament. With the tangent of contact and ligaments this tension is
+   linear in the muscle forces (`ReleasedForces.tension_per_wrench`). A condyle that lifts off
+   changes that row smoothly.
 
-2. The normal forces are the sum of what each load causes by itself (`condyle_contributions`),
+2. A normal force is the sum of the contributions of all loads (`condyle_contributions`),
 
        N_side = N_side(weight, inertia and ground) + N_side(ligaments) + sum_i N_side(muscle i),
 
-   and N_side(post) where a cam on the insert's post is modelled. Each term is computed with all
-   other muscles and, except in their own term, the ligaments at zero force. A muscle alone leaves
-   a flexion moment at the knee. A moment about the insert's z balances it, beside the residuals
-   that balance the AP and ML force and the axial moment in every frame. The sum of these moments
-   over all terms is the knee's reserve. The extensor group is one muscle here.
+   plus N_side(post) if a cam on the insert's post is modelled. Each term is computed with all other
+   muscles and ligaments at zero force. One muscle alone leaves a flexion moment at the knee, which
+   a moment about the insert's z balances. As in every frame, residuals balance the AP and ML force
+   and the axial moment. The sum of the moments about z over all terms is the knee's reserve. The
+   extensor group is one muscle here.
 
 References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
 Sasaki & Neptune, J Biomech 43:2780 (2010), doi:10.1016/j.jbiomech.2010.06.011.
@@ -56,10 +57,10 @@ class CrossingLines:
     """Lines from the shank to the thigh at one frame.
 
     Args:
-        shank: (c, 3) m, points where they leave the shank or the foot, tibia link.
-        thigh: (c, 3) m, points where they reach the thigh or the pelvis, femur link.
-        knee: (4, 4) pose of the femur link in the tibia link for which the points were computed;
-            None: not known.
+        shank: points where the lines leave the shank or foot, tibia frame, shape (c, 3), m.
+        thigh: points where the lines arrive at the thigh or pelvis, femur frame, shape (c, 3), m.
+        knee: pose of the femur in the tibia for which the points were computed, shape (4, 4);
+            None: unknown.
     """
 
     shank: Array
@@ -69,9 +70,9 @@ class CrossingLines:
     def turned(self, state: "ChainState") -> float:
         """Return the rotation of the knee since the points were computed, rad; NaN: unknown.
 
-        The end of a line that wraps a bone or passes a via point moves as the knee turns. Here the
-        ends are fixed to their links, so that the error of a line's direction is about this angle
-        at most.
+        The end of a line that wraps a bone or passes a via point moves as the knee rotates. Here
+        the ends are fixed to their links. The error of a line's direction is at most about this
+        angle.
         """
         if self.knee is None:
             return float("nan")
@@ -83,8 +84,8 @@ class CrossingLines:
         """Return the wrenches (..., c, 6) of one newton of each line on the insert.
 
         Args:
-            tibia: (4, 4) pose of the tibia link in the insert frame.
-            femur: (..., 4, 4) poses of the femur link in it.
+            tibia: pose of the tibia link in the insert frame, shape (4, 4).
+            femur: poses of the femur link in the insert frame, shape (..., 4, 4).
         """
         start = transform(tibia, self.shank)
         along = np.einsum("...ij,cj->...ci", femur[..., :3, :3], self.thigh)
@@ -106,7 +107,7 @@ class CrossingLines:
         return PointForces("tibia", start, pulls), PointForces("femur", end, -pulls)
 
     def _ends(self, state: "ChainState") -> tuple[Array, Array, Array]:
-        """Return starts, ends and directions (c, 3), insert frame."""
+        """Return the starts, ends and unit directions (c, 3) of the lines, insert frame."""
         start = transform(state.pose("tibia"), self.shank)
         end = transform(state.pose("femur"), self.thigh)
         along = end - start
@@ -119,13 +120,13 @@ class MuscleShare:
 
     Args:
         muscles: names of the m muscles.
-        activation: (m,) activations, 0 to 1.
-        force: (m,) N.
+        activation: activations, 0 to 1, shape (m,).
+        force: muscle forces, shape (m,), N.
         coordinates: names of the n balanced coordinates of the leg.
-        moment: (n,) N·m, joint moments, which muscles and reserves supply together.
-        reserve: (n,) N·m, part of the moments that no muscle supplies.
+        moment: joint moments that muscles and reserves supply together, shape (n,), N·m.
+        reserve: part of the moments that no muscle supplies, shape (n,), N·m.
         flexion: index of the knee's flexion among the coordinates.
-        crossing: (c,) indices of the muscles that cross the knee, without the extensor group.
+        crossing: indices of the muscles across the knee, without the extensor group, shape (c,).
         lines: lines of action of these c muscles.
         status: "ok" or "failed: …".
     """
@@ -150,8 +151,8 @@ class MuscleShare:
         """Return the wrench (..., 6) of these loads on the insert, about its origin.
 
         Args:
-            tibia: (4, 4) pose of the tibia link in the insert frame.
-            femur: (..., 4, 4) poses of the femur link in it.
+            tibia: pose of the tibia link in the insert frame, shape (4, 4).
+            femur: poses of the femur link in the insert frame, shape (..., 4, 4).
         """
         units = self.lines.unit_wrenches(tibia, femur)
         total = np.einsum("i,...ij->...j", self.force[self.crossing], units)
@@ -160,7 +161,7 @@ class MuscleShare:
 
     @property
     def _knee_reserve(self) -> Array:
-        """(3,) N·m on the tibia, about the insert's z."""
+        """The knee's reserve moment on the tibia about the insert's z, (3,), N·m."""
         return self.reserve[self.flexion] * unknowns.AXES["ml"]
 
 
@@ -169,9 +170,9 @@ class FlexionRow:
     """The knee's row of the static optimisation.
 
     Args:
-        moment: N·m on the tibia about the insert's z, which muscles and reserve supply together.
-        extensor_arm: m, moment arm of the extensor group.
-        arms: (c,) m, moment arms of the crossing muscles.
+        moment: moment on the tibia about the insert's z from muscles and reserve together, N·m.
+        extensor_arm: moment arm of the extensor group, m.
+        arms: moment arms of the crossing muscles, shape (c,), m.
     """
 
     moment: float
@@ -182,7 +183,7 @@ class FlexionRow:
 def flexion_row(
     geometry: KneeGeometry, lines: CrossingLines, friction: float, lifted: frozenset[str]
 ) -> FlexionRow:
-    """Return the row at one frame with a taut extensor mechanism.
+    """Return the knee's row of the static optimisation, with a taut extensor mechanism.
 
     Args:
         geometry: the frame with an extensor mechanism; forces of other muscles are ignored.
@@ -195,8 +196,7 @@ def flexion_row(
     """
     if geometry.extensor is None:
         raise ComputationError("; ".join(geometry.problems) or "no patella", "muscles")
-    # Forces of the other muscles are the unknown of the row, so that the equations must not hold
-    # them.
+    # The forces of the other muscles are the unknowns of the row, so the equations exclude them.
     alone = replace(geometry, share=None)
     system = KneeSystem(alone, friction, LoadState(lifted, frozenset()))
     if not system.solution.regular:
@@ -212,16 +212,16 @@ def flexion_row(
 def yielding_flexion_row(
     geometry: KneeGeometry, lines: CrossingLines, base: float, per_wrench: Array
 ) -> FlexionRow:
-    """Return the row at one frame if the released coordinates yield to the muscles.
+    """Return the knee's row of the static optimisation if released coordinates move with muscles.
 
-    By the patella's equilibrium the extensor group's tension is Q = a T + b, T the tension of the
-    patellar ligament.
+    By the patella's equilibrium the extensor group's tension is Q = a T + b, where T is the tension
+    of the patellar ligament.
 
     Args:
         geometry: the frame with an extensor mechanism; its contact is not used.
         lines: lines of action of the muscles that cross the knee.
-        base: N, tension of the patellar ligament without the other muscles.
-        per_wrench: (6,) 1 and 1/m, change of that tension by a wrench on the insert.
+        base: tension of the patellar ligament without the other muscles, N.
+        per_wrench: change of that tension per wrench on the insert, shape (6,), 1 and 1/m.
 
     Raises:
         ComputationError: the equations of the patella are singular.
@@ -234,7 +234,7 @@ def yielding_flexion_row(
 
 
 def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
-    """Return a and b (N) of Q = a T + b, from the three equations of the patella."""
+    """Return a (1) and b (N) of Q = a T + b from the three equations of the patella."""
     extensor, state = geometry.extensor, geometry.state
     assert extensor is not None
     femur_ml = state.pose("femur")[:3, 2]
@@ -255,13 +255,13 @@ def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
 
 
 def _solved_for_reserve(alone: float, gains: Array, slope: float) -> FlexionRow:
-    """Return the row of Q = alone + gains F + slope r."""
+    """Return the row from Q = alone + gains F + slope r, solved for the reserve r."""
     return FlexionRow(-alone / slope, -1.0 / slope, np.asarray(gains / slope))
 
 
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
-"""Names of contributions other than single muscles: weight, inertia and ground reaction; all
-ligaments; a cam on the post; the extensor group."""
+"""Names of contributions other than single muscles. "external": weight, inertia and ground
+reaction. "ligaments": all ligaments. "post": a cam on the post. "quadriceps": extensor group."""
 
 
 def condyle_contributions(
@@ -273,14 +273,14 @@ def condyle_contributions(
 
     Args:
         geometry: a frame with contact, extensor mechanism and the other muscles.
-        loads: its solution; a lifted side has no contributions.
+        loads: solution of the frame; a lifted side has no contributions.
         friction: Coulomb coefficient of the femorotibial contact.
     """
     share, extensor = geometry.share, geometry.extensor
     if share is None or extensor is None or loads.problems:
         return {}
     slack = frozenset(extensor.muscles) if loads.slack else frozenset[str]()
-    # With every known load at zero the solution is the contribution of weight, inertia and ground.
+    # If all known loads are zero, the solution is the contribution of weight, inertia and ground.
     bare = replace(geometry, share=None, ligaments=(), post=())
     system = KneeSystem(bare, friction, LoadState(loads.lifted, slack))
     lines = share.lines.unit_loads(geometry.state)
@@ -293,7 +293,7 @@ def condyle_contributions(
     caused = np.column_stack([outside, unit[:, :-1] * pulls])
     pulled = np.zeros(len(outside))
     if not slack:
-        # The extensor group is a known load here; a flexion moment is the unknown in its place.
+        # The extensor group is a known load here. A flexion moment replaces it as unknown.
         row = system.names.index(unknowns.muscle_load(extensor.muscles[0]))
         per_newton = unit[:, -1] / unit[row, -1]
         caused = caused - np.outer(per_newton, caused[row])

@@ -1,12 +1,12 @@
-"""One frame of the knee: known geometry in, every unknown load out.
+"""The equations of one frame of the knee: they give all unknown loads from a known geometry.
 
 The full model has 15 equations (6 of the free root, 6 of the knee, 3 of the patella) and 15
 unknowns: hip force and moment (6), one muscle, patellar ligament, patellofemoral force (2), medial
-and lateral normal force, and three residuals. A smaller model has fewer:
+and lateral normal force, and three residuals. A smaller model has other unknowns:
 
-- without muscles the chain has no patella, and the flexion moment is one more residual;
-- without contact a force and the coronal and axial moments act at the femoral origin, and without
-  muscles the flexion moment, too.
+- Without muscles the chain has no patella, and the flexion moment is an additional residual.
+- Without contact a force and the coronal and axial moments act at the femoral origin. Without
+  muscles the flexion moment acts there, too.
 """
 
 from collections.abc import Iterable, Mapping
@@ -39,8 +39,8 @@ class EquationSettings:
     """The equations of motion of the leg."""
 
     residual_shift: float = 0.010
-    """m: shift along y of the point where the residuals act, by which the column
-    `residual_sensitivity_N` is defined."""
+    """m: shift along y of the point where the residuals act. It defines the column
+    `residual_sensitivity_N`."""
 
 
 EQUATION = EquationSettings()
@@ -51,14 +51,14 @@ PATELLAR = ("patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
 @dataclass(frozen=True, eq=False)
 class Extensor:
-    """The extensor mechanism at one frame, insert frame; tensions are unknown.
+    """The extensor mechanism at one frame, insert frame. Its tensions are unknown.
 
     Args:
         patellar_ligament: loads on the links at a tension of one newton.
-        contact_point: (3,) m, patellofemoral contact.
-        contact_normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
+        contact_point: point of patellofemoral contact, shape (3,), m.
+        contact_normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
         muscles: names of the extensor group, the muscles that insert on the patella.
-        wrap: rad, angle over which the extensor group wraps the femur.
+        wrap: angle over which the extensor group wraps the femur, rad.
     """
 
     patellar_ligament: tuple[PointForces, ...]
@@ -81,14 +81,14 @@ class KneeGeometry:
         ground: ground reaction on the shank; None: not measured.
         ligaments: loads of the ligaments on the links.
         condyles: side -> contact point; empty: contact is not modelled.
-        lifted: sides that the recorded gap keeps off the insert.
+        lifted: sides that are lifted off the insert by their recorded gap.
         extensor: the extensor mechanism; None: not modelled.
         muscles: the unknown tension of each muscle on its line of action.
-        coordinates: (6,) knee coordinates of this geometry, m and rad.
-        tensions: ligament name -> N.
+        coordinates: knee coordinates of this geometry, shape (6,), m and rad.
+        tensions: ligament name -> tension, N.
         share: the other muscles with their forces; None: not modelled.
         post: loads of a cam on the insert's post; empty: not modelled, or no contact.
-        problems: why the equations cannot be set up, in words; empty: they can.
+        problems: reasons why the equations cannot be set up; empty: they can.
     """
 
     state: ChainState
@@ -110,17 +110,18 @@ class SolvedLoads:
     """Loads from the equations of one frame; NaN where there is no solution.
 
     Args:
-        values: unknown -> magnitude, N or N·m.
-        contact_force: (3,) N of the condyles on the femur, insert frame, without residuals.
-        external_flexion: N·m, moment that tends to flex, about the femoral ML axis.
-        external_adduction: N·m, moment that tends to adduct, about the floating axis.
-        sensitivity: N, largest change of the total contact force if the residuals act 10 mm higher
-            or lower.
+        values: name of an unknown -> magnitude, N or N·m.
+        contact_force: force of the condyles on the femur without residuals, insert frame, shape
+            (3,), N.
+        external_flexion: external flexion moment about the femoral ML axis, N·m.
+        external_adduction: external adduction moment about the floating axis, N·m.
+        sensitivity: largest change of the total contact force if the residuals act 10 mm higher
+            or lower, N.
         condition: condition number of the matrix with unit columns.
         lifted: sides that carry no load.
         slack: whether the extensor group carries no load, because it would have to push.
-        ambiguous: whether another load state, too, has no wrong sign.
-        problems: why there is no solution, in words; empty: there is one.
+        ambiguous: whether a second load state has no wrong sign either.
+        problems: reasons why there is no solution; empty: there is a solution.
     """
 
     values: dict[str, float]
@@ -138,8 +139,9 @@ class SolvedLoads:
 def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     """Return all loads of one frame, in the load state without a wrong sign.
 
-    If several states have no wrong sign, that with the fewest zero loads is taken, and `ambiguous`
-    is true. If every state has a wrong sign, there is no solution. See `tkamb.knee.unknowns`.
+    If several states have no wrong sign, the state with the fewest zero loads is used, and
+    `ambiguous` is true. If every state has a wrong sign, there is no solution. See
+    `tkamb.knee.unknowns`.
 
     Args:
         geometry: the frame.
@@ -148,15 +150,15 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     off = geometry.lifted
     extensors = geometry.extensor.muscles if geometry.extensor else ()
     first, *others = load_states(geometry.condyles, off, extensors)
-    # The state in which all loads act is tried first; most frames need no other.
+    # The state in which all loads act is solved first. Most frames need no other state.
     full = KneeSystem(geometry, friction, first)
     condition = full.solution.condition
     if not full.solution.regular:
         return replace(unsolved(("singular equations",)), condition=condition)
     if not wrong_signs(first, full.solution):
         return full.loads()
-    # A contact that would pull, or a muscle that would push, carries no load. All combinations are
-    # solved, and one without a wrong sign is taken.
+    # A contact cannot pull and a muscle cannot push: they carry no load instead. All combinations
+    # are solved, and a combination without a wrong sign is used.
     systems = {first: full} | {state: KneeSystem(geometry, friction, state) for state in others}
     solutions = {state: system.solution for state, system in systems.items()}
     wrong = {state: contradictions(state, solutions, off) for state in systems}
@@ -170,7 +172,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
 
 
 def solved_unknowns(geometry: KneeGeometry, loads: SolvedLoads, friction: float) -> list[Unknown]:
-    """Return the unknown loads of one frame in the load state that was found.
+    """Return the unknown loads of one frame in the load state of its solution.
 
     Args:
         geometry: the frame.
@@ -192,19 +194,19 @@ def unsolved(problems: Iterable[str]) -> SolvedLoads:
 def dome_sensitivity(
     geometry: KneeGeometry, loads: SolvedLoads, friction: float
 ) -> tuple[float, float] | None:
-    """Return the change of muscle and patellofemoral force as the button sits higher, N/m.
+    """Return the change of muscle and patellofemoral force per height of the button, N/m.
 
-    The patellofemoral force passes through the contact of the button with the femur. The arms about
-    that line decide the ratio of muscle and patellar-ligament tension. A button that sits higher or
-    lower on the patella (its y axis) shifts the line sideways and changes the arms. A button that
-    sits deeper (x) shifts the line along itself and changes little. The position of the button is
-    not known to a millimetre.
+    The patellofemoral force passes through the contact of the button with the femur. The moment
+    arms about this line of action decide the ratio of muscle and patellar-ligament tension. A
+    button that is higher or lower on the patella (y axis) shifts the line sideways and changes the
+    arms. A deeper button (x axis) shifts the line along itself and changes little. The position of
+    the button is not known to a millimetre.
 
-    Here the line is shifted along the patella's y axis and the patella does not move. With A x = b
-    the frame's equations, dx = -A⁻¹ dA x. Measured per millimetre on the shipped knee, from
-    extension to 120 deg: the quadriceps changes by 1.6 to 5.6 % and the patellofemoral force by 1.0
-    to 4.3 %. A patella that moves to its new equilibrium turns by up to 1 deg per millimetre, which
-    cancels most of this: the quadriceps then changes by 1.6 % at most. The value for the quadriceps
+    Here the line is shifted along the patella's y axis and the patella does not move. If A x = b
+    are the frame's equations, dx = -A⁻¹ dA x. On the shipped knee, from extension to 120 deg, the
+    quadriceps changes by 1.6 to 5.6 % per millimetre, and the patellofemoral force by 1.0 to 4.3 %.
+    A patella that moves to its new equilibrium rotates by up to 1 deg per millimetre and cancels
+    most of this change: the quadriceps then changes by 1.6 % at most. The value for the quadriceps
     is therefore an upper estimate.
 
     Args:
@@ -213,15 +215,15 @@ def dome_sensitivity(
         friction: Coulomb coefficient of the femorotibial contact.
 
     Returns:
-        Changes of the extensor group's tension and of the patellofemoral force; zero if it is
-        slack. None without an extensor mechanism.
+        Changes of the extensor group's tension and of the patellofemoral force, N/m; zero if the
+        extensor group is slack. None without an extensor mechanism.
     """
     extensor, state = geometry.extensor, geometry.state
     if extensor is None:
         return None
     if loads.slack:
         return 0.0, 0.0
-    bare = replace(geometry, share=None, ligaments=(), post=())  # known loads stay as they are
+    bare = replace(geometry, share=None, ligaments=(), post=())  # known loads do not change
     system = KneeSystem(bare, friction, LoadState(loads.lifted, frozenset()))
     femur_ml, up = state.pose("femur")[:3, 2], state.pose("patella")[:3, 1]
     at_contact = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
@@ -241,7 +243,7 @@ class KneeSystem:
     Args:
         geometry: the frame.
         friction: Coulomb coefficient.
-        assumed: the load state, the loads that are assumed to be zero.
+        assumed: load state: the loads that are assumed to be zero.
     """
 
     def __init__(self, geometry: KneeGeometry, friction: float, assumed: LoadState) -> None:
@@ -252,7 +254,7 @@ class KneeSystem:
         unknown_forces = self.unknowns = [*hip, *self._extensor(), *self._knee()]
         self.names = [unknown.name for unknown in unknown_forces]
         ground = [geometry.ground] if geometry.ground else []
-        # Unit couples about x and z, by which `sensitivity` shifts the residual forces along y.
+        # `sensitivity` shifts the residual forces along y by these unit couples about x and z.
         couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]
         pulls = geometry.share.loads(state) if geometry.share else ()
         given_loads = (*geometry.ligaments, *geometry.post, *pulls)
@@ -271,7 +273,7 @@ class KneeSystem:
         return [side for side in self.geometry.condyles if side not in self.lifted]
 
     def loads(self) -> SolvedLoads:
-        """Return the solution as loads, with the zero loads among them."""
+        """Return the solution as loads, including the zero loads."""
         values = self.solution.values
         flexion, adduction = self.external_moments()
         return SolvedLoads(
@@ -298,8 +300,8 @@ class KneeSystem:
         return np.asarray(np.sum(forces, axis=0))
 
     def response(self, loads: Array) -> Array:
-        """Return the change of the unknowns (k, n) per unit of each known load, columns (k, n)."""
-        # Unknowns balance the added loads, hence the sign.
+        """Return the change of the unknowns (k, n) per unit of known loads, columns (k, n)."""
+        # The sign is negative because the unknowns balance the added loads.
         return np.asarray(-np.linalg.solve(self._columns, loads))
 
     def sensitivity(self) -> float:
@@ -326,19 +328,19 @@ class KneeSystem:
         """Return the external flexion and adduction moments, N·m.
 
         Hip, ground, gravity and inertia require generalised forces of the knee about its flexion
-        and adduction axes; the external moments are their negatives. The knee centre is the femoral
-        origin, where the three axes meet.
+        and adduction axes. The external moments are the negatives of these forces. The three axes
+        meet at the femoral origin, the centre of the knee.
         """
         hip = self._columns[:, :6]
-        # The knee's internal loads vanish in the six equations of the free root, so that these
-        # give the hip's six unknowns.
+        # The knee's internal loads cancel in the six equations of the free root. These equations
+        # therefore give the hip's six unknowns.
         at_hip = np.linalg.solve(hip[:6], self._outside[:6])
         knee = self._outside - hip @ at_hip
         rows = self.geometry.state.chain.knee_columns()
         return -float(knee[rows[5]]), -float(knee[rows[4]])
 
     def _zero_loads(self) -> list[str]:
-        """Return the loads of the extensor mechanism that are zero, where it is slack."""
+        """Return the names of the extensor loads that are zero if the mechanism is slack."""
         return [*map(muscle_load, self.slack), *PATELLAR] if self.slack else []
 
     def _extensor(self) -> list[Unknown]:

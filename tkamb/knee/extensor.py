@@ -35,9 +35,9 @@ class ExtensorParts:
         muscle: the muscle that pulls the patella.
         ligament: the patellar ligament.
         chain: chain of the knee.
-        femoral: femoral component, in the femur link's frame.
-        button: patellar button, in the patella link's frame.
-        insert: insert, in the insert frame; None: the ligament wraps nothing.
+        femoral: surface of the femoral component, in the femur link's frame.
+        button: surface of the patellar button, in the patella link's frame.
+        insert: surface of the insert, in the insert frame; None: the ligament does not wrap.
     """
 
     muscle: Muscle
@@ -64,11 +64,11 @@ class ExtensorLines:
     Attributes:
         muscle: line of action of the muscle.
         ligament: line of action of the patellar ligament.
-        mechanism: the mechanism as the search for the patella takes it.
+        mechanism: input of the search for the patella.
         prepared: the patellofemoral contact, shared by all objects with the same surfaces.
 
     Raises:
-        InputError: a line starts inside what it wraps.
+        InputError: a line starts inside the bone that it wraps.
     """
 
     def __init__(self, parts: ExtensorParts) -> None:
@@ -79,7 +79,7 @@ class ExtensorLines:
         self.mechanism, self.prepared = self._build_mechanism()
 
     def given(self, pose: Array, coordinates: Array) -> PatellaState:
-        """Return the patella at given coordinates (3,), the femur at a pose (4, 4)."""
+        """Return the patella at given coordinates (3,) with the femur at a pose (4, 4)."""
         contact = self.mechanism.contact.at(coordinates)
         return patella_at(self.mechanism, pose, coordinates, contact)
 
@@ -89,9 +89,10 @@ class ExtensorLines:
         """Return the patella in equilibrium.
 
         Args:
-            pose: (4, 4) pose_femur_in_insert.
-            guess: the patella at a pose near by, as initial guess.
-            near: (3,) m and rad, initial guess without `guess`; None: all rotations are searched.
+            pose: pose_femur_in_insert, shape (4, 4).
+            guess: the patella at a similar pose, as initial guess.
+            near: coordinates as initial guess if `guess` is None, shape (3,), m and rad; None: all
+                rotations are searched.
         """
         if guess is None or not guess.status.found:
             return solve_patella(self.mechanism, pose, near)
@@ -103,9 +104,9 @@ class ExtensorLines:
         """Return the mechanism and its muscle, for the equations of one frame.
 
         Args:
-            flexion: rad, for messages.
+            flexion: flexion, for messages, rad.
             state: the chain at that frame.
-            patella: the patella there.
+            patella: the patella at that frame.
 
         Raises:
             ComputationError: the patella was not found, or an end of a line lies inside the
@@ -139,10 +140,11 @@ class ExtensorLines:
 
         Args:
             poses: link -> pose (4, 4) in the insert frame.
-            patella: the patella there.
-            flexion: rad, for messages.
-            tension: N, of the muscle.
-            patellar_tension: N, of the patellar ligament; None: from the patella's equilibrium.
+            patella: the patella at these poses.
+            flexion: flexion, for messages, rad.
+            tension: tension of the muscle, N.
+            patellar_tension: tension of the patellar ligament, N; None: from the patella's
+                equilibrium.
 
         Raises:
             ComputationError: the patella has no equilibrium with forces of the right signs.
@@ -159,8 +161,7 @@ class ExtensorLines:
         else:
             pulls += scaled(extensor.patellar_ligament, patellar_tension)
             pull = sum(load.forces.sum(axis=0) for load in pulls if load.link == "patella")
-            # The groove takes no force along the femur's ML axis; the patella is guided in its
-            # plane.
+            # The contact has no force along the femur's ML axis: the patella stays in its plane.
             across = poses["femur"][:3, 2]
             force = -(pull - (pull @ across) * across)
         point = patella.contact_point[None]
@@ -171,7 +172,7 @@ class ExtensorLines:
         ]
 
     def paths_at(self, poses: Mapping[str, Array]) -> tuple[TautPath, TautPath]:
-        """Return the same as `paths`, from link -> pose (4, 4) in the insert frame."""
+        """Return the result of `paths` from link -> pose (4, 4) in the insert frame."""
         return self.paths(_Poses(poses))
 
     def paths(self, state: Posed) -> tuple[TautPath, TautPath]:
@@ -194,12 +195,12 @@ class ExtensorLines:
         return Line("patellar_ligament", (ligament.proximal, ligament.distal), wrap)
 
     def _tibia_in_insert(self) -> Array:
-        """Return the pose in the insert frame of the link that holds the ligament's end."""
+        """Return the pose of the link of the ligament's distal end in the insert frame."""
         on_tibia = self._chain.link_in(self._parts.ligament.distal.link, "tibia")
         return inverse(self._chain.insert_in_tibia) @ on_tibia
 
     def _check_fixed_ends(self) -> None:
-        """Raise if an end that is fixed to the wrapped bone lies inside its outline."""
+        """Raise an error if an end that is fixed to the wrapped bone lies inside its outline."""
         ends, name = [], self.muscle.name
         if self.muscle.wrap is not None:
             last = self.muscle.points[self.muscle.wrap.stretch]
@@ -245,18 +246,19 @@ class ExtensorFrames:
 
     Args:
         lines: the extensor mechanism.
-        time: (f,) s.
-        poses: (f, 4, 4) pose_femur_in_insert.
-        recorded: (f, 3, 3) patella coordinates, rates and accelerations; None: they are solved.
+        time: times of the frames, shape (f,), s.
+        poses: pose_femur_in_insert, shape (f, 4, 4).
+        recorded: patella coordinates, rates and accelerations, shape (f, 3, 3); None: the patella
+            is solved.
         rates: function of time (n,) and coordinates (n, 3). It returns the filtered coordinates
             and their first and second derivatives.
 
     Attributes:
         lines: the extensor mechanism.
-        states: the patella at each frame; a recorded one is evaluated on first use.
+        states: the patella at each frame; a recorded patella is evaluated at first use.
 
     Raises:
-        InputError: the patella is found nowhere.
+        InputError: the patella is found in fewer than two frames.
     """
 
     def __init__(
@@ -276,12 +278,12 @@ class ExtensorFrames:
     def moved(self, lines: ExtensorLines, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
         """Return a solved patella for slightly changed lines or poses of the femur.
 
-        In the given frames the patella is solved again, with its present place as initial guess.
-        Rates, and the patella in the other frames, stay the same.
+        In the given frames the patella is solved again, with its present position as initial guess.
+        The rates and all other frames do not change.
 
         Args:
             lines: the changed mechanism.
-            poses: (f, 4, 4) changed pose_femur_in_insert.
+            poses: changed pose_femur_in_insert, shape (f, 4, 4).
             frames: frames in which the patella is solved again.
         """
         other = copy.copy(self)
@@ -306,16 +308,16 @@ class ExtensorFrames:
     def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
         """Return the patella of frame k with the femur at another pose (4, 4).
 
-        A recorded patella keeps its coordinates. A solved patella is solved again, with `guess` or
-        its place at the recorded pose as initial guess.
+        A recorded patella keeps its coordinates. A solved patella is solved again. The initial
+        guess is `guess` or the patella at the recorded pose.
         """
         mechanism = self.lines.mechanism
         if self._contacts is not None:
             return patella_at(mechanism, pose, self._contacts.places[k], self._contacts[k])
         own = self.states[k]
         if guess is not None and own.status.found:
-            # If the search from a distant guess fails, that from the frame's own place may
-            # converge.
+            # If the search from a distant guess fails, the search from the frame's own solution
+            # may converge.
             near = guess.coordinates
             solution = solve_patella(mechanism, pose, near, guess.slopes, anywhere=False)
             if solution.status.found:
@@ -325,14 +327,13 @@ class ExtensorFrames:
         return solve_patella(mechanism, pose, last.coordinates, last.slopes)
 
     def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
-        """Return the solved coordinates with their rates (f, 3, 3); NaN where the patella is lost.
+        """Return the solved coordinates with their rates (f, 3, 3); NaN: the patella is lost.
 
-        The coordinates are those of equilibrium. The filter is for rates and accelerations alone:
-        at a filtered place the button would not touch and the moments would not balance.
+        Only rates and accelerations are filtered. At filtered coordinates the button would not
+        touch the femur and the moments would not balance.
 
-        Lost frames between solved ones are bridged for the rates of their neighbours (shape-
-        preserving cubic): a patella of 0.1 kg turns an acceleration that is wrong by 1 m/s²
-        into 0.1 N.
+        The rates next to a lost frame need coordinates in that frame: a shape-preserving cubic
+        interpolates them. An error of 1 m/s² changes the force on a patella of 0.1 kg by 0.1 N.
         """
         places = np.array([state.coordinates for state in self.states])
         solved_frames = np.flatnonzero(np.isfinite(places).all(axis=1))
@@ -393,11 +394,11 @@ def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> Patell
 
 
 class _RecordedContacts:
-    """The contact at each recorded place, computed on first use.
+    """The patellofemoral contact at recorded coordinates, computed at first use.
 
     Args:
         contact: contact of the two surfaces, without stored distances.
-        places: (f, 3) m and rad, recorded coordinates of the patella.
+        places: recorded coordinates of the patella, shape (f, 3), m and rad.
     """
 
     def __init__(self, contact: PatellofemoralContact, places: Array) -> None:
@@ -412,7 +413,7 @@ class _RecordedContacts:
 
 @lru_cache(maxsize=1)
 def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
-    """Return the contacts at recorded places, which do not depend on the knee's pose.
+    """Return the contacts at recorded coordinates. They do not depend on the knee's pose.
 
     Args:
         prepared: the prepared contact; the cache compares its identity.
@@ -422,7 +423,7 @@ def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _
 
 
 class _RecordedStates(Sequence[PatellaState]):
-    """The patella where it was recorded, at the recorded poses of the femur (f, 4, 4)."""
+    """The recorded patella at the recorded poses of the femur (f, 4, 4)."""
 
     def __init__(
         self, mechanism: ExtensorMechanism, poses: Array, contacts: _RecordedContacts
@@ -448,7 +449,7 @@ class _RecordedStates(Sequence[PatellaState]):
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
-    """Return the patella at each frame, with the frame before as initial guess."""
+    """Return the patella at each frame, with the previous frame as initial guess."""
     states: list[PatellaState] = []
     for pose in poses:
         near = (states[-1].coordinates, states[-1].slopes) if states else ()
@@ -468,5 +469,5 @@ class _Poses:
 
 
 def _on_tibia(load: PointForces) -> PointForces:
-    """Return a load on the link "insert", which is fixed to the tibia, as one on "tibia"."""
+    """Return a load with the link "insert" replaced by "tibia". The two are fixed to each other."""
     return replace(load, link="tibia") if load.link == "insert" else load

@@ -1,4 +1,4 @@
-"""The contact of one frame as a run records it: both condyles, and cam and post."""
+"""The contact of one frame in a run: both condyles, and cam and post."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,8 +27,8 @@ class PostSideSettings:
     """Limits for cam and post."""
 
     pose_error: float = 0.5 * MILLIMETRE
-    """m: overlap of cam and post at a recorded pose above which a flag is set. Chosen: the usual
-    error of a position from fluoroscopy."""
+    """m: overlap of cam and post at a recorded pose above which a flag is set. Chosen because it is
+    the usual error of a position from fluoroscopy."""
 
 
 POST_SIDE = PostSideSettings()
@@ -41,17 +41,17 @@ def cam_on_post(
     material: "Material",
     ready: "CamPost | None" = None,
 ) -> "CamPost":
-    """Return cam and post, prepared.
+    """Return the prepared contact of cam and post.
 
     Args:
         model: the contact model.
         pair: femoral component and insert.
-        post: of the insert, insert frame.
-        material: of the insert.
-        ready: an earlier result, perhaps with another material; None: there is none.
+        post: surface of the insert's post, insert frame.
+        material: material of the insert.
+        ready: an earlier result, perhaps with another material; None: no earlier result.
 
     Raises:
-        InputError: as `CamPost`.
+        InputError: the errors of `CamPost`.
     """
     if ready is not None:
         return ready if ready.material == material else ready.of_material(material)
@@ -63,9 +63,9 @@ def cam_on_post(
 def post_contact(
     cam_post: "CamPost | None", pose: "Array", released: Sequence[str]
 ) -> "PostContact | None":
-    """Return cam and post at a pose (4, 4), with a flag if a recorded AP makes them overlap.
+    """Return the contact of cam and post at a pose (4, 4); None: not modelled.
 
-    None if they are not modelled.
+    The result has a flag if cam and post overlap at a recorded AP position.
     """
     if cam_post is None:
         return None
@@ -84,23 +84,23 @@ NAN = float("nan")
 
 @dataclass(frozen=True, eq=False)
 class FrameContact:
-    """The contact side of one frame.
+    """The contact of one frame, with the data of its computation.
 
     Args:
         result: the contact; None: it could not be computed.
-        medial: (n,) whether a map point lies under the medial condyle.
-        adjustment: the femoral adjustment after its check; None: none was asked for.
+        medial: whether each map point lies under the medial condyle, shape (n,).
+        adjustment: the femoral adjustment after its check; None: the run has no adjustment.
         seconds: computing time, s.
-        problem: why there is no result, in words; empty: there is one.
-        flags: remarks on the result, in words.
+        problem: reason why there is no result; empty: there is a result.
+        flags: flags of the result.
         iterations: number of iterations between loads and contact; 0: not coupled.
-        load_change: N, change of the load in the last iteration.
-        point_change: m, change of the centres of pressure in the last iteration.
-        equilibrium: result of the search for released coordinates; None: there are none.
-        sensitivity: N/rad, change of the medial force with adduction (`split_sensitivity`); NaN if
+        load_change: change of the load in the last iteration, N.
+        point_change: change of the centres of pressure in the last iteration, m.
+        equilibrium: result of the search for released coordinates; None: none are released.
+        sensitivity: change of the medial force with adduction (`split_sensitivity`), N/rad; NaN if
             adduction is released, or with one condyle.
         start: warm start of the next frame; None: there is no result.
-        triangles: (k, 3) triangles of the map.
+        triangles: triangles of the map, shape (k, 3).
         post: contact of cam and post; None: not modelled.
     """
 
@@ -122,8 +122,7 @@ class FrameContact:
     def area_above(self, side: str, pressure: float) -> float:
         """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
 
-        The pressure is taken as linear between the map's points, see
-        `tkamb.contact.area.area_above`.
+        The pressure is linear between the map points, see `tkamb.contact.area.area_above`.
         """
         if self.result is None or self.triangles is None:
             return NAN

@@ -1,7 +1,7 @@
 """A knee at one instant: its geometry and loads, at the pose of q or at other knee coordinates.
 
-The motion of the shank follows from q, v and a alone. The wrench that the knee must exert on the
-shank is therefore computed once, and holds for all knee coordinates that a search tries.
+The motion of the shank depends on q, v and a alone. The wrench that the knee must exert on the
+shank is therefore computed once for all knee coordinates of a search.
 """
 
 from collections.abc import Mapping
@@ -52,10 +52,10 @@ class SharingMuscles(Protocol):
     def share_of_yielding_knee(
         self, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> "MuscleShare":
-        """Return the force of each muscle if the released coordinates yield to the forces."""
+        """Return the force of each muscle if the released coordinates depend on these forces."""
 
     def at(self, share: "MuscleShare") -> "MuscleShare":
-        """Return a share with the lines of action of this instant."""
+        """Return the forces of a share with the lines of action of this instant."""
 
     def tension(self, share: "MuscleShare") -> float:
         """Return the tension of the extensor group, N."""
@@ -70,8 +70,8 @@ class PatellaAt:
 
     Args:
         lines: the extensor mechanism.
-        pose: (4, 4) pose of the femur in the insert frame at q.
-        coordinates: (3,) patella coordinates of q, m and rad; None: q has none.
+        pose: pose of the femur in the insert frame at q, shape (4, 4).
+        coordinates: patella coordinates of q, shape (3,), m and rad; None: q has none.
         solved: True: the patella is solved again at other poses. False: it is fixed to the femur.
     """
 
@@ -99,11 +99,11 @@ class Instant:
     Args:
         chain: the canonical chain.
         motion: motion of the chain.
-        shank: (6,) wrench that motion and weight of the shank need, insert frame.
-        thigh: (6,) external wrench on the thigh, insert frame.
-        on_patella: (6,) external wrench on the patella, insert frame.
-        ligaments: the bundles, with ends on links of the chain.
-        extensor: finds the patella; None: not modelled.
+        shank: wrench for the inertia and weight of the shank, shape (6,), insert frame.
+        thigh: external wrench on the thigh, shape (6,), insert frame.
+        on_patella: external wrench on the patella, shape (6,), insert frame.
+        ligaments: ligament bundles, with ends on links of the chain.
+        extensor: object that finds the patella; None: not modelled.
         friction: Coulomb coefficient.
         two_condyles: whether the femoral component has two condyles.
         ground: external load on the shank; None: no load.
@@ -138,8 +138,8 @@ class Instant:
         """Return the knee without its contact.
 
         Args:
-            coordinates: (6,) knee coordinates, m and rad; None: those of q.
-            patella: the patella; None: it is found.
+            coordinates: knee coordinates, shape (6,), m and rad; None: those of q.
+            patella: the patella; None: `extensor` finds it.
         """
         place = self.coordinates if coordinates is None else coordinates
         motion = self.motion
@@ -169,7 +169,7 @@ class Instant:
         return replace(geometry, extensor=extensor, muscles=(muscle,))
 
     def _pulls(self, state: "ChainState") -> tuple[dict[str, float], tuple[PointForces, ...]]:
-        """Return ligament -> tension (N), and their loads on the links."""
+        """Return ligament -> tension (N), and the ligaments' loads on the links."""
         if not self.ligaments:
             return {}, ()
         from tkamb.knee.ligaments import ligament_loads
@@ -184,7 +184,7 @@ class Instant:
         return contact_points(query, pose, lambda point: self.sliding(self.coordinates, point))
 
     def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
-        """Return a geometry with the muscles' forces added, and its loads.
+        """Return a geometry with the muscle forces added, and its loads.
 
         Args:
             geometry: result of `geometry`, with contact points.
@@ -196,13 +196,13 @@ class Instant:
         return self.muscles.solve(geometry, self.friction)
 
     def sliding(self, coordinates: Array, point: Array) -> Array:
-        """Return the velocity (3,) m/s of a point of the femur against the insert.
+        """Return the velocity (3,), m/s, of a point of the femur relative to the insert.
 
         The rates of the knee coordinates are those of q and v.
 
         Args:
-            coordinates: (6,) knee coordinates, m and rad.
-            point: (3,) m, insert frame.
+            coordinates: knee coordinates, shape (6,), m and rad.
+            point: position, insert frame, shape (3,), m.
         """
         velocity, spin = knee_twist(coordinates, self.motion.joints[1, :6])
         return np.asarray(velocity + cross(spin, point - coordinates[:3]))
@@ -213,8 +213,8 @@ class Instant:
         """Return the resultants of a contact as the contact points of the equations.
 
         Args:
-            coordinates: (6,) knee coordinates, m and rad.
-            condyles: side -> its load on the insert there.
+            coordinates: knee coordinates, shape (6,), m and rad.
+            condyles: side -> load on the insert at these coordinates.
         """
         return {
             side: CondylePoint(
@@ -234,9 +234,9 @@ class Instant:
 
         Args:
             geometry: result of `geometry`.
-            coordinates: (6,) knee coordinates, m and rad.
-            condyles: side -> its load on the insert there; a side without one carries no load.
-            points: side -> (3,) m, point where an unloaded condyle is nearest to the insert.
+            coordinates: knee coordinates, shape (6,), m and rad.
+            condyles: loaded side -> its load on the insert at these coordinates.
+            points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
         """
         up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
         separated = {
@@ -249,18 +249,18 @@ class Instant:
     def post_loads(
         self, coordinates: Array, post: "CondyleWrench | None"
     ) -> tuple[PointForces, ...]:
-        """Return the loads of a cam on the post on tibia and femur, with friction.
+        """Return the loads of cam and post on tibia and femur, including friction.
 
         Args:
-            coordinates: (6,) knee coordinates, m and rad.
-            post: load of the cam on the insert there; None: no contact.
+            coordinates: knee coordinates, shape (6,), m and rad.
+            post: load of the cam on the insert at these coordinates; None: no contact.
         """
         if post is None:
             return ()
         sliding = self.sliding(coordinates, post.point)
         touch = CondylePoint(post.point, post.normal, sliding, 0.0)
         force = -post.force * touch.direction(self.friction)
-        # The couple that the cam's pressure has about the centre of pressure.
+        # Couple of the cam's pressure about its centre.
         twist = post.wrench[3:] - cross(post.point, post.wrench[:3])
         return (
             PointForces("tibia", post.point[None], force[None], twist),

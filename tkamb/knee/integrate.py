@@ -1,14 +1,14 @@
 """Forward dynamics of a model with a knee: one implicit time step, as an example to copy.
 
-With v_m = (1 - theta) v + theta v' the step solves
+Let v_m = (1 - theta) v + theta v'. Newton's method solves the equations of a step h,
 
-    v' = v + h a(q + theta h v_m, v_m),    q' = q + h v_m
+    v' = v + h a(q + theta h v_m, v_m),    q' = q + h v_m,
 
-for v' by Newton's method, where a is the result of `pin.aba` with `Knee.external_forces`. theta =
-1/2 is the implicit midpoint rule, of second order, which conserves the energy of a frictionless
-contact. theta = 1 is implicit Euler, of first order, which dissipates energy and so converges to
-the knee's equilibrium. An explicit step would have to resolve the contact, which oscillates at 100
-Hz or more under the mass of a thigh.
+for v'. The acceleration a is the result of `pin.aba` with `Knee.external_forces`. theta = 1/2 is
+the implicit midpoint rule. It is of second order and conserves the energy of a frictionless
+contact. theta = 1 is implicit Euler. It is of first order and dissipates energy, so that the knee
+converges to equilibrium. An explicit step would have to resolve the oscillation of the contact,
+which has 100 Hz or more under the mass of a thigh.
 
 Reference: Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed., II.1.1 (2006),
 doi:10.1007/3-540-30666-8.
@@ -32,15 +32,15 @@ class ImplicitStepSettings:
 
     velocity_tolerance: float = 1e-8
     """m/s and rad/s: residual of the step's equation below which Newton's method has converged.
-    Chosen: far below any speed of a knee."""
+    Chosen because it is far below any speed of a knee."""
     max_newton_steps: int = 40
-    """Newton steps at most. Chosen: steps that converge need fewer."""
+    """Maximum number of Newton steps. Chosen because a time step that converges needs fewer."""
 
 
 IMPLICIT_STEP = ImplicitStepSettings()
 
 REUSE_BELOW = 0.2
-"""1: the Jacobian is used again while each Newton step reduces the residual below this share."""
+"""1: the Jacobian is reused while each Newton step reduces the residual below this share."""
 
 
 def implicit_step(
@@ -56,19 +56,20 @@ def implicit_step(
     data: KneeData | None = None,
     linear: bool = False,
 ) -> tuple[Array, Array]:
-    """Return q and v one step later.
+    """Return q and v after one time step.
 
     Args:
-        knee: the knee, whose model moves.
-        q: (nq,) configuration.
-        v: (nv,) velocity.
+        knee: the knee on the model that moves.
+        q: configuration, shape (nq,).
+        v: velocity, shape (nv,).
         step: time step, s.
-        tau: (nv,) torques and forces of the joints, N·m and N; None: zero.
-        external: forces on the joints beside those of the knee, as `fext` of `pin.aba`.
-        tensions: muscle -> N, as for `Knee.external_forces`.
+        tau: torques and forces of the joints, shape (nv,), N·m and N; None: zero.
+        external: other forces on the joints, as `fext` of `pin.aba`; None: zero.
+        tensions: muscle -> tension, N, as for `Knee.external_forces`.
         theta: 0.5: implicit midpoint; 1: implicit Euler.
-        friction_of_joints: (nv,) viscous friction of the joints, N·s/m or N·m·s/rad; None: zero.
-        data: from `Knee.create_data`, to save time.
+        friction_of_joints: viscous friction of the joints, shape (nv,), N·s/m or N·m·s/rad; None:
+            zero.
+        data: data from `Knee.create_data`; they save time.
         linear: True: one Newton step, the linearly implicit method of first order. It takes a third
             of the time or less, and does not check the residual of the step.
 
@@ -86,7 +87,7 @@ def implicit_step(
         place = pin.integrate(model, q, theta * step * middle)
         try:
             forces = knee.external_forces(place, middle, tensions, data)
-        except ComputationError:  # too deep: half of Newton's step
+        except ComputationError:  # penetration too large: halve Newton's step
             if not change.any():
                 raise
             change = change / 2.0
@@ -109,12 +110,12 @@ def implicit_step(
             stiffness = stiffness + _turning(knee, own, data)
             damping = knee.damping(place, middle, data)
             pin.computeABADerivatives(model, cache, place, middle, torque, forces)
-            # In Pinocchio's derivatives the forces are constant; the knee's stiffness and damping
-            # add their change.
+            # Pinocchio's derivatives hold the forces constant. The knee's stiffness and damping add
+            # the change of the forces.
             by_q = cache.ddq_dq - cache.Minv @ jacobian.T @ stiffness @ jacobian
             by_v = cache.ddq_dv - cache.Minv @ (jacobian.T @ damping @ jacobian + np.diag(drag))
-            # Derivative of the residual by the end velocity, on which the place depends by
-            # theta * step and the velocity by theta.
+            # Derivative of the residual by the end velocity v'. The derivative of the middle
+            # velocity by v' is theta, that of the configuration theta * theta * step.
             slope = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
         last = size
         change = -np.linalg.solve(slope, missed)
@@ -131,8 +132,9 @@ def implicit_step(
 def _turning(knee: Knee, forces: Any, data: KneeData) -> Array:
     """Return the stiffness (6, 6) due to the rotation of the femur, insert frame.
 
-    Derivatives of `pin.aba` hold a force fixed in the joint's frame, while the knee's force on the
-    femur is fixed in the insert's: displaced by xi it turns back by xi x* w against the femur.
+    The derivatives of `pin.aba` hold a force constant in the joint's frame. The knee's force w on
+    the femur is constant in the insert frame: a displacement xi of the femur changes w by -xi x* w
+    in the femur's frame.
     """
     bridge, placements = knee.bridge, data.data.oMi
     insert = placements[bridge.insert.joint] * bridge.insert.placement

@@ -3,9 +3,9 @@
     knee = tkamb.Knee(model, side="right", implant=..., ligaments=[...], contact=..., friction=0.05)
     tau = pin.rnea(model, data, q, v, a, knee.external_forces(q, v))
 
-All units are SI; arguments and results are NumPy arrays and Pinocchio types. No call reads a file,
-prints, or changes the result of the next call. A `KneeData`, which the caller creates and passes,
-saves time.
+All units are SI. Arguments and results are NumPy arrays and Pinocchio types. A call reads no files,
+prints nothing, and does not change the result of the next call. To save time, a caller creates a
+`KneeData` and passes it to each call.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,14 +41,15 @@ class Equilibrium:
     """Result of `Knee.equilibrium`.
 
     Args:
-        q: (nq,) configuration of the user's model in equilibrium.
-        coordinates: (6,) knee coordinates there, as those of a right knee, m and rad.
-        loads: loads of the knee there.
-        contact: the contact there; None: no equilibrium was found.
-        residual: N (moments are divided by 25 mm), largest residual force on a released
-            coordinate.
-        stiffness: (n, n) N/m, of the n released coordinates, with rotations times 25 mm.
-        problem: why no equilibrium was found, in words; empty: one was found.
+        q: configuration of the user's model in equilibrium, shape (nq,).
+        coordinates: knee coordinates in equilibrium, shape (6,), m and rad. The coordinates of a
+            left knee are those of its mirror image.
+        loads: loads of the knee in equilibrium.
+        contact: the contact in equilibrium; None: no equilibrium was found.
+        residual: largest residual force on a released coordinate, N (moments divided by 25 mm).
+        stiffness: stiffness of the n released coordinates, shape (n, n), N/m (rotations times
+            25 mm).
+        problem: reason why no equilibrium was found; empty: it was found.
         search: details of the search.
     """
 
@@ -65,19 +66,19 @@ class Equilibrium:
 class Knee(AssembledKnee):
     """A total knee replacement on a user's Pinocchio model.
 
-    The knee lies between the frames "femur" and "tibia" of the model. There may be any joints
-    between them, above and below. Its parts are placed by these frames, which are found by their
-    names or given by `frames`:
+    The knee lies between the frames "femur" and "tibia" of the model. The model may have any joints
+    between, above and below these frames. Frames of the model give the poses of the knee's parts.
+    The argument `frames` names a frame if its name differs from that of the part:
 
-    - `femur`, `tibia`: needed; attachment points may lie on any frame that is fixed to them;
-    - `femoral`: axes of the femoral component's mesh, fixed to the femur. Default: `femur`;
+    - `femur`, `tibia`: required. Attachment points may lie on any frame that is fixed to them.
+    - `femoral`: axes of the femoral component's mesh, fixed to the femur. Default: `femur`.
     - `insert`: axes of the insert's mesh, fixed to the tibia. Default: the placement of a joint
-      "knee_ap" on the tibia, or `tibia`;
-    - `patella`: a body that moves against the femur. Default: the equilibrium of the extensor
-      mechanism gives the place of the patella;
-    - `hip`: hip centre, fixed to the femur. Default: the joint that carries the femur.
+      "knee_ap" on the tibia, or `tibia`.
+    - `patella`: a body that moves relative to the femur. Default: the equilibrium of the extensor
+      mechanism gives the pose of the patella.
+    - `hip`: hip centre, fixed to the femur. Default: the parent joint of the femur.
 
-    A part that is not given is not modelled, and its code is not imported.
+    A part whose argument is missing is not modelled, and its code is not imported.
 
     Args:
         model: any Pinocchio model; it is not changed.
@@ -85,13 +86,13 @@ class Knee(AssembledKnee):
         implant: meshes, material and bearing of the implant.
         ligaments: ligament bundles with slack lengths.
         extensor: quadriceps, patella and patellar ligament.
-        contact: a contact model (`tkamb.contact_model`), its name, or the `contact` of another knee
-            with the same implant, which is prepared already; None: no contact.
+        contact: a contact model (`tkamb.contact_model`), its name, or the prepared `contact` of
+            another knee with the same implant; None: no contact.
         friction: Coulomb coefficient of the femorotibial contact.
         muscles: straight lines of given tension between any frames of the model.
         frames: part of the knee -> name of its frame in the model.
-        joints: names of the joints between tibia and femur, which are checked; empty: no check.
-        cache: whether a lattice keeps its prepared operators on disk for the next time.
+        joints: expected names of the joints between tibia and femur; empty: no check.
+        cache: whether a lattice stores its prepared operators on disk for later runs.
 
     Raises:
         InputError: the arguments do not fit together.
@@ -106,24 +107,23 @@ class Knee(AssembledKnee):
     ) -> Any:
         """Return the forces of contact, ligaments and muscles on the bodies at q and v.
 
-        The contact follows from the overlap of the bodies at q, and its friction from v. The
-        patella is massless here: it transmits the quadriceps' tension to patellar ligament and
-        femur.
+        The overlap of the bodies at q gives the contact force, and v its friction. The patella is
+        massless here: it transmits the quadriceps' tension to patellar ligament and femur.
 
         Args:
-            q: (nq,) configuration.
-            v: (nv,) velocity.
-            tensions: muscle -> N, or a number, the tension of the quadriceps. Other muscles are
-                slack. If "patellar_ligament" is given beside the quadriceps, as in
-                `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
-            data: from `create_data`, to save time.
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            tensions: muscle -> tension, N; or the tension of the quadriceps alone, N. Muscles
+                without a tension are slack. If "patellar_ligament" is given with the quadriceps, as
+                in `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
+            data: data from `create_data`; they save time.
 
         Returns:
             `pin.StdVec_Force`, one per joint in its joint's frame: `fext` of `pin.rnea` and
             `pin.aba`.
 
         Raises:
-            InputError: q or v of the wrong size, or an unknown muscle.
+            InputError: q or v has the wrong size, or a muscle is unknown.
             ComputationError: the contact model is out of its range, or the patella is not found.
         """
         data = self.create_data() if data is None else data
@@ -165,22 +165,22 @@ class Knee(AssembledKnee):
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
     ) -> Array:
-        """Return the derivative (6, 6) of the femorotibial wrench by the relative twist.
+        """Return the derivative (6, 6) of the femorotibial wrench by the relative displacement.
 
         The wrench on the insert is the sum of contact, friction and ligaments between femur and
-        tibia: force (N) and moment about the insert's origin (N·m). The displacement of the femoral
-        component against the insert is that of its point at the insert's origin (m) and its
-        rotation (rad). Both are in the insert frame; v is constant.
+        tibia: force (N) and moment about the insert's origin (N·m). The displacement is that of the
+        femoral component relative to the insert: translation at the insert's origin (m), then
+        rotation (rad). All vectors are in the insert frame. v is constant.
 
         Args:
-            q: (nq,) configuration.
-            v: (nv,) velocity.
-            data: from `create_data`, to save time.
-            exact: False: a tangent of the contact model is used even if it is approximate, as that
-                of the lattices with a softening material.
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            data: data from `create_data`; they save time.
+            exact: False: use a tangent of the contact model even if it is approximate. The lattices
+                with a softening material have an approximate tangent.
 
         Raises:
-            ComputationError: as `external_forces`.
+            ComputationError: the contact model is out of its range.
         """
         data = self.create_data() if data is None else data
         place = self._kinematics(data, q, v)
@@ -193,10 +193,10 @@ class Knee(AssembledKnee):
         return self._mirrored_matrix(total)
 
     def damping(self, q: Array, v: Array, data: KneeData | None = None) -> Array:
-        """Return the derivative (6, 6) of the femorotibial wrench by the rate of the twist.
+        """Return the derivative (6, 6) of the femorotibial wrench by the relative twist.
 
-        As `stiffness`, but the derivative by the femur's velocity against the insert (m/s, rad/s).
-        Only friction depends on the velocity.
+        The twist is the velocity of the femur relative to the insert (m/s, rad/s), in the
+        conventions of `stiffness`. Only friction depends on the velocity.
         """
         data = self.create_data() if data is None else data
         place = self._kinematics(data, q, v)
@@ -222,21 +222,22 @@ class Knee(AssembledKnee):
         bodies, or the resultants of `contact`.
 
         Args:
-            q: (nq,) configuration.
-            v: (nv,) velocity.
-            a: (nv,) acceleration.
-            external: forces on the joints, each in its joint's frame, as `fext` of `pin.rnea`: the
-                ground reaction and all other external forces. None: there are none.
-            tensions: muscle of `muscles` -> N. The quadriceps is unknown and cannot be given.
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            a: acceleration, shape (nv,).
+            external: ground reaction and all other external forces on the joints, each in its
+                joint's frame, as `fext` of `pin.rnea`; None: zero.
+            tensions: muscle of `muscles` -> tension, N. The tension of the quadriceps is unknown
+                and cannot be given.
             contact: a contact from `press` or `evaluate`; None: closest points.
-            data: from `create_data`, to save time.
+            data: data from `create_data`; they save time.
 
         Returns:
-            The loads. Without a solution they are NaN, and `problems` says why.
+            The loads. Without a solution they are NaN, and `problems` states the reasons.
 
         Raises:
-            InputError: an argument of the wrong size, an unknown muscle, or a contact given to a
-                knee without a contact model.
+            InputError: an argument has the wrong size, a muscle is unknown, or a contact is given
+                to a knee without a contact model.
         """
         data = self.create_data_for_kinematics() if data is None else data
         instant = self.instant(q, v, a, external, tensions, data)
@@ -261,28 +262,28 @@ class Knee(AssembledKnee):
         """Return the contact under a load, at the rotations, AP and ML of q.
 
         Args:
-            q: (nq,) configuration.
-            load: N, compressive force along the insert's y axis, 0 or more.
-            guess: an earlier result or warm start, to save time.
+            q: configuration, shape (nq,).
+            load: compressive force along the insert's y axis, 0 or more, N.
+            guess: an earlier result or a warm start; it saves time.
 
         Returns:
             Pressure, area and forces of both condyles, in the insert frame of a right knee: a
             left knee is computed as its mirror image (z to -z).
 
         Raises:
-            InputError: no contact model, or a load that is negative or not finite.
+            InputError: the knee has no contact model, or the load is negative or not finite.
         """
         return self.press_from(q, load, guess)[0]
 
     def press_from(
         self, q: Array, load: float, start: "Guess | None" = None
     ) -> "tuple[ContactResult, WarmStart]":
-        """Return the same as `press`, and the warm start of the next press near by.
+        """Return the result of `press`, and a warm start for the next press at a similar pose.
 
         Args:
-            q: (nq,) configuration.
-            load: N, as for `press`.
-            start: warm start that the last press returned, to save time.
+            q: configuration, shape (nq,).
+            load: load of `press`, N.
+            start: warm start of the last press; it saves time.
         """
         contact = self._need_contact()
         if not (np.isfinite(load) and load >= 0):
@@ -293,7 +294,7 @@ class Knee(AssembledKnee):
     def evaluate(self, q: Array, guess: "Guess | None" = None) -> "ContactResult":
         """Return the contact at q: pressure, area and forces from the overlap of the bodies.
 
-        The result is as that of `press`, but the height is that of q.
+        The result has the form of `press`, but the height of the femur is that of q.
         """
         contact = self._need_contact()
         place = self._kinematics(self.create_data_for_kinematics(), q)
@@ -311,22 +312,22 @@ class Knee(AssembledKnee):
     ) -> Equilibrium:
         """Return the pose at which the released coordinates are in equilibrium, with its loads.
 
-        Flexion and the coordinates that are not released stay as in q. The superior-inferior
-        position is always released. The motion of the shank is that of q, v and a. The released
-        coordinates are quasi-static (docs/equilibrium.md).
+        Flexion and the coordinates that are not released keep their values of q. The
+        superior-inferior position is always released. The motion of the shank is that of q, v and
+        a. The released coordinates are quasi-static (docs/equilibrium.md).
 
         Args:
-            q: (nq,) configuration, the initial guess.
-            v: (nv,) velocity.
-            a: (nv,) acceleration.
-            external: as for `inverse_dynamics`.
-            released: names of "ap", "ml", "axial_rotation", "adduction"; "si" is always released.
-            tensions: as for `inverse_dynamics`.
-            data: from `create_data`, to save time.
+            q: configuration, the initial guess, shape (nq,).
+            v: velocity, shape (nv,).
+            a: acceleration, shape (nv,).
+            external: external forces, see `inverse_dynamics`.
+            released: some of "ap", "ml", "axial_rotation", "adduction"; "si" is always released.
+            tensions: muscle tensions, see `inverse_dynamics`.
+            data: data from `create_data`; they save time.
 
         Raises:
-            InputError: an unknown coordinate, no contact model, or too few degrees of freedom
-                between tibia and femur to reach the pose.
+            InputError: a coordinate is unknown, the knee has no contact model, or the joints
+                between tibia and femur have too few degrees of freedom for the pose.
             ComputationError: the femur does not lie over the insert.
         """
         from tkamb.knee.released import ReleasedKnee
@@ -373,21 +374,21 @@ class Knee(AssembledKnee):
         show_knee(self, viewer, q, **options)
 
     def live(self, q: Array, load: float = 1000.0, folder: Any = None) -> Any:
-        """Serve a page on which the knee is moved and loaded by hand (docs/live.md).
+        """Serve a page on which a user moves and loads the knee by hand (docs/live.md).
 
-        The load acts along the insert's y axis, beside the ligaments between femur and tibia. The
-        page does not change this object.
+        The load acts along the insert's y axis, in addition to the ligaments between femur and
+        tibia. The page does not change this object.
 
         Args:
-            q: (nq,) configuration, or (f, nq) for the slider "recorded frame".
-            load: N, first value of the load.
+            q: configuration, shape (nq,), or (f, nq) for the slider "recorded frame".
+            load: first value of the load, N.
             folder: folder for saved scenes; None: out/live.
 
         Returns:
-            The server. Its address is `url`; it answers until `close()`.
+            The server. Its address is `url`; it runs until `close()`.
 
         Raises:
-            InputError: no contact model, or a model that was not made by `tkamb.contact_model`.
+            InputError: the contact model is missing, or `tkamb.contact_model` did not make it.
         """
         return import_module("tkamb.show.view.live_window").live_knee(self, q, load, folder)
 
@@ -402,21 +403,21 @@ class Knee(AssembledKnee):
         patella: PatellaFinder | None = None,
         muscles: SharingMuscles | None = None,
     ) -> Instant:
-        """Return the knee at one instant, on which its equations and searches work.
+        """Return the knee at one instant, the input of its equations and searches.
 
         Args:
-            q: (nq,) configuration.
-            v: (nv,) velocity.
-            a: (nv,) acceleration.
-            external: as for `inverse_dynamics`.
-            tensions: as for `inverse_dynamics`.
-            data: from `create_data`, to save time.
-            patella: finds the patella; None: its place is that of q, or of equilibrium if q has
-                none.
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            a: acceleration, shape (nv,).
+            external: external forces, see `inverse_dynamics`.
+            tensions: muscle tensions, see `inverse_dynamics`.
+            data: data from `create_data`; they save time.
+            patella: object that finds the patella; None: the patella of q, or its equilibrium if q
+                has none.
             muscles: muscles of the leg that share the load; None: the quadriceps alone acts.
 
         Raises:
-            InputError: an argument of the wrong size, or an unknown muscle.
+            InputError: an argument has the wrong size, or a muscle is unknown.
         """
         data = self.create_data_for_kinematics() if data is None else data
         q = self._check(q, "q", self.model.nq)
@@ -428,7 +429,7 @@ class Knee(AssembledKnee):
         pulled = self._tensions(tensions)
         if self._pulls(pulled):
             raise InputError(
-                "the quadriceps is what is sought", "tensions", "give other muscles' alone"
+                "the tension of the quadriceps is unknown", "tensions", "give other muscles alone"
             )
         bridge, pin_data, lines = self.bridge, data.data, self.extensor_lines
         pin.forwardKinematics(self.model, pin_data, q, v, a)
@@ -453,7 +454,7 @@ class Knee(AssembledKnee):
         )
 
     def _contact_at(self, data: KneeData, place: KneePlace) -> "ProbedContact":
-        """Return the contact at a place; the caller's data store the last one."""
+        """Return the contact at a pose. The last contact is stored in `data`."""
         key = place.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
             assert self.contact is not None
@@ -461,7 +462,7 @@ class Knee(AssembledKnee):
         return data.seen[1]
 
     def _ligament_stiffness(self, place: KneePlace) -> Array:
-        """Return the derivative (6, 6) of the wrench of the bundles between femur and tibia."""
+        """Return the stiffness (6, 6) of the ligaments between femur and tibia."""
         if self._crossing is None:
             return np.zeros((6, 6))
         from tkamb.knee.contact import DifferenceSettings, batch_differences
@@ -479,7 +480,7 @@ class Knee(AssembledKnee):
         return knee_loads(geometry, loads, self.friction, self.bridge, data.data)
 
     def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
-        """Return the knee in equilibrium, with first touch at the pose of q as initial guess."""
+        """Return the knee in equilibrium. The initial guess is first touch at the pose of q."""
         from tkamb.knee.starts import InitialPoses
 
         pair = self._need_contact().pair

@@ -1,18 +1,20 @@
 """Ligament bundles: straight lines between two links that pull and never push.
 
-With slack length L0 and strain eps = (L - L0)/L0, eps1 = 0.03:
+L0 is the slack length, eps = (L - L0)/L0 the strain, and eps1 = 0.03:
 
     two-line (k in N/m)                         quadratic toe (k_eps in N per unit strain)
     F = 0                      eps <= 0         F = 0                        eps <= 0
     F = (k/2) (L - L0)         eps <= 2 eps1    F = k_eps eps²/(4 eps1)      eps <= 2 eps1
     F = k (L - (1 + eps1) L0)  otherwise        F = k_eps (eps - eps1)       otherwise
 
-Both are continuous; the first has a kink at 2 eps1, the second has none.
+Both laws are continuous. The slope of the two-line law jumps at 2 eps1; the slope of the quadratic
+toe does not.
 
 `generic_ligaments` scales a set of bundles to the implant, for a patient without measured
-ligaments. Femoral ends are placed about the axis of the posterior condyles, near which the
-collaterals are nearly isometric, distal ends about the insert's flat bottom. The proportions are
-those of an average knee, not of a patient: check the strain table before using any force.
+ligaments. Positions of the femoral ends are relative to the axis of the posterior condyles, because
+collaterals are nearly isometric near this axis. Positions of the distal ends are relative to the
+insert's flat bottom. The proportions are those of an average knee: check the strain table before
+using any force.
 
 References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998) (stiffness); Blankevoort & Huiskes,
 J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883 (law, strains at extension).
@@ -39,11 +41,11 @@ class LigamentSettings:
     """Toe strain and reference pose of ligaments."""
 
     toe_strain: float = 0.03
-    """1: eps1; the toe region ends at twice this strain. The value of Blankevoort & Huiskes (1991),
-    the same for every ligament."""
+    """1: eps1 of every ligament. The toe region ends at twice this strain. Source: Blankevoort &
+    Huiskes (1991)."""
     max_reference_distance: float = 15.0 * DEGREE
-    """rad: largest difference of a frame's flexion from the reference flexion, at which the frame
-    serves as reference pose. Chosen: farther away a ligament has another strain."""
+    """rad: largest difference between the reference flexion and the flexion of the frame that is
+    used as reference pose. Chosen because at a larger difference a ligament has another strain."""
 
 
 LIGAMENT = LigamentSettings()
@@ -55,7 +57,7 @@ Law = Literal["two-line", "quadratic-toe"]
 def two_line_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
     """Return the tension (N) of the two-line law; `stiffness` in N/m, lengths in m."""
     length, slack = np.asarray(length, float), np.asarray(slack_length, float)
-    # The first line has half the slope of the second one; they meet at twice the toe strain.
+    # The first line has half the slope of the second line. They meet at twice the toe strain.
     toe = 0.5 * np.asarray(stiffness) * (length - slack)
     line = np.asarray(stiffness) * (length - (1.0 + LIGAMENT.toe_strain) * slack)
     strain = (length - slack) / slack
@@ -81,10 +83,10 @@ class Ligament:
         proximal: proximal end.
         distal: distal end.
         law: force-length law, "two-line" or "quadratic-toe".
-        stiffness: N/m for "two-line", N per unit strain for "quadratic-toe".
-        slack_length: m; NaN: it follows from the reference strain.
-        reference_strain: 1, strain at the reference pose.
-        reference_flexion: rad, flexion of the reference pose.
+        stiffness: stiffness, N/m for "two-line", N per unit strain for "quadratic-toe".
+        slack_length: slack length, m; NaN: it is computed from the reference strain.
+        reference_strain: strain at the reference pose, 1.
+        reference_flexion: flexion of the reference pose, rad.
     """
 
     name: str
@@ -97,10 +99,10 @@ class Ligament:
     reference_flexion: float = 0.0
 
     def ends(self, poses: Mapping[str, Array]) -> tuple[Array, Array]:
-        """Return proximal and distal end (..., 3) in the insert frame.
+        """Return proximal and distal end (..., 3), m, in the insert frame.
 
         Args:
-            poses: link -> pose_link_in_insert, (4, 4) or (f, 4, 4).
+            poses: link -> pose_link_in_insert, shape (4, 4) or (f, 4, 4).
         """
         proximal = transform(poses[self.proximal.link], self.proximal.position)
         return proximal, transform(poses[self.distal.link], self.distal.position)
@@ -122,14 +124,14 @@ class Ligament:
 
 @dataclass(frozen=True, eq=False)
 class BundleArrays:
-    """Arrays of m bundles, with all proximal ends in one frame and all distal ends in another.
+    """Arrays of m bundles. All proximal ends share one frame, and all distal ends share one frame.
 
     Args:
-        proximal: (m, 3) m, proximal ends.
-        distal: (m, 3) m, distal ends.
-        two_line: (m,) whether the law is "two-line".
-        stiffness: (m,) N/m ("two-line") or N per unit strain ("quadratic-toe").
-        slack_length: (m,) m.
+        proximal: proximal ends, shape (m, 3), m.
+        distal: distal ends, shape (m, 3), m.
+        two_line: whether each law is "two-line", shape (m,).
+        stiffness: N/m ("two-line") or N per unit strain ("quadratic-toe"), shape (m,).
+        slack_length: slack lengths, shape (m,), m.
     """
 
     proximal: Array
@@ -140,7 +142,7 @@ class BundleArrays:
 
     @classmethod
     def of(cls, bundles: Sequence[Ligament], proximal: Array, distal: Array) -> "BundleArrays":
-        """Return the arrays of bundles whose ends (m, 3) are given."""
+        """Return the arrays of bundles with the given ends (m, 3), m."""
         return cls(
             proximal.reshape(-1, 3),
             distal.reshape(-1, 3),
@@ -150,11 +152,11 @@ class BundleArrays:
         )
 
     def pulls(self, proximal: Array, distal: Array) -> tuple[Array, Array]:
-        """Return tensions (..., m) N and the pulls (..., m, 3) N on the distal ends.
+        """Return the tensions (..., m), N, and the forces (..., m, 3), N, on the distal ends.
 
         Args:
-            proximal: (..., m, 3) m, proximal ends.
-            distal: (..., m, 3) m, distal ends in the same frame.
+            proximal: proximal ends, shape (..., m, 3), m.
+            distal: distal ends in the same frame, shape (..., m, 3), m.
         """
         along = proximal - distal
         length = np.linalg.norm(along, axis=-1)
@@ -166,7 +168,7 @@ class BundleArrays:
         """Return the wrench (..., 6) on the body of the distal ends, about its frame's origin.
 
         Args:
-            poses: (..., 4, 4) pose of the frame of the proximal ends in that of the distal ends.
+            poses: pose of the proximal frame in the distal frame, shape (..., 4, 4).
         """
         proximal = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.proximal)
         proximal = proximal + poses[..., None, :3, 3]
@@ -177,7 +179,7 @@ class BundleArrays:
 def ligament_loads(
     ligaments: Sequence[Ligament], poses: Mapping[str, Array]
 ) -> tuple[Array, tuple[PointForces, ...]]:
-    """Return the tensions (n,) N and one load per link.
+    """Return the tensions (n,), N, and one load per link.
 
     The forces on the two ends of a bundle are equal and opposite, along the line through both ends.
 
@@ -205,17 +207,18 @@ def build_ligaments(
 ) -> tuple[Ligament, ...]:
     """Return the bundles with slack lengths.
 
-    A slack length that is not given follows from the reference strain eps_r. It holds at the frame
-    nearest to the reference flexion. With the length L_r there, L0 = L_r/(1 + eps_r).
+    A missing slack length is computed from the reference strain eps_r. The bundle has this strain
+    in the frame nearest to the reference flexion. If its length in that frame is L_r,
+    L0 = L_r/(1 + eps_r).
 
     Args:
         ligaments: the bundles.
         poses: link -> pose_link_in_insert (f, 4, 4).
-        flexion: (f,) rad, of the same frames.
+        flexion: flexion in these frames, shape (f,), rad.
 
     Raises:
-        InputError: an unknown link, both ends at the same point, or no recorded frame near the
-            reference flexion.
+        InputError: a link is unknown, both ends are the same point, or no recorded frame is near
+            the reference flexion.
     """
     flexion = np.asarray(flexion, float)
     return tuple(_with_slack_length(bundle, poses, flexion) for bundle in ligaments)
@@ -247,7 +250,7 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
 
 
 def nearest_frame(flexion: Array, target: float) -> int:
-    """Return the index of the frame whose flexion (f,), rad, is nearest to a target, rad."""
+    """Return the index of the flexion (f,), rad, that is nearest to a target, rad."""
     return int(np.nanargmin(np.abs(flexion - target)))
 
 
@@ -258,14 +261,15 @@ def strain_table(
     at_deg: Sequence[float] = (0.0, 60.0, 90.0),
     within_deg: float = 10.0,
 ) -> dict[str, tuple[float, ...]]:
-    """Return the strain of each bundle at a few flexions, which reveals a wrong insertion.
+    """Return the strain of each bundle at a few flexions. It reveals a wrong insertion.
 
     Args:
         ligaments: the bundles.
         poses: link -> pose_link_in_insert (f, 4, 4).
-        flexion: (f,) rad, of the same frames.
-        at_deg: flexions, deg; the recorded frame nearest to each is taken.
-        within_deg: deg, largest difference of that frame's flexion; NaN if it is larger.
+        flexion: flexion in these frames, shape (f,), rad.
+        at_deg: flexions at which the strain is computed, in the nearest recorded frame, deg.
+        within_deg: largest difference of that frame's flexion, deg. At a larger difference the
+            strain is NaN.
 
     Returns:
         bundle -> strain at each flexion.
@@ -293,9 +297,9 @@ class LigamentSideSettings:
     """Check of the side of a collateral ligament."""
 
     wrong_side_distance: float = 8.0 * MILLIMETRE
-    """m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen:
-    collateral ligaments end 20 to 45 mm from the middle, and no frame is displaced by as much as
-    this."""
+    """m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen
+    because collateral ligaments end 20 to 45 mm from the middle, and frames are displaced by less
+    than this distance."""
 
 
 LIGAMENT_SIDE = LigamentSideSettings()
@@ -313,15 +317,16 @@ _LATERAL = re.compile(
 
 
 def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: str) -> None:
-    """Raise where a ligament's name and its place are of different sides of the knee.
+    """Raise an error if a ligament's name and its position belong to different sides of the knee.
 
     Args:
-        ligaments: the bundles, of a right knee or mirrored to one: z points laterally.
-        chain: of the links that carry them.
-        side: of the patient, for the message.
+        ligaments: the bundles of a right knee, or of a left knee mirrored to a right one: z points
+            laterally.
+        chain: chain with the links of the bundles.
+        side: side of the patient's knee, for the message.
 
     Raises:
-        InputError: names the bundle and its end.
+        InputError: an end lies on the wrong side; the message names the bundle and the end.
     """
     for bundle in ligaments:
         sign = _lateral_sign(bundle.name)
@@ -339,13 +344,13 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
 
 
 def _lateral_sign(name: str) -> int:
-    """Return -1 for a ligament that is medial by its name, 1 for a lateral one, else 0."""
+    """Return -1 if the name is that of a medial ligament, 1 if of a lateral ligament, else 0."""
     medial, lateral = bool(_MEDIAL.search(name)), bool(_LATERAL.search(name))
     return int(lateral) - int(medial)
 
 
 def _lateral_place(end: LinkPoint, chain: Chain) -> float:
-    """Return how far (m) an end lies laterally in the insert frame, or the femur's or patella's."""
+    """Return the lateral position (m) of an end in the frame of insert, femur or patella."""
     carrier = chain.carrier(end.link)
     place = transform(chain.link_in(end.link, carrier), end.position)
     if carrier == "tibia":
@@ -358,7 +363,7 @@ PREFIX = "generic_"
 
 @dataclass(frozen=True)
 class _Bundle:
-    """One bundle of a right knee: ends in half widths, stiffness, strain at extension."""
+    """One generic bundle of a right knee (ends: see `BUNDLES`); the strain is in extension."""
 
     proximal: tuple[float, float, float]
     distal: tuple[float, float, float]
@@ -376,8 +381,8 @@ BUNDLES = {
     "ACL_anteromedial": _Bundle((-0.20, 0.11, 0.20), (0.22, -0.08, -0.05), 83.15, 0.06),
     "ACL_posterolateral": _Bundle((-0.11, -0.03, 0.23), (0.05, -0.08, 0.08), 83.15, 0.10),
 }
-"""Ends of a right knee, x anterior, y superior, z lateral: proximal from the condylar axis, distal
-from the insert frame, in half widths of the part."""
+"""Generic bundles of a right knee. Ends are in half widths of the part, x anterior, y superior,
+z lateral. Proximal ends are relative to the condylar axis, distal ends to the insert's origin."""
 
 
 def generic_ligaments(
@@ -389,16 +394,16 @@ def generic_ligaments(
     """Return the bundles of a generic set, scaled to an implant.
 
     Args:
-        femoral: femoral component in the femur link's frame (right knee).
-        insert: insert in the insert frame.
-        pose_insert_in_tibia: (4, 4).
-        chosen: names of the patient's ligaments, of MCL, LCL, PCL, ACL.
+        femoral: surface of the femoral component in the femur link's frame (right knee).
+        insert: surface of the insert in the insert frame.
+        pose_insert_in_tibia: pose, shape (4, 4).
+        chosen: names of the patient's ligaments, some of MCL, LCL, PCL, ACL.
 
     Returns:
         Bundles between the links "femur" and "tibia"; the reference pose is extension.
 
     Raises:
-        InputError: no such ligament.
+        InputError: a ligament is unknown.
     """
     names = {name.split("_")[0] for name in BUNDLES}
     for name in chosen:
@@ -428,16 +433,16 @@ def generic_ligaments(
 
 
 def condylar_axis(femoral: Surface) -> Array:
-    """Return the centre (3,) of the circle that the posterior condyles roll on, m.
+    """Return the centre (3,) of the circle that fits the posterior condyles, m.
 
     It is a point of the condylar axis, which is parallel to z. At a flexion phi let u be the
-    downward direction in the femur's frame. The support of the component in this direction is h(u)
-    = max over the vertices p of u . p. For a circle of centre c and radius r it is u . c + r. c and
-    r are fitted by least squares to the supports at 20 to 100 deg of flexion. z is the middle of
-    the component's width.
+    downward direction in the femur's frame. The support of the component in this direction is the
+    maximum of u . p over the vertices p. For a circle of centre c and radius r the support is
+    u . c + r. c and r are fitted by least squares to the supports at 20 to 100 deg of flexion. z is
+    the middle of the component's width.
 
     Args:
-        femoral: in the femur's frame.
+        femoral: surface of the femoral component in the femur's frame.
     """
     flexion = np.deg2rad(np.arange(20.0, 101.0, 5.0))
     down = np.column_stack([-np.sin(flexion), -np.cos(flexion)])

@@ -15,7 +15,7 @@ class LinkPoint:
 
     Args:
         link: name of the link.
-        position: (3,) m, in the link's frame.
+        position: position in the link's frame, shape (3,), m.
     """
 
     link: str
@@ -31,10 +31,10 @@ class PointForces:
     """Forces on one link, at one frame of the motion.
 
     Args:
-        link: name of the link on which they act.
-        points: (m, 3) m, where they act, in the insert frame.
-        forces: (m, 3) N, or N per unit of an unknown magnitude, in the insert frame.
-        moment: (3,) N·m, free moment on the same link.
+        link: name of the link.
+        points: points of application, insert frame, shape (m, 3), m.
+        forces: forces, or forces per unit of an unknown magnitude, insert frame, shape (m, 3), N.
+        moment: free moment on the same link, insert frame, shape (3,), N·m.
     """
 
     link: str
@@ -82,7 +82,7 @@ def link_point(point: Point) -> LinkPoint:
     """Return a point on a frame as a `LinkPoint`.
 
     Raises:
-        InputError: not a frame's name and three finite numbers.
+        InputError: the point is no pair of a frame's name and three finite numbers.
     """
     link: object = None
     position: object = ()

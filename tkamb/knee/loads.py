@@ -12,8 +12,8 @@ from tkamb.knee.load import PointForces, scaled
 from tkamb.knee.unknowns import MUSCLE, muscle_load
 
 MIRRORED = ("ml", "axial", "coronal")
-"""Last parts of the names of loads that change sign between a left knee and its mirror image:
-forces along z, moments about y and x."""
+"""Endings of load names. These loads change sign between a left knee and its mirror image: forces
+along z, moments about y and x."""
 NAN = float("nan")
 
 
@@ -21,32 +21,34 @@ NAN = float("nan")
 class KneeLoads:
     """Loads of the knee at one instant, SI, in the insert frame; NaN without a solution.
 
-    The insert frame is x anterior, y superior, z to the subject's right, for left knees too.
+    The insert frame is x anterior, y superior, z to the patient's right, for left knees too. The
+    four extensor loads are NaN without an extensor mechanism.
 
     Args:
-        contact_force: (3,) N, force of the insert on the femur, without residuals.
-        normal_force: side -> N, force of each condyle along its contact normal, by equilibrium.
-        quadriceps: N, tension; NaN without an extensor mechanism, as the next three.
-        patellar_ligament: N, tension.
-        patellofemoral: N, force along the contact normal.
-        patellofemoral_tangential: N, force across the normal, in the sagittal plane.
+        contact_force: force of the insert on the femur without residuals, shape (3,), N.
+        normal_force: side -> force of the condyle along its contact normal, by equilibrium, N.
+        quadriceps: tension of the quadriceps, N.
+        patellar_ligament: tension of the patellar ligament, N.
+        patellofemoral: patellofemoral force along the contact normal, N.
+        patellofemoral_tangential: patellofemoral force across the normal, in the sagittal plane, N.
         ligaments: bundle -> tension, N.
         residuals: loads on the tibia that are zero in an exact model: ap, ml (N), axial and, in
             some load states, coronal and flexion (N·m).
-        hip_force: (3,) N, sum of all loads across the hip, on the femur at the hip centre.
-        hip_moment: (3,) N·m, their moment about the hip centre.
-        external_flexion: N·m, external moment, positive in flexion.
-        external_adduction: N·m, external moment, positive in adduction.
+        hip_force: sum of all loads across the hip on the femur, shape (3,), N.
+        hip_moment: moment of these loads about the hip centre, shape (3,), N·m.
+        external_flexion: external moment, positive in flexion, N·m.
+        external_adduction: external moment, positive in adduction, N·m.
         condition: condition number of the equations.
         lifted: condyles that carry no load.
         slack: whether the extensor mechanism carries no load.
-        ambiguous: whether another load state, too, has no wrong sign.
-        problems: why there is no solution, in words; empty: there is one.
+        ambiguous: whether a second load state has no wrong sign either.
+        problems: reasons why there is no solution; empty: there is a solution.
         external_forces: `pin.StdVec_Force` of contact, ligaments and extensor mechanism, as `fext`
-            of the model. With these and the external loads `pin.rnea` leaves the residuals.
+            of the model. With these and the external loads the result of `pin.rnea` at the knee is
+            the residuals.
         residual_forces: `pin.StdVec_Force` of the residuals.
         hip_forces: `pin.StdVec_Force` of the loads across the hip, on the thigh.
-        equations: the solution of the equations, of a right knee.
+        equations: the solution of the equations of a right knee.
         geometry: the geometry of the equations.
     """
 
@@ -80,9 +82,9 @@ class KneeLoads:
 
     @property
     def tensions(self) -> dict[str, float]:
-        """Muscle or "patellar_ligament" -> N, as for `Knee.external_forces`.
+        """Muscle or "patellar_ligament" -> tension, N, as input of `Knee.external_forces`.
 
-        Empty without an extensor mechanism.
+        It is empty without an extensor mechanism.
         """
         extensor, values = self.geometry.extensor, self.equations.values
         if extensor is None:
@@ -98,13 +100,13 @@ def knee_loads(
 
     Args:
         geometry: geometry of the equations.
-        solved: solution of the equations, of a right knee.
+        solved: solution of the equations of a right knee.
         friction: Coulomb coefficient of the femorotibial contact.
         bridge: conversion to the user's model.
         data: Pinocchio data with joint placements up to date.
     """
     unknowns = [] if solved.problems else solved_unknowns(geometry, solved, friction)
-    # Each unknown belongs to the group that its name begins with; ligaments are known loads.
+    # The first word of an unknown's name is its group. Ligaments are known loads.
     groups: dict[str, list[PointForces]] = {"external": [], "residual": [], "hip": []}
     if unknowns:
         groups["external"] += geometry.ligaments
@@ -158,9 +160,10 @@ def _sides(geometry: KneeGeometry) -> list[str]:
 
 
 def _mirrored(name: str) -> bool:
-    """Say whether a load's magnitude changes sign in the mirror image."""
+    """Return whether a load's magnitude changes sign in the mirror image."""
     if name.startswith(MUSCLE):
         return False
-    if "moment" in name:  # about x and y; about z and the clinical axes it keeps its sign
+    # Moments about x and y change sign. Moments about z and the clinical axes do not.
+    if "moment" in name:
         return name.endswith(("_ap", "_si", "_axial", "_coronal"))
     return name.endswith(MIRRORED)

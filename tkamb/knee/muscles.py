@@ -1,8 +1,8 @@
 """Muscles and their lines of action, as columns of the equations or with given tensions.
 
-A line of action is a massless string through points of the links, perhaps around the outline
-of one of them. A unit tension on it, with the reactions of what it passes, is one column of the
-equations of motion. Its moment arm about any coordinate q of the chain is then -dL/dq.
+A line of action is a massless string through points of the links. It may wrap the outline of one
+link. The forces of a unit tension on all links of the line are one column of the equations of
+motion. The moment arm of a line of length L about a coordinate q of the chain is then -dL/dq.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,8 +30,8 @@ class MuscleBandSettings:
     """The outline that a muscle wraps."""
 
     sections: int = 7
-    """Number of sagittal sections across the band, whose common outline is wrapped. Chosen: more
-    sections change the lines by little."""
+    """Number of sagittal sections across the band. The line wraps their common outline. Chosen
+    because more sections hardly change the lines."""
 
 
 MUSCLE_BAND = MuscleBandSettings()
@@ -42,9 +42,9 @@ class SagittalWrap:
     """Wrapping of a line around the front of an implant part's sagittal outline.
 
     Args:
-        band: m, half of the medial-lateral width over which sections are taken, about the line.
-        half_thickness: m, half of the tendon's thickness, the distance of the line from the part.
-        bone: surface that is wrapped together with the part, in the same frame; None: none.
+        band: half of the medial-lateral width of the sections about the line, m.
+        half_thickness: half of the tendon's thickness, the distance of the line from the part, m.
+        bone: second surface that the line wraps, in the part's frame; None: no second surface.
     """
 
     band: float
@@ -52,12 +52,12 @@ class SagittalWrap:
     bone: "Surface | None" = None
 
     def outline(self, part: "Surface", middle: float, below: float = np.inf) -> Array:
-        """Return the convex outline (n, 2) m of the part and the bone, grown by the tendon.
+        """Return the convex outline (n, 2), m, of part and bone, offset by `half_thickness`.
 
         Args:
-            part: the part, in the frame whose x-y plane holds the outline.
-            middle: m, z of the line in that frame.
-            below: m, greatest y; parts of the surfaces above are left out.
+            part: surface of the part. The outline lies in the x-y plane of its frame.
+            middle: z of the line in that frame, m.
+            below: largest y, m; the surfaces above it are ignored.
         """
         surfaces = [part] if self.bone is None else [part, self.bone]
         planes = middle + np.linspace(-self.band, self.band, MUSCLE_BAND.sections)
@@ -71,10 +71,10 @@ class Muscle:
     Args:
         name: name of the muscle.
         points: points from origin to insertion, at least two.
-        wrap: wrapping of the femoral component by the stretch that leaves the femur; None: it is
-            straight.
-        strength: N, maximal isometric force; NaN: unknown.
-        group: name of the muscles that are shown together; empty: it is shown by itself.
+        wrap: wrapping of the femoral component by the segment that leaves the femur; None: this
+            segment is straight.
+        strength: maximal isometric force, N; NaN: unknown.
+        group: name of the group of muscles with which it is shown; empty: it is shown alone.
     """
 
     name: str
@@ -91,8 +91,8 @@ class PatellarLigament:
     Args:
         proximal: end on the patella.
         distal: end on the tibia.
-        wrap: wrapping of the insert's front lip; None: it is straight.
-        length: m, constant length, from which the place of the patella follows; NaN: not needed.
+        wrap: wrapping of the insert's front lip; None: the ligament is straight.
+        length: constant length, which determines the position of the patella, m; NaN: not needed.
     """
 
     proximal: LinkPoint
@@ -103,12 +103,12 @@ class PatellarLigament:
 
 @dataclass(frozen=True, eq=False)
 class Wrap:
-    """An outline that one stretch of a line wraps.
+    """An outline that one segment of a line wraps.
 
     Args:
-        link: name of the link that the outline is fixed to, which takes the reaction.
-        outline: (n, 2) m, convex polygon in the link's x-y plane.
-        stretch: number of the stretch; 0 runs from the first point to the second.
+        link: name of the link with the outline; the reaction acts on this link.
+        outline: convex polygon in the link's x-y plane, shape (n, 2), m.
+        stretch: number of the segment; segment 0 is between the first two points.
     """
 
     link: str
@@ -123,7 +123,7 @@ class Line:
     Args:
         name: name of the muscle or ligament, for messages.
         points: points from the proximal to the distal end, at least two.
-        wrap: outline that it wraps; None: it runs straight from point to point.
+        wrap: outline that the line wraps; None: the line is straight from point to point.
     """
 
     name: str
@@ -137,7 +137,7 @@ class Line:
             poses: link -> pose_link_in_insert (4, 4).
 
         Raises:
-            ComputationError: an end of the wrapped stretch lies inside the outline.
+            ComputationError: an end of the wrapped segment lies inside the outline.
         """
         from tkamb.knee.wrapping import TautPath, path_in_link  # imports numba
 
@@ -161,10 +161,10 @@ class Line:
         )
 
     def loads(self, path: "TautPath") -> tuple[PointForces, ...]:
-        """Return the forces of a unit tension on the links; their sum is zero.
+        """Return the forces of a unit tension on the links. Their sum is zero.
 
-        The tension pulls both ends along the path. At every point and corner between, the force is
-        the change of direction. The two ends come first.
+        The tension pulls both ends along the path. The force at an inner point or corner is the
+        change of direction. The two ends come first.
         """
         links = [point.link for point in self.points]
         if self.wrap:
@@ -184,10 +184,10 @@ class Line:
 
 
 def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
-    """Return the number of the stretch that leaves the femur.
+    """Return the number of the segment of a line that leaves the femur.
 
     Raises:
-        InputError: no stretch leaves it.
+        InputError: no segment leaves the femur.
     """
     carriers = [chain.carrier(point.link) for point in points]
     for i, (one, other) in enumerate(pairwise(carriers)):
@@ -197,12 +197,12 @@ def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
 
 
 def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
-    """Return a muscle's line of action, which wraps the femoral component in the patella's plane.
+    """Return a muscle's line of action. It may wrap the femoral component in the patella's plane.
 
     Args:
         muscle: the muscle.
         chain: chain of the knee.
-        femoral: femoral component in the femur link's frame.
+        femoral: surface of the femoral component in the femur link's frame.
     """
     if muscle.wrap is None:
         return Line(muscle.name, muscle.points)
@@ -217,13 +217,13 @@ def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
 
 
 def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
-    """Raise unless there is one muscle, from the femur to the patella.
+    """Raise an error unless there is one muscle, from the femur to the patella.
 
     With one muscle the equations of a frame are square. Equilibrium does not determine how several
     muscles share the joint moments.
 
     Raises:
-        InputError: several muscles, one that crosses no joint, or one that inserts elsewhere.
+        InputError: there are several muscles, or the muscle crosses no joint or inserts elsewhere.
     """
     for muscle in muscles:
         if len({chain.carrier(point.link) for point in muscle.points}) == 1:
@@ -253,18 +253,18 @@ class TensionLine:
 
     Args:
         places: frame of each point.
-        positions: (3,) m, position of each point in its frame.
+        positions: position (3,) of each point in its frame, m.
     """
 
     places: tuple[Place, ...]
     positions: tuple[Array, ...]
 
     def forces(self, data: Any, tension: float) -> list[tuple[int, pin.Force]]:
-        """Return the joints, and the force on each in the joint's frame.
+        """Return pairs of a joint and the force on it, in the joint's frame.
 
         Args:
             data: Pinocchio data with joint placements up to date.
-            tension: N.
+            tension: tension, N.
         """
         placements = [data.oMi[place.joint] for place in self.places]
         points = [
@@ -275,7 +275,8 @@ class TensionLine:
         ]
         steps = np.diff(np.array(points), axis=0)
         along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-        # The tension pulls each end along the line. A point between takes the change of direction.
+        # The tension pulls the ends along the line. At an inner point the force is the change of
+        # direction.
         pulls = tension * np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
         return [
             (place.joint, placement.actInv(pin.Force(pull, cross(point, pull))))
@@ -286,7 +287,7 @@ class TensionLine:
 
 
 def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, TensionLine]:
-    """Return muscle -> line of given tension.
+    """Return name of a muscle -> its line.
 
     Raises:
         InputError: a muscle has fewer than two points or a wrap, or names an unknown frame.
@@ -311,12 +312,12 @@ def checked_tensions(
     """Return muscle -> tension, N, after a check.
 
     Args:
-        tensions: muscle -> N, or a number, the tension of the quadriceps.
+        tensions: muscle -> tension, N; or the tension of the quadriceps alone, N.
         extensor: names of the lines of the extensor mechanism, the quadriceps first.
         lines: names of the other muscles.
 
     Raises:
-        InputError: an unknown muscle, or a tension that is negative or not finite.
+        InputError: a muscle is unknown, or a tension is negative or not finite.
     """
     if tensions is None:
         return {}

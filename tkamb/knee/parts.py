@@ -1,7 +1,7 @@
 """The parts of a `tkamb.Knee` as plain data, and their conversion to the canonical chain.
 
-Lengths are in metres, forces in newtons. A point on a frame of the user's model is a `LinkPoint` or
-a pair of the frame's name and three coordinates, ("femur", (0.0, 0.01, -0.042)).
+Lengths are in metres, forces in newtons. A point on a frame of the user's model is a `LinkPoint`,
+or a pair of the frame's name and three coordinates, such as ("femur", (0.0, 0.01, -0.042)).
 """
 
 from collections.abc import Sequence
@@ -38,8 +38,8 @@ class PartSettings:
     """Checks of the implant meshes."""
 
     max_length: float = 0.5
-    """m: a longer mesh is refused, because it is probably in millimetres. Chosen: no part of an
-    implant is longer."""
+    """m: a longer mesh is refused, because it is probably in millimetres. Chosen because no part of
+    an implant is longer."""
 
 
 PART = PartSettings()
@@ -50,15 +50,17 @@ class Implant:
     """The parts of a total knee replacement, SI.
 
     Args:
-        femoral: femoral component, in the axes of the frame "femoral" (see `tkamb.Knee`):
-            x anterior, y superior, z to the subject's right.
-        insert: closed polyethylene insert, in the axes of the frame "insert": x anterior, y
-            superior, z to the subject's right. Its flat bottom is found and faces -y.
-        patella: patellar button, in the axes of the frame "patella", its joint side facing -x.
+        femoral: mesh of the femoral component, in the axes of the frame "femoral" (see
+            `tkamb.Knee`): x anterior, y superior, z to the patient's right.
+        insert: closed mesh of the polyethylene insert, in the axes of the frame "insert": x
+            anterior, y superior, z to the patient's right. Its flat bottom faces -y.
+        patella: mesh of the patellar button, in the axes of the frame "patella". Its articular side
+            faces -x.
         material: material of the insert, a name (`tkamb.contact.materials.MATERIALS`) or a
-        `Material`. bearing: "fixed" (bottom glued) or "mobile" (bottom slides). placed: True: the
-        insert frame of the results is the frame "insert" itself. False: its
-            origin is the centre of the flat bottom of the mesh.
+            `Material`.
+        bearing: "fixed" (bottom glued) or "mobile" (bottom slides).
+        placed: True: the insert frame of the results is the frame "insert". False: its origin is
+            the centre of the mesh's flat bottom.
     """
 
     femoral: Mesh = None
@@ -80,16 +82,16 @@ class Implant:
 class Extensor:
     """Quadriceps, patella and patellar ligament.
 
-    The patella moves in a sagittal plane of the femur. Where the model has a frame "patella" that
-    moves against the femur, its place is that of q. Otherwise the place follows from the
-    equilibrium of a massless patella, with the given length of the ligament.
+    The patella moves in a sagittal plane of the femur. If the model has a frame "patella" that
+    moves relative to the femur, q gives the pose of the patella. Otherwise the equilibrium of a
+    massless patella gives it, with a constant length of the ligament.
 
     Args:
         quadriceps: muscle from the femur to the patella.
-        patellar_ligament: line from the patella to the tibia; its `length` is needed if the place
-            of the patella is not part of q.
-        plane: pose of the plane's frame in the frame "femur"; None: that of the joint "patella_ap",
-            or the frame "femur" if the model has no such joint.
+        patellar_ligament: line from the patella to the tibia. Its `length` is required if q does
+            not give the pose of the patella.
+        plane: pose of the plane's frame in the frame "femur"; None: the placement of the joint
+            "patella_ap", or the frame "femur" if the model has no such joint.
         solved: True: if `Knee.equilibrium` moves the femur, the patella of the model is solved
             again. False: it is fixed to the femur.
     """
@@ -103,16 +105,17 @@ class Extensor:
 def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
     """Return a mesh in memory as a surface, m.
 
-    Duplicate and degenerate triangles, wrong winding and small holes are mended
+    Duplicate and degenerate triangles, wrong winding and small holes are repaired
     (`tkamb.geometry.repair`).
 
     Args:
         mesh: a `Mesh`; a `Surface` is returned unchanged.
         name: name of the mesh in messages.
-        closed: whether it must enclose a volume.
+        closed: whether the mesh must enclose a volume.
 
     Raises:
-        InputError: no mesh, not finite, in millimetres, not a surface, or open.
+        InputError: the mesh has no valid triangles, is not finite, is in millimetres, is not one
+            surface, or is open although `closed`.
     """
     if isinstance(mesh, Surface):
         return mesh
@@ -140,7 +143,7 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
 
 
 def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
-    """Return vertices (n, 3) and triangles (k, 3) of a mesh object or of a pair of arrays."""
+    """Return vertices (n, 3) and triangles (k, 3) of a mesh object or a pair of arrays."""
     how = "give a trimesh.Trimesh, or vertices (n, 3) in metres and triangles (k, 3)"
     parts = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
     try:
@@ -156,7 +159,7 @@ def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
 
 
 def mirrored_surface(surface: Surface) -> Surface:
-    """Return the mirror image in the sagittal plane (z to -z), normals still outward."""
+    """Return the mirror image in the sagittal plane (z to -z) with outward normals."""
     faces = surface.faces[:, ::-1].copy()
     return Surface(surface.vertices @ MIRROR + 0.0, faces, surface.name, surface.merged)
 
@@ -166,8 +169,8 @@ class AssemblySettings:
     """Tolerance of the assembly."""
 
     frame_tolerance: float = 1e-9
-    """m and rad: an insert frame that differs from that of the flat bottom by less is the same.
-    Chosen: above rounding."""
+    """m and rad: a smaller difference between the mesh frame and the frame of the flat bottom is
+    ignored. Chosen because it is above rounding errors."""
 
 
 ASSEMBLY = AssemblySettings()
@@ -178,9 +181,9 @@ class Surfaces:
     """The implant's surfaces, mirrored for a left knee; None: not given.
 
     Args:
-        femoral: femoral component, in its own frame.
-        insert: insert, in the insert frame.
-        button: patellar button, in the patella's frame.
+        femoral: surface of the femoral component, in the frame "femoral".
+        insert: surface of the insert.
+        button: surface of the patellar button, in the patella's frame.
     """
 
     femoral: Surface | None
@@ -194,7 +197,7 @@ def surfaces_of(
     """Return the surfaces of an implant, with the insert in the frame "insert".
 
     Raises:
-        InputError: a needed mesh is missing or cannot be used.
+        InputError: a required mesh is missing or cannot be used.
     """
     needs = {"femoral": with_contact or with_extensor}
     needs |= {"insert": with_contact, "patella": with_extensor}
@@ -202,7 +205,7 @@ def surfaces_of(
     for name, needed in needs.items():
         mesh = getattr(implant, name)
         if mesh is None and needed:
-            what = "[the contact]" if name == "insert" else "the contact or the extensor"
+            what = "the contact" if name == "insert" else "the contact or the extensor"
             raise InputError(f"has no {name} mesh", "Implant", f"{what} needs it")
         if mesh is None:
             surfaces.append(None)
@@ -224,7 +227,7 @@ def placed_insert(
     placement = insert_placement(insert)
     if np.abs(placement - np.eye(4)).max() < ASSEMBLY.frame_tolerance:
         return place, insert
-    # The placement was found in the mirrored mesh; a left knee has its mirror image.
+    # The placement is that of the mirrored mesh: a left knee needs its mirror image.
     mesh_in_insert = mirrored_pose(placement) if is_left else placement
     moved = Place(place.joint, place.placement * se3(inverse(mesh_in_insert)))
     return moved, insert.moved(placement)
@@ -234,7 +237,7 @@ def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
     """Return a bundle with its ends on links of the chain.
 
     Raises:
-        InputError: no slack length, or an end on a frame that is no part of the knee.
+        InputError: the slack length is missing, or an end is on a frame outside the knee.
     """
     ends = [bridge.link_point(link_point(end)) for end in (bundle.proximal, bundle.distal)]
     if not bundle.slack_length > 0:
@@ -249,9 +252,9 @@ def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
 def crossing_and_others(
     chain: Chain, bundles: "Sequence[Ligament]"
 ) -> "tuple[BundleArrays | None, tuple[Ligament, ...]]":
-    """Return the bundles between femur and tibia, and the others.
+    """Return the bundles between femur and tibia as arrays, and all other bundles.
 
-    The ends of the first are in the femoral and the insert frame.
+    The ends of the arrays are in the femoral frame and the insert frame.
     """
     crossing = [
         bundle
@@ -263,7 +266,7 @@ def crossing_and_others(
         return None, others
     from tkamb.knee.ligaments import BundleArrays
 
-    # Both ends in the frames between which the pose of the knee leads: femoral and insert frame.
+    # The pose of the knee is that of the femoral frame in the insert frame.
     shank = inverse(chain.insert_in_tibia)
     ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
     for bundle in crossing:
@@ -300,7 +303,7 @@ def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "E
     ligament = replace(ligament, proximal=ends[0], distal=ends[1])
     if anatomy.patella is None and not ligament.length > 0:
         raise InputError(
-            "has no length", "patellar ligament", "the place of the patella follows from it"
+            "has no length", "patellar ligament", "give length: it determines the patella's pose"
         )
     return ExtensorLines(
         ExtensorParts(

@@ -1,8 +1,8 @@
-"""Forces on a massless patella without friction, at a place in the femur's sagittal plane.
+"""Forces on a massless patella without friction, at a pose in the femur's sagittal plane.
 
-A place has three coordinates: patella_ap, patella_si and patella_rotation. Muscle, patellar
-ligament and contact are in force equilibrium at every place. At the place of equilibrium the
-residual moment vanishes, too (`tkamb.knee.patella_search`).
+The pose has three coordinates: patella_ap, patella_si and patella_rotation. The forces of muscle,
+patellar ligament and contact are in equilibrium at every pose. Their moment vanishes only at the
+pose of equilibrium (`tkamb.knee.patella_search`).
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from tkamb.knee.wrapping import TautPath, path_in_link
 
 @dataclass(frozen=True)
 class PatellaSettings:
-    """When the forces on the patella are not determined."""
+    """Limit at which the forces on the patella are not determined."""
 
     least_determinant: float = 1e-6
     """1: determinant of the unit vectors of contact normal and ligament, below which they are
-    parallel. Chosen: above rounding."""
+    parallel. Chosen because it is above rounding errors."""
 
 
 PATELLA = PatellaSettings()
 
 
 class PatellaStatus(Enum):
-    """How the search for the patella ended: with a place, or with a condition that is not met."""
+    """How the search for the patella ended: with a pose, or with the condition that failed."""
 
     OK = "ok"
     SEVERAL = "several_solutions"
@@ -43,7 +43,7 @@ class PatellaStatus(Enum):
 
     @property
     def found(self) -> bool:
-        """Whether a place was found. If not, the value says which condition is not met."""
+        """Whether the patella was found. If not, the value states the condition that failed."""
         return self in (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
 
 
@@ -52,20 +52,22 @@ class PatellaState:
     """The patella at one frame.
 
     Args:
-        coordinates: (3,) patella_ap, patella_si (m), patella_rotation (rad); NaN: not found.
-        contact_point: (3,) m, on the line of action of the contact force, insert frame.
-        contact_normal: (3,) unit, out of the femur into the patella, in the femur's sagittal
-            plane, insert frame.
-        contact_on_patella: (3,) m, the same point in the patella's frame.
-        gap: m, distance of button and femoral component, negative in penetration.
+        coordinates: patella_ap, patella_si (m) and patella_rotation (rad), shape (3,); NaN: not
+            found.
+        contact_point: point on the line of action of the contact force, insert frame, shape (3,),
+            m.
+        contact_normal: unit normal from femur to patella in the femur's sagittal plane, insert
+            frame, shape (3,).
+        contact_on_patella: contact point in the patella's frame, shape (3,), m.
+        gap: distance of button and femoral component, negative in penetration, m.
         ligament_ratio: patellar ligament tension per muscle tension, for a massless patella.
         patellofemoral_ratio: patellofemoral force per muscle tension, for a massless patella.
-        shift: m along z, first-order estimate of the mediolateral shift; the patella stays in the
-            sagittal plane.
-        tilt: rad about y, first-order estimate of the tilt.
+        shift: first-order estimate of the mediolateral shift along z, m. The computed patella stays
+            in the sagittal plane.
+        tilt: first-order estimate of the tilt about y, rad.
         status: how the search ended.
-        slopes: (3, 3) approximate derivatives of gap, ligament length and moment per unit tension
-            (m) by the coordinates, which shorten a search near by; None: unknown.
+        slopes: approximate derivatives of gap, ligament length and moment per unit tension (m) by
+            the coordinates, shape (3, 3). They shorten a later search; None: unknown.
     """
 
     coordinates: Array
@@ -83,18 +85,20 @@ class PatellaState:
 
 @dataclass(frozen=True, eq=False)
 class ExtensorMechanism:
-    """The extensor mechanism as the search for the patella takes it; the same in all frames.
+    """The extensor mechanism as input of the search for the patella. It is constant over frames.
 
     Args:
-        contact: button against femoral component, in the patellar joint's frame.
-        pose_joint_in_femur: (4, 4), the patellar joint's frame on the femur link.
-        muscle_origin: (3,) m, start of the stretch that leaves the femur, femur link.
-        muscle_insertion: (3,) m, patella link.
-        ligament_proximal: (3,) m, patella link.
-        ligament_distal: (3,) m, insert frame.
-        ligament_length: m, constant length of the patellar ligament.
-        femoral_outline: (n, 2) m, in the femur link's x-y plane; None: the muscle wraps nothing.
-        insert_outline: (n, 2) m, in the insert's x-y plane; None: the ligament wraps nothing.
+        contact: contact of button and femoral component, in the patellar joint's frame.
+        pose_joint_in_femur: pose of the patellar joint's frame in the femur link, shape (4, 4).
+        muscle_origin: start of the segment that leaves the femur, femur frame, shape (3,), m.
+        muscle_insertion: end of the muscle, patella frame, shape (3,), m.
+        ligament_proximal: proximal end of the ligament, patella frame, shape (3,), m.
+        ligament_distal: distal end of the ligament, insert frame, shape (3,), m.
+        ligament_length: constant length of the patellar ligament, m.
+        femoral_outline: outline that the muscle wraps, in the femur's x-y plane, shape (n, 2), m;
+            None: no wrapping.
+        insert_outline: outline that the ligament wraps, in the insert's x-y plane, shape (n, 2), m;
+            None: no wrapping.
     """
 
     contact: PatellofemoralContact
@@ -128,13 +132,13 @@ def patella_at(
     coordinates: Array,
     contact: PatellarContact,
 ) -> PatellaState:
-    """Return the state of a patella at given coordinates, whatever its gap and moment are.
+    """Return the state of a patella at given coordinates, for any gap and residual moment.
 
     Args:
         mechanism: the extensor mechanism.
-        pose_femur_in_insert: (4, 4).
-        coordinates: (3,) of the patella, m and rad.
-        contact: contact of the button there.
+        pose_femur_in_insert: pose of the femur, shape (4, 4).
+        coordinates: patella coordinates, shape (3,), m and rad.
+        contact: contact of the button at these coordinates.
     """
     frame = PatellaFrame(mechanism, pose_femur_in_insert)
     balance = frame.balance_at(np.asarray(coordinates, float), contact)
@@ -143,12 +147,12 @@ def patella_at(
 
 
 def touching_patella(coordinates: Array, point: Array, normal: Array) -> PatellaState:
-    """Return the state of a patella whose place and contact alone are known.
+    """Return the state of a patella from its coordinates and contact; all other values are NaN.
 
     Args:
-        coordinates: (3,) patella coordinates, m and rad.
-        point: (3,) m, contact point, insert frame.
-        normal: (3,) unit, into the patella, insert frame.
+        coordinates: patella coordinates, shape (3,), m and rad.
+        point: contact point, insert frame, shape (3,), m.
+        normal: unit normal towards the patella, insert frame, shape (3,).
     """
     nan = float("nan")
     on_patella = np.full(3, nan)
@@ -172,7 +176,7 @@ class PatellaFrame:
         return self.balance_at(coordinates, self.mechanism.contact.at(coordinates))
 
     def balance_at(self, coordinates: Array, contact: PatellarContact) -> PatellaBalance:
-        """Return the same as `balance`, for a known contact."""
+        """Return the result of `balance` for a known contact."""
         m = self.mechanism
         patella_pose = m.contact.pose(coordinates)
         muscle = path_in_link(
@@ -184,14 +188,14 @@ class PatellaFrame:
             m.insert_outline,
             self.insert,
         )
-        # Unit forces on the patella: the muscle pulls it back along its path, the ligament towards
+        # Unit forces on the patella: the muscle pulls it towards the origin, the ligament towards
         # the tibia.
         pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
         sides = np.column_stack([hold, contact.normal[:2]])
         if abs(np.linalg.det(sides)) < PATELLA.least_determinant:
             raise ComputationError("the patellar ligament runs along the contact normal")
-        # Force equilibrium in the sagittal plane, per newton of muscle: two equations for ligament
-        # and contact.
+        # Force equilibrium in the sagittal plane, per newton of muscle tension: two equations for
+        # the ligament tension and the contact force.
         ligament_force, normal_force = np.linalg.solve(sides, -pull)
         # The residual moment about the origin vanishes in equilibrium.
         moment = (

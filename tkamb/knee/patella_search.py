@@ -7,11 +7,11 @@ equations of a massless patella without friction:
     length of the patellar ligament = its given length
     muscle, ligament and contact force meet in one point (moment balance in the plane)
 
-By virtual work, the third equation says that the muscle's length is stationary among all places
-that satisfy the first two. A stable patella is at a minimum of this length. Near a known solution,
-Newton's method solves the three equations together. Broyden's updates improve its Jacobian, which
-is called slopes here. Elsewhere the search turns the patella in the direction of the residual
-moment until the moment changes sign.
+By virtual work, the third equation states that the muscle's length is stationary among all
+positions that satisfy the first two. A stable patella is at a minimum of this length. Near a known
+solution, Newton's method solves the three equations together. Broyden's updates improve its
+Jacobian, which the code calls slopes. Without a known solution, the search rotates the patella in
+the direction of the residual moment until the moment changes sign.
 """
 
 from collections.abc import Sequence
@@ -38,23 +38,23 @@ class PatellaSearchSettings:
     """Tolerances and limits of the search for the patella."""
 
     length_tolerance: float = 1e-8
-    """m: error of gap and ligament length below which the search has converged. Chosen: far below
-    what changes a force."""
+    """m: error of gap and ligament length below which the search has converged. Chosen because such
+    an error does not change a force noticeably."""
     rotation_tolerance: float = 1e-7
-    """rad: step of the rotation below which the search has converged. Chosen: far below what
-    changes a force."""
+    """rad: step of the rotation below which the search has converged. Chosen because such a step
+    does not change a force noticeably."""
     max_chord_lengths: float = 8.0
     """1: largest extrapolation along the chord between the states at two rotations, in lengths of
-    this chord. Chosen: farther away the prediction fails."""
+    this chord. Chosen because a longer extrapolation fails."""
     max_evaluations: int = 14
-    """Maximum number of Newton steps from a guess near by. Chosen: searches that converge need
-    fewer."""
+    """Maximum number of Newton steps from a guess near the solution. Chosen because searches that
+    converge need fewer."""
     lever_arm: float = 0.02
-    """m: arm that makes a rotation comparable to a length in Broyden's update. Chosen: half the
+    """m: arm that makes a rotation comparable to a length in Broyden's update. Chosen as half the
     width of a patella."""
     max_distance: float = 5e-3
     """m: largest distance between a solution and the position at which the button first touches
-    the femur at the same rotation. Chosen: a solution farther away lies behind the femur."""
+    the femur at the same rotation. Chosen because a more distant solution lies behind the femur."""
 
 
 PATELLA_SEARCH = PatellaSearchSettings()
@@ -65,15 +65,15 @@ LONGEST_STEP = np.array([5e-3, 5e-3, np.deg2rad(4.0)])
 
 
 FIRST_STEP = np.deg2rad(0.5)
-"""rad: first step of the rotation when the search turns the patella."""
+"""rad: first step when the search rotates the patella."""
 NEAR_TURN = np.deg2rad(12.0)
 """rad: largest rotation from the initial guess in Newton's method with known slopes."""
 WIDEST_TURN = np.deg2rad(40.0)
-"""rad: largest rotation from the initial guess when the search turns the patella."""
+"""rad: largest rotation from the initial guess when the search rotates the patella."""
 
 
 class _Lost(ComputationError):
-    """The search found no equilibrium; `status` names the condition that is not met."""
+    """The search found no equilibrium. `status` names the condition that failed."""
 
     def __init__(self, status: PatellaStatus) -> None:
         super().__init__(status.value)
@@ -87,17 +87,18 @@ def solve_patella(
     slopes: Array | None = None,
     anywhere: bool = True,
 ) -> PatellaState:
-    """Return the patella's place at one frame.
+    """Return the patella in equilibrium at one frame.
 
     Args:
         mechanism: the extensor mechanism.
-        pose_femur_in_insert: (4, 4) pose of the femur link.
-        guess: (3,) m and rad, initial guess; None: all rotations are searched.
-        slopes: (3, 3) `PatellaState.slopes` at the guess; None: unknown.
+        pose_femur_in_insert: pose of the femur link, shape (4, 4).
+        guess: coordinates as initial guess, shape (3,), m and rad; None: all rotations are
+            searched.
+        slopes: `PatellaState.slopes` at the guess, shape (3, 3); None: unknown.
         anywhere: whether all rotations are searched if the search from the guess fails.
 
     Returns:
-        The state; coordinates and forces are NaN unless status is OK, SEVERAL or EDGE.
+        The state. Coordinates and forces are NaN unless its status is OK, SEVERAL or EDGE.
     """
     search = _Search(mechanism, pose_femur_in_insert)
     balance, several = None, False
@@ -125,7 +126,7 @@ class _Closing:
     """Newton steps for gap and ligament length at a constant rotation, with Broyden's slopes.
 
     The first slopes are the contact's unit normal and the ligament's direction. On the flanks of
-    the groove the slope of the gap is up to a fifth smaller, which Broyden's updates correct.
+    the groove the slope of the gap is up to a fifth smaller. Broyden's updates correct this.
     """
 
     def __init__(self, ligament_length: float) -> None:
@@ -163,8 +164,8 @@ class _Search(PatellaFrame):
         """Return the balance with zero gap and the given ligament length at a rotation (rad).
 
         Raises:
-            ComputationError: no such balance exists, or an end of the muscle or the ligament lies
-                inside the outline that it wraps.
+            ComputationError: no such balance exists, or a line ends inside the outline that it
+                wraps.
         """
         closing = _Closing(self.mechanism.ligament_length)
         coordinates = np.array([start[0], start[1], rotation])
@@ -181,11 +182,11 @@ class _Search(PatellaFrame):
         """Return the stable equilibrium near a guess, where the moment vanishes.
 
         Args:
-            guess: (3,) coordinates, m and rad.
-            slopes: (3, 3) of a place near by, for Newton's method; None: unknown.
+            guess: patella coordinates, shape (3,), m and rad.
+            slopes: slopes at a similar pose, for Newton's method, shape (3, 3); None: unknown.
 
         Raises:
-            ComputationError: there is none within `WIDEST_TURN`.
+            ComputationError: there is no equilibrium within `WIDEST_TURN`.
         """
         if slopes is not None:
             balance = self._closed_in(guess, slopes, (-NEAR_TURN, NEAR_TURN))
@@ -220,20 +221,20 @@ class _Search(PatellaFrame):
         try:
             brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
-            # A search from `first` may end at another solution than `second` at the same rotation.
-            # The moment there may have the same sign as at `first`, so no zero is bracketed.
+            # At the rotation of `second`, a search from `first` may find another solution. If its
+            # moment has the sign of the moment at `first`, no zero is bracketed.
             raise _Lost(PatellaStatus.MOMENT) from None
         return last
 
     def _chord(
         self, first: PatellaBalance, second: PatellaBalance, reach: float = 1.0
     ) -> PatellaBalance | None:
-        """Return the stable equilibrium near the chord between two balances; None: there is none.
+        """Return the stable equilibrium near the chord between two balances; None: not found.
 
         Args:
             first: balance at the start of the chord.
-            second: balance at its end.
-            reach: 1, largest distance from the start, in lengths of the chord.
+            second: balance at the end of the chord.
+            reach: largest distance from the start, in lengths of the chord, 1.
         """
         turn = float(second.coordinates[2] - first.coordinates[2])
         way = (second.coordinates - first.coordinates)[:2] / turn
@@ -250,15 +251,15 @@ class _Search(PatellaFrame):
     def _closed_in(
         self, start: Array, slopes: Array, span: Sequence[float]
     ) -> PatellaBalance | None:
-        """Return the stable balance near a place by Newton's method with Broyden's slopes.
+        """Return the stable balance near a pose by Newton's method with Broyden's slopes.
 
-        None if a step leaves the span, if the slopes show an unstable state, or if the iteration
-        does not converge.
+        The result is None if a step leaves the span, if the slopes are those of an unstable state,
+        or if the iteration does not converge.
 
         Args:
-            start: (3,) coordinates, m and rad.
-            slopes: (3, 3) approximate slopes of gap, ligament length and moment.
-            span: rad, least and greatest rotation from the start.
+            start: patella coordinates, shape (3,), m and rad.
+            slopes: approximate slopes of gap, ligament length and moment, shape (3, 3).
+            span: smallest and largest rotation from the start, rad.
         """
         scale = np.array([1.0, 1.0, PATELLA_SEARCH.lever_arm])
         coordinates, step, before = start, None, np.zeros(3)
@@ -284,14 +285,15 @@ class _Search(PatellaFrame):
         return None
 
     def scan(self) -> tuple[PatellaBalance, bool]:
-        """Return the stable balance with the shortest muscle, and whether there are others.
+        """Return the stable balance with the shortest muscle, and whether there are several.
 
         Raises:
-            _Lost: there is none; `status` is the condition that the best attempt did not meet.
+            _Lost: there is no stable balance. `status` is the condition that failed in the best
+                attempt.
         """
         flexion = np.arctan2(self.in_insert[1, 0], self.in_insert[0, 0])
-        # The patella turns with the tibia by about two thirds of the flexion; the scan is centred
-        # there.
+        # The patella rotates with the tibia by about two thirds of the flexion: the scan is centred
+        # at this rotation.
         rotations = -0.65 * flexion + np.deg2rad(np.arange(-50.0, 50.1, 10.0))
         places: list[PatellaBalance | None] = []
         misses = []
@@ -303,7 +305,7 @@ class _Search(PatellaFrame):
                 misses.append(_condition(error))
         balances = []
         for first, second in pairwise(places):
-            # A moment that falls through zero belongs to a stable equilibrium.
+            # The equilibrium is stable where the moment falls through zero.
             if first and second and first.moment > 0.0 >= second.moment:
                 try:
                     balances.append(self.between(first, second))
@@ -320,12 +322,13 @@ class _Search(PatellaFrame):
         The patella swings on its ligament about the tuberosity, from anterior to posterior.
 
         Raises:
-            ComputationError: the button touches nothing, or there is no balance near the touch.
+            ComputationError: the button does not touch the femur, or there is no balance near the
+                first contact.
         """
         m = self.mechanism
         rotated = m.contact.pose(np.array([0.0, 0.0, rotation]))
         proximal = transform(rotated, m.ligament_proximal)
-        # The ligament has a constant length: its end on the patella lies on a circle about the
+        # The ligament has a constant length: its proximal end moves on a circle about the
         # tuberosity.
         radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
 
@@ -335,7 +338,8 @@ class _Search(PatellaFrame):
 
         leans = np.deg2rad(np.arange(75.0, -75.1, -5.0))
         touching = next((k for k, lean in enumerate(leans) if m.contact.touches(place(lean))), 0)
-        if touching == 0:  # never, or from the start
+        # Index 0: no position touches the femur, or the first position touches it.
+        if touching == 0:
             raise _Lost(PatellaStatus.NO_CONTACT)
         free, deep = leans[touching - 1], leans[touching]
         for _ in range(6):
@@ -354,11 +358,11 @@ _CONDITIONS = (
     PatellaStatus.GAP,
     PatellaStatus.MOMENT,
 )
-"""Conditions in the order in which a search checks them. The last one that failed is reported."""
+"""Conditions in the order of the search's checks. The last condition that failed is reported."""
 
 
 def _condition(error: ComputationError) -> PatellaStatus:
-    """Return the condition that an error reports; an error without a status means LINE."""
+    """Return the condition of an error; an error without a status means LINE."""
     return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
 
 
@@ -368,7 +372,7 @@ def _slopes_in_plane(balance: PatellaBalance) -> Array:
 
 
 def _stable(slopes: Array) -> bool:
-    """Say whether the moment opposes a rotation at constant gap and ligament length."""
+    """Return whether the moment opposes a rotation at constant gap and ligament length."""
     plane = slopes[:2, :2]
     if abs(np.linalg.det(plane)) < PATELLA.least_determinant:
         return False

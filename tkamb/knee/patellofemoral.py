@@ -1,27 +1,28 @@
 """Contact of the patellar button with the femoral component, and line of action of its force.
 
-Everything is in the patellar joint's frame, x anterior, y superior, z right, which is fixed to the
-femur. The patella moves in the sagittal plane of this frame (x, y, rotation about z).
+All positions are in the patellar joint's frame, x anterior, y superior, z right. This frame is
+fixed to the femur. The patella moves in its sagittal plane (x, y, rotation about z).
 
-The joint side of the button is sampled. Sample i has the signed distance d_i from the femoral
-component, with the nearest point p_i and the normal n_i there. The closest point of two faceted,
+The articular side of the button is sampled. Sample i has the signed distance d_i from the femoral
+component, the nearest point p_i and the normal n_i at that point. The closest point of two faceted,
 nearly conforming surfaces jumps by centimetres from frame to frame. So the contact is a weighted
-mean over the samples of each side of the patella's middle, with weights w_i ~ exp(-d_i/tau):
+mean over the samples on the left (-z) and on the right side of the patella, with weights
+w_i ~ exp(-d_i/tau):
 
     g = sum w_i d_i - tau,    p = sum w_i p_i,    n = sum w_i n_i
 
 For a paraboloid of any curvature, g is exactly the distance of the closest points. A patella in its
-groove touches on its left (-z) and on its right side. The left side has the share lambda of the
-force. The share follows from soft tissue with which the patella shifts by c times the lateral force
-and tilts by d times the tilting moment, per unit contact force:
+groove touches on both sides. The left side has the share lambda of the force. Soft tissue decides
+this share: per unit contact force, the patella shifts by c times the lateral force and tilts by d
+times the tilting moment:
 
     gap = min over 0 <= lambda <= 1 of
           lambda g_l + (1 - lambda) g_r + (c/2) n_z² + (d/2) a²
     n_z = lambda n_lz + (1 - lambda) n_rz      a = lambda z_l + (1 - lambda) z_r
 
-with z from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is the
-direction of the patellofemoral force. Shift and tilt are reported as first-order estimates; the
-patella itself stays in the sagittal plane.
+where z is measured from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is
+the direction of the patellofemoral force. Shift and tilt are first-order estimates: the computed
+patella stays in the sagittal plane.
 """
 
 import copy
@@ -41,38 +42,40 @@ class PatellofemoralSettings:
     """Samples and weights of the patellofemoral contact, and its soft tissue."""
 
     patch_depth: float = 5e-5
-    """m: tau of the module's equations. Chosen: a contact of relative radius R is averaged over
-    about sqrt(R tau)."""
+    """m: tau of the module's equations. A contact of relative radius R is averaged over a radius of
+    about sqrt(R tau). Larger: smoother, less local."""
     sample_spacing: float = 1e-3
-    """m: spacing of the button's samples in the patella's coronal plane. Chosen: about the facets
-    of a mesh."""
+    """m: spacing of the button's samples in the patella's coronal plane. Chosen because the facets
+    of a mesh have about this size."""
     sample_range: float = 14.0 * patch_depth
-    """m: a sample whose distance exceeds the least one by more has no weight. Chosen: its weight
-    would be exp(-14) = 8e-7, and the gap of a patch of twenty samples jumps by 3e-11 m."""
+    """m: excess over the smallest distance above which a sample has no weight. Chosen because the
+    weight at this excess is exp(-14) = 8e-7. The gap of a patch of twenty samples then jumps by
+    3e-11 m."""
     coarse_samples: int = 60
-    """Number of samples of the quick check for touch. Chosen: enough for an initial guess."""
+    """Number of samples of the quick check for touch. Chosen because an initial guess needs no
+    more."""
     lateral_compliance: float = 0.01
-    """m: c of the module's equations, the shift under a purely lateral contact force. Chosen: soft
-    enough to keep the search smooth."""
+    """m: c of the module's equations, the shift under a purely lateral contact force. Chosen soft
+    enough for a smooth search."""
     tilt_compliance: float = 10.0
-    """rad/m: d of the module's equations; a force 10 mm beside the middle tilts by 5.7 deg. Chosen:
-    soft enough to keep the search smooth."""
+    """rad/m: d of the module's equations. A force 10 mm beside the middle tilts by 5.7 deg. Chosen
+    soft enough for a smooth search."""
     least_sagittal_part: float = 1e-9
-    """1: sagittal part of a unit normal below which the normal has no sagittal direction. Chosen:
-    above rounding."""
+    """1: sagittal part of a unit normal below which the normal has no sagittal direction. Chosen
+    because it is above rounding errors."""
 
 
 PATELLOFEMORAL = PatellofemoralSettings()
 
 
 STRAIGHT = 1e-12
-"""m: curvature of the gap over the share below which the nearer side carries all of the force."""
+"""m: second derivative of the gap by the share below which the nearer side has the whole force."""
 
 FIELDS = 11
-"""Count of the numbers that describe the contact; see `_shared`."""
+"""Number of values that describe the contact, see `_shared`."""
 
 EDGE_MARGIN = 0.02
-"""Barycentric distance from a sharp edge within which a point lies on it."""
+"""1: barycentric distance from a sharp edge below which a point counts as a point of the edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +83,12 @@ class PatellarContact:
     """The contact at one position of the patella, in the patellar joint's frame.
 
     Args:
-        gap: m, negative in penetration.
-        point: (3,) m, point of the line of action next to the mean of both sides' points.
-        normal: (3,) unit, in the sagittal plane, out of the femur into the patella.
+        gap: gap, negative in penetration, m.
+        point: point of the line of action that is nearest to the mean contact point, shape (3,), m.
+        normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
         share_left: lambda, share of the force on the -z side.
-        shift: m along z, first-order estimate of the patella's shift.
-        tilt: rad about y, first-order estimate of the patella's tilt.
+        shift: first-order estimate of the patella's shift along z, m.
+        tilt: first-order estimate of the patella's tilt about y, rad.
         on_edge: share of the force on sharp or open edges of the femoral mesh.
     """
 
@@ -101,16 +104,17 @@ class PatellarContact:
 class PatellofemoralContact:
     """Contact between button and femoral component, prepared for many positions.
 
-    The distance of a sample is computed again only if the sample can have a weight at the new
-    position: the change of its distance is at most its displacement. This saves time without a
-    change of the result.
+    The distance of a sample changes at most by its displacement. A distance is computed again only
+    if the sample can have a weight at the new position. This saves time and does not change the
+    result.
 
     Args:
-        femoral: femoral component in the patellar joint's frame, with shared vertices.
-        patellar: button in the patella's frame; its joint side faces -x.
-        ml: m, z of the patella's frame in the joint's frame.
-        lateral_yield: m, c of the module's equation.
-        tilt_yield: rad/m, d of the module's equation.
+        femoral: surface of the femoral component in the patellar joint's frame, with shared
+            vertices.
+        patellar: surface of the button in the patella's frame; its articular side faces -x.
+        ml: z of the patella's frame in the joint's frame, m.
+        lateral_yield: c of the module's equation, m.
+        tilt_yield: d of the module's equation, rad/m.
 
     Raises:
         InputError: the button does not lie on both sides of the sagittal plane.
@@ -137,7 +141,7 @@ class PatellofemoralContact:
         count = len(self._samples)
         never, zeros = np.full((count, 3), np.inf), np.zeros(count)
         places = np.zeros((count, 3)), np.zeros((count, 3))
-        # Of each sample: position at its last evaluation, distance, nearest point, normal, and
+        # For each sample: position at the last evaluation, distance, nearest point, normal, and
         # whether the nearest point is on an edge.
         self._seen = never, zeros, *places, np.zeros(count)
 
@@ -167,7 +171,7 @@ class PatellofemoralContact:
         return PatellarContact(gap, contact[5:8], contact[8:], left_share, shift, tilt, on_edge)
 
     def touches(self, coordinates: Array) -> bool:
-        """Say whether any of a few samples lies inside the femur, as a quick check."""
+        """Return whether any of a few samples lies inside the femur, as a quick check."""
         few = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
         samples = transform(self.pose(np.asarray(coordinates, float)), few)
         low, high = self._nearest.surface.bounds
@@ -178,7 +182,7 @@ class PatellofemoralContact:
         return bool((apart < 0.0).any())
 
     def _sides_at(self, coordinates: Array) -> Array:
-        """Return gap, point, normal and share on edges (2, 8), left and right."""
+        """Return gap, point, normal and share on edges of the left and the right side (2, 8)."""
         samples = transform(self.pose(np.asarray(coordinates, float)), self._samples)
         seen_at, distance = self._seen[:2]
         which = _which_matter(samples, self._left, PATELLOFEMORAL.sample_range, seen_at, distance)
@@ -210,15 +214,16 @@ def _which_matter(
 ) -> Index:
     """Return the samples whose distances must be computed again.
 
-    A sample that has moved by m since its distance was d has a distance between d - m and d + m.
-    These bounds show which samples cannot have a weight.
+    Let d be the distance of a sample at its last evaluation, and m its displacement since then. The
+    present distance is between d - m and d + m. These bounds exclude samples without weight.
 
     Args:
-        samples: (n, 3) m, present positions of the samples.
-        on_left: (n,) whether a sample is on the -z side.
-        reach: m, excess over the least distance beyond which a sample has no weight.
-        seen_at: (n, 3) m, position of each sample at its last evaluation; inf: none.
-        distance: (n,) m, signed distance at that position.
+        samples: present positions of the samples, shape (n, 3), m.
+        on_left: whether each sample is on the -z side, shape (n,).
+        reach: excess over the smallest distance above which a sample has no weight, m.
+        seen_at: position of each sample at its last evaluation, shape (n, 3), m; inf: no
+            evaluation.
+        distance: signed distance at that position, shape (n,), m.
     """
     count, nearest = len(samples), np.full(2, np.inf)
     displacement, which, number = np.full(count, np.inf), np.empty(count, np.int64), 0
@@ -226,12 +231,12 @@ def _which_matter(
         if seen_at[n, 0] < np.inf:
             displacement[n] = np.sqrt(np.sum((samples[n] - seen_at[n]) ** 2))
             side = 0 if on_left[n] else 1
-            # Upper bound of the least distance of this side.
+            # Upper bound of the smallest distance on this side.
             nearest[side] = min(nearest[side], distance[n] + displacement[n])
     for n in range(count):
-        # The lower bound of this sample's distance shows that it has no weight.
+        # True: even the lower bound of this sample's distance is too large for a weight.
         beyond = distance[n] - displacement[n] >= nearest[0 if on_left[n] else 1] + reach
-        if displacement[n] != 0.0 and not beyond:  # a NaN is computed again, too
+        if displacement[n] != 0.0 and not beyond:  # true for NaN, too
             which[number] = n
             number += 1
     return which[:number]
@@ -257,27 +262,27 @@ def _take(
     """Store the distances, nearest points and normals of samples.
 
     Args:
-        which: (m,) indices of the samples.
-        samples: (n, 3) m, positions of all samples.
-        apart: (m,) m, unsigned distances of the samples.
-        faces: (m,) triangles of their nearest points.
-        weights: (m, 3) barycentric coordinates of their nearest points.
-        triangles: (k, 3, 3) m, triangles of the femoral component.
-        smooth_normals: (k, 3, 3) unit normals at the corners, which differ across sharp edges.
-        vertex_normals: (k, 3, 3) unit normals at the corners, means over each vertex.
-        sharp: (k, 3) whether the edge opposite each corner is sharp or open.
-        seen_at: (n, 3) m, output: positions of the samples.
-        distance: (n,) m, output: signed distances.
-        foot: (n, 3) m, output: nearest points.
-        normal: (n, 3) output: unit normals at the nearest points.
-        on_edge: (n,) output: 1 if the nearest point is on a sharp or open edge, else 0.
+        which: indices of m samples, shape (m,).
+        samples: positions of all samples, shape (n, 3), m.
+        apart: unsigned distances of the m samples, shape (m,), m.
+        faces: triangle of each nearest point, shape (m,).
+        weights: barycentric coordinates of each nearest point, shape (m, 3).
+        triangles: triangles of the femoral component, shape (k, 3, 3), m.
+        smooth_normals: unit normals at the corners, shape (k, 3, 3). They jump at sharp edges.
+        vertex_normals: unit normals at the corners, means over each vertex, shape (k, 3, 3).
+        sharp: whether the edge opposite each corner is sharp or open, shape (k, 3).
+        seen_at: output: positions of the samples, shape (n, 3), m.
+        distance: output: signed distances, shape (n,), m.
+        foot: output: nearest points, shape (n, 3), m.
+        normal: output: unit normals at the nearest points, shape (n, 3).
+        on_edge: output: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
     """
     outward = np.empty(3)
     for m in range(len(which)):
         n, face, edge = which[m], faces[m], False
         for corner in range(3):
             edge |= sharp[face, corner] and weights[m, corner] < EDGE_MARGIN
-        # Across a sharp edge the mean over the vertices turns without a jump.
+        # Vertex normals change across a sharp edge without a jump.
         normals = vertex_normals[face] if edge else smooth_normals[face]
         along, length = 0.0, 0.0
         for k in range(3):
@@ -289,7 +294,7 @@ def _take(
             length += outward[k] ** 2
         for k in range(3):
             normal[n, k] = outward[k] / np.sqrt(length)
-        # A sample behind the surface is inside the femur.
+        # A sample behind the surface is inside the femur: its distance is negative.
         distance[n] = -apart[m] if along < 0.0 else apart[m]
         on_edge[n] = 1.0 if edge else 0.0
 
@@ -305,17 +310,17 @@ def _mean_over_sides(
     on_edge: Array,
     means: Array,
 ) -> None:
-    """Write g, p, n and the share on edges (2, 8), left and right.
+    """Compute g, p, n and the share on edges of the left and the right side.
 
     Args:
-        on_left: (n,) as for `_which_matter`.
-        depth: m, tau of the module's equation.
-        reach: m, as for `_which_matter`.
-        distance: (n,) m, as for `_take`.
-        foot: (n, 3) m, as for `_take`.
-        normal: (n, 3) as for `_take`.
-        on_edge: (n,) as for `_take`.
-        means: (2, 8) output.
+        on_left: whether each sample is on the -z side, shape (n,).
+        depth: tau of the module's equation, m.
+        reach: excess over the smallest distance above which a sample has no weight, m.
+        distance: signed distances, shape (n,), m.
+        foot: nearest points, shape (n, 3), m.
+        normal: unit normals at the nearest points, shape (n, 3).
+        on_edge: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
+        means: output: the means of each side, shape (2, 8).
     """
     for side in range(2):
         nearest, total = np.inf, 0.0
@@ -336,23 +341,22 @@ def _mean_over_sides(
                 means[side, 1 + k] += weight * foot[n, k]
                 means[side, 4 + k] += weight * normal[n, k]
         means[side] /= total
-        # The weighted mean over a paraboloid exceeds its smallest distance by tau, which is
-        # subtracted.
+        # The weighted mean over a paraboloid exceeds its smallest distance by tau.
         means[side, 0] -= depth
 
 
 @compiled_as_written
 def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float:
-    """Write the contact with the share of the module's equation; return the normal's sagittal part.
+    """Compute the contact by the module's equation, and return the normal's sagittal part.
 
     Args:
-        sides: (2, 8) gap, point, normal and share on edges, left and right.
-        middle: m, z of the patella's middle.
-        yields: (2,) c and d.
-        contact: (`FIELDS`,) output: gap, share of the left, shift, tilt, share on edges,
-            point (3,) and normal (3,) of the line of action in the sagittal plane.
+        sides: gap, point, normal and share on edges of the left and the right side, shape (2, 8).
+        middle: z of the patella's middle, m.
+        yields: c and d of the module's equation, shape (2,).
+        contact: output: gap, share of the left, shift, tilt, share on edges, point (3,) and normal
+            (3,) of the line of action in the sagittal plane, shape (`FIELDS`,).
     """
-    # The gap is a parabola in the share of the left side; at its minimum, shift and tilt are in
+    # The gap is a parabola in the share of the left side. At its minimum, shift and tilt are in
     # equilibrium.
     curvature, slope = 0.0, sides[0, 0] - sides[1, 0]
     for k in range(2):
@@ -363,7 +367,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
     if curvature < STRAIGHT:
         left_share = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
     else:
-        # A side cannot pull, so that the share stays in [0, 1].
+        # A side cannot pull: the share stays in [0, 1].
         left_share = min(max(-slope / curvature, 0.0), 1.0)
     mean = left_share * sides[0] + (1.0 - left_share) * sides[1]
     moment, length = 0.0, np.sqrt(mean[4] ** 2 + mean[5] ** 2)
@@ -371,7 +375,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
         part = left_share if side == 0 else 1.0 - left_share
         moment += (sides[side, 1] - mean[1]) * part * sides[side, 5]
         moment -= (sides[side, 2] - mean[2]) * part * sides[side, 4]
-    # Lateral part of the normal, and the distance of the force from the middle.
+    # Lateral part of the normal, and lever arm of the force about the middle.
     aside, lever = mean[6], mean[3] - middle
     contact[0] = mean[0] + 0.5 * (yields[0] * aside**2 + yields[1] * lever**2)
     contact[1], contact[2], contact[3], contact[4] = (
@@ -380,7 +384,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
         yields[1] * lever,
         mean[7],
     )
-    # The mean point, moved in the sagittal plane onto the line of action of the resultant.
+    # Projection of the mean point onto the line of action, in the sagittal plane.
     contact[5] = mean[1] + moment / length**2 * mean[5]
     contact[6], contact[7] = mean[2] - moment / length**2 * mean[4], mean[3]
     contact[8], contact[9], contact[10] = mean[4] / length, mean[5] / length, 0.0
@@ -388,7 +392,7 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
 
 
 def _joint_side(patellar: Surface) -> Array:
-    """Return samples (n, 3), m, of the surface that is seen along the patella's +x."""
+    """Return samples (n, 3), m, of the articular side, by rays along the patella's +x."""
     low, high = patellar.bounds
     axes = [
         np.arange(

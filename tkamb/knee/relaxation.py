@@ -1,17 +1,20 @@
-"""Relaxation of the muscle forces that a search for equilibrium holds constant.
+"""Relaxation of the muscle forces between the passes of a search for equilibrium.
 
-The muscle sharing depends on the knee's equilibrium, and the equilibrium depends on the sharing.
-Under a light load the knee is compliant, and computing both in turn would oscillate. Each pass
-therefore changes the forces f by a part omega of the difference from the required forces f',
+The muscle forces depend on the knee's equilibrium, and the equilibrium depends on the muscle
+forces. Under a light load the knee is compliant, and an alternating computation would oscillate.
+Each pass therefore changes the applied forces f by a part omega of the difference from the required
+forces f',
 
     f <- f + omega (f' - f),   omega <- -omega d . (d' - d) / |d' - d|²,
 
-with d and d' the last two differences f' - f (Aitken's secant for a vector). At the end f = f'.
+where d and d' are the last two differences f' - f (Aitken's secant for a vector). At the end
+f = f'.
 
-The compliance of the knee enters the muscles' arms, and depends itself on the equilibrium. The
-first passes use the measured compliance. Later passes change it by half of the difference from the
-measured one, then by a quarter, so that it converges if the contact's stiffness changes fast with
-the pose. After these passes it stays constant. `doubt` is the remaining difference.
+The moment arms of the muscles depend on the compliance of the knee, and the compliance depends on
+the equilibrium. The first passes use the measured compliance. Later passes change the compliance by
+half of its difference from the measured value, then by a quarter. So the compliance converges even
+if the contact's stiffness changes fast with the pose. After these passes it stays constant. `doubt`
+is the remaining difference.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -35,28 +38,29 @@ class MuscleIterationSettings:
 
     muscle_force_tolerance: float = 1.0
     """N: largest difference of a muscle's required force from its applied force at which the
-    iteration has converged. Chosen: a thousandth of a usual muscle force."""
+    iteration has converged. Chosen as a thousandth of a usual muscle force."""
 
 
 MUSCLE_ITERATION = MuscleIterationSettings()
 
 LEAST, MOST = 0.05, 1.0
-"""Least and largest omega."""
+"""Smallest and largest omega."""
 
 
 STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
-"""Up to this number of passes the compliance changes by this share of the difference."""
+"""Pairs (number of passes, share): up to this pass the compliance changes by this share of the
+difference from the measured compliance."""
 TURNS = np.array(
     [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
 )
-"""m: arms that make the responses to forces and to moments comparable."""
+"""1 and m: factors that make the responses to forces and moments comparable."""
 
 
 class Relaxation:
     """The muscles' forces over the passes of one search.
 
     Attributes:
-        settled: whether the required forces agree with the applied forces.
+        settled: whether the applied forces have converged to the required forces.
         doubt: relative difference of the measured compliance from the compliance in use.
     """
 
@@ -71,8 +75,8 @@ class Relaxation:
         """Return the compliance of the knee for the next pass.
 
         Args:
-            measured: (6,) compliance at the last equilibrium, from
-                `ReleasedForces.tension_per_wrench`; None: unknown.
+            measured: compliance at the last equilibrium, from `ReleasedForces.tension_per_wrench`,
+                shape (6,); None: unknown.
         """
         self._passes, self.doubt = self._passes + 1, 0.0
         last, self._yields = self._yields, measured
@@ -90,7 +94,7 @@ class Relaxation:
         """Return the forces of the next pass.
 
         Args:
-            required: sharing at the equilibrium under the forces of the last pass.
+            required: muscle forces at the equilibrium of the last pass.
         """
         applied, self._held, self.settled = self._held, required, False
         if applied is None:

@@ -1,18 +1,18 @@
 """Released knee coordinates: their equilibrium under contact, ligaments and muscles.
 
-Flexion is as recorded. The superior-inferior position always follows from the contact.
-Adduction, axial rotation, anterior-posterior and medial-lateral position follow from equilibrium
-if the scene releases them. If not, they are kept as recorded, and the force or moment that keeps
-them is a residual of the equations of motion.
+Flexion keeps its recorded value. Equilibrium with the contact always determines the
+superior-inferior position. It also determines adduction, axial rotation, anterior-posterior and
+medial-lateral position if the scene releases them. A coordinate that is not released keeps its
+recorded value. The force or moment that this requires is a residual of the equations of motion.
 
 The search is repeated in passes. Within one pass the patella is fixed to the femur, and the forces
-of the other muscles are constant. Then patella and lines are solved again at the new pose, and the
-load is shared again among the muscles with the new contact, until the knee does not move between
-passes. So the shared tension of the extensor group agrees with the knee's equations.
+of the other muscles are constant. Then patella, lines and muscle forces are computed again at the
+new pose and contact. The passes end when the knee does not move between them. The tension of the
+extensor group then satisfies the knee's equations.
 
-Inertia and sliding speed follow from the recorded rates: the released coordinates are quasi-static.
-Coulomb friction is mu times the resultant of each condyle, against the recorded sliding, on the
-line of action of the resultant.
+Inertia and sliding speed use the recorded rates: the released coordinates are quasi-static. Coulomb
+friction is mu times the resultant of each condyle, opposite to the recorded sliding, on the line of
+action of the resultant.
 """
 
 from collections.abc import Sequence
@@ -46,38 +46,39 @@ class ReleasedKneeSettings:
     """Tolerances and limits of the passes between knee, patella and muscles."""
 
     knee_tolerance: float = 2e-6
-    """m: movement of the knee between passes below which they have converged. Chosen: the same as
-    the tolerance of a step of the search."""
+    """m: movement of the knee between passes below which they have converged. Chosen equal to the
+    step tolerance of the search."""
     contact_force_tolerance: float = 0.1
     """N: change of the contact force below which passes have converged, or `contact_force_share` of
-    the force if that is larger. Chosen: a ten-thousandth of a usual contact force."""
+    the force if that is larger. Chosen as a ten-thousandth of a usual contact force."""
     residual_tolerance: float = 0.5
-    """N (moments are divided by the lever arm): largest residual force on a released coordinate at
-    the returned pose, with patella, lines and contact computed there. A frame has no result if the
-    residual exceeds the largest of this, `residual_share` of the contact force, and the error of
-    the contact force. Chosen: measured residuals are below 0.1 N."""
+    """N (moments are divided by the lever arm): largest residual force on a released coordinate,
+    with patella, lines and contact of the returned pose. A frame has no result if the residual
+    exceeds the largest of this tolerance, `residual_share` of the contact force, and the error of
+    the contact force. Chosen because measured residuals are below 0.1 N."""
     residual_share: float = 1e-3
-    """1: see `residual_tolerance`. Chosen: the patella's changes from facet to facet alter the
-    force by 2e-4 of it."""
+    """1: see `residual_tolerance`. Chosen because the facets of the patella change the force by a
+    share of 2e-4."""
     contact_force_share: float = 2e-4
-    """1: see `contact_force_tolerance`. Chosen: the patella's changes from facet to facet alter the
-    force by about as much."""
+    """1: see `contact_force_tolerance`. Chosen because the facets of the patella change the force
+    by about this share."""
     max_passes: int = 24
-    """Maximum number of passes. Chosen: for a compliant knee a pass halves the change."""
+    """Maximum number of passes. Chosen because a pass halves the change of a compliant knee."""
     inner_tolerance_share: float = 0.1
     """1: remaining step of a pass with muscles, as a share of its movement, at which the pass ends.
-    Chosen: more passes follow in any case."""
+    Chosen because more passes follow in any case."""
     muscle_force_range: float = 3e-3
     """m: distance from the initial guess within which the muscle forces of the last frame are a
-    good guess. Chosen: the knee moves by less from frame to frame."""
+    good guess. Chosen because the knee moves by less from frame to frame."""
     slack_force: float = 1e-3
-    """N: an extensor group with a smaller tension is slack. Chosen: far below what is reported."""
+    """N: an extensor group with a smaller tension is slack. Chosen because it is far below the
+    resolution of the reports."""
     initial_load_error: float = 0.5
     """1: largest relative difference between the load at an initial guess and the load of the last
-    frame. Chosen: from there the search converges."""
+    frame. Chosen because the search converges from such a guess."""
     max_height_steps: int = 4
     """Maximum number of heights that are tried to bring the load within `initial_load_error`.
-    Chosen: each costs one evaluation of the contact."""
+    Chosen because each height costs one evaluation of the contact."""
 
 
 RELEASED_KNEE = ReleasedKneeSettings()
@@ -90,21 +91,20 @@ class KneeEquilibrium:
     """Result of the search for the released coordinates of one frame.
 
     Args:
-        coordinates: (6,) knee coordinates, m and rad.
-        geometry: input of the equations there, without the contact.
-        patella: the patella there; None: not modelled.
-        contact: the contact there.
-        balance: the last pass.
+        coordinates: knee coordinates, shape (6,), m and rad.
+        geometry: input of the equations at these coordinates, without the contact.
+        patella: the patella at these coordinates; None: not modelled.
+        contact: the contact at these coordinates.
+        balance: result of the last pass.
         passes: number of passes.
         trials: number of evaluations of the contact.
-        change: N, change of the contact force in the last pass.
-        problem: why this is no result, in words; empty: it is one.
+        change: change of the contact force in the last pass, N.
+        problem: reason why the search failed; empty: it succeeded.
         doubt: `Relaxation.doubt` at the end.
-        residual: N (moments are divided by the lever arm), largest residual force on a released
-            coordinate at the returned pose, with patella, lines and contact computed there; inf:
-            not measured.
-        second: a second equilibrium that another initial guess leads to, in words; empty: none was
-            found (`InitialPoses`).
+        residual: largest residual force on a released coordinate with patella, lines and contact of
+            the returned pose, N (moments divided by the lever arm); inf: not measured.
+        second: description of a second equilibrium from another initial guess (`InitialPoses`);
+            empty: not found.
     """
 
     coordinates: Array
@@ -122,7 +122,7 @@ class KneeEquilibrium:
 
 
 def released_indices(names: Sequence[str]) -> tuple[int, ...]:
-    """Return the indices of the released coordinates, the superior-inferior one among them."""
+    """Return the indices of the released coordinates, including "si"."""
     return tuple(i for i, name in enumerate(KNEE_COORDINATES) if name == "si" or name in names)
 
 
@@ -131,7 +131,7 @@ class ReleasedKnee:
 
     Args:
         probe: probe of the contact model.
-        names: the released coordinates; "si" is always one of them.
+        names: names of released coordinates; "si" is always released.
 
     Attributes:
         released: indices of the released coordinates.
@@ -153,22 +153,22 @@ class ReleasedKnee:
         """Return the knee in equilibrium.
 
         Args:
-            instant: the knee.
-            start: (6,) knee coordinates, initial guess of the released ones.
-            points: side -> (3,) m, point where an unloaded condyle is nearest to the insert. The
-                residual forces act in the middle of both condyles' points.
-            before: result of the frame before, used as initial guess.
+            instant: the knee at one instant.
+            start: knee coordinates with an initial guess of the released coordinates, shape (6,).
+            points: side -> point (3,), m, where an unloaded condyle is nearest to the insert. The
+                residual forces act in the middle of the two condyles' points.
+            before: result of the previous frame, used as initial guess.
 
         Raises:
             ComputationError: no muscle forces balance the frame.
         """
         place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
-        # `slack` starts again in every frame: a ligament that pushed in the last one may pull now.
+        # `slack` is reset in every frame: a ligament that was slack in the last frame may pull now.
         knee, slack, trials, passes = before, False, 0, 0
         touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
         if instant.muscles and before:
             place, touch = self._carrying(place, before.contact)
-        # Only near a known contact do the muscle forces of the last frame hold in the first pass.
+        # The muscle forces of the last frame are a good guess only near a contact of that load.
         reach = RELEASED_KNEE.muscle_force_range if touch else np.inf
         while passes < RELEASED_KNEE.max_passes:
             knee, pushes = self._pass(instant, place, middle, slack, knee, touch, mixing, reach)
@@ -181,7 +181,7 @@ class ReleasedKnee:
             middle = _middle(knee.contact, points, place)
             ways.append(max(travel, np.abs(middle - last).max() if self._keeps else 0.0))
             if pushes:
-                # A ligament that would push cannot act: the search begins again without it.
+                # The patellar ligament cannot push: the search begins again without its force.
                 slack, knee, touch = True, before, None
                 place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
                 ways = [np.inf, np.inf]
@@ -210,7 +210,7 @@ class ReleasedKnee:
     def _measured(
         self, instant: Instant, knee: KneeEquilibrium, middle: Array, slack: bool
     ) -> KneeEquilibrium:
-        """Return the knee with patella, lines and residual computed at its pose."""
+        """Return the knee with patella, lines and residual of its final pose."""
         if knee.problem:
             return knee
         patella = None
@@ -228,11 +228,11 @@ class ReleasedKnee:
     def _carrying(
         self, place: Array, like: "ProbedContact"
     ) -> "tuple[Array, ProbedContact | None]":
-        """Return a place raised or lowered to about the contact force of another contact.
+        """Return coordinates raised or lowered until the load is about that of another contact.
 
         Returns:
-            Coordinates (6,), and the contact there. The contact is None if other condyles carry
-            load there, or if the contact has no tangent.
+            Coordinates (6,), and the contact at these coordinates. The contact is None if other
+            condyles carry the load, if it has no tangent, or if the load is not reached.
         """
         load = float(like.wrench[1])
         for _ in range(RELEASED_KNEE.max_height_steps):
@@ -267,7 +267,7 @@ class ReleasedKnee:
         mixing: Relaxation,
         reach: float,
     ) -> tuple[KneeEquilibrium, bool]:
-        """Return the equilibrium of a pass, and whether the patellar ligament would push."""
+        """Return the equilibrium of one pass, and whether the patellar ligament would push."""
         patella, guess = None, before.patella if before else None
         if instant.extensor is not None:
             patella = instant.extensor.patella(knee_pose(place), guess)
@@ -302,7 +302,7 @@ class ReleasedKnee:
             np.nan,
             problem,
         )
-        # With other muscles, the sharing decides whether the quadriceps is slack.
+        # With other muscles, static optimisation decides whether the quadriceps is slack.
         ended = balance.at_rest or balance.status is not BalanceStatus.OK
         return knee, ended and not muscles and contact.known and forces.pushes(balance)
 
@@ -315,17 +315,18 @@ class ReleasedKnee:
         applied: "MuscleShare | None",
         mixing: Relaxation,
     ) -> "MuscleShare":
-        """Return the force of each muscle, while the released coordinates yield to these forces.
+        """Return the force of each muscle if the released coordinates depend on these forces.
 
         If no equilibrium is known yet, or if the contact has no tangent, the contact points are
         constant. If the equations are then singular, the contact force acts at the femoral origin.
 
         Args:
-            instant: the knee.
+            instant: the knee at one instant.
             geometry: input of the equations, without the contact.
             joint: equations of the released coordinates with a taut extensor mechanism.
-            touch: the contact there; None: no contact like that of the last frame is known.
-            applied: sharing of the last pass, in this frame or the frame before.
+            touch: the contact at this pose; None: no contact with the load of the last frame is
+                known.
+            applied: muscle forces of the last pass, in this frame or the previous frame.
             mixing: relaxation of forces and compliance.
 
         Raises:
@@ -356,7 +357,7 @@ class ReleasedKnee:
 
     @property
     def _keeps(self) -> bool:
-        """Whether residual forces act, because a coordinate is kept as recorded."""
+        """Whether residual forces act, because a coordinate keeps its recorded value."""
         return len(self.released) < 5
 
     def _joint(
@@ -366,7 +367,8 @@ class ReleasedKnee:
         if self._external is None or self._external[0] is not instant:
             self._external = instant, external_wrench(geometry, place)
         external = self._external[1]
-        if not np.isfinite(external).all():  # of a patella that was lost: the next may not be
+        # The patella was lost in this call. It may be found in the next call.
+        if not np.isfinite(external).all():
             self._external = None
         return joint_equilibrium(geometry, ligaments, place, self.released, middle, slack, external)
 
@@ -386,10 +388,10 @@ def ahead(ways: Sequence[float]) -> float:
 
     Let q be the larger of the last two ratios of successive distances. The remaining geometric
     series has the sum q / (1 - q). The result is 1 if there were fewer than three passes, or if a
-    pass did not halve the distance of the pass before.
+    pass did not halve the distance of the previous pass.
 
     Args:
-        ways: m, distances of the last three passes; inf: no such pass.
+        ways: distances of the last three passes, m; inf: no such pass.
     """
     first, second, last = ways
     if not 0.0 < second <= 0.5 * first < np.inf or last > 0.5 * second:

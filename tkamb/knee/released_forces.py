@@ -1,19 +1,20 @@
 """Generalised forces on the released knee coordinates, of a leg or of a simulator.
 
-Across the knee, femur and shank exchange one wrench. It balances ground reaction, weight and
-inertia of the shank. It does not depend on the knee coordinates, because the shank moves as
-recorded. Contact, ligaments, muscles and the patellar ligament must add up to it:
+The wrench between femur and shank balances ground reaction, weight and inertia of the shank. The
+shank moves as recorded, so this wrench does not depend on the knee coordinates. Contact, ligaments,
+muscles and the patellar ligament must add up to it:
 
     R(q, y) = w_external + w_ligaments(q) + w_muscles(q) + w_contact(q) + B y = 0   (on the insert)
 
-The columns B are the loads that keep the prescribed coordinates: the patellar ligament for flexion,
-and the residuals of the equations of motion for the others. The extensor muscle and the
-patellofemoral force act within the femur's side. A released
-coordinate i is driven by the generalised force
+The columns B are the reactions of the prescribed coordinates: the patellar ligament for flexion,
+and the residuals of the equations of motion for all other prescribed coordinates. The extensor
+muscle and the patellofemoral force are internal to the femur's side. The generalised force on a
+released coordinate i is
 
-    r_i = -J_i(q) . R(q, y),   y such that the prescribed coordinates have none,
+    r_i = -J_i(q) . R(q, y),
 
-with J of `knee_axes`. It is zero at equilibrium, and positive if it drives the femur towards +q_i.
+where J is `knee_axes`, and y makes the generalised forces on the prescribed coordinates zero. r_i
+is zero at equilibrium, and positive if it drives the femur towards +q_i.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,11 +38,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PatellarLine:
-    """The first straight stretch of the patellar ligament below the patella.
+    """The first straight segment of the patellar ligament below the patella.
 
     Args:
-        end: (3,) m, end on the patella, which is taken as fixed to the femur; femur frame.
-        anchor: (3,) m, next point on the shank, the tuberosity or the front lip; insert frame.
+        end: end on the patella, which is fixed to the femur here, femur frame, shape (3,), m.
+        anchor: next point on the shank (tuberosity or front lip), insert frame, shape (3,), m.
     """
 
     end: Array
@@ -58,13 +59,13 @@ class JointEquilibrium:
     """The equations of equilibrium of the released knee coordinates at one frame.
 
     Args:
-        external: (6,) w_external on the insert, force and moment about its origin.
-        ligaments: the bundles.
+        external: w_external on the insert, force and moment about its origin, shape (6,).
+        ligaments: the ligament bundles.
         line: the patellar ligament, which balances flexion; None: a moment balances flexion.
-        keeping: (6, m) the other columns of B, unit loads.
+        keeping: unit residual loads, the remaining columns of B, shape (6, m).
         released: indices of the n released coordinates.
-        share: the muscles across the knee beside the quadriceps; None: not modelled.
-        tibia: (4, 4) pose of the tibia link in the insert frame.
+        share: the muscles across the knee except the quadriceps; None: not modelled.
+        tibia: pose of the tibia link in the insert frame, shape (4, 4).
     """
 
     external: Array
@@ -76,19 +77,19 @@ class JointEquilibrium:
     tibia: Array = field(default_factory=lambda: np.eye(4))
 
     def imbalance(self, coordinates: Array, contact: Array) -> Array:
-        """Return r (..., n): generalised forces on the released coordinates.
+        """Return r (..., n), the generalised forces on the released coordinates.
 
         Args:
-            coordinates: (..., 6) knee coordinates.
-            contact: (6,) w_contact on the insert.
+            coordinates: knee coordinates, shape (..., 6).
+            contact: w_contact on the insert, shape (6,).
         """
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         reactions = _magnitudes(axes[..., self._prescribed, :], columns, wrench)
         remainder = wrench + np.einsum("...ij,...j->...i", columns, reactions)
         return -np.einsum("...ij,...j->...i", axes[..., list(self.released), :], remainder)
 
-    def kept(self, coordinates: Array, contact: Array) -> Array:
-        """Return y (6 - n,): the loads that keep the prescribed coordinates, flexion last."""
+    def reactions(self, coordinates: Array, contact: Array) -> Array:
+        """Return y (6 - n,), the reactions of the prescribed coordinates, flexion last."""
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         return _magnitudes(axes[..., self._prescribed, :], columns, wrench)
 
@@ -96,22 +97,22 @@ class JointEquilibrium:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
         axes, columns = knee_axes(coordinates), self.columns(coordinates)
         rows = axes[self._prescribed]
-        # Projection that takes the reactions of the prescribed coordinates out of a contact wrench.
+        # This projection subtracts the reactions that balance a contact wrench.
         through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
         return np.asarray(-axes[list(self.released)] @ through)
 
-    def kept_and_left(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
-        """Return y as `kept`, and the residual wrench R (6,) on the insert."""
+    def reactions_and_residual(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
+        """Return y of `reactions`, and the residual wrench R (6,) on the insert."""
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         reactions = _magnitudes(axes[self._prescribed], columns, wrench)
         return reactions, wrench + columns @ reactions
 
     def whole(self, coordinates: Array, contact: Array) -> Array:
-        """Return the generalised forces (m, 6) on all coordinates, with y of the last place.
+        """Return the generalised forces (m, 6) on all coordinates, with y of the last row.
 
         Args:
-            coordinates: (m, 6) knee coordinates.
-            contact: (6,) w_contact on the insert.
+            coordinates: knee coordinates, shape (m, 6).
+            contact: w_contact on the insert, shape (6,).
         """
         axes, columns, wrench = self._sum_loads(coordinates, contact)
         reactions = _magnitudes(axes[-1, self._prescribed], columns[-1], wrench[-1])
@@ -144,7 +145,7 @@ class JointEquilibrium:
 
 def _magnitudes(rows: Array, columns: Array, wrench: Array) -> Array:
     """Return y with rows (columns y + wrench) = 0."""
-    # The reactions make the generalised forces on the prescribed coordinates vanish.
+    # The reactions make the generalised forces on the prescribed coordinates zero.
     right = np.einsum("...ij,...j->...i", rows, wrench)
     return np.asarray(-np.linalg.solve(rows @ columns, right[..., None])[..., 0])
 
@@ -162,16 +163,16 @@ def joint_equilibrium(
 
     Args:
         geometry: the frame; its condyles and ligament loads are not used.
-        ligaments: the bundles.
-        coordinates: (6,) knee coordinates of the geometry.
-        released: indices of the released coordinates; flexion is never among them.
-        middle: (3,) m, where the residual forces act, insert frame.
+        ligaments: the ligament bundles.
+        coordinates: knee coordinates of the geometry, shape (6,), m and rad.
+        released: indices of the released coordinates, never including flexion.
+        middle: point where the residual forces act, insert frame, shape (3,), m.
         slack: whether the extensor mechanism carries no load.
-        external: (6,) result of `external_wrench`.
+        external: result of `external_wrench`, shape (6,).
     """
     line = None if slack or geometry.extensor is None else patellar_line(geometry, coordinates)
     columns = [
-        unit_keeper(name, middle)
+        unit_residual(name, middle)
         for i, name in enumerate(KNEE_COORDINATES)
         if i not in released and not (name == "flexion" and line)
     ]
@@ -186,8 +187,8 @@ def joint_equilibrium(
     )
 
 
-def unit_keeper(name: str, middle: Array) -> Array:
-    """Return the wrench (6,) on the insert of the residual that keeps one knee coordinate.
+def unit_residual(name: str, middle: Array) -> Array:
+    """Return the wrench (6,) on the insert of the unit residual for one prescribed coordinate.
 
     As in the equations of motion, the residuals are forces along the insert's axes at `middle`, and
     moments about its x (adduction), y (axial rotation) and z (flexion).
@@ -201,19 +202,19 @@ def unit_keeper(name: str, middle: Array) -> Array:
 
 
 def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
-    """Return the patellar ligament's first straight stretch at coordinates (6,)."""
+    """Return the first straight segment of the patellar ligament at coordinates (6,)."""
     extensor, chain = geometry.extensor, geometry.state.chain
     assert extensor is not None
     shank = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
     free = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
     end, along = free[0].points[0], free[0].forces[0]
-    # The ligament may wrap the insert, so that its anchor is the first point on the shank along it.
+    # The ligament may wrap the insert: its anchor is the nearest point on the shank along it.
     away = min(float((load.points[0] - end) @ along) for load in shank)
     return PatellarLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
 
 
 def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
-    """Return the wrench (6,) on the insert that ground, weight and inertia exert on the shank.
+    """Return the wrench (6,) of ground, weight and inertia on the shank, insert frame.
 
     It does not depend on the knee coordinates.
     """
@@ -221,12 +222,12 @@ def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
     hip = unknowns.hip(state.point("hip", np.zeros(3)))
     ground = [geometry.ground] if geometry.ground else []
     columns = state.generalised([*(unknown.loads for unknown in hip), ground])
-    # As in `KneeSystem`: what hip and knee supply together, less the ground reaction.
+    # As in `KneeSystem`: generalised forces that hip and knee supply together.
     without = state.inertial - columns[:, -1]
-    # The six equations of the free root hold no internal loads of the knee and give the hip's.
+    # The knee's internal loads cancel in the six equations of the free root. These give the hip's.
     at_hip = np.linalg.solve(columns[:6, :6], without[:6])
     knee = (without - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
-    # Generalised forces are axes times wrench; solved for the wrench on the tibia.
+    # Generalised forces are axes times wrench: solve for the wrench on the tibia.
     return np.asarray(np.linalg.solve(knee_axes(coordinates), knee))
 
 
@@ -235,7 +236,7 @@ def crossing_bundles(
 ) -> "BundleArrays":
     """Return the bundles that cross the knee, with ends in the femur and insert frames.
 
-    An end on the patella is taken as fixed to the femur.
+    An end on the patella is fixed to the femur here.
     """
     from tkamb.knee.ligaments import BundleArrays
 
@@ -259,11 +260,11 @@ class ReleasedForceSettings:
     """Scaling and step of the forces on released coordinates."""
 
     lever_arm: float = 0.025
-    """m: arm that makes rotations comparable to translations. Chosen: half the usual distance of
+    """m: arm that makes rotations comparable to translations. Chosen as half the usual distance of
     the condyles."""
     difference_step: float = 1e-7
-    """m: step of the finite differences of joint axes and ligaments. Chosen: far above rounding,
-    far below a curvature's radius."""
+    """m: step of the finite differences of joint axes and ligaments. Chosen because it is far above
+    rounding errors and far below any radius of curvature."""
 
 
 RELEASED_FORCE = ReleasedForceSettings()
@@ -280,7 +281,7 @@ def _no_sliding(place: Array, point: Array) -> Array:
 
 
 class Joint(Protocol):
-    """Loads on the free coordinates beside the contact, of a leg or of a simulator."""
+    """Loads other than contact on the free coordinates, of a leg or of a simulator."""
 
     @property
     def released(self) -> tuple[int, ...]:
@@ -290,29 +291,30 @@ class Joint(Protocol):
         """Return the generalised forces (..., n) at coordinates (..., 6) and a contact (6,)."""
 
     def contact_gain(self, coordinates: Array) -> Array:
-        """Return their derivative by the contact's wrench on the insert, (n, 6)."""
+        """Return the derivative (n, 6) of these forces by the contact's wrench on the insert."""
 
 
 J = TypeVar("J", bound=Joint)
 
 
 class FreeForces(Generic[J]):
-    """Generalised forces on the free coordinates of a joint at trial places.
+    """Generalised forces on the free coordinates of a joint at trial coordinates.
 
     Coordinates and forces are scaled: rotations are multiplied by the lever arm, moments are
     divided by it.
 
     Args:
-        joint: loads beside the contact.
+        joint: loads other than contact.
         probe: probe of the contact model.
-        place: (6,) knee coordinates, m and rad; coordinates that are not free keep these values.
+        place: knee coordinates, shape (6,), m and rad; coordinates that are not free keep these
+            values.
         friction: Coulomb coefficient.
         sliding: function of coordinates (6,) and a point (3,). It returns the velocity (3,), m/s,
-            of the femur there against the insert.
-        touch: the contact at `place`, if it is known.
+            of the femur relative to the insert at that point.
+        touch: the contact at `place`; None: unknown.
 
     Attributes:
-        seen: scaled coordinates as bytes -> contact there.
+        seen: scaled coordinates as bytes -> contact at these coordinates.
     """
 
     def __init__(
@@ -336,12 +338,12 @@ class FreeForces(Generic[J]):
     def balance(
         self, stiffness: Array | None = None, residual_share: float = 0.0, reach: float = np.inf
     ) -> Balance:
-        """Return the equilibrium of the free coordinates, with the given place as initial guess.
+        """Return the equilibrium of the free coordinates, with `place` as initial guess.
 
         Args:
-            stiffness: (n, n) N/m, from a search near by; None: unknown.
-            residual_share: as for `find_balance`.
-            reach: m, as for `find_balance`.
+            stiffness: stiffness of an earlier, similar search, shape (n, n), N/m; None: unknown.
+            residual_share: see `find_balance`.
+            reach: see `find_balance`, m.
         """
         return find_balance(self.trial, self._start, stiffness, residual_share, reach)
 
@@ -362,7 +364,7 @@ class FreeForces(Generic[J]):
         if stiffness is None:
             force = self._joint.imbalance(place, wrench) / self._scale
             return Trial(force, force_noise=force_noise)
-        # The joint's loads at displaced coordinates, and in the last row at the place itself.
+        # The joint's loads at displaced coordinates; the last row is at the coordinates themselves.
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
         forces = self._joint.imbalance(place + steps, wrench) / self._scale
@@ -373,7 +375,7 @@ class FreeForces(Generic[J]):
         return Trial(forces[-1], tangent, contact.exact, force_noise)
 
     def residual(self) -> float:
-        """Return the largest scaled force, N, at the given place."""
+        """Return the largest scaled force, N, at the initial coordinates."""
         return float(np.abs(self.trial(self._start).force).max())
 
     def at(self, balance: Balance) -> Array:
@@ -386,7 +388,7 @@ class FreeForces(Generic[J]):
         return place
 
     def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
-        """Return wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
+        """Return the wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
         wrench, stiffness = np.zeros(6), np.zeros((6, 6))
         for condyle in contact.loads:
             sliding = self._sliding(place, condyle.point)
@@ -406,16 +408,16 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
         """Return v (6,): a wrench dw on the insert adds v . dw to the patellar ligament's tension.
 
-        The released coordinates move by dq to the new equilibrium. With K = -df/dq of the
-        generalised forces f = -J w of contact, ligaments and muscles,
+        The released coordinates move by dq to the new equilibrium. Let f = -J w be the generalised
+        forces of contact, ligaments and muscles, and K = -df/dq. The equations
 
             -J dw - K dq - J B dy = 0
 
-        gives dq and the change dy of the loads that keep the other coordinates. The tension of the
-        patellar ligament is one of these. The result is None if the contact has no tangent.
+        give dq and the change dy of the reactions of the prescribed coordinates. The tension of the
+        patellar ligament is one of the reactions. The result is None if the contact has no tangent.
 
         Args:
-            contact: the contact at the given place, in equilibrium.
+            contact: the contact in equilibrium at `place`.
         """
         place = self._place
         wrench, stiffness = self._with_friction(place, contact)
@@ -434,22 +436,22 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 
     def tension_at_rest(self, contact: "ProbedContact", per_wrench: Array) -> float:
-        """Return the tension (N) of the patellar ligament at the equilibrium near by.
+        """Return the predicted tension (N) of the patellar ligament at equilibrium near `place`.
 
-        The residual wrench at the given place is added as a wrench to which the knee yields.
+        The prediction is linear in the residual wrench at `place`.
 
         Args:
-            contact: the contact at the given place.
-            per_wrench: (6,) result of `tension_per_wrench`.
+            contact: the contact at `place`.
+            per_wrench: result of `tension_per_wrench`, shape (6,).
         """
         wrench, _ = self._with_friction(self._place, contact)
-        reactions, remainder = self._joint.kept_and_left(self._place, wrench)
+        reactions, remainder = self._joint.reactions_and_residual(self._place, wrench)
         return float(reactions[-1] + per_wrench @ remainder)
 
     def pushes(self, balance: Balance) -> bool:
-        """Say whether a taut patellar ligament would have to push."""
+        """Return whether a taut patellar ligament would have to push."""
         if self._joint.line is None:
             return False
         place = self.at(balance)
         wrench, _ = self._with_friction(place, self.contact(balance))
-        return bool(self._joint.kept(place, wrench)[-1] < 0)
+        return bool(self._joint.reactions(place, wrench)[-1] < 0)

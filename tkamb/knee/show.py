@@ -23,18 +23,19 @@ LIGAMENT, MUSCLE, ARROW = 0x2E7D32, 0xB71C1C, 0x1A1A1A
 
 @dataclass(frozen=True)
 class KneeDrawingSettings:
-    """Sizes of what is drawn."""
+    """Sizes in the drawing."""
 
     arrow_radius: float = 1.5e-3
-    """m: radius of the arrows of forces. Chosen: it is easy to see."""
+    """m: radius of the force arrows. Chosen because it is easy to see."""
     strand_radius: float = 8e-4
-    """m: radius of ligaments, muscles and the patellar ligament. Chosen: it is easy to see."""
+    """m: radius of ligaments, muscles and the patellar ligament. Chosen because it is easy to
+    see."""
 
 
 KNEE_DRAWING = KneeDrawingSettings()
 
 PRESSURE_COLOURS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])
-"""RGB from no pressure to the peak: three colours of viridis, whose lightness increases evenly."""
+"""RGB from no pressure to the peak: three colours of viridis. Their lightness increases evenly."""
 
 
 def show_knee(
@@ -51,21 +52,21 @@ def show_knee(
 
     Implant, pressure map, ligaments, lines of the extensor mechanism and an arrow for the force on
     each condyle appear below the viewer's root node. A second call with the same node replaces the
-    first.
+    first drawing.
 
     Args:
         knee: the knee.
         viewer: a `pin.visualize.MeshcatVisualizer`, or a `meshcat.Visualizer`.
-        q: (nq,).
-        contact: contact from `Knee.press` or `Knee.evaluate`, whose pose of the femur is drawn;
-            None: the contact at q.
+        q: configuration, shape (nq,).
+        contact: contact from `Knee.press` or `Knee.evaluate`. The femur is drawn at its pose. None:
+            the contact at q.
         node: name of the node in the viewer's tree.
-        newton: m, length of an arrow per newton.
-        peak: Pa, pressure of the last colour; None: the largest there is.
-        opacity: of the femoral component, 0 to 1.
+        newton: length of an arrow per newton, m.
+        peak: pressure of the last colour, Pa; None: the peak pressure.
+        opacity: opacity of the femoral component, 0 to 1.
 
     Raises:
-        InputError: the viewer is neither.
+        InputError: the viewer is no MeshCat viewer.
     """
     window, root = _window(viewer)
     tree = window[root][node] if root else window[node]
@@ -79,7 +80,7 @@ def show_knee(
     femur = place.pose if contact is None else contact.pose
 
     def in_world(points: Array) -> Array:
-        """Return points (n, 3) of the insert frame of a right knee in the world."""
+        """Return points (n, 3) in the world, from the insert frame of a right knee."""
         return transform(world, points @ MIRROR if knee.left else points)
 
     flip = mirrored_pose if knee.left else np.asarray
@@ -144,7 +145,7 @@ def _solid(
 def _strand(
     node: Any, points: Array, colour: int, radius: float = KNEE_DRAWING.strand_radius
 ) -> None:
-    """Draw a polyline (n, 3) of the world as cylinders."""
+    """Draw a polyline (n, 3) in the world frame as cylinders."""
     for k, (start, end) in enumerate(pairwise(points)):
         along = end - start
         length = float(np.linalg.norm(along))

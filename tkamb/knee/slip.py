@@ -1,17 +1,17 @@
 """Rolling and slipping of the femoral condyles on the insert, by arc lengths.
 
 From frame to frame the lowest point of a condyle moves by an arc a_f on the femoral surface, and
-its projection moves by an arc a_i on the insert. Both are arcs in the insert's sagittal plane,
-positive if the contact moves backwards, as in flexion. In rolling both arcs are equal. The part of
-a_i that is due to axial rotation about the geometric centre of the femoral component is subtracted:
+its projection moves by an arc a_i on the insert. The arcs lie in the insert's sagittal plane. They
+are positive if the contact moves backwards, as in flexion. In rolling the two arcs are equal. The
+part of a_i due to axial rotation about the geometric centre of the femoral component is subtracted:
 
     slip = sum (a_f - (a_i - a_axial)),   a_axial = d(alpha) (z_condyle - z_centre) / cos(slope)
 
 alpha is positive if the femur rotates externally. Slip is positive if the femur's surface slides
-forwards on the insert. Its rate is the x velocity of the femur's contact point against the insert,
-without the axial part; `sliding_velocity` computes this rate without arcs.
+forwards on the insert. Its rate is the x velocity of the femur's contact point relative to the
+insert, without the axial part. `sliding_velocity` computes this rate without arcs.
 
-The arc between two points of a profile whose tangent turns by d is chord (d/2)/sin(d/2). This is
+If the tangent of a profile turns by d between two points, the arc is chord (d/2)/sin(d/2). This is
 exact on a circle. On a profile of changing curvature the error is of third order in the step.
 """
 
@@ -31,13 +31,12 @@ UP = np.array([0.0, 1.0, 0.0])
 class CondyleSlip:
     """Rolling and slipping of one condyle over f frames, cumulated from the first frame.
 
-    NaN from the frame on in which the condyle is beside the insert.
+    All values are NaN from the first frame in which the condyle is beside the insert.
 
     Args:
-        femoral_arc: (f,) m, arc on the femoral surface, positive backwards.
-        insert_arc: (f,) m, arc on the insert, positive backwards.
-        axial_part: (f,) m, part of `insert_arc` that is due to axial rotation.
-        slip: (f,) m, femoral_arc - (insert_arc - axial_part).
+        femoral_arc: arc on the femoral surface, positive backwards, shape (f,), m.
+        insert_arc: arc on the insert, positive backwards, shape (f,), m.
+        axial_part: part of `insert_arc` due to axial rotation, shape (f,), m.
     """
 
     femoral_arc: Array
@@ -46,11 +45,11 @@ class CondyleSlip:
 
     @property
     def slip(self) -> Array:
-        """Return the slip (f,) m, positive if the femur's surface slides forwards."""
+        """The slip (f,), m, positive if the femur's surface slides forwards."""
         return np.asarray(self.femoral_arc - (self.insert_arc - self.axial_part))
 
     def slip_velocity(self, time: Array) -> Array:
-        """Return the rate of the slip (f,) m/s by central differences over the time (f,), s."""
+        """Return the rate of the slip (f,), m/s, by central differences over the time (f,), s."""
         return np.asarray(np.gradient(self.slip, time[: len(self.slip)]))
 
 
@@ -58,7 +57,7 @@ class InsertProfile:
     """The insert's upper surface as a height over x and z.
 
     Args:
-        insert: insert, in the insert frame.
+        insert: surface of the insert, in the insert frame.
     """
 
     def __init__(self, insert: Surface) -> None:
@@ -66,10 +65,10 @@ class InsertProfile:
         self._above = float(insert.bounds[1, 1]) + 1e-3
 
     def at(self, points: Array) -> tuple[Array, Array]:
-        """Return the height y (n,) m and the sagittal slope (n,) rad; NaN beside the insert.
+        """Return the height y (n,), m, and the sagittal slope (n,), rad; NaN beside the insert.
 
         Args:
-            points: (n, 3) m, insert frame; y is ignored.
+            points: positions in the insert frame, shape (n, 3), m; y is ignored.
         """
         start = np.array(points, float)
         start[:, 1] = self._above
@@ -90,10 +89,10 @@ def condyle_slip(
     """Return rolling and slipping of the medial and the lateral condyle.
 
     Args:
-        femoral: femoral component, femoral frame.
-        insert: insert, insert frame.
-        split: m, z between the condyles in the femoral frame; None: one condyle, the medial one.
-        coordinates: (f, 6) recorded knee coordinates, m and rad.
+        femoral: surface of the femoral component, femoral frame.
+        insert: surface of the insert, insert frame.
+        split: z between the condyles in the femoral frame, m; None: only a medial condyle.
+        coordinates: recorded knee coordinates, shape (f, 6), m and rad.
     """
     lowest = LowestPoints(femoral, split)
     poses, profile = knee_pose(coordinates), InsertProfile(insert)
@@ -114,11 +113,11 @@ def slip_of_points(
     """Return rolling and slipping of one condyle from its lowest points.
 
     Args:
-        points: (f, 3) m, lowest points of the condyle, insert frame.
-        poses: (f, 4, 4) pose_femoral_in_insert.
-        axial_rotation: (f,) rad, positive: femur external.
-        centre_z: (f,) m, geometric centre of the component, insert frame.
-        profile: the insert's surface.
+        points: lowest points of the condyle, insert frame, shape (f, 3), m.
+        poses: pose_femoral_in_insert, shape (f, 4, 4).
+        axial_rotation: axial rotation, positive if the femur rotates externally, shape (f,), rad.
+        centre_z: z of the component's geometric centre, insert frame, shape (f,), m.
+        profile: height profile of the insert.
     """
     height, slope = profile.at(points)
     on_insert = np.column_stack([points[:, 0], height])
@@ -135,19 +134,19 @@ def slip_of_points(
 
 
 def femoral_arcs(points: Array, poses: Array) -> Array:
-    """Return the arcs (f-1,) m between successive lowest points, on the femoral surface.
+    """Return the arcs (f-1,), m, between successive lowest points, on the femoral surface.
 
-    At a lowest point the surface's normal is the insert's -y, so that the profile's tangent turns
-    by the rotation of the femur about its ML axis. An arc is positive backwards. The chord is taken
-    in the insert's sagittal plane.
+    At a lowest point the surface's normal is the insert's -y. The profile's tangent therefore turns
+    by the rotation of the femur about its ML axis. An arc is positive backwards. Its chord lies in
+    the insert's sagittal plane.
 
     Args:
-        points: (f, 3) m, lowest points, insert frame.
-        poses: (f, 4, 4) pose_femoral_in_insert.
+        points: lowest points, insert frame, shape (f, 3), m.
+        poses: pose_femoral_in_insert, shape (f, 4, 4).
     """
     back = inverse(poses)
     in_femur = transform(back, points[:, None])[:, 0]
-    # The angle of the downward normal in femoral axes is the turn of the arc.
+    # The change of the downward normal's angle in femoral axes is the turn of the arc.
     normal = rotate(back, -UP)
     angle = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
     chord = np.diff(in_femur, axis=0)
@@ -158,7 +157,7 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
 
 
 def arc(chord: Array, turn: Array) -> Array:
-    """Return the lengths (n,) m of circular arcs from chords (n, 2), m, and turns (n,), rad."""
+    """Return the lengths (n,), m, of circular arcs from chords (n, 2), m, and turns (n,), rad."""
     # Arc over chord of a circle: (turn / 2) / sin(turn / 2).
     half = 0.5 * np.abs(turn)
     stretch = np.where(half > 1e-6, half / np.where(half > 1e-6, np.sin(half), 1.0), 1.0)
@@ -166,15 +165,17 @@ def arc(chord: Array, turn: Array) -> Array:
 
 
 def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> Array:
-    """Return the forward sliding (f,) m/s of the femur's contact point, without axial rotation.
+    """Return the forward sliding (f,), m/s, of the femur's contact point, without axial rotation.
 
     By rigid-body kinematics it is (v + w x r)_x - w_y (z_condyle - z_centre).
 
     Args:
-        velocity: (f, 3) m/s of the femoral origin relative to the insert, insert frame.
-        spin: (f, 3) rad/s of the femur relative to the insert, insert frame.
-        arm: (f, 3) m from the femoral origin to the contact point.
-        lever: (f,) m, z of the contact point relative to the component's geometric centre.
+        velocity: velocity of the femoral origin relative to the insert, insert frame, shape (f, 3),
+            m/s.
+        spin: angular velocity of the femur relative to the insert, insert frame, shape (f, 3),
+            rad/s.
+        arm: vector from the femoral origin to the contact point, shape (f, 3), m.
+        lever: z of the contact point relative to the component's geometric centre, shape (f,), m.
     """
     return np.asarray((velocity + np.cross(spin, arm))[:, 0] - spin[:, 1] * lever)
 
@@ -183,10 +184,10 @@ def forward_sliding(coordinates: Array, rates: Array, centre: Array, contact: Ar
     """Return the forward sliding (m/s) at a contact point by rigid-body kinematics.
 
     Args:
-        coordinates: (6,) knee coordinates, m and rad.
-        rates: (6,) rates of the knee coordinates, m/s and rad/s.
-        centre: (3,) m, geometric centre of the component, femoral frame.
-        contact: (3,) m, insert frame.
+        coordinates: knee coordinates, shape (6,), m and rad.
+        rates: rates of the knee coordinates, shape (6,), m/s and rad/s.
+        centre: geometric centre of the component, femoral frame, shape (3,), m.
+        contact: contact point, insert frame, shape (3,), m.
     """
     velocity, spin = knee_twist(coordinates, rates)
     arm, lever = (
@@ -206,19 +207,19 @@ def roll_slip_motion(
     """Return the motion of Sharma (2008): AP follows from rolling and slip, SI from first touch.
 
     The mean of the condyles' contact points moves backwards along the insert by the femoral arc
-    less the slip. In every frame the femur is lowered to first touch. AP of the first frame is
-    given.
+    less the slip. In every frame the femur is lowered to first touch.
 
     Args:
-        femoral: femoral component, femoral frame.
-        insert: insert, insert frame.
-        split: m, z between the condyles in the femoral frame; None: one condyle.
-        coordinates: (f, 6) knee coordinates, m and rad, whose rotations and ML are used.
-        slip: (f,) m, cumulated slip, positive forwards; zero: pure rolling.
+        femoral: surface of the femoral component, femoral frame.
+        insert: surface of the insert, insert frame.
+        split: z between the condyles in the femoral frame, m; None: one condyle.
+        coordinates: knee coordinates, shape (f, 6), m and rad. Their rotations, ML, and the AP of
+            the first frame are used.
+        slip: cumulated slip, positive forwards, shape (f,), m; zero: pure rolling.
 
     Returns:
-        (f, 6) knee coordinates, m and rad; NaN from the frame on in which the femur leaves the
-        insert.
+        Knee coordinates, shape (f, 6), m and rad. AP and SI are NaN from the first frame in which
+        the femur leaves the insert.
     """
     changed = np.array(coordinates, float)
     poses, profile = knee_pose(changed), InsertProfile(insert)
@@ -238,9 +239,10 @@ def roll_slip_motion(
 
 
 def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
-    """Return arms (f, 3) m and femoral arcs (f-1,) m, means over the condyles.
+    """Return arms (f, 3), m, and femoral arcs (f-1,), m, as means over the condyles.
 
-    An arm leads from the femoral origin to the lowest point. Both depend on the rotations alone.
+    An arm is the vector from the femoral origin to the lowest point. Arms and arcs depend on the
+    rotations alone.
     """
     condyle_points = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
     points = np.array(condyle_points).swapaxes(0, 1)

@@ -32,21 +32,22 @@ class InitialPoseSettings:
     """Limits of the initial guesses of the released coordinates."""
 
     max_extrapolation: float = 2e-3
-    """m: largest extrapolation from the last frame. Chosen: a guess far from the
-    solution costs more than it saves."""
+    """m: largest extrapolation from the last frame. Chosen because a guess far from the solution
+    costs more time than it saves."""
     first_penetration: float = 5e-5
-    """m: penetration of the initial guess of a first frame. Chosen: a loaded contact of
-    polyethylene is deeper, and the search finds a lightly loaded one from it, too."""
+    """m: penetration of the initial guess of a first frame. Chosen because a loaded contact of
+    polyethylene has more penetration, and the search also finds a lightly loaded contact from this
+    guess."""
     max_continuation: float = 1e-3
-    """m (rotations times the lever arm): if a search ends farther from its initial guess, other
-    initial guesses are tried, because there may be a second equilibrium. Chosen: frame by frame the
-    shipped knee moves by 0.5 mm at most."""
+    """m (rotations times the lever arm): distance of an equilibrium from its initial guess above
+    which other guesses are tried, because there may be a second equilibrium. Chosen because the
+    shipped knee moves by 0.5 mm at most between frames."""
     other_shift: float = 5e-3
     """m: shift of the recorded pose in anterior and posterior direction, for two more initial
-    guesses of a first frame. Chosen: about a third of a dish."""
+    guesses of a first frame. Chosen as about a third of a dish."""
     same_place: float = 0.5e-3
-    """m (rotations times the lever arm): two equilibria that are farther apart are different.
-    Chosen: well above the tolerances of the search."""
+    """m (rotations times the lever arm): distance above which two equilibria are different. Chosen
+    because it is well above the tolerances of the search."""
 
 
 INITIAL_POSE = InitialPoseSettings()
@@ -55,10 +56,10 @@ AP = KNEE_COORDINATES.index("ap")
 
 
 class InitialPoses:
-    """The initial guesses of a search, the most likely first.
+    """The initial guesses of a search, the most likely guess first.
 
     Args:
-        knee: searches from an initial guess.
+        knee: object that searches from an initial guess.
         pair: femoral component and insert.
         post: cam and post; None: not modelled.
     """
@@ -72,13 +73,13 @@ class InitialPoses:
         """Return the equilibrium from the first initial guess that converges.
 
         If the equilibrium is farther than `INITIAL_POSE.max_continuation` from that guess, the
-        search is repeated from other guesses. If one of these leads to another equilibrium,
+        search is repeated from other guesses. If such a search ends at another equilibrium,
         `second` of the result describes it.
 
         Args:
-            instant: the knee.
-            previous: results of up to three frames before, the last one last.
-            points: side -> (3,) m, point where an unloaded condyle is nearest to the insert.
+            instant: the knee at one instant.
+            previous: results of up to three previous frames, in their order.
+            points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
 
         Raises:
             ComputationError: no initial guess lies over the insert, or no muscle forces balance the
@@ -118,7 +119,7 @@ class InitialPoses:
         starts: list[Array],
         points: dict[str, Array],
     ) -> str:
-        """Return a second equilibrium, from other initial guesses, in words; empty: none."""
+        """Return words that describe a second equilibrium from other guesses; empty: not found."""
         for place in starts:
             if not np.isfinite(place).all():
                 continue
@@ -139,9 +140,9 @@ class InitialPoses:
         return ""
 
     def _starts(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
-        """Yield the initial guesses: extrapolated, of the last frame, and as recorded.
+        """Yield three initial guesses: extrapolated, of the last frame, and recorded.
 
-        The extrapolated guess keeps its height. The others are moved to first touch.
+        The extrapolated guess keeps its height. The other two are moved to first touch.
         """
         rows = list(self._knee.released)
         for number, place in enumerate([carried_on(previous), previous[-1]] if previous else []):
@@ -153,7 +154,8 @@ class InitialPoses:
     def on_the_insert(self, place: Array) -> Array:
         """Return coordinates (6,), m and rad, with the height changed to first touch.
 
-        If AP is released and a cam overlaps the post, AP is changed to their first touch, too.
+        If AP is released and cam and post overlap, AP is changed to the first touch of cam and
+        post.
         """
         touching = self._on_the_dishes(place)
         if self._post is None or AP not in self._knee.released:
@@ -178,15 +180,15 @@ def _apart(first: Array, second: Array) -> float:
 def carried_on(previous: list[Array]) -> Array:
     """Return coordinates (6,) extrapolated from up to three frames.
 
-    The last step is repeated times a factor from 0 to 1, the projection of the last step on the
-    step before. It is limited to `INITIAL_POSE.max_extrapolation`, because a lightly loaded knee
-    moves irregularly.
+    The last step is repeated with a factor from 0 to 1, the projection of the last step on the
+    previous step. The extrapolation is limited to `INITIAL_POSE.max_extrapolation`, because a
+    lightly loaded knee moves irregularly.
     """
     if len(previous) < 3:
         return previous[-1]
     before, step = ((b - a) * SCALE for a, b in pairwise(previous))
-    # A knee that moves steadily has part = 1; one that turns back has part < 0, and the last place
-    # is the guess.
+    # A steady motion has part = 1. A motion that reverses has part < 0: the guess is then the last
+    # frame.
     part = float(before @ step) / max(float(before @ before), 1e-18)
     longest = INITIAL_POSE.max_extrapolation / max(float(np.linalg.norm(step)), 1e-9)
     return previous[-1] + min(max(part, 0.0), 1.0, longest) * (previous[-1] - previous[-2])

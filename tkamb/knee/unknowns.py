@@ -2,16 +2,16 @@
 
     sum_k J_k(q)^T w_k x_k = RNEA(q, v, a) - sum_known J^T w_known
 
-Each unknown x_k is the magnitude of a load w_k: a line of action or an axis, per unit magnitude
-(the reduction method), and there are as many as equations of motion. All points and directions are
-in the insert frame, SI. A pair of loads is equal and opposite, so that only the hip and the ground
-act on the leg from outside.
+Each unknown x_k is the magnitude of a load w_k with a known line of action or axis (the reduction
+method). There are as many unknowns as equations of motion. All points and directions are in the
+insert frame, SI units. The two loads of a pair are equal and opposite: only hip and ground exert
+external loads on the leg.
 
-Lines pull and contacts push: both normal forces, the muscle's tension, the patellar ligament's
-tension and the patellofemoral normal force are >= 0. A load is left out only where it would have
-the wrong sign; a residual moment then takes its place. There are at most six load states: no
-condyle, the medial or the lateral one lifted, each with the extensor mechanism taut or slack. The
-recorded gap may exclude some of them.
+Lines pull and contacts push: the two normal forces, the muscle's tension, the patellar ligament's
+tension and the patellofemoral normal force are >= 0. A load that would have the wrong sign is zero,
+and a residual moment replaces it as unknown. There are at most six load states: no condyle, the
+medial or the lateral condyle lifted, each with the extensor mechanism taut or slack. The recorded
+gap may exclude some of these states.
 
 Reference: Komistek et al., J Biomech 38:215 (2005), doi:10.1016/j.jbiomech.2004.02.041.
 """
@@ -30,13 +30,14 @@ from tkamb.knee.load import PointForces
 
 @dataclass(frozen=True)
 class UnknownsSettings:
-    """When the equations count as singular."""
+    """Limit at which the equations count as singular."""
 
     max_condition: float = 1e4
-    """1: condition number (unit columns) above which a frame counts as singular. Chosen: it grows
-    as one over the arm d at which the patellar ligament passes the femorotibial contact: 7 to 9 m /
-    d. The shipped knee has d = 43 to 45 mm and 148 to 218. The limit is d = 0.8 mm, where an error
-    of 1 mm in a line of action exceeds the whole force."""
+    """1: condition number (unit columns) above which a frame counts as singular. The number is
+    about 7 to 9 m / d, where d is the moment arm of the patellar ligament about the femorotibial
+    contact. The shipped knee has d = 43 to 45 mm and condition numbers of 148 to 218. Chosen
+    because at the limit, d = 0.8 mm, an error of 1 mm in a line of action exceeds the whole
+    force."""
 
 
 UNKNOWNS = UnknownsSettings()
@@ -57,10 +58,10 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Magnitudes of the unknown loads at one frame; NaN where the system is singular.
+    """Magnitudes of the unknown loads at one frame; NaN if the system is singular.
 
     Args:
-        values: name -> N or N·m.
+        values: name -> magnitude, N or N·m.
         condition: 2-norm condition number of the matrix with unit columns.
         regular: whether the values may be used.
     """
@@ -74,9 +75,9 @@ def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
     """Solve the equations of motion of one frame for the magnitudes of the unknown loads.
 
     Args:
-        names: of the k unknowns.
-        columns: (k, k) generalised force of one unit of each.
-        right: (k,) what they must add up to.
+        names: names of the k unknowns.
+        columns: generalised force per unit of each unknown, shape (k, k).
+        right: generalised forces that the unknown loads must add up to, shape (k,).
 
     Raises:
         ValueError: the system is not square.
@@ -84,8 +85,7 @@ def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
     if columns.shape != (len(right), len(right)):
         raise ValueError(f"{columns.shape[1]} unknown loads for {len(right)} equations")
     size = np.linalg.norm(columns, axis=0)
-    # Unit columns: the condition number then measures the geometry, not newtons against newton
-    # metres.
+    # With unit columns the condition number measures the geometry, not the units N and N·m.
     scaled = columns / np.where(size > 0, size, 1.0)
     condition = float(np.linalg.cond(scaled))
     regular = bool(np.isfinite(condition) and condition < UNKNOWNS.max_condition)
@@ -139,7 +139,7 @@ def intersegmental(point: Array, rotation_axes: dict[str, Array]) -> list[Unknow
     """Return the knee's force and moment on the femur, for a knee without contact.
 
     Args:
-        point: (3,) m, knee centre.
+        point: knee centre, shape (3,), m.
         rotation_axes: name -> unit axis (3,) of a moment.
     """
     forces = [
@@ -157,11 +157,11 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
     """Return the patellofemoral force in the femur's sagittal plane.
 
     Args:
-        point: (3,) m, contact point.
-        normal: (3,) unit, out of the femur into the patella, in the sagittal plane.
-        femur_ml: (3,) unit, medial-lateral axis of the femur.
+        point: contact point, shape (3,), m.
+        normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
+        femur_ml: unit medial-lateral axis of the femur, shape (3,).
     """
-    # The second component, along the groove, is zero for a massless patella in equilibrium.
+    # The tangential force along the groove is zero for a massless patella in equilibrium.
     tangent = cross(femur_ml, normal)
     return [
         Unknown("patellofemoral", pair("patella", "femur", point, normal)),
@@ -173,10 +173,10 @@ def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
     """Return the loads that balance the patella's weight if the extensor mechanism is slack.
 
     Args:
-        point: (3,) m, contact point on the femur.
-        femur_ml: (3,) unit, medial-lateral axis of the femur.
+        point: contact point on the femur, shape (3,), m.
+        femur_ml: unit medial-lateral axis of the femur, shape (3,).
     """
-    # Any two directions in the sagittal plane serve.
+    # Any two directions in the sagittal plane can be used.
     first = cross(femur_ml, AXES["ap"])
     first /= np.linalg.norm(first)
     return [
@@ -196,9 +196,9 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
     """Return the residuals, loads on the tibia that are zero in an exact model.
 
     Args:
-        point: (3,) m, where the residual forces act: the midpoint of the contact points.
+        point: midpoint of the contact points, where the residual forces act, shape (3,), m.
         lifted: whether a condyle is lifted off; a coronal moment then replaces its force.
-        extensor: whether muscles act; without them a flexion moment is one more residual.
+        extensor: whether muscles act; without muscles a flexion moment is an additional residual.
     """
     unknowns = [
         Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
@@ -217,10 +217,11 @@ class LoadStateSettings:
     """Limits for the signs of the loads."""
 
     force_rounding: float = 1e-6
-    """N: a smaller force of the wrong sign counts as zero. Chosen: above rounding."""
+    """N: a smaller force of the wrong sign counts as zero. Chosen because it is above rounding
+    errors."""
     patella_moment: float = 0.25
-    """N·m: a slack extensor mechanism may lack an extension moment up to this. Chosen: weight and
-    inertia of the patella, up to 5 N on an arm of 45 mm, make such a moment."""
+    """N·m: largest missing extension moment in the state of a slack extensor mechanism. Chosen
+    because weight and inertia of the patella, up to 5 N on an arm of 45 mm, cause such a moment."""
 
 
 LOAD_STATE = LoadStateSettings()
@@ -230,11 +231,11 @@ PATELLAR_LOADS = ("patellar_ligament", "patellofemoral")
 
 
 class LoadState(NamedTuple):
-    """An assumption about which loads are zero.
+    """The loads that are assumed to be zero.
 
     Args:
         lifted: sides of the condyles that carry no load.
-        slack: names of the muscles of a slack extensor mechanism; empty: it is taut.
+        slack: names of the muscles of a slack extensor mechanism; empty: the mechanism is taut.
     """
 
     lifted: frozenset[str]
@@ -242,7 +243,7 @@ class LoadState(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The zero loads, in words."""
+        """Words that name the zero loads."""
         left_out = [f"{side} lifted" for side in sorted(self.lifted)]
         left_out += [f"{muscle} slack" for muscle in sorted(self.slack)]
         return " and ".join(left_out) or "all loaded"
@@ -251,14 +252,14 @@ class LoadState(NamedTuple):
 def load_states(
     sides: Iterable[str], off: frozenset[str], extensors: Iterable[str]
 ) -> list[LoadState]:
-    """Return the load states to try, the preferred ones first.
+    """Return the load states to try, the preferred states first.
 
-    States with fewer zero loads come first, and a slack muscle comes before a lifted condyle: the
-    recorded gap shows contact, while no recording shows the activity of the muscle.
+    States with fewer zero loads come first. A slack muscle comes before a lifted condyle, because
+    the recorded gap shows contact, but no recording shows the activity of the muscle.
 
     Args:
         sides: names of the modelled condyles.
-        off: sides that the recorded gap keeps off the insert.
+        off: sides that are lifted off the insert by their recorded gap.
         extensors: names of the extensor muscles; empty: they are not modelled.
     """
     near = [side for side in sides if side not in off]
@@ -275,7 +276,7 @@ def _muscles(values: Mapping[str, float]) -> list[str]:
 
 
 def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
-    """Return the loads of the wrong sign in a load state, in words; empty: there is none."""
+    """Return descriptions of the loads with a wrong sign; empty: all signs are right."""
     if not solution.regular:
         return ["singular equations"]
     values = solution.values
@@ -286,7 +287,7 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
         if values.get(name, 0.0) < -LOAD_STATE.force_rounding
     ]
     if state.slack:
-        # The residual acts on the tibia, the moment of a knee without contact on the femur.
+        # The residual acts on the tibia. The moment of a knee without contact acts on the femur.
         extension = values.get("residual_flexion", 0.0) - values.get("knee_moment_flexion", 0.0)
         if extension > LOAD_STATE.patella_moment:
             wrong.append(f"extension moment {extension:.3g} N·m needed")
@@ -296,14 +297,14 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
 def contradictions(
     state: LoadState, solutions: Mapping[LoadState, Solution], off: frozenset[str]
 ) -> list[str]:
-    """Return why a load state cannot hold, in words; empty: it can.
+    """Return reasons why a load state is inadmissible; empty: it is admissible.
 
     A load has the wrong sign, or a load that is assumed to be zero would act with the right sign.
 
     Args:
         state: the load state.
-        solutions: load state -> solution, of all states.
-        off: sides that the recorded gap keeps off the insert.
+        solutions: load state -> its solution, for all states.
+        off: sides that are lifted off the insert by their recorded gap.
     """
     wrong = wrong_signs(state, solutions[state])
     if state.slack:

@@ -1,17 +1,17 @@
 """The taut path of a massless string around a bone's convex sagittal outline.
 
-The bone is a general cylinder: a convex polygon in its own x-y plane, extruded along z. The string
-passes in front of the bone: seen with x to the right and y up, a string that runs down has the bone
-on its right-hand side. The shortest length follows from unrolling the cylinder. With S the length
-of the taut path in the x-y plane,
+The bone is a general cylinder: a convex polygon in its x-y plane, extruded along z. The string
+passes in front of the bone: in a view with x to the right and y up, a string from top to bottom has
+the bone on its right-hand side. Unrolling the cylinder gives the shortest length. If S is the
+length of the taut path in the x-y plane,
 
     L = sqrt(S² + dz²),   z linear in S.
 
-The length changes continuously: where the tangent corner changes, and where wrapping begins, both
-candidate paths coincide. So the moment arm has no jump.
+The length is continuous: when the tangent corner changes or wrapping begins, the two candidate
+paths coincide. So the moment arm has no jump.
 
-There is no friction: the tension is the same along the string. At each corner the string presses on
-the bone with the change of its direction, which has no z component.
+There is no friction: the tension is constant along the string. The force of the string on the bone
+at a corner is the tension times the change of direction. It has no z component.
 """
 
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ class TautPath:
     """A taut path at one instant.
 
     Args:
-        points: (m, 3) m, start, touched corners of the outline, end.
-        length: m.
-        wrap_angle: rad, change of direction in the bone's sagittal plane; 0 if straight.
+        points: start, touched corners of the outline, end, shape (m, 3), m.
+        length: length of the path, m.
+        wrap_angle: change of direction in the bone's sagittal plane, rad; 0: straight.
     """
 
     points: Array
@@ -53,12 +53,12 @@ class TautPath:
 
     @property
     def start_direction(self) -> Array:
-        """Unit vector (3,) along the string at its start: a tension pulls the start this way."""
+        """Unit vector (3,) along the string at its start. Tension pulls the start along it."""
         return np.asarray(self.directions[0])
 
     @property
     def end_direction(self) -> Array:
-        """Unit vector (3,) along the string at its end: a tension pulls the end the other way."""
+        """Unit vector (3,) along the string at its end. Tension pulls the end against it."""
         return np.asarray(self.directions[-1])
 
     def moved(self, pose_here_in_there: Array) -> "TautPath":
@@ -72,15 +72,15 @@ def straight_path(start: Array, end: Array) -> TautPath:
 
 
 def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
-    """Return the taut path around an outline, all in the bone's frame.
+    """Return the taut path around an outline in the bone's frame.
 
     The clockwise angle from start to end about the outline's centre (x to the right, y up) decides
-    on which side the string passes. It is taken between -90 and 270 deg.
+    on which side the string passes. The angle is between -90 and 270 deg.
 
     Args:
-        start: (3,) m.
-        end: (3,) m.
-        outline: (n, 2) m, strictly convex polygon in x-y, counter-clockwise.
+        start: start of the path, bone frame, shape (3,), m.
+        end: end of the path, bone frame, shape (3,), m.
+        outline: strictly convex polygon in x-y, counter-clockwise, shape (n, 2), m.
 
     Raises:
         ComputationError: start or end lies inside the outline.
@@ -94,7 +94,7 @@ def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
 
 
 def is_inside(point: Array, outline: Array) -> bool:
-    """Say whether a point (3,) lies within an outline (n, 2) of its own frame."""
+    """Return whether a point (3,) lies within an outline (n, 2) of the same frame."""
     return bool(_is_inside(np.asarray(point, float), outline))
 
 
@@ -104,15 +104,15 @@ def path_in_link(
     """Return the taut path between two points around an outline that is fixed to a link.
 
     Args:
-        start: (3,) m, in the frame "here".
-        end: (3,) m, in the frame "here".
-        outline: (n, 2) m in the link's sagittal plane; None for a straight line.
-        pose_link_in_here: (4, 4).
+        start: start of the path, in the result's frame, shape (3,), m.
+        end: end of the path, in the result's frame, shape (3,), m.
+        outline: outline in the link's sagittal plane, shape (n, 2), m; None: a straight path.
+        pose_link_in_here: pose of the link in the result's frame, shape (4, 4).
     """
     if outline is None:
         return straight_path(np.asarray(start, float), np.asarray(end, float))
     origin = pose_link_in_here[:3, 3]
-    # The outline is given in the link's axes, so that the path is found there.
+    # The path is computed in the link's axes, the axes of the outline.
     back = pose_link_in_here[:3, :3].T
     path = taut_path(back @ (start - origin), back @ (end - origin), outline)
     return path.moved(pose_link_in_here)
@@ -120,7 +120,7 @@ def path_in_link(
 
 @compiled_as_written
 def _height(point: Array, outline: Array, edge: int) -> float:
-    """Return twice the area of the triangle of an edge and a point; negative: it is outside."""
+    """Return twice the area of the triangle of edge and point; negative: the point is outside."""
     following = (edge + 1) % len(outline)
     x, y = point[0] - outline[edge, 0], point[1] - outline[edge, 1]
     return float(x * (point[1] - outline[following, 1]) - y * (point[0] - outline[following, 0]))
@@ -137,7 +137,7 @@ def _is_inside(point: Array, outline: Array) -> bool:
 @compiled_as_written
 def _sweep(start: Array, end: Array, outline: Array) -> float:
     """Return the clockwise angle (rad) from start to end about the outline's centre."""
-    # The centroid of a convex outline lies inside it, so that the angle about it is defined.
+    # The centroid of a convex outline lies inside the outline: the angle about it is defined.
     x, y = np.mean(outline[:, 0]), np.mean(outline[:, 1])
     ax, ay, bx, by = start[0] - x, start[1] - y, end[0] - x, end[1] - y
     return float(-np.arctan2(ax * by - ay * bx, ax * bx + ay * by))
@@ -145,7 +145,7 @@ def _sweep(start: Array, end: Array, outline: Array) -> float:
 
 @compiled_as_written
 def _crosses(start: Array, end: Array, outline: Array) -> bool:
-    """Say whether a segment crosses the outline: clipping by half-planes (Cyrus and Beck 1978)."""
+    """Return whether a segment crosses the outline, by half-planes (Cyrus and Beck 1978)."""
     entry_at, exit_at = 0.0, 1.0
     for edge in range(len(outline)):
         above, below = _height(start, outline, edge), _height(end, outline, edge)
@@ -160,24 +160,24 @@ def _crosses(start: Array, end: Array, outline: Array) -> bool:
 
 @compiled_as_written
 def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float, int]:
-    """Return the taut path's points (m, 3), length and turn, and which end is inside.
+    """Return the taut path's points (m, 3), length and turn, and the end inside the outline.
 
     The path is straight if the segment misses the outline. Otherwise it touches the outline from
     the corner of the tangent through the start to the corner of the tangent through the end. At
     these corners the outline's edges change from visible to hidden.
 
     Args:
-        start: (3,) m.
-        end: (3,) m.
-        outline: (n, 2) m.
+        start: start of the path, shape (3,), m.
+        end: end of the path, shape (3,), m.
+        outline: convex polygon, shape (n, 2), m.
     """
     ends, straight = np.stack((start, end)), np.sqrt(np.sum((end - start) ** 2))
     if _is_inside(start, outline):
         return ends, straight, 0.0, START
     if _is_inside(end, outline):
         return ends, straight, 0.0, END
-    # A straight line is taut where it misses the bone. The swept angle is taken between -90 and 270
-    # deg: more than 90 deg backwards means around the front.
+    # A straight line is taut if it misses the bone. The swept angle is between -90 and 270 deg: a
+    # path of more than 90 deg backwards passes around the front.
     if _sweep(start, end, outline) >= -0.5 * np.pi and not _crosses(start, end, outline):
         return ends, straight, 0.0, NEITHER
     count, first, last = len(outline), -1, -1
@@ -191,7 +191,7 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
     points, turn, along = np.empty((corners + 2, 3)), 0.0, np.zeros(corners + 2)
     points[0], points[-1] = start, end
     for corner in range(corners):
-        # The outline is counter-clockwise; the string runs down its front, in the opposite order.
+        # The outline is counter-clockwise. The string runs down its front, in the opposite order.
         points[corner + 1, :2] = outline[(first - corner) % count]
     for k in range(1, corners + 2):
         x, y = points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1]
