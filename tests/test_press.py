@@ -315,10 +315,10 @@ def test_a_zero_load_is_ok_and_too_large_a_load_is_out_of_range(meshes):
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"load": -5.0}, "impossible load"),
-        ({"load": float("nan")}, "impossible load"),
-        ({"load": float("inf")}, "impossible load"),
-        ({"load": 1e8}, "impossible load"),
+        ({"load": -5.0}, "load: cannot be"),
+        ({"load": float("nan")}, "load: cannot be"),
+        ({"load": float("inf")}, "load: cannot be"),
+        ({"load": 1e8}, "more than any knee carries"),
         ({"contact": "magic"}, "there are: .*foundation"),
         ({"material": "cheese"}, "there are: polyethylene"),
         ({"units": "inch"}, "unit"),

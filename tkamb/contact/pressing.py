@@ -99,7 +99,7 @@ class LoadSearch:
 def check_load(load: float) -> None:
     """Raise an InputError for a load (N) that no contact can carry."""
     if not (math.isfinite(load) and load >= 0):
-        raise InputError(f"impossible load {load} N", hint="give a finite load >= 0")
+        raise InputError(f"cannot be {load:g} N", "load", "give a finite force of at least 0 N")
 
 
 def press_by_search(

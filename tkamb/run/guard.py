@@ -32,6 +32,7 @@ OPTIONS = {
     "camera": "--camera",
     "frame": "--frame",
     "frames": "--frames",
+    "load": "--load",
     "method": "--method",
     "overrides": "--set",
     "restore_when": "--restore-when",

@@ -347,8 +347,8 @@ def press_meshes(
 def _check_load(load: float) -> None:
     check_load(load)
     if load > PRESS_LIMITS.max_load:
-        limit = f"no knee carries more than {PRESS_LIMITS.max_load:g} N"
-        raise InputError(f"impossible load {load:g} N", hint=f"{limit}, in N")
+        most = f"give the force in N, at most {PRESS_LIMITS.max_load:,.0f} N"
+        raise InputError(f"{load:g} N is more than any knee carries", "load", most)
 
 
 def _adjustment_settings(
