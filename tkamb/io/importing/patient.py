@@ -40,16 +40,16 @@ class ModelMassSettings:
     """Scaling of an OpenSim model's mass to a patient."""
 
     one_leg_share: float = 0.6
-    """1: a model is of one leg if thigh, shank and foot have more than this share of its mass.
+    """A model is of one leg if thigh, shank and foot have more than this share of its mass.
     Chosen because one leg has less than a fifth of a whole body's mass."""
     leg_mass_share: float = 0.161
-    """1: share of the body's mass in one leg, from thigh 0.100, shank 0.0465 and foot 0.0145
+    """Share of the body's mass in one leg, from thigh 0.100, shank 0.0465 and foot 0.0145
     (Winter, Biomechanics, 2009)."""
     max_reasons: int = 3
-    """1: the report of an import gives reasons for at most this number of unreadable parts. Chosen
+    """The report of an import gives reasons for at most this number of unreadable parts. Chosen
     because the report stays short."""
     same_mass_share: float = 0.01
-    """1: the model is not scaled if its mass differs from the subject's by less than this share.
+    """The model is not scaled if its mass differs from the subject's by less than this share.
     Chosen because clothes and rounding change the mass by less."""
 
 

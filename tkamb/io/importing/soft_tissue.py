@@ -14,7 +14,7 @@ class ImportedLigamentSettings:
     """Properties of imported ligaments that an OpenSim model does not state."""
 
     toe_strain: float = 0.06
-    """1: strain at the end of the toe region of the law \"quadratic-toe\". It is twice the 0.03
+    """Strain at the end of the toe region of the law \"quadratic-toe\". It is twice the 0.03
     of Blankevoort (1991)."""
 
 

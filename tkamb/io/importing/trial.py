@@ -127,7 +127,7 @@ class TrialFrameSettings:
     """Number of frames of a trial in an imported scene."""
 
     frames_per_period: float = 5.0
-    """1: number of frames per period of the cut-off frequency. Chosen because a low-pass-filtered
+    """Number of frames per period of the cut-off frequency. Chosen because a low-pass-filtered
     motion does not change faster."""
 
 

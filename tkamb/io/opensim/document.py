@@ -231,7 +231,7 @@ class DocumentSettings:
     """Limits of reading an OpenSim file."""
 
     max_nested_files: int = 5
-    """1: largest depth of files that include further files. OpenSim's own models have depth 1."""
+    """Largest depth of files that include further files. OpenSim's own models have depth 1."""
 
 
 DOCUMENT = DocumentSettings()

@@ -34,13 +34,13 @@ class PlaneStringSettings:
     """Initial guesses of a string around an ellipsoid, in planes through its end points."""
 
     runge_kutta_steps: int = 6
-    """1: number of Runge-Kutta steps along a geodesic. Chosen because few steps suffice: the method
+    """Number of Runge-Kutta steps along a geodesic. Chosen because few steps suffice: the method
     (DOP853) has order eight."""
     rival_share: float = 0.1
-    """1: a second plane string is also tried if it is longer than the shortest by less than this
+    """A second plane string is also tried if it is longer than the shortest by less than this
     share of its arc. Chosen because it may lead to the shortest geodesic."""
     planes: int = 24
-    """1: number of half planes through both points that are tried. Chosen as one every 15 deg."""
+    """Number of half planes through both points that are tried. Chosen as one every 15 deg."""
 
 
 PLANE_STRING = PlaneStringSettings()
@@ -195,7 +195,7 @@ class GeodesicSettings:
     """Newton iteration for the taut string over an ellipsoid."""
 
     max_iterations: int = 30
-    """1: largest number of Newton steps. Chosen because strings that converge need fewer."""
+    """Largest number of Newton steps. Chosen because strings that converge need fewer."""
     tolerance: float = 1e-11
     """rad: the iteration has converged if the error of the string's direction at its end is
     smaller. Chosen because the touching points then do not change noticeably."""
@@ -367,7 +367,7 @@ class _Shot:
         return residual, jacobian, entry, leave, reach[:, 0] * dot(rest, direction)
 
     def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
-        """Return the rates (f, 3) of the unit normals at points that move with velocities (f, 3)."""
+        """Return the rates (f, 3) of the unit normals at points with velocities (f, 3)."""
         bent = velocity / self.axes**2
         return (bent - dot(bent, normal)[:, None] * normal) / slope[:, None]
 

@@ -1,7 +1,7 @@
-"""The tables of the scene file: what each key means, its unit and its limits.
+"""The tables of the scene file, with the meaning, unit and limits of each key.
 
-Units are in the key names; unknown keys are errors; every table is frozen. The tables of what was
-recorded are in `recording_tables`.
+Units are in the key names. Unknown keys are errors. All tables are frozen. The tables of recordings
+are in `recording_tables`.
 """
 
 from pathlib import Path

@@ -47,10 +47,10 @@ class FluoroscopyErrorSettings:
 
 @dataclass(frozen=True)
 class SkinMarkerErrorSettings:
-    """Standard deviations of a pose from skin markers, and of the markers themselves.
+    """Standard deviations of a pose from skin markers, and of the markers.
 
-    A coordinate that is computed from the markers varies with them (`thigh_mm`, `shank_mm`). The
-    other fields are used for the coordinates that were not recorded.
+    The error of a coordinate from markers follows from the errors `thigh_mm` and `shank_mm` of the
+    markers. The other fields are used for coordinates that were not recorded.
 
     References: doi:10.1016/j.gaitpost.2005.04.012 (Benoit et al. 2006, eight men with pins in
     femur and tibia: knee rotations off by up to 4.4 deg and translations by up to 13 mm in
@@ -60,7 +60,7 @@ class SkinMarkerErrorSettings:
     """
 
     ap_mm: float = 5.0
-    """mm; an assumption: the largest error of Benoit et al. is 2.6 of it."""
+    """mm; an assumption: the largest error of Benoit et al. is 2.6 times this value."""
     si_mm: float = 1.0
     """mm; an assumption: contact keeps the condyles on the insert."""
     ml_mm: float = 3.0
@@ -74,10 +74,10 @@ class SkinMarkerErrorSettings:
     markers: their own deviation then counts."""
     thigh_mm: float = 10.0
     """mm, of each thigh marker in each direction; an assumption: a rigid fit of three markers
-    240 mm apart is then off by 3 deg and 6 mm, a third of the largest errors in PMC8631460."""
+    240 mm apart then errs by 3 deg and 6 mm, a third of the largest errors in PMC8631460."""
     shank_mm: float = 6.0
-    """mm, of each shank marker in each direction; an assumption: likewise 2 deg and 3.5 mm, a third
-    to a fifth of the largest errors in PMC8631460, which stand in swing."""
+    """mm, of each shank marker in each direction; an assumption: a rigid fit then errs by 2 deg and
+    3.5 mm, a third to a fifth of the largest errors in PMC8631460, which occur in swing."""
 
 
 FLUOROSCOPY_ERROR = FluoroscopyErrorSettings()
@@ -218,12 +218,11 @@ class UncertaintyTable(SceneTable):
     )
 
     def completed(self, from_markers: bool) -> Self:
-        """Return the table with the pose's deviations of its kind of recording.
-
-        What the table gives stays.
+        """Return the table with default deviations for the pose coordinates that it lacks.
 
         Args:
-            from_markers: whether the knee's motion is taken from skin markers; else fluoroscopy.
+            from_markers: whether the knee's motion is from skin markers; otherwise the defaults
+                are of fluoroscopy.
         """
         defaults = asdict(SKIN_MARKER_ERROR if from_markers else FLUOROSCOPY_ERROR)
         own = {
