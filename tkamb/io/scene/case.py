@@ -76,7 +76,7 @@ class Case:
 
     @cached_property
     def split(self) -> float | None:
-        """z coordinate between the condyles, m, femoral frame; None if there is only one condyle."""
+        """z coordinate between the condyles, m, femoral frame; None with only one condyle."""
         from tkamb.geometry.condyles import condyle_split
 
         return condyle_split(self.femoral) if self.femoral else None

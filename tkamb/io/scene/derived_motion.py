@@ -19,9 +19,9 @@ def seated_motion(
 ) -> KneeMotion:
     """Return the motion with an initial guess of the coordinates that were not recorded.
 
-    Unrecorded rotations are zero. Unrecorded AP and ML place the mean of the condyles' lowest points
-    above the insert's origin. Unrecorded SI lowers the femur to first touch. The velocities and
-    accelerations of this guess determine the inertia forces and the direction of sliding.
+    Unrecorded rotations are zero. Unrecorded AP and ML place the mean of the condyles' lowest
+    points above the insert's origin. Unrecorded SI lowers the femur to first touch. The velocities
+    and accelerations of this guess determine the inertia forces and the direction of sliding.
 
     Args:
         motion: recorded motion; `motion.unrecorded` names the missing coordinates.

@@ -50,8 +50,8 @@ class Scene(SceneTable):
     base: str | None = Field(
         None,
         description=(
-            "name of another scene file in the same folder: its keys hold where this file does "
-            "not give them, table by table; lists are replaced whole"
+            "name of another scene file in the same folder. Its keys apply unless this file gives "
+            "them. Tables are merged; lists are replaced as a whole"
         ),
     )
     patient: PatientTable
@@ -377,7 +377,7 @@ def _model_at(place: tuple[int | str, ...]) -> type[BaseModel] | None:
 
 
 def _table_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the class of the table in an annotation, such as `T`, `T | None` or `tuple[T, ...]`."""
+    """Return the table's class in an annotation, such as `T`, `T | None` or `tuple[T, ...]`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((t for a in get_args(annotation) if (t := _table_in(a)) is not None), None)

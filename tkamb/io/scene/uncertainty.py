@@ -15,8 +15,8 @@ Length = Annotated[Number, Field(ge=0, le=50)]
 Angle = Annotated[Number, Field(ge=0, le=20)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 
-_OF_POSE = "of the recorded pose; default: that of the recording, fluoroscopy or skin markers"
-_GIVE = "; no default: give what your laboratory knows"
+_OF_POSE = "of the recorded pose; default: the value for fluoroscopy or for skin markers"
+_GIVE = "; 0 by default: give the value of your laboratory"
 _TISSUE = (
     "; default: an assumption, for a Monte Carlo study of the kind of Smith et al. (PMC4755512)"
 )
@@ -111,7 +111,9 @@ class UncertaintyTable(SceneTable):
     names.
     """
 
-    seed: Count = Field(1, ge=0, description="of all draws; the same seed gives the same samples")
+    seed: Count = Field(
+        1, ge=0, description="seed of all random draws; the same seed gives the same samples"
+    )
     ap_mm: Length | None = Field(None, description=_OF_POSE)
     si_mm: Length | None = Field(None, description=_OF_POSE)
     ml_mm: Length | None = Field(None, description=_OF_POSE)
@@ -125,8 +127,8 @@ class UncertaintyTable(SceneTable):
     )
     correlation_s: Annotated[Number, Field(ge=0, le=100)] = Field(
         0.1,
-        description="correlation time of that noise: AR(1) with exp(-dt/correlation_s); 0 is "
-        "white. An assumption, without a source",
+        description="correlation time of the noise per frame: AR(1) with exp(-dt/correlation_s); 0 "
+        "is white noise. An assumption, without a source",
     )
     markers_mm: Length | None = Field(
         None,
@@ -183,8 +185,8 @@ class UncertaintyTable(SceneTable):
     )
     yield_stress: Share = Field(
         0.0,
-        description="relative, of [output] yield_stress_MPa, which tells overloaded area; 0: the "
-        "limit stands as it is stated",
+        description="relative, of the yield stress above which area counts as overloaded; 0: the "
+        "limit does not vary",
     )
     wear_factor: Share = Field(
         0.44,
@@ -210,8 +212,7 @@ class UncertaintyTable(SceneTable):
     )
     dome_mm: Length = Field(
         1.0,
-        description="AP and SI each: where a recorded patella, the dome of its button, is on the "
-        "femur" + _ASSUMED,
+        description="AP and SI each: position of a recorded patella on the femur" + _ASSUMED,
     )
     correlation: tuple[CorrelationTable, ...] = Field(
         (), description="inputs that err together; needs a positive semi-definite matrix"
