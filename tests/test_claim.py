@@ -210,7 +210,7 @@ def test_interrupted_renames_are_completed_later(tmp_path, monkeypatch):
 )
 def test_a_malformed_or_foreign_journal_is_refused(tmp_path, content):
     (tmp_path / JOURNAL).write_text(content)
-    with pytest.raises(InputError, match=r"journal|outside"):
+    with pytest.raises(InputError, match=r"journal|outside|JSON"):
         settle(tmp_path)
 
 
