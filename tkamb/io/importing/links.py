@@ -3,8 +3,7 @@
 Each link is a frame on a body of the model:
 
 - femur: origin of the femoral component's mesh, with the mesh axes turned to x anterior,
-  y superior, z right. Without an implant: the knee's centre, with ground's axes in the neutral
-  position.
+  y superior, z right. Without an implant: the knee's centre, with the axes of the femoral body.
 - tibia: the ankle joint's centre, with the axes of the tibial body.
 - patella: the origin of the patella's body. Its axes are those of the body, turned by multiples
   of 90 deg so that they are nearest the axes of the femur link.
