@@ -1,4 +1,4 @@
-"""Recordings with wrong bytes, from a seed, and what reading them comes to."""
+"""Helpers that damage the bytes of a recording at random, and read the damaged file."""
 
 import random
 import warnings
@@ -14,11 +14,11 @@ from tkamb.io.recordings.tables import read_table
 WORDS = [b"\x00", b"\xff", b"\x7f", b"\x80", b"\x01", b"\x00\x00\x80\x7f", b"\xff\xff\xff\x7f"]
 TEXTS = [b"", b" ", b"\t\t", b",", b"1e308", b"nan", b"-", b"\n", b"\x00", b"\xe9", b"9" * 400]
 HEAD = 4096
-"""Bytes of a C3D's header and parameters, which most wrong bytes are put into."""
+"""bytes: size of a C3D's header and parameters, where most of the damage is."""
 
 
 def damaged(content: bytes, seed: int, words: list[bytes] = WORDS) -> bytes:
-    """Return bytes with one to three of them changed, put in, taken out or cut off."""
+    """Return the content with one to three random changes, insertions, deletions or cuts."""
     chance = random.Random(seed)
     broken = bytearray(content)
     for _ in range(chance.randint(1, 3)):
@@ -40,29 +40,29 @@ def damaged(content: bytes, seed: int, words: list[bytes] = WORDS) -> bytes:
 
 
 def read_all(path: Path) -> str:
-    """Read everything that a recording holds, and return "read" or the refusal, a single line.
+    """Read a whole recording, and return "read" or the error message.
 
     Raises:
-        AssertionError: values that are no numbers of a measurement, or a message of many lines.
+        AssertionError: a value is infinite, or the message has several lines.
     """
     parts = [lambda: read_table(path)]
     if path.suffix == ".c3d":
         parts.append(lambda: read_c3d(path))
     else:
         parts.append(lambda: table_forces(read_table(path)))
-    said = "read"
+    message = "read"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for part in parts:
             try:
-                found = part()
+                content = part()
             except InputError as error:
-                said = str(error)
+                message = str(error)
                 continue
-            if path.suffix == ".c3d" and hasattr(found, "plates"):
-                for plate in found.plates:
+            if path.suffix == ".c3d" and hasattr(content, "plates"):
+                for plate in content.plates:
                     assert not np.isinf(plate.wrench).any()
-                assert not np.isinf(found.points).any()
-                assert len(found.time) == len(found.points)
-    assert "\n" not in said
-    return said
+                assert not np.isinf(content.points).any()
+                assert len(content.time) == len(content.points)
+    assert "\n" not in message
+    return message

@@ -1,4 +1,4 @@
-"""Subject JW's overground gait trial og3: the model's own coordinates and the plates' loads."""
+"""Subject JW's overground gait trial og3: fitted model coordinates and plate loads."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -28,7 +28,10 @@ needs_jw = pytest.mark.skipif(not JW.is_dir(), reason="subject JW is absent from
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """A trial; ground reactions by side; as loads, wrenches at ground's origin by body."""
+    """A trial: motion of the model, and side -> ground reaction.
+
+    `loads` are the same reactions as wrenches at ground's origin, by body.
+    """
 
     kinematics: Kinematics
     motion: CoordinateMotion
@@ -63,7 +66,7 @@ def gait(start: float = 1.9, end: float = 4.2) -> Gait:
 
 
 def natural_motion(time: Array, q: Array) -> CoordinateMotion:
-    """Return the natural quintic spline's motion: what OpenSim makes of a coordinate file."""
+    """Return the motion of a natural quintic spline, which OpenSim fits to a coordinate file."""
     ends = [(order, np.zeros(q.shape[1])) for order in (3, 4)]
     spline = make_interp_spline(time, q, 5, bc_type=(ends, ends))
     return CoordinateMotion(time, q, spline(time, 1), spline(time, 2))

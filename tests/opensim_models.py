@@ -1,4 +1,4 @@
-"""OpenSim models for the tests: two small ones of our own, and those of the data folder."""
+"""OpenSim models for the tests: two small models of tkamb, and published models."""
 
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,7 @@ PUBLISHED = {
 
 @cache
 def kinematics(name: str) -> Kinematics:
-    """Return a model's kinematics; skips where its file is absent."""
+    """Return a model's kinematics. Skip the test if the model's file is absent."""
     path = (OWN | PUBLISHED)[name]
     if not path.is_file():
         pytest.skip(f"{name}'s file is absent from ../shared/data")
@@ -30,5 +30,5 @@ def kinematics(name: str) -> Kinematics:
 
 
 def model(name: str) -> OpenSimModel:
-    """Return a model; skips where its file is absent."""
+    """Return a model. Skip the test if the model's file is absent."""
     return kinematics(name).model

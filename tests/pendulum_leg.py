@@ -10,7 +10,7 @@ from tkamb.show.storage import write_trc
 
 
 def pendulum_osim(path: Path, changes: dict[str, str] | None = None) -> Path:
-    """Write a leg of four bodies: pelvis (free), femur, tibia, foot, with markers."""
+    """Write a model of a free pelvis, femur, tibia and foot, with markers. Return its path."""
     joints = [
         ("FreeJoint", "root", "/ground", "/bodyset/pelvis", "0 0 0", 6),
         ("BallJoint", "hip_r", "/bodyset/pelvis", "/bodyset/femur_r", "-0.04 -0.1 0.08", 3),
@@ -65,7 +65,7 @@ def _joint(kind: str, name: str, parent: str, child: str, place: str, count: int
 
 
 def moving_leg(osim: Path, frames: int = 60) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return coordinates (n, 11) of a knee bend, and the markers in ground."""
+    """Return coordinates (n, 11) of a knee bend, and label -> marker positions (n, 3) in ground."""
     model = read_osim(osim)
     chain = ModelChain(model, list(model.markers))
     q = chain.default(frames)
@@ -99,7 +99,7 @@ def recorded_leg(tmp_path: Path, **changes) -> list[str]:
 
 
 def changed(arguments: list[str], **options: str | None) -> list[str]:
-    """Return the arguments with options replaced, added or (None) dropped."""
+    """Return the arguments with options replaced or added. Options with value None are removed."""
     result = list(arguments)
     for name, value in options.items():
         option = "--" + name.replace("_", "-")

@@ -48,7 +48,10 @@ def muscle(
 
 
 def plane_leg(*muscles: OpenSimMuscle) -> OpenSimModel:
-    """Return the leg: hip at the pelvis's origin 1 m up, knee and ankle below it when straight."""
+    """Return the leg. The hip is at the pelvis's origin, 1 m above ground's origin.
+
+    Knee and ankle are below the hip if all coordinates are zero.
+    """
     inertia = 0.01 * np.eye(3)
     places = {"pelvis": 0.0, "femur_r": -0.2, "tibia_r": -0.2, "foot_r": 0.0}
     bodies = {n: Body(n, m, np.array([0.0, places[n], 0.0]), inertia) for n, m in MASSES.items()}

@@ -50,13 +50,13 @@ def test_one_process_at_a_time(tmp_path, holder):
     ):
         pass
     assert names(tmp_path / "out") == {MARKER}
-    holder.kill()  # -9: no lock is left behind
+    holder.kill()  # SIGKILL: the system releases the lock
     holder.wait()
     with claimed_directory(tmp_path / "out") as folder:
         assert folder_token(folder)
 
 
-def test_a_thread_may_claim_again_what_it_holds(tmp_path):
+def test_a_thread_may_lock_a_folder_twice(tmp_path):
     with claimed_directory(tmp_path / "out") as outer, claimed_directory(tmp_path / "out") as inner:
         assert outer == inner
 
@@ -69,7 +69,7 @@ def test_a_foreign_folder_is_refused_without_force(tmp_path):
     assert names(tmp_path) == {"thesis.tex"}
     with claimed_directory(tmp_path, force=True):
         pass
-    with claimed_directory(tmp_path):  # from now on it is tkamb's
+    with claimed_directory(tmp_path):  # the marker makes the folder tkamb's own
         pass
     assert (tmp_path / "thesis.tex").read_text() == "mine"
 
@@ -86,7 +86,7 @@ def test_a_foreign_folder_is_refused_without_force(tmp_path):
         (".frames/holiday.jpg", "", False),
     ],
 )
-def test_folders_of_earlier_releases_are_known(tmp_path, name, text, ours):
+def test_folders_of_earlier_releases_are_recognised(tmp_path, name, text, ours):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text(text)
@@ -99,7 +99,7 @@ def test_folders_of_earlier_releases_are_known(tmp_path, name, text, ours):
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_bad_input_leaves_nothing(tmp_path, there):
+def test_bad_input_leaves_no_new_file_or_folder(tmp_path, there):
     out = tmp_path / "a" / "out"
     if there:
         out.mkdir(parents=True)
@@ -109,7 +109,7 @@ def test_bad_input_leaves_nothing(tmp_path, there):
     assert not there or not names(out)
 
 
-def test_only_own_temporaries_go(tmp_path):
+def test_only_the_folders_own_temporary_files_are_removed(tmp_path):
     with claimed_directory(tmp_path) as folder:
         token = folder_token(folder)
     own = tmp_path / f".tkamb-{token}-12ab.part"
@@ -140,7 +140,7 @@ def test_a_marker_that_is_no_file_is_refused(tmp_path, kind):
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "nul\0"])
-def test_names_that_no_folder_can_have(tmp_path, name):
+def test_an_impossible_folder_name_is_refused(tmp_path, name):
     with pytest.raises(InputError, match="cannot be written"), claimed_directory(tmp_path / name):
         pass
     assert not names(tmp_path)
@@ -168,20 +168,20 @@ def test_files_change_together(tmp_path):
     assert names(tmp_path) == {"a.csv", "b.json"} and (tmp_path / "a.csv").read_text() == "new"
 
 
-def test_a_kill_between_the_renames_is_mended_by_the_next(tmp_path, monkeypatch):
-    """A process is killed after any number of renames: the next one completes the new state."""
+def test_interrupted_renames_are_completed_later(tmp_path, monkeypatch):
+    """A process is killed after some of its renames. The next process completes them."""
     for renames in range(1, 4):
         folder = tmp_path / str(renames)
         folder.mkdir()
         write_two(folder, "old")
         (folder / "c.html").write_text("old")
-        left = [renames]
+        remaining = [renames]
         replace = os.replace
 
-        def dying(source, target, left=left, replace=replace):
-            if left[0] == 0:
+        def dying(source, target, remaining=remaining, replace=replace):
+            if remaining[0] == 0:
                 raise SystemExit
-            left[0] -= 1
+            remaining[0] -= 1
             replace(source, target)
 
         with monkeypatch.context() as patch:
@@ -208,9 +208,9 @@ def test_a_kill_between_the_renames_is_mended_by_the_next(tmp_path, monkeypatch)
         json.dumps({"written": {"a": 1}, "removed": []}),
     ],
 )
-def test_a_journal_of_somebody_else_is_refused(tmp_path, content):
+def test_a_malformed_or_foreign_journal_is_refused(tmp_path, content):
     (tmp_path / JOURNAL).write_text(content)
-    with pytest.raises(InputError, match=r"journal|outside"):
+    with pytest.raises(InputError, match=r"journal|outside|JSON"):
         settle(tmp_path)
 
 
@@ -224,6 +224,6 @@ def test_a_long_name_can_be_written(tmp_path):
     assert names(tmp_path) == {path.name}
 
 
-def test_names_that_are_not_utf8_can_be_written_down(tmp_path):
+def test_text_with_bytes_that_are_not_utf8_can_be_written(tmp_path):
     files.write_text(tmp_path / "a.json", json.dumps({"f": "\udcff"}, ensure_ascii=False))
     assert json.loads((tmp_path / "a.json").read_text()) == {"f": "\udcff"}

@@ -1,4 +1,4 @@
-"""`tkamb data get` from a local server and a folder: SHA-256 checks and complete files only."""
+"""`tkamb data get` from a local server and a folder writes only complete, checked files."""
 
 import hashlib
 import http.server

@@ -88,7 +88,7 @@ def test_dm_is_in_balance_on_free_bodies(dm, k):
 
 
 def assert_same_loads(leg, frame, t):
-    """Assert that tkamb and the free bodies agree on every load that both compute."""
+    """Assert that tkamb and the free bodies agree on every common load."""
     assert not frame.loads.problems
     own = FreeBodies(leg, t, lent(frame)).loads()
     for k, axis in enumerate(("ap", "si", "ml")):
@@ -143,7 +143,7 @@ def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):
 
 
 def test_the_free_bodies_notice_a_load_that_is_wrong_by_one_per_cent(shipped):
-    """One per cent of the ground reaction is more than the tolerance: the test can fail."""
+    """The comparison fails if the ground reaction changes by one per cent."""
     leg, mechanics, time = shipped
     k, ground = SHIPPED_FRAMES[3], leg.ground
     own = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()

@@ -58,7 +58,7 @@ def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
 
 @pytest.mark.parametrize(("off", "asked"), [(10.0, 0), (14.0, 1)])
 def test_markers_of_another_subject_are_asked_about(tmp_path, off, asked):
-    """If marker clusters grow by the share c, the rms of a rigid fit is c times their radius."""
+    """If marker clusters grow by the share c, the rms of a rigid fit is c times the radius."""
     assert main(recorded_leg(tmp_path)) == 0
     scene = load_scene(tmp_path / "out" / "scene.toml")
     segments = scene.motion.markers.segment[:2]

@@ -94,9 +94,9 @@ def bent_leg(tmp_path_factory) -> tuple[list[str], np.ndarray, np.ndarray]:
 
 
 def test_the_femur_of_the_scene_stands_where_it_was(bent_leg, tmp_path, capsys):
-    """Poses on the insert, insert on a shank of two markers and two joint centres: all as it was.
+    """Two shank markers and two joint centres reproduce the recorded shank and knee.
 
-    The knee is a pin, so the thigh's markers carry its centre without an error.
+    The knee is a pin joint, so that the thigh's markers give its centre exactly.
     """
     arguments, tibia, femur = bent_leg
     options = {"without": "M.foot_r.1", "out": str(tmp_path / "out")}

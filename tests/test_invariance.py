@@ -1,4 +1,4 @@
-"""What must not change the answer does not: laboratory frame, units, sampling rate."""
+"""Results do not depend on the laboratory frame, the units or the sampling rate."""
 
 import csv
 from dataclasses import replace
@@ -48,7 +48,7 @@ def shipped_loads() -> list[FrameLoads]:
 
 
 def numbers(frame: FrameLoads) -> np.ndarray:
-    """All that the equations of a frame say: forces (N), moments (N·m), tensions (N)."""
+    """Return the loads of a frame: forces (N), moments (N·m), tensions (N)."""
     assert not frame.loads.problems
     loads = frame.loads
     return np.array(
@@ -65,7 +65,7 @@ def numbers(frame: FrameLoads) -> np.ndarray:
 
 
 def turned(case: Case, rotation: np.ndarray, shift: np.ndarray) -> Case:
-    """Return the case with what was measured in the laboratory seen from another one."""
+    """Return the case with its laboratory measurements in another laboratory frame."""
     move = pose(rotation, shift)
     ground = replace(
         case.ground,
@@ -101,7 +101,7 @@ def test_turning_it_anyhow_changes_nothing_if_gravity_is_turned_too():
 
 @pytest.mark.parametrize("axes", ["+y,+z,+x", "-x,+y,-z"])
 def test_a_laboratory_with_other_axes_gives_the_same(tmp_path, axes):
-    """The same measurements in files whose axes are named otherwise: `laboratory_axes`."""
+    """The same measurements are in files with other `laboratory_axes`."""
     to_laboratory = np.zeros((3, 3))
     for row, axis in enumerate(axes.split(",")):
         to_laboratory[row, "xyz".index(axis[1])] = -1.0 if axis[0] == "-" else 1.0
@@ -309,7 +309,7 @@ def resampled_scene(folder, rate, cutoff, start=1.0, stop=2.0):
 
 
 def test_slow_and_fast_recordings_of_the_same_motion_agree(tmp_path):
-    """20 Hz and 1000 Hz, the same 6 Hz cut-off, a second of the bend: within 1e-4 BW."""
+    """One second of the bend at 20 Hz and 1000 Hz, both filtered at 6 Hz, agrees to 1e-4 BW."""
     found = {}
     for rate in (20, 1000):
         case = load_case(load_scene(resampled_scene(tmp_path / str(rate), rate, 6.0)))

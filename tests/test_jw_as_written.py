@@ -1,4 +1,4 @@
-"""Subject JW's trial og3 as laboratories write such trials: the import stays what it is."""
+"""Imports of subject JW's trial og3 from several usual file layouts give equal results."""
 
 from pathlib import Path
 

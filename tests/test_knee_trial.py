@@ -51,7 +51,7 @@ def test_the_muscles_that_cross_the_knee_are_found(jw):
 
 @needs_jw
 def test_their_lines_have_the_wrench_of_the_paths_on_shank_and_foot(jw):
-    """In the model's own pose; a wrap object that yields to a point adds what it pushes with."""
+    """In the model's pose. The force of a shrinking wrap object on a path point is included."""
     links, trial, bones = jw
     link = links.tibia
     pulls = bones.pull_on(("tibia", "foot"), "tibia")[:, trial.crossing]
@@ -67,7 +67,7 @@ def test_their_lines_have_the_wrench_of_the_paths_on_shank_and_foot(jw):
 
 @needs_jw
 def test_slsqp_finds_the_same_forces_in_gait(jw):
-    """The quadratic programme of whole legs, hip to subtalar joint, by another solver."""
+    """Another solver of the quadratic programme of a leg, hip to subtalar joint, agrees."""
     problems = jw[1].problems
     for k in range(0, len(problems.moment), 3):
         problem = problems.frame(k)
@@ -103,7 +103,7 @@ def walked(names, time, left):
 
 
 def test_the_left_leg_of_a_symmetric_model_is_the_mirror_image_of_the_right(tmp_path):
-    """Mirrored motion: the same moments, arms and strengths by name, mirrored lines at the knee."""
+    """A mirrored motion gives the same moments, arms and strengths, and mirrored lines."""
     time, found = np.linspace(0.0, 1.0, 41), {}
     names = list(model("Rajagopal2016").coordinates)
     for side in ("right", "left"):

@@ -59,7 +59,7 @@ def moved_points(chain, q, coordinate, bones, attached):
 
 @needs_jw
 def test_attachments_do_the_work_of_the_length(walking):
-    """Along each of the knee's six axes the work of unit tension is -dL/dq, wraps included."""
+    """The virtual work of unit tension is -dL/dq along each of the knee's six axes."""
     trial, found = walking
     chain, q = trial.kinematics, trial.motion.q[::33]
     pull = found.bones.pull_on(("tibia", "foot"), "tibia")[..., 3:]
@@ -154,7 +154,7 @@ def test_a_muscle_past_the_tibia_loads_it_through_the_foot_alone():
 
 
 def test_quadriceps_that_end_on_the_patella_are_named():
-    """In DM a ligament joins patella and tibia; in Rajagopal the muscles continue to the tibia."""
+    """In DM a ligament joins patella and tibia. In Rajagopal the muscles continue to the tibia."""
     chain = kinematics("DM")
     q = chain.coupled({})[None]
     with pytest.raises(InputError, match=r"recfem_r.* end on 'patella_r'"):

@@ -87,7 +87,7 @@ def test_reserves_are_returned_with_what_muscles_carry():
 
 
 def test_a_coupled_coordinate_adds_its_share():
-    """The ankle that follows the knee twice as far takes half the lever's work to the knee."""
+    """With ankle = 2 knee, moments and arms are those of the knee plus twice the ankle's."""
     calf = muscle("calf", ("tibia_r", [-0.03, -0.1, 0.0]), ("foot_r", [-0.05, -0.02, 0.0]))
     plain = plane_leg(calf)
     follower = CoordinateCoupler("c", COORDINATES[2], COORDINATES[1], Linear(2.0, 0.1))
@@ -100,9 +100,9 @@ def test_a_coupled_coordinate_adds_its_share():
     np.testing.assert_allclose(motion.accelerations[:, 2], 2 * motion.accelerations[:, 1])
     loose = solve_trial(plain, motion, {}, sharing=Sharing(coordinates=COORDINATES[1:]))
     tied = solve_trial(coupled, motion, {}, sharing=Sharing(coordinates=KNEE))
-    both = np.array([1.0, 2.0])
-    np.testing.assert_allclose(tied.moment[:, 0], loose.moment @ both, atol=1e-12)
-    np.testing.assert_allclose(tied.moment_arm_m[..., 0], loose.moment_arm_m @ both, atol=1e-15)
+    factors = np.array([1.0, 2.0])
+    np.testing.assert_allclose(tied.moment[:, 0], loose.moment @ factors, atol=1e-12)
+    np.testing.assert_allclose(tied.moment_arm_m[..., 0], loose.moment_arm_m @ factors, atol=1e-15)
 
 
 def test_frames_fail_with_a_reason_and_no_numbers():

@@ -36,7 +36,7 @@ def test_the_long_form_of_the_quadriceps_gives_the_same_numbers(tmp_path):
 
 
 def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_path):
-    """Generalised force of a newton of it = -dL/dq for all nine joint coordinates."""
+    """The generalised force of unit tension is -dL/dq for all nine joint coordinates."""
     moved = {"link": "femur", "point_mm": [25.0, 180.0, 9.0]}
     case = case_of(tmp_path, muscle("vastus_lateralis", (moved, INSERTION)))
     mechanics = mechanics_of(case)
@@ -60,7 +60,7 @@ def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_pa
 
 
 def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_path):
-    """Straight from the last point on the femur: what lies before it pulls nothing."""
+    """The muscle pulls along the line from its last point on the femur."""
     via = {"link": "femur", "point_mm": [45.0, 90.0, 0.0]}
     bent = case_of(tmp_path / "a", muscle(path=(ORIGIN, via, INSERTION), wraps=False))
     direct = case_of(tmp_path / "b", muscle(path=(via, INSERTION), wraps=False))

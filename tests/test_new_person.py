@@ -37,7 +37,7 @@ def test_neither_leg_is_asked_about(knees):
 
 
 def test_forces_go_with_body_weight(tmp_path):
-    """Mass alone scales all weights and the plate's force, but not the ligaments."""
+    """A change of mass alone scales all weights and the ground reaction, but not the ligaments."""
     light = tkamb.load_scene(lay_out(tmp_path / "light", Person(mass=60.0)), {"ligament": []})
     heavy = tkamb.load_scene(lay_out(tmp_path / "heavy", Person(mass=120.0)), {"ligament": []})
     forces = [

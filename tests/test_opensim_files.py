@@ -32,7 +32,7 @@ def written(folder: Path, text: str | bytes, name: str = "model.osim") -> Path:
 
 
 def assert_same(one: OpenSimModel, other: OpenSimModel) -> None:
-    """Raise unless two models have the same bodies, poses and lines."""
+    """Assert that two models have the same bodies, poses and paths."""
     assert one.bodies.keys() == other.bodies.keys()
     for name, body in one.bodies.items():
         np.testing.assert_array_equal(body.inertia, other.bodies[name].inertia)
@@ -52,7 +52,7 @@ def cut_out(text: str, tag: str) -> tuple[str, str]:
 
 
 SETS = ("BodySet", "JointSet", "ConstraintSet", "ForceSet", "MarkerSet")
-"""Sets that are moved into files; `MARKER` adds a MarkerSet to the model first."""
+"""Sets that the tests move into separate files. `MARKER` adds a MarkerSet to the model first."""
 MARKER = (
     '<MarkerSet name="markerset"><objects><Marker name="spot"><socket_parent_frame>/bodyset/tibia'
     "</socket_parent_frame><location>0.01 -0.1 0.02</location></Marker></objects></MarkerSet>"
@@ -408,7 +408,7 @@ def test_the_versions_between_3_and_4(tmp_path, style, version):
     ],
 )
 def test_a_frame_defined_by_stations(tmp_path, axes, turn):
-    """The knee's frame on the femur, given by stations, is the same frame."""
+    """Stations that define the knee's frame on the femur give the same frame as an offset."""
     places = {"a": (0, 0, 0), "b": (0.1, 0, 0), "c": (0.02, 0, -0.1), "o": (0, -0.4, 0)}
     stations = "".join(
         f'<Station name="{name}"><socket_parent_frame>/bodyset/femur_r</socket_parent_frame>'

@@ -12,7 +12,7 @@ X = np.array([-1.0, -0.4, 0.1, 0.7, 1.5])
 
 
 def test_spline_reproduces_a_cubic():
-    """The end conditions are exact for cubics; those of a natural spline are not."""
+    """The end conditions are exact for cubics, unlike those of a natural spline."""
     cubic = Polynomial(np.array([0.3, -1.0, 0.5, 2.0]))
     spline = simm_spline(X, cubic(X))
     inside = np.linspace(-1.0, 1.5, 40)
@@ -70,7 +70,7 @@ def test_jacobian_is_the_derivative_of_points(name):
 
 
 def test_a_backwards_joint_is_the_same_joint():
-    """JW's knee leads from the tray to the femoral component; the chain passes it backwards."""
+    """The parent of JW's knee is the tray and the child is the femur, which is nearer to ground."""
     chain = kinematics("JW")
     q = {"knee_flexion": -1.0, "knee_rotation": 0.2, "knee_ty": 0.03}
     poses = dict(zip(chain.bodies, chain.poses(q), strict=True))

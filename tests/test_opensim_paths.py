@@ -1,4 +1,4 @@
-"""Taut paths beside closed forms, finite differences and OpenSim; their lengths do not jump."""
+"""Taut paths agree with closed forms, finite differences and OpenSim. Lengths are continuous."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def around_circle(first, second, sweep, radius):
 
 
 def cut(shape, rng, count=400):
-    """Return ends (f, 3) outside an ellipsoid whose straight line cuts it."""
+    """Return starts and ends (f, 3) of lines that cut an ellipsoid."""
     axes = np.array(shape)
     ends = rng.normal(size=(2, count, 3))
     ends *= rng.uniform(1.02, 4.0, (2, count, 1)) / np.linalg.norm(ends, axis=2, keepdims=True)
@@ -63,7 +63,7 @@ def test_geodesic_of_a_sphere():
 
 
 def test_geodesic_in_the_plane_of_symmetry():
-    """Over the flat side of an ellipsoid the string is that over an ellipse."""
+    """In a plane of symmetry the string over an ellipsoid is the string over an ellipse."""
     a, b = 0.05, 0.03
     start, end = np.array([[-0.08, 0.01, 0.0]]), np.array([[0.09, 0.012, 0.0]])
     strings = shortest_strings(start, end, np.array([a, b, 0.07]))

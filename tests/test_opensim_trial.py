@@ -1,8 +1,8 @@
 """A whole trial beside OpenSim's tools: inverse dynamics, static optimisation, knee reaction.
 
 The same model, coordinates, plates, cost (Σa², isometric muscles) and reserves. OpenSim's
-optimiser sometimes stops at a point that balances but is not the least: 80 times the cost in one
-frame of the trial here. Such frames are told by their cost and compared with nothing.
+optimiser sometimes stops at a feasible point that is not the minimum, with 80 times the minimum
+cost in one frame of this trial. The tests recognise such frames by their cost and skip them.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""No command replaces a file that is not its own; one that fails leaves every byte as it was."""
+"""No command replaces foreign files. A command that fails does not change any file."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Scene files, motions and meshes at random: an answer or one clean error, nothing else."""
+"""Random changes of scenes, motions and meshes give a result or a one-line error message."""
 
 import shutil
 import string
@@ -40,7 +40,7 @@ VALUES = st.recursive(
 
 
 def paths_of(content, above=()):
-    """Return the way to every key of nested tables."""
+    """Return the path to every key of nested tables."""
     found = []
     for key, value in content.items():
         found.append((*above, key))
@@ -53,7 +53,7 @@ PATHS = sorted(paths_of(SCENE))
 
 
 def changed(content, path, value):
-    """Return nested tables with one key changed; None takes it out."""
+    """Return nested tables with one key changed. The value None removes the key."""
     content = dict(content)
     if len(path) > 1:
         content[path[0]] = changed(content[path[0]], path[1:], value)
@@ -65,7 +65,7 @@ def changed(content, path, value):
 
 
 def run_cleanly(folder, capsys, *more):
-    """Run three frames; return the status, having looked at what was said."""
+    """Run three frames, check the printed messages, and return the exit status."""
     out = folder / "out"
     status = main(
         ["run", str(folder / "scene.toml"), "--out", str(out), "--frames", "0:101:50", *more]
@@ -80,7 +80,7 @@ def run_cleanly(folder, capsys, *more):
 
 
 def refusal(file):
-    """Return what is said against a scene file; empty if it is read."""
+    """Return the error message of a scene file, or "" if the file can be read."""
     try:
         load_scene(file)
     except TkambError as error:

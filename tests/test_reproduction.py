@@ -1,4 +1,4 @@
-"""The page on the dissertation: made of its numbers, and what it names is there."""
+"""The page on the dissertation has the printed numbers and names existing objects."""
 
 import ast
 import json

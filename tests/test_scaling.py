@@ -1,4 +1,4 @@
-"""A scaled patient: the loads of a body of the same shape and another size."""
+"""Loads of a scaled patient, with the same shape and another size."""
 
 from pathlib import Path
 

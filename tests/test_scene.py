@@ -165,7 +165,7 @@ def table_classes():
 
 
 def test_every_key_is_read_somewhere():
-    """A key that is declared but not read would be ignored without a word."""
+    """A key that is declared but not read would be ignored without a message."""
     read = set()
     for path in (ROOT / "tkamb").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -14,7 +14,7 @@ from tkamb.run.plausibility.ground import step_questions
 WEIGHT, PEAK = 700.0, 750.0
 TIME = np.arange(0.0, 2.4, 0.01)
 STANCES = ((0.1, 0.7), (1.2, 1.8))
-"""s, of the foot; between them it swings."""
+"""s: start and end of each stance of the foot."""
 MODELS = Path(__file__).parents[1] / "models"
 
 

@@ -1,4 +1,4 @@
-"""Reading tables: what a file says, and one clear line when it cannot be used."""
+"""Tables are read, or refused with a one-line message."""
 
 import numpy as np
 import pytest

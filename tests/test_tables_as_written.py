@@ -60,7 +60,7 @@ def storage(folder, rows="2", degrees="yes", more="", encoding="utf-8"):
 
 
 def test_a_header_that_states_another_number_of_rows_is_noticed(tmp_path):
-    """A file cut short by a copy or a program that stopped is no error; but it is said."""
+    """A file with fewer rows than its header states is read with a notice."""
     assert storage(tmp_path).notices == ()
     for rows in ("1", "5"):
         (notice,) = storage(tmp_path, rows).notices

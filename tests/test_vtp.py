@@ -1,4 +1,4 @@
-"""VTK PolyData in every encoding that VTK writes; what is cut short or foreign is refused."""
+"""VTK PolyData is read in every encoding that VTK writes. Truncated and other files are refused."""
 
 import base64
 import zlib

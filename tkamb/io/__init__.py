@@ -1,4 +1,4 @@
-"""Files to objects and back: scenes, recordings, OpenSim models, meshes, datasets."""
+"""Reading and writing of scenes, recordings, OpenSim models, meshes and data sets."""
 
 CONTACT_MODEL = "lattice"
-"""Contact model of scene files and of the command line, where none is named."""
+"""Default contact model of scene files and of the command line."""

@@ -34,7 +34,7 @@ PEAKS_BW: dict[str, dict[str, float]] = {
 
 
 def peaks_words(activity: str) -> str:
-    """Return the published mean peaks of an activity in two sentences."""
+    """Return two sentences on the published mean peak forces of an activity."""
     parts = [f"{force:.2f} BW ({source})" for source, force in PEAKS_BW[activity].items()]
     plural = "peaks" if len(parts) > 1 else "peak"
     return (

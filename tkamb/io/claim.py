@@ -1,9 +1,9 @@
 """Ownership of output folders: a folder is tkamb's own, and one process at a time writes to it.
 
 The file `.tkamb` marks a folder as tkamb's own. A process that writes holds a lock on it (flock).
-The system releases the lock when the process ends for any reason. tkamb uses a folder with other
-files only if the user asks for it, and removes only files that it names itself. The files in a
-folder also show which command wrote there, so that no command overwrites or mixes another's output.
+The system releases the lock when the process ends for any reason. tkamb uses a folder with foreign
+files only if the user asks for it, and removes only its own files. The files in a folder also show
+which command wrote them. A command does not write into a folder with another command's output.
 """
 
 import fcntl
@@ -40,17 +40,17 @@ WRITTEN = {
     "cohort": ("cohort.json",),
     "wear": ("wear.json", ".wear.npz"),
 }
-"""Command -> files that only it writes. Beside a bands.csv, results.csv is from `uncertainty`.
+"""Command -> files that show its output. `uncertainty` writes bands.csv and also results.csv.
 
 The files of `compare` and `export --vtp` have other names and may be in any folder.
 """
 BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear"}}
-"""Command -> other commands that may write into the same folder: their file names differ, and the
+"""Command -> other commands that may write into the same folder. Their file names differ, and the
 page of a run shows its wear."""
 
 
 def occupants(folder: Path) -> dict[str, str]:
-    """Return command -> name of a file of its output, finished or unfinished, in a folder."""
+    """Return the commands with output in a folder, finished or not, and one file name of each."""
     result = {
         command: name
         for command, names in WRITTEN.items()
@@ -78,7 +78,7 @@ def check_occupants(folder: Path, command: str) -> None:
 
 
 def _frames_of(folder: Path) -> tuple[str, str]:
-    """Return the command with an unfinished run in a folder ("": none), and the run's file."""
+    """Return the command of a folder's unfinished run ("" without one), and the run's file."""
     name = ".frames/run.json"
     try:
         result = read_json(folder / name)
@@ -92,7 +92,7 @@ def _frames_of(folder: Path) -> tuple[str, str]:
 
 
 def _rows_of(folder: Path) -> tuple[str, str]:
-    """Return the command with an unfinished study in a folder ("": none), and the study's file."""
+    """Return the command of a folder's unfinished study ("" without one), and the study's file."""
     name = "rows.jsonl"
     if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
         return "", name
@@ -110,7 +110,7 @@ LONGEST_WAIT = 5.0
 """s: longest time that a reader waits while a writer moves finished files into place."""
 
 _held: set[tuple[int, int, int]] = set()
-"""(thread, device, inode) of the folders that this process holds."""
+"""(thread, device, inode) of each folder that this process has locked."""
 
 
 @contextmanager
@@ -123,9 +123,9 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
     Args:
         path: the folder; it is made if it does not exist.
-        force: use the folder even if it holds other files, which do not change, or another
-            command's output.
-        command: tkamb command that writes there; "": output of any command may be there.
+        force: whether the folder may hold foreign files, which do not change, or another command's
+            output.
+        command: tkamb command that writes into the folder; "": any command's output is allowed.
 
     Raises:
         InputError: the folder cannot be made or written, holds foreign files or another command's
@@ -169,17 +169,17 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
 
 def settle(folder: Path) -> None:
-    """Complete the interrupted file changes of a killed process in a folder, before it is read.
+    """Complete a killed process's file changes in a folder. Call it before reading the folder.
 
     Raises:
-        InputError: they cannot be completed.
+        InputError: the changes cannot be completed.
     """
     deadline = clock.monotonic() + LONGEST_WAIT
     while replacement_pending(folder):
         try:
             with _holding_lock(folder):
                 finish_replacement(folder)
-        except BusyFolderError:  # the process with the lock completes them itself
+        except BusyFolderError:  # the process that has the lock completes the changes
             if clock.monotonic() > deadline:
                 raise
             clock.sleep(0.02)
@@ -217,8 +217,8 @@ def _acquire_lock(path: Path) -> int:
             os.close(descriptor)
             what = f"cannot be locked ({error.strerror})"
             raise InputError(what, marker, CHOOSE) from None
-        # The process that held the lock before may have removed the marker. The lock is then on a
-        # file that no other process can find.
+        # The previous owner of the lock may have removed the marker. This lock is then on a
+        # removed file and excludes no other process.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(descriptor), marker.lstat()):
                 return descriptor
@@ -256,7 +256,7 @@ def _remove_temporaries(path: Path) -> None:
 
 
 def _check_ours(path: Path, force: bool) -> None:
-    """Raise if a folder holds files and tkamb has not written into it before."""
+    """Raise an InputError if a folder holds files and none of them marks it as tkamb's own."""
     if force or is_ours(path):
         return
     others = sorted(entry.name for entry in path.iterdir())
@@ -266,10 +266,10 @@ def _check_ours(path: Path, force: bool) -> None:
 
 
 def is_ours(path: Path) -> bool:
-    """Return whether any release of tkamb has written into a folder before.
+    """Return whether a folder holds tkamb's marker file or its output.
 
-    Releases without the marker file wrote a summary.json with tkamb's version, the identity of an
-    unfinished run, or the rows of a study.
+    Releases without the marker are recognised by a summary.json with tkamb's version, by the file
+    of an unfinished run, or by the rows of a study.
     """
     if (path / MARKER).is_file() and not (path / MARKER).is_symlink():
         return True
@@ -288,20 +288,22 @@ def is_ours(path: Path) -> bool:
 OWN_MARK = b"tkamb"
 """Mark near the beginning of every page, map and deck that tkamb writes."""
 MARK_WITHIN = 4096
-"""Number of bytes at the beginning of a file in which the mark is searched."""
+"""Number of bytes at the beginning of a file that are searched for the mark."""
 PICTURES = {".png": b"\x89PNG", ".gif": b"GIF8"}
-"""Suffix -> first bytes of formats without a mark. A picture may replace any picture."""
+"""Suffix of a picture file -> its first bytes. Pictures have no mark of tkamb, so that a picture
+may replace any picture of its format."""
 
 
 def check_output_file(path: str | Path | None, force: bool = False) -> None:
-    """Raise unless the path is free or holds a file that tkamb has written.
+    """Raise an InputError if writing an output file would replace a file that tkamb did not write.
 
     Args:
         path: the output file; None: no file is written.
         force: whether any file may be replaced.
 
     Raises:
-        InputError: the path holds a file that tkamb did not write, or is not a file.
+        InputError: the path holds a file that tkamb did not write, other than an .mp4 file, or is
+            not a file.
     """
     if path is None or not os.path.lexists(path):
         return
@@ -323,7 +325,7 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
 
 
 def _object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; an empty one if there is no such file or object."""
+    """Return the object in a JSON file, or {} if the file is unreadable or holds no object."""
     try:
         claim = read_json(path)
     except InputError:
@@ -334,5 +336,5 @@ def _object(path: Path) -> dict[str, Any]:
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except (OSError, ValueError):  # too long a name, or NUL in it: making the folder reports that
+    except (OSError, ValueError):  # The name is too long or has a NUL; `mkdir` reports this later.
         return True

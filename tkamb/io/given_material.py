@@ -29,7 +29,7 @@ LAW_KEYS = {
     "ramberg-osgood": ("alpha", "reference_stress_MPa", "exponent"),
     "tabulated": ("strain", "stress_MPa"),
 }
-"""Name of a law -> the keys that it needs."""
+"""Name of a stress–strain law -> its required keys."""
 NUMBERS = (
     *("young_modulus_MPa", "poisson_ratio", "yield_stress_MPa", "alpha"),
     *("reference_stress_MPa", "exponent"),
@@ -40,14 +40,14 @@ EXAMPLE = "see docs/materials.md"
 def given_material(table: Mapping[str, Any], where: object = "[material]") -> Material:
     """Return the material that a table with the keys `KEYS` describes.
 
-    With only `base`, it is that built-in material. Further keys change it; a `law` replaces that of
-    the base. Without `base`, the table needs E, nu and the numbers of its law. E of a
-    tabulated curve is its slope at the origin; if E is given too, the curve is scaled to it.
+    A table with only `base` is that built-in material. Further keys replace the base's values.
+    Without `base`, the table needs Young's modulus, Poisson's ratio and the numbers of its law.
+    Young's modulus of a tabulated curve is its slope at the origin. If it is given too, the curve
+    is scaled to it.
 
     Args:
-        table: see docs/materials.md; stresses in MPa, strain dimensionless. None counts as
-            absent.
-        where: the file or table, for messages.
+        table: keys of docs/materials.md; a key with value None is ignored.
+        where: name of the file or table, for messages.
 
     Raises:
         InputError: a key is unknown, missing or superfluous, or a value is out of range.
@@ -88,11 +88,11 @@ def named_material(name: str | Path | Material) -> Material:
     """Return a material by its name or file.
 
     Args:
-        name: a key of `MATERIALS`, the path of a .toml file with the keys of [material], or a
-            material, which is returned unchanged.
+        name: key of `MATERIALS`, path of a .toml file with the keys of [material], or a material,
+            which is returned unchanged.
 
     Raises:
-        InputError: no such material or file, or the file does not describe a material.
+        InputError: the material or file does not exist, or the file does not describe a material.
     """
     if isinstance(name, Material):
         return name
@@ -136,7 +136,7 @@ def material_as_json(chosen: Material) -> dict[str, Any]:
 
 
 def material_in_words(values: Mapping[str, Any]) -> str:
-    """Return one line of text from the result of `material_as_json`."""
+    """Return one line of text on a material from the result of `material_as_json`."""
     parts = [
         f"E = {values['young_modulus_MPa']:.4g} MPa",
         f"Poisson's ratio {values['poisson_ratio']:.3g}",
@@ -165,7 +165,7 @@ def _check_name(entries: Mapping[str, Any], where: object) -> None:
 
 
 def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
-    """Return the law that the table gives, or the law of the base."""
+    """Return the stress–strain law of the table, or else of the base."""
     name = entries.get("law")
     if name is not None and name not in LAW_KEYS:
         raise InputError(f"no law '{name}'", where, names_near(str(name), LAW_KEYS))

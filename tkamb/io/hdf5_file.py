@@ -1,9 +1,8 @@
-"""HDF5 files on a disk that may become full.
+"""Writing of HDF5 files with an error message when the disk is full.
 
 The HDF5 library cannot close a file after a failed write: it tries again, fails, and ends the
-process. Here the library writes through a Python file object. The object records the first failure
-and ignores all later writes, so that the library can close the file. Then the failure is raised,
-and the caller discards the file.
+process. tkamb lets the library write through a Python file object. This object records the first
+failure and ignores later writes, so that the library can close the file. Then `new_hdf5` raises.
 """
 
 import os
@@ -18,13 +17,13 @@ from tkamb.errors import InputError
 
 
 class NotingFile:
-    """A file object for HDF5 that records the first failed write instead of raising it.
+    """A file object for HDF5 that records the first failed write and raises no error.
 
     Args:
         path: the file; it is created, or emptied if it exists.
 
     Attributes:
-        failure: the error of the first failed write; None: every write has succeeded.
+        failure: error of the first failed write; None if every write has succeeded.
 
     Raises:
         OSError: the file cannot be opened.
@@ -37,7 +36,7 @@ class NotingFile:
         self.failure: OSError | None = None
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a position; return it in bytes from the beginning."""
+        """Move to a position and return it, in bytes from the beginning."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size()}[whence]
         self._place = start + offset
         return self._place
@@ -47,7 +46,7 @@ class NotingFile:
         return self._place
 
     def read(self, size: int) -> bytes:
-        """Return `size` bytes, as `readinto` reads them."""
+        """Return `size` bytes from the current position, zeros beyond the end of the file."""
         buffer = bytearray(size)
         self.readinto(buffer)
         return bytes(buffer)
@@ -74,7 +73,7 @@ class NotingFile:
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the length of the file in bytes; default the current position."""
+        """Set the length of the file, bytes; default: the current position."""
         size = self._place if size is None else size
         try:
             if self.failure is None:
@@ -84,7 +83,7 @@ class NotingFile:
         return size
 
     def flush(self) -> None:
-        """Do nothing: the system has the written bytes already."""
+        """Do nothing: this object has no buffer."""
 
     def close(self) -> None:
         """Close the file."""
@@ -101,7 +100,7 @@ def new_hdf5(path: Path) -> Iterator[Any]:
     """Provide a new HDF5 file, open for writing.
 
     Args:
-        path: a temporary file: after a failure it is incomplete.
+        path: path of a temporary file; after a failure its content is incomplete.
 
     Raises:
         InputError: the file cannot be opened or written.

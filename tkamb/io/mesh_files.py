@@ -1,4 +1,4 @@
-"""Files made from a mesh: the lattice of an insert, or one of the mesh's separate bodies."""
+"""Files from a mesh: the lattice of an insert, or one of several bodies in the mesh."""
 
 import os
 from dataclasses import asdict, dataclass
@@ -29,7 +29,7 @@ class LatticeReport:
     Args:
         lattice: the lattice in the insert frame.
         quality: measures of its quality.
-        out: the .vtu file; None: not written.
+        out: path of the .vtu file; None: no file is written.
         side: side of the knee; the lattice of a left insert is mirrored.
     """
 
@@ -45,7 +45,7 @@ class LatticeReport:
         return [*self.quality.lines(), *written]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the report for JSON; SI units, angles in rad."""
+        """Return the report for JSON, in SI units and rad."""
         values = asdict(self.quality)
         return {
             **values,
@@ -63,18 +63,18 @@ def lattice_of_file(
     side: str = "right",
     out: str | Path | None = None,
 ) -> LatticeReport:
-    """Build the lattice of an insert's mesh, and write it to `out` if given.
+    """Build the lattice of an insert's mesh, and write it to `out` unless that is None.
 
     Args:
         insert: STL, OBJ or PLY file with a closed surface.
-        resolution_mm: edge length (mm) of a cell.
+        resolution_mm: edge length of a cell, mm.
         units: unit of the mesh: "m", "cm", "mm" or "inch".
         axes: axes of the mesh that point anterior, superior and right.
         side: side of the knee; a left insert is mirrored.
-        out: .vtu file (metres, insert frame); None: not written.
+        out: path of the .vtu file, in metres and in the insert frame; None: no file is written.
 
     Raises:
-        InputError: bad file, unit, axes, side or resolution, or an open mesh.
+        InputError: file, unit, axes, side or resolution cannot be used, or the mesh is open.
     """
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is not a .vtu file", "out", "give a name like lattice.vtu")
@@ -96,17 +96,17 @@ def lattice_of_file(
 
 
 def write_body(path: str | Path, number: int, out: str | Path) -> str:
-    """Write one of the separate bodies of a mesh, in the file's unit and axes.
+    """Write one of several bodies in a mesh to a file, in the mesh's unit and axes.
 
-    The mesh is repaired first, as for a run.
+    The mesh is repaired first, as in a run.
 
     Args:
         path: the mesh.
-        number: number of the body, as in `tkamb mesh check`; 1 has the largest surface.
-        out: a new file, .stl, .ply or .obj.
+        number: number of the body in `tkamb mesh check`; body 1 has the largest surface.
+        out: path of a new .stl, .ply or .obj file.
 
     Returns:
-        One line on what was written.
+        One line on the written body.
 
     Raises:
         InputError: the mesh cannot be read or has no such body, or `out` exists, has another

@@ -1,7 +1,7 @@
-"""Presets: the choices of a study by name, applied to any scene by `tkamb run SCENE --as NAME`.
+"""Presets: named choices of a study. `tkamb run SCENE --as NAME` applies them to a scene.
 
-A built-in preset is one row of `BUILT_IN`. Another package offers one through the entry-point group
-`tkamb.io.presets`:
+`BUILT_IN` lists the built-in presets. Another package can offer a preset through the entry-point
+group `tkamb.io.presets`:
 
     [project.entry-points."tkamb.io.presets"]
     my-study-2026 = "my_package.my_module:MyStudy"
@@ -27,7 +27,7 @@ class Change:
 
     Args:
         key: dotted key, as for `--set`.
-        before: value in the scene; None: absent, so that the default applies.
+        before: value in the scene; None: the key is absent, so that the default applies.
         after: value of the preset; None: the table is left out.
     """
 
@@ -43,8 +43,8 @@ class AppliedPreset:
     Args:
         name: name of the preset, as in `--as`.
         source: reference of the study.
-        changes: keys whose value in the scene was different.
-        overridden: keys of the preset that `--set` or another option has replaced.
+        changes: keys that had another value in the scene.
+        overridden: keys of the preset that `--set` or another option overrides.
         departures: remaining differences between the scene and the study, in words.
     """
 
@@ -95,7 +95,7 @@ class Preset:
         name: name of the preset, as in `--as`.
         source: reference of the study.
         settings: dotted key of the scene -> value; None: the table is left out.
-        needs: dotted key of a table -> why the study needs it.
+        needs: dotted key of a required table -> reason for which the study needs it.
     """
 
     name: ClassVar[str]
@@ -104,7 +104,7 @@ class Preset:
     needs: ClassVar[Mapping[str, str]] = {}
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return in words what a scene lacks for the study, beside tables; None: nothing.
+        """Return words on data other than tables that a scene lacks for the study, or None.
 
         Args:
             content: content of the scene's file.
@@ -113,7 +113,7 @@ class Preset:
         return None
 
     def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return in words the differences between a scene and the study that remain.
+        """Return words on each remaining difference between a scene and the study.
 
         Args:
             content: content of the scene's file.
@@ -128,7 +128,7 @@ class Preset:
 
         Args:
             content: content of the scene's file.
-            overrides: dotted key -> value that later replaces the preset's value.
+            overrides: dotted key -> value that replaces the preset's value later.
             where: name of the scene in messages.
 
         Raises:
@@ -167,7 +167,7 @@ class Preset:
 
 
 def _value_at(content: Mapping[str, Any], dotted: str) -> Any:
-    """Return the value of a dotted key; None: it is absent."""
+    """Return the value of a dotted key; None if the key is absent."""
     value: Any = content
     for part in dotted.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -192,7 +192,7 @@ def _put(content: dict[str, Any], dotted: str, value: Any) -> None:
 class Sharma2008(Preset):
     """Sharma, dissertation, University of Tennessee, Knoxville (2008), chapter 4.
 
-    It sets each choice that a key of the scene can express. Comments name the source's section.
+    It sets each choice that a key of the scene can express. Comments name the section of the study.
     """
 
     name: ClassVar[str] = "sharma-2008"
@@ -203,7 +203,7 @@ class Sharma2008(Preset):
             "motion.motion": "roll-slip",
             # 4.4: the ground reaction, "obtained from a force plate, was applied at the ankle".
             "ground_reaction.applied": "ankle",
-            # 4.4: one quadriceps and nothing else; wrapping "was taken into account".
+            # 4.4: the quadriceps is the only muscle; wrapping "was taken into account".
             "muscles": None,
             "quadriceps.wrap": True,
             "patellar_ligament.wrap": True,
@@ -215,10 +215,11 @@ class Sharma2008(Preset):
             # 4.5.2, 5.2: Halloran's curve by the fit that the source gives (E, alpha, sigma0, n).
             "contact.material": "polyethylene",
             "contact.friction": 0.05,
-            # 4.3: 0.5 mm, 0.5 deg; undone where penetration and angle exceed it.
+            # 4.3: 0.5 mm, 0.5 deg; undone if both penetration and angle exceed these values.
             "contact.adjust": True,
             "contact.adjust_restore_when": "both",
-            # 4.4, 4.5.5: the body's total force loads the lattice; there is no coupling back.
+            # 4.4, 4.5.5: the total force of the bodies loads the lattice; the contact does not
+            # change the equations of motion.
             "contact.coupling": "none",
             "contact.released": [],
             "contact.post": False,
@@ -237,7 +238,7 @@ class Sharma2008(Preset):
     )
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return what a motion of skin markers lacks; None: the motion can be used."""
+        """Return words on the missing pose if the motion is from skin markers, or None."""
         if content.get("motion", {}).get("interpretation") != "markers":
             return None
         return (
@@ -269,9 +270,9 @@ PRESETS = NamedClasses("preset", Preset, "tkamb.io.presets", BUILT_IN)
 
 
 def find_preset(name: str) -> Preset:
-    """Return the preset of that name.
+    """Return the preset with a name.
 
     Raises:
-        InputError: no such preset, two presets of one name, or the class cannot be imported.
+        InputError: no preset or several presets have the name, or its class cannot be imported.
     """
     return PRESETS.find(name)()

@@ -1,8 +1,8 @@
-"""TOML of users, read within limits, and values as TOML text.
+"""Reading of users' TOML within limits, and writing of values as TOML text.
 
-A small text must not take hours or gigabytes. The time of Python's reader grows with the square of
-the parts of a dotted key, its memory with nesting. It refuses integers of thousands of digits in
-its own way. tkamb refuses all three before it reads the text.
+A small text must not take hours or gigabytes to read. The time of Python's reader grows with the
+square of the number of parts of a dotted key, and its memory with nesting. It also fails at
+integers of thousands of digits. tkamb therefore checks all three before it reads a text.
 """
 
 import json
@@ -25,18 +25,18 @@ class TomlLimits:
     """Limits of a TOML text. Scenes, cohorts and materials stay far below them."""
 
     size: int = 8 * MEGABYTE
-    """Size (bytes) of a file: Python's reader takes ten seconds for it."""
+    """bytes: largest size of a file. Python's reader takes ten seconds for it."""
     key_parts: int = 16
-    """Number of parts of a dotted key or of a table's name; a scene has four."""
+    """Largest number of parts of a dotted key or of a table's name. A scene needs four."""
     digits: int = 100
-    """Number of successive digits in a number."""
+    """Largest number of successive digits in a number."""
     depth: int = 32
-    """Depth of nested lists and inline tables; a scene has four."""
+    """Largest depth of nested lists and inline tables. A scene needs four."""
 
 
 LIMITS = TomlLimits()
 
-# Strings and comments are not structure; each is replaced by an empty string.
+# Strings and comments may contain any brackets or dots. Each is replaced by an empty string.
 _STRINGS = re.compile(
     r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
 )
@@ -53,7 +53,7 @@ def read_toml(path: str | Path, *, what: str) -> dict[str, Any]:
         what: name of the kind of file in messages.
 
     Raises:
-        InputError: as for `tkamb.files.read_text` and `parse_toml`.
+        InputError: the file cannot be read, is not TOML, or exceeds `TomlLimits`.
     """
     return parse_toml(read_text(path, LIMITS.size, what=what), path)
 
@@ -66,7 +66,7 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
         where: file or option, for messages.
 
     Raises:
-        InputError: it is not TOML, or exceeds `TomlLimits`.
+        InputError: the text is not TOML, or exceeds `TomlLimits`.
     """
     check_limits(text, where)
     try:
@@ -113,12 +113,12 @@ def toml_mm(point: "Array") -> str:
 
 
 def toml_key(label: str, whole: bool = False) -> str:
-    """Return a marker's label as a TOML key, with its prefix if `whole`."""
+    """Return a marker's label as a TOML key. The key has the label's prefix if `whole`."""
     plain = label if whole else label.rpartition(":")[2]
     return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_text(plain)
 
 
 def toml_markers(points: Mapping[str, "Array"], whole: bool = False) -> str:
-    """Return an inline table of markers and their places in mm; with prefixes if `whole`."""
+    """Return an inline table of marker positions, mm. Keys have the labels' prefixes if `whole`."""
     places = [f"{toml_key(label, whole)} = {toml_mm(point)}" for label, point in points.items()]
     return f"{{ {', '.join(places)} }}"

@@ -1,7 +1,7 @@
-"""VTK XML files for ParaView and meshio: lattices as .vtu, contact maps as .vtp.
+"""Writing of VTK XML files for ParaView and meshio: lattices as .vtu, contact maps as .vtp.
 
-Arrays are written in base64, little-endian and uncompressed, each after its length in bytes
-(UInt64). Coordinates are in metres.
+Arrays are in base64, little-endian and uncompressed. The length of an array in bytes (UInt64)
+precedes it. Coordinates are in metres.
 """
 
 import base64
@@ -29,10 +29,10 @@ TYPES = {"f8": "Float64", "i8": "Int64", "u1": "UInt8", "i1": "Int8"}
 
 
 def write_lattice(lattice: Lattice, path: str | Path) -> None:
-    """Write the cells of a lattice as .vtu: metres, node classes, scaled Jacobians.
+    """Write the cells of a lattice, its node classes and scaled Jacobians as .vtu, in metres.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the file cannot be written.
     """
     write_hexahedra(
         path,
@@ -76,7 +76,7 @@ def write_triangles(
 
 
 def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
-    """Write the maps of a run for ParaView: a .vtp for each frame, and a .pvd with their times.
+    """Write the maps of a run for ParaView: a .vtp for each frame, and a .pvd with all times.
 
     A failed frame has no map (NaN) and gets no file.
 
@@ -123,7 +123,7 @@ def _append_data(
 
 
 def _append(block: Element, name: str, values: NDArray) -> None:
-    """Append one array (n,) or (n, d), as float64 or in its own integer type."""
+    """Append one array (n,) or (n, d), as float64, int64, int8 or uint8."""
     kind = values.dtype.str[1:]
     values = values if kind in TYPES else values.astype("<f8")
     array = SubElement(

@@ -1,8 +1,7 @@
-"""Real data for the shipped scenes: fetched on demand by `tkamb data get`, never by a run.
+"""Measured data for the shipped scenes. Only `tkamb data get` downloads them.
 
-A data set has files, their SHA-256 and the address where they are published. Each file is written
-completely or not at all, and checked by its SHA-256. A file with the right content stays, so that
-an interrupted download continues.
+Each data set lists its files, their SHA-256 and their published address. A file is checked by its
+SHA-256 before it is written. Repeating an interrupted download loads only the missing files.
 """
 
 import json
@@ -19,7 +18,7 @@ from tkamb.errors import InputError
 from tkamb.files import claim_directory, replaced_file, sha256_of
 
 NAMES = ("dm",)
-"""Data sets that `tkamb data get` knows."""
+"""Names of the data sets of `tkamb data get`."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,8 @@ class DataFile:
         name: path in the data set's folder.
         sha256: SHA-256 of the content, hexadecimal.
         commit: commit of the repository; None: no published address is known.
-        path: path in the repository; None likewise.
-        size: registered size (bytes); None: unknown.
+        path: path in the repository; None: no published address is known.
+        size: published size, bytes; None: unknown.
     """
 
     name: str
@@ -41,13 +40,16 @@ class DataFile:
     size: int | None = None
 
     def url(self, base: str) -> str | None:
-        """Return the file's address below `base`, the address of all raw files; None: unknown."""
+        """Return the file's address below `base`, the address of all raw files, or None."""
         if self.commit is None or self.path is None:
             return None
         return f"{base.rstrip('/')}/{self.commit}/{quote(self.path)}"
 
     def places(self, folder: Path) -> list[Path]:
-        """Return possible paths in a folder of downloads: by the name here, or as published."""
+        """Return the file's possible paths in a folder of downloads.
+
+        A path has the file's name in the data set or in the repository, with or without folders.
+        """
         names = [self.name, PurePosixPath(self.name).name]
         if self.path:
             names += [self.path, PurePosixPath(self.path).name]
@@ -67,7 +69,7 @@ class Dataset:
 
 
 def read_dataset(name: str) -> Dataset:
-    """Return the data set of a name, one of `NAMES`."""
+    """Return the data set with a name from `NAMES`."""
     text = (files("tkamb.io.datasets") / f"{name}.json").read_text(encoding="utf-8")
     content = json.loads(text)
     return Dataset(
@@ -86,18 +88,24 @@ def read_dataset(name: str) -> Dataset:
 
 
 TIMEOUT_S = 30
-"""s: after this time without an answer the download fails."""
+"""s: a download fails if the server sends nothing for this time."""
 LONGEST_S = 1800.0
-"""s: longest time for one file; enough for 500 MB at 0.3 MB/s."""
+"""s: longest download time of one file; enough for 500 MB at 0.3 MB/s."""
 LARGEST = 1_000_000_000
-"""Bytes: largest accepted size of a file without a registered size."""
+"""bytes: largest accepted size of a file with unknown published size."""
 CHUNK = 65_536
-"""Bytes that are read at a time."""
+"""bytes: amount of a download that is written at a time."""
 
 
 @dataclass
 class Got:
-    """Names of the files that were there already, were written, or were not found."""
+    """Result of fetching a data set.
+
+    Args:
+        kept: names of files that existed already.
+        written: names of new files.
+        absent: names of files that were not found.
+    """
 
     kept: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
@@ -113,11 +121,11 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
         url: address of a mirror with the same paths; None: the data set's own address.
 
     Returns:
-        Files that were there already, were written, or have no known address.
+        Names of the files. A file without a known address counts as absent.
 
     Raises:
-        InputError: pooch is not installed, no answer, content other than registered, or an
-            existing file of other content. Complete files stay.
+        InputError: pooch is not installed, the download fails, or the content of a downloaded or
+            existing file has another SHA-256. Complete files stay.
     """
     try:
         import pooch
@@ -143,15 +151,14 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
     Args:
         dataset: the data set.
         to: its folder; it is made if it does not exist.
-        folder: folder with the files, under their names here or in the repository, with or
-            without their sub-folders.
+        folder: folder with the files, see `DataFile.places`.
 
     Returns:
-        Files that were there already, were written, or are not in the folder.
+        Names of the files. A file that is not in the folder counts as absent.
 
     Raises:
-        InputError: no such folder, no file of the data set in it, content other than
-            registered, or an existing file of other content.
+        InputError: the folder does not exist, it holds no file of the data set, or the content
+            of a source or existing file has another SHA-256.
     """
     if not folder.is_dir():
         raise InputError("is not a folder", folder, "give the folder of what you downloaded")
@@ -171,7 +178,7 @@ def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | No
     Args:
         dataset: the data set.
         to: its folder.
-        fetch: function of a file and a temporary folder; returns the path of the content, or None.
+        fetch: function of a file and a temporary folder, which returns the path of a copy or None.
     """
     missing = [file for file in dataset.files if not _is_there(file, to)]
     got = Got(kept=[file.name for file in dataset.files if file not in missing])
@@ -222,10 +229,10 @@ class _LimitedDownload:
     size: int
 
     def __call__(self, url: str, output_file: str, pooch: object) -> None:
-        """Write what the address gives into a file.
+        """Download an address into a file.
 
         Raises:
-            InputError: it gives more bytes than are registered, or takes too long.
+            InputError: the download is larger than `size`, or takes too long.
         """
         import requests
 
@@ -247,7 +254,7 @@ class _LimitedDownload:
 
 
 def _found(file: DataFile, folder: Path) -> Path | None:
-    """Return the path of a file in a folder of downloads; None: it is not there."""
+    """Return the path of a file in a folder of downloads, or None."""
     copies = [place for place in file.places(folder) if place.is_file()]
     for place in copies:
         if sha256_of(place) == file.sha256:

@@ -1,4 +1,4 @@
-"""One leg found in an OpenSim model: its joints, and the bodies that move together."""
+"""Search of an OpenSim model for the joints and bodies of one leg."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from tkamb.io.opensim.model import Coordinate, Joint, OpenSimModel
 
 OTHER = {"right": "left", "left": "right"}
 SEGMENT_LENGTH = (0.15, 0.75)
-"""m: accepted lengths of thigh and shank. Chosen: from a child of six (about 0.25) to the tallest
-adult (about 0.6), with a margin."""
+"""m: smallest and largest accepted length of thigh and shank. Chosen with a margin around 0.25 m (a
+child of six) and 0.6 m (the tallest adults)."""
 SUFFIX = {"right": ("_r", "_R", ".r"), "left": ("_l", "_L", ".l")}
 
 
@@ -25,16 +25,16 @@ class Leg:
         model: the model.
         side: "right" or "left".
         knee: the femorotibial joint.
-        flexion: name of its flexion coordinate; None if the knee has no coordinate that rotates it.
+        flexion: name of the knee's flexion coordinate; None if the knee has no rotation coordinate.
         ankle: the joint below the tibia.
         hip: the joint above the femur.
-        femur: bodies that move with the femur, the femur first.
-        tibia: bodies that move with the tibia, the tibia first.
-        foot: bodies below the ankle.
-        patella: the patella's body; None if the model has none.
-        pelvis: the body above the hip.
-        neutral: body -> (4, 4) pose in ground in the neutral position: all coordinates at their
-            defaults, the knee straight.
+        femur: names of the femur and of the bodies welded to it, the femur first.
+        tibia: names of the tibia and of the bodies welded to it, the tibia first.
+        foot: names of the bodies below the ankle.
+        patella: name of the patella; None if the model has no patella.
+        pelvis: name of the body above the hip.
+        neutral: body -> (4, 4) pose in ground in the neutral position. There the knee flexion is
+            zero, and all other coordinates have their default values.
     """
 
     model: OpenSimModel
@@ -58,8 +58,9 @@ class Leg:
     def knee_centre(self) -> Array:
         """(3,) m, the knee's centre in ground in the neutral position.
 
-        It is the joint's frame on the femur. In Delp's models that frame is at the hip, because the
-        joint's translation includes the thigh's length. There it is the frame on the tibia.
+        The centre is the origin of the knee joint's frame on the femur. In Delp's models this
+        origin is at the hip, because the joint's translation includes the thigh's length. Then the
+        centre is the origin of the joint's frame on the tibia.
         """
         hip = transform(self.neutral[self.hip_centre[0]], self.hip_centre[1])
         for group in (self.femur, self.tibia):
@@ -71,12 +72,12 @@ class Leg:
 
     @property
     def hip_centre(self) -> tuple[str, Array]:
-        """Hip centre: name of the femoral body, and the point (3,) m in it."""
+        """Name of a femoral body, and the hip centre (3,) m in that body."""
         return _end(self.hip, self.femur)
 
     @property
     def ankle_centre(self) -> tuple[str, Array]:
-        """Ankle centre: name of the tibial body, and the point (3,) m in it."""
+        """Name of a tibial body, and the ankle centre (3,) m in that body."""
         return _end(self.ankle, self.tibia)
 
 
@@ -86,16 +87,17 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     Args:
         model: the model.
         side: "right" or "left".
-        knee: name of the femorotibial joint; None: find it by its name.
+        knee: name of the femorotibial joint; None: the joint with "knee" or "femorotibial" in its
+            name.
 
     Raises:
-        InputError: no such joint; or no single joint above the femur or below the tibia; or a
-            thigh or shank of impossible length.
+        InputError: the joint does not exist, the model has not exactly one joint above the femur
+            and one below the tibia, or the thigh or shank has an impossible length.
     """
     try:
         joint, hip, ankle, femur, tibia = _joints(model, side, knee)
     except InputError as error:
-        # The missing part may be one that could not be read.
+        # The leg may lack a joint because that joint could not be read.
         raise _unread_joint(model) or error from None
     patellas = [
         body
@@ -145,11 +147,11 @@ def _joints(
 
 
 def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError | None:
-    """Return the error of the first joint that could not be read at all; None without one.
+    """Return the error of the first joint that could not be read, or None.
 
     Args:
         model: the model.
-        bodies: names of bodies that the joint must connect; empty: any joint counts.
+        bodies: the joint must concern one of these bodies; empty: any joint counts.
     """
     names = {joint.name for joint in model.joints}
     for one in model.unread:
@@ -160,11 +162,7 @@ def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError
 
 
 def _refuse_unread(model: OpenSimModel, joints: Iterable[Joint], bodies: set[str]) -> None:
-    """Raise if a joint or constraint of the leg's bodies could not be read.
-
-    Raises:
-        InputError: the joint or constraint, and why it could not be read.
-    """
+    """Raise an InputError if a joint or constraint of the leg's bodies could not be read."""
     for joint in model.joints:
         if joint.unread and (joint in joints or {*_ends(joint)} <= bodies):
             raise _unread_joint(model, [joint.outboard]) or InputError(joint.unread)
@@ -187,7 +185,7 @@ def way_to_pelvis(leg: Leg) -> list[Joint]:
 
 
 def _check_lengths(leg: Leg) -> None:
-    """Raise if thigh or shank has no human length: the joint is then not the knee."""
+    """Raise an InputError if the thigh or shank has no human length, so the knee joint is wrong."""
     centre = leg.knee_centre
     for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
         length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))
@@ -209,7 +207,7 @@ def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
         j for j in _moving(model) if "knee" in j.name.lower() or "femorotibial" in j.name.lower()
     ]
     own = [j for j in named if j.name.endswith(SUFFIX[side])]
-    if not own:  # in a model of one leg the names may have no suffix
+    if not own:  # names in a model of one leg may have no suffix
         own = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
     if len(own) != 1:
         result = f"{len(own)} joints" if own else "no joint"
@@ -237,7 +235,7 @@ def _moving(model: OpenSimModel) -> list[Joint]:
 
 
 def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
-    """Return body -> set of the bodies welded to it, including itself."""
+    """Return body -> set of the bodies that are welded to it, and the body itself."""
     groups = {body: {body} for body in ("ground", *model.bodies)}
     moving = _moving(model)
     for joint in model.joints:
@@ -249,12 +247,12 @@ def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
 
 
 def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]:
-    """Return the group's bodies, the heaviest with the stem in its name first."""
+    """Return the bodies by mass; those with the stem in their name come first."""
     return tuple(sorted(group, key=lambda b: (stem not in b.lower(), -model.bodies[b].mass_kg, b)))
 
 
 def _carried(model: OpenSimModel, body: str) -> list[str]:
-    """Return a body and all bodies beyond it, seen from ground."""
+    """Return a body and all bodies that follow it in the tree from ground."""
     result = [body]
     for joint in model.joints:  # from ground outwards
         if joint.inboard in result:
@@ -283,7 +281,7 @@ def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[
 
 
 def _end(joint: Joint, group: tuple[str, ...]) -> tuple[str, Array]:
-    """Return a joint's frame on a group of bodies: the body, and the origin (3,) m in it."""
+    """Return the body of a group that a joint connects, and the joint's origin (3,) m in it."""
     if joint.parent in group:
         return joint.parent, joint.pose_parent_frame[:3, 3]
     return joint.child, joint.pose_child_frame[:3, 3]

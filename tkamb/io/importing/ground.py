@@ -38,15 +38,15 @@ class ImportedForceSettings:
     """Settings of the ground reaction in an imported scene."""
 
     hold_below: float = 40.0
-    """N; below this vertical force the centre of pressure is interpolated in time. Chosen: below 40
-    N the quotient of moment and force is noise."""
+    """N: below this vertical force the centre of pressure is interpolated in time. Chosen because
+    the quotient of moment and force is noise below 40 N."""
 
 
 IMPORTED_FORCE = ImportedForceSettings()
 
 COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
-"""Columns of a table of summed forces: time (s), force (N), point (m) and moment (N·m) about the
-point; x forward, y up, z right."""
+"""Columns of a table of summed forces: time (s), force (N), point of application (m), and moment
+about this point (N·m). Axes: x forward, y up, z right."""
 Interval = tuple[float, float]
 
 
@@ -55,10 +55,9 @@ class FoundGround:
     """The ground reaction of one foot.
 
     Args:
-        ground: its file and plates or columns; None: no ground reaction is modelled.
-        interval: start and end (s) of the part in which every surface under the foot was measured;
-            None: unknown.
-        span: times (s) of a table's first and last sample; None: plates of the recording itself.
+        ground: file with its plates or columns; None: no ground reaction is modelled.
+        interval: start and end, s, of the part of the recording to use; None: unknown.
+        span: times of a table's first and last sample, s; None: the forces are not from a table.
         remarks: lines for the report.
     """
 
@@ -72,13 +71,13 @@ def find_ground(request: ImportRequest, side: str, axes: str, feet: Feet | None)
     """Return the ground reaction of one foot.
 
     Args:
-        request: names the recording, table, plates and interval.
+        request: the recording, table, plates and interval.
         side: "left" or "right".
-        axes: axes of recording and table that point forward, up and right.
+        axes: axes of the recording and table that point forward, up and right.
         feet: positions of the feet; None: unknown.
 
     Raises:
-        InputError: plates or columns cannot be used, or both feet stood on a plate.
+        InputError: the plates or columns cannot be used, or both feet loaded one plate.
     """
     if request.grf is not None:
         return _from_table(request, request.grf, side, axes, feet)
@@ -123,7 +122,11 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
 def _from_table(
     request: ImportRequest, path: Path, side: str, axes: str, feet: Feet | None
 ) -> FoundGround:
-    """Return a foot's forces in a table, chosen by option, by name, or by where they act."""
+    """Return a foot's ground reaction from the forces of a table.
+
+    The forces are chosen by the option --grf-force, else by their names, else by their points of
+    application.
+    """
     table = read_table(path)
     forces = table_forces(table)
     time = table.time()
@@ -160,9 +163,9 @@ def _from_table(
 def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     """Return the table's axes that point forward, up and right.
 
-    They are the recording's, except where the recording's z points up and the largest force of the
-    table is along y. Such a table was turned about x, as OpenSim does: its x, y, z are the
-    recording's x, z, -y.
+    These are usually the axes of the recording. If the recording's z points up and the largest
+    force of the table is along y, the table has OpenSim's axes: its x, y, z are the recording's
+    x, z, -y.
     """
     if not forces or axes.split(",")[1][-1] != "z":
         return axes
@@ -181,7 +184,7 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
 def _named(
     forces: list[TableForce], side: str, source_name: str | None, table: Table
 ) -> list[TableForce]:
-    """Return the forces that --grf-force names, or the force named after the foot; else none."""
+    """Return the forces of --grf-force, or else the one force with the foot's name, or else []."""
     names = ", ".join(force.name for force in forces) or "none"
     if source_name is not None:
         chosen = []
@@ -208,7 +211,7 @@ def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError
 
 
 def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
-    """Return a force of a table as a recorded force in the laboratory."""
+    """Return a force of a table, in the axes of the laboratory."""
     columns = {"time": "time", **force.columns}
     source = GroundReactionTable(
         file=table.path,
@@ -227,7 +230,11 @@ def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
 def _table_file(
     path: Path, axes: str, chosen: list[TableForce], recorded: list[RecordedForce]
 ) -> GroundFile:
-    """Return the source of the scene's ground reaction: columns of one force, or a summed table."""
+    """Return the scene's source of the ground reaction.
+
+    One force is read from its columns in the user's table. Several forces are summed in a new
+    table.
+    """
     if len(chosen) == 1:
         own = chosen[0].columns
         columns = (("time", "time"), *((role, own[role]) for role in COLUMNS[1:] if role in own))
@@ -236,7 +243,7 @@ def _table_file(
 
 
 def _summed(recorded: list[RecordedForce], path: Path) -> str:
-    """Return a table of the summed forces as CSV; a force counts only while it is loaded."""
+    """Return a table of the summed forces as CSV. A force below the load threshold is zero."""
     time = recorded[0].time
     levels = [one.level for one in recorded]
     wrenches = []
@@ -253,16 +260,18 @@ def _summed(recorded: list[RecordedForce], path: Path) -> str:
 def common_interval(
     time: Array, interval: Interval | None, span: Interval | None
 ) -> tuple[Interval | None, list[str]]:
-    """Return the part of an interval that both recordings cover, and a remark if that is shorter.
+    """Return the interval that the motion and the ground reaction share.
+
+    A list with one remark is returned too if this interval is shorter than the requested one.
 
     Args:
-        time: (n,) s, times of the motion.
-        interval: requested start and end (s); None: all of the motion.
-        span: times (s) of the ground reaction's first and last sample; None: the ground reaction
+        time: times of the motion, s, shape (n,).
+        interval: requested start and end, s; None: all of the motion.
+        span: times of the ground reaction's first and last sample, s; None: the ground reaction
             is from the recording of the motion.
 
     Raises:
-        InputError: they share less than two frames.
+        InputError: the interval contains fewer than two frames of the motion.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
     if span is None or (span[0] <= start + 1e-9 and span[1] >= end - 1e-9):

@@ -1,11 +1,12 @@
-"""The links of docs/patient.md in the bodies of an OpenSim model, and the URDF of these links.
+"""Placement of the links of docs/patient.md on the bodies of an OpenSim model, and their URDF.
 
-Each link is fixed to a body of the model:
+Each link is a frame on a body of the model:
 
-- femur: the frame of the femoral component's mesh, turned to x anterior, y superior, z right.
-  Without an implant: the femur's axes at the knee's centre.
-- tibia: the tibia's axes at the ankle joint's centre.
-- patella: the patella's origin; its axes are turned by quarter turns to be nearest the femur's.
+- femur: origin of the femoral component's mesh, with the mesh axes turned to x anterior,
+  y superior, z right. Without an implant: the knee's centre, with the axes of the femoral body.
+- tibia: the ankle joint's centre, with the axes of the tibial body.
+- patella: the origin of the patella's body. Its axes are those of the body, turned by multiples
+  of 90 deg so that they are nearest the axes of the femur link.
 """
 
 from dataclasses import dataclass
@@ -26,11 +27,11 @@ from tkamb.units import DEGREE
 
 @dataclass(frozen=True)
 class LinkFitSettings:
-    """Limits on where the implant sits on the bones of an OpenSim model."""
+    """Limits on the pose of the implant on the bones of an OpenSim model."""
 
     max_implant_rotation: float = 35.0 * DEGREE
-    """rad; largest rotation between the axes of implant and bone. Chosen: with wrong axes it is 90
-    deg, in a real implantation a few degrees."""
+    """rad: largest rotation between the axes of implant and bone. Chosen because wrong mesh axes
+    give at least 90 deg and a real implantation gives a few degrees."""
 
 
 LINK_FIT = LinkFitSettings()
@@ -42,8 +43,8 @@ class MeshFrame:
 
     Args:
         body: name of the body.
-        pose: (4, 4) pose_mesh_in_body; None: at the body's origin, with anatomical axes.
-        why: how the frame was found, for the report.
+        pose: pose_mesh_in_body, shape (4, 4); None: at the body's origin, with anatomical axes.
+        why: words for the report on how the frame was identified.
     """
 
     body: str
@@ -64,10 +65,10 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
     Args:
         leg: the leg.
         part: "femoral component", "insert" or "patellar button".
-        wished_name: name of the offset frame or body; None: find one with the part in its name.
+        wished_name: name of the offset frame or body; None: the first with the part in its name.
 
     Raises:
-        InputError: no such frame, or no frame with the part in its name.
+        InputError: no frame has this name, or no frame has the part in its name.
     """
     model = leg.model
     group = {
@@ -102,7 +103,7 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
 
 
 def quarter_turn(rotation: Array) -> tuple[Array, float]:
-    """Return the nearest rotation (3, 3) by quarter turns, and the angle (rad) to it."""
+    """Return the nearest rotation (3, 3) that maps axes onto axes, and its distance, rad."""
     turns = Rotation.create_group("O")
     angles = (turns.inv() * Rotation.from_matrix(rotation)).magnitude()
     nearest = int(np.argmin(angles))
@@ -111,7 +112,7 @@ def quarter_turn(rotation: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """The links of a leg as poses (4, 4), m, in the bodies of the model.
+    """The links of a leg. Poses are (4, 4) matrices, in m.
 
     Args:
         leg: the leg.
@@ -119,11 +120,11 @@ class Links:
         tibia: pose of the tibia link in the tibia's body.
         patella: pose of the patella link in the patella's body; None without a patella.
         insert_in_tibia: pose of the insert frame in the tibia link.
-        button_in_patella: pose of the button, in anatomical axes, in the patella link; None
-            without a button.
-        patella_error: angle (rad) between the axes of patella link and femur link in the neutral
-            position.
-        remarks: lines on where the implant sits, for the report.
+        button_in_patella: pose of the button's mesh, turned to anatomical axes, in the patella
+            link; None without a button.
+        patella_error: angle between the axes of the patella link and the femur link in the neutral
+            position, rad.
+        remarks: lines for the report on the pose of the implant.
     """
 
     leg: Leg
@@ -152,7 +153,7 @@ class Links:
         raise InputError(f"body '{body}' is not part of any link of the leg", leg.model.name)
 
     def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
-        """Return the link that moves with a body, and a point (3,) m of the body in that link."""
+        """Return the link that moves with a body, and the coordinates (3,) m of a point in it."""
         link, offset = self.body_in_link(body)
         return link, transform(offset, point)
 
@@ -172,7 +173,7 @@ class Links:
 
     @property
     def patella_in_femur(self) -> Array | None:
-        """(4, 4) pose of the patella link in the femur link, neutral position; None without it."""
+        """(4, 4) neutral pose of the patella link in the femur link; None without a patella."""
         leg = self.leg
         if leg.patella is None or self.patella is None:
             return None
@@ -191,14 +192,14 @@ def find_links(
 
     Args:
         leg: the leg.
-        placement: (4, 4) pose of the insert's mesh, in anatomical axes about its own origin, in
-            the insert frame; None without an implant.
+        placement: pose in the insert frame of the insert's mesh, turned to anatomical axes about
+            the mesh origin, shape (4, 4); None without an implant.
         axes: axes of the meshes that point anterior, superior and right.
-        frames: part -> name of its mesh's frame; None: find it by its name.
+        frames: part of the implant -> name of its mesh's frame; None: inferred from the names.
         with_button: whether the implant has a patellar button.
 
     Raises:
-        InputError: a mesh has no frame, or its axes do not agree with the bone's.
+        InputError: a mesh has no frame, or is rotated too far from the bone's axes.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     text: list[str] = []
@@ -224,7 +225,7 @@ def find_links(
 def _anatomical(
     leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, remarks: list[str]
 ) -> Array:
-    """Return the pose (4, 4) in a body of a part's frame, turned to anatomical axes.
+    """Return the pose (4, 4) of a part in a body, with the part's frame turned to anatomical axes.
 
     Raises:
         InputError: the part is rotated too far from the bone's axes.
@@ -235,10 +236,10 @@ def _anatomical(
     angle = Rotation.from_matrix(pose[:3, :3]).magnitude()
     if not np.allclose(nearest, np.eye(3)) or angle > LINK_FIT.max_implant_rotation:
         raise InputError(
-            f"the {part} stands turned by {angle / DEGREE:.0f} deg on '{body}' with these axes "
+            f"the {part} is rotated by {angle / DEGREE:.0f} deg on '{body}' with these axes "
             f"({frame.why})",
             "--mesh-axes",
-            "name the mesh's axes that point anterior, superior and right, like -x,+y,-z",
+            "give the mesh's axes that point anterior, superior and right, like -x,+y,-z",
         )
     place = ", ".join(f"{v * 1e3:.1f}" for v in pose[:3, 3])
     remarks.append(
@@ -272,24 +273,24 @@ def _patella(
 
 
 RESERVED = ("ground", "tibia", "femur", "patella", "hip")
-"""Names of links in docs/patient.md; a body with one of these names gets the suffix `_bone`."""
+"""Names of links in docs/patient.md. A body with such a name becomes a link with suffix `_bone`."""
 
 _LIMIT = '<limit lower="-10" upper="10" effort="1e6" velocity="1e3"/>'
 
 
 def body_link(body: str) -> str:
-    """Return the name of the URDF's link for a body of the model."""
+    """Return the name of the link in the URDF that represents a body of the model."""
     return f"{body}_bone" if body in RESERVED else body
 
 
 def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
-    """Return link -> its inertia in its own frame.
+    """Return name of a link -> its inertia in the link's frame.
 
-    The tibia link includes the foot with the ankle at its neutral angle.
+    The tibia link includes the foot, with the ankle at its neutral angle.
 
     Args:
         links: the links of the leg.
-        scale: factor (1) on masses and inertias.
+        scale: factor on masses and inertias.
     """
     leg = links.leg
     groups = {
@@ -303,7 +304,7 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
 
 
 def _seen_from(links: Links, body: str, base: str, own: Array, scale: float) -> RigidInertia:
-    """Return a body's inertia in a link, where `own` is the link's pose in the body `base`."""
+    """Return the inertia of a body in a link's frame. `own` is the link's pose in body `base`."""
     pose = np.linalg.inv(own) @ links.leg.in_body(body, base)
     inertia, turn = links.leg.model.bodies[body], pose[:3, :3]
     tensor = scale * turn @ inertia.inertia @ turn.T
@@ -315,7 +316,7 @@ def patient_urdf(links: Links, scale: float, comment: str) -> str:
 
     Args:
         links: the links of the leg.
-        scale: factor (1) on the model's masses.
+        scale: factor on the model's masses.
         comment: comment at the top of the file.
     """
     leg = links.leg
@@ -348,10 +349,10 @@ def _chain(
     first: Array,
     side: str,
 ) -> list[str]:
-    """Return the lines of joints in series, each with one axis, and massless links between them."""
+    """Return the URDF lines of a series of one-axis joints with massless links between them."""
     lines, parent = [], start
     for number, (name, (kind, axis)) in enumerate(joints.items(), 1):
-        # docs/patient.md: in a left knee the axes x and y of rotation have the other sign
+        # docs/patient.md: in a left knee the rotation axes x and y have the opposite sign
         reversed_axis = side == "left" and kind == "revolute" and axis[2] == 0
         own = tuple(-v for v in axis) if reversed_axis else axis
         child = end if number == len(joints) else f"{name}_link"

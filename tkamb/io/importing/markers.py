@@ -1,4 +1,4 @@
-"""Markers of the leg: matched between model and recording, and used to find the laboratory axes."""
+"""Markers of the leg that model and recording share, and the laboratory axes they imply."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,12 +20,12 @@ class ModelSegment:
 
     Args:
         name: "shank", "thigh", "foot" or "pelvis".
-        points: label in the recording -> its place (3,) m in the link of shank or thigh, or in the
-            body of foot or pelvis.
-        missing: names of the model's markers that the recording does not show.
-        joined_to: "shank" for the foot, "thigh" for the pelvis, else "".
-        joint: (3,) m, the ball joint between them, in the link of `joined_to`.
-        centre: (3,) m, the same point in the body of foot or pelvis.
+        points: label in the recording -> position of the marker, m, shape (3,), in the link of
+            shank or thigh, or in the body of foot or pelvis.
+        missing: names of the model's markers that are not visible in the recording.
+        joined_to: neighbouring segment: "shank" for the foot, "thigh" for the pelvis, else "".
+        joint: ball joint with the neighbouring segment, in the link of that segment, m, shape (3,).
+        centre: the same ball joint in the body of foot or pelvis, m, shape (3,).
     """
 
     name: str
@@ -39,12 +39,12 @@ class ModelSegment:
 def model_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> list[ModelSegment]:
-    """Return the segments with three markers or more: shank and thigh, and possibly foot, pelvis.
+    """Return the segments with at least three markers: shank, thigh, and possibly foot, pelvis.
 
     Args:
         links: the links of the leg.
         recorded: table of markers.
-        without: labels of markers that are left out.
+        without: labels of markers to leave out.
 
     Raises:
         InputError: shank or thigh has fewer than three markers in the recording.
@@ -74,15 +74,15 @@ def model_segments(
 def seen_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> dict[str, ModelSegment]:
-    """Return the segments shank, thigh, foot and pelvis with their markers that are ever visible.
+    """Return shank, thigh, foot and pelvis with the markers that are visible in any frame.
 
     Args:
         links: the links of the leg.
         recorded: table of markers.
-        without: labels of markers that are left out.
+        without: labels of markers to leave out.
 
     Raises:
-        InputError: the recording has no marker of a label in `without`.
+        InputError: the recording has no marker with a label from `without`.
     """
     leg = links.leg
     foot = _with_most_markers(leg, leg.foot)
@@ -115,7 +115,7 @@ def seen_segments(
 
 
 def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the labels of the markers that are ever visible, and the labels that are left out."""
+    """Return the labels of markers that are visible in any frame, and the labels to leave out."""
     labels = recorded_labels(recorded)
     dropped = matched_labels(without, labels)
     if unknown := [name for name in without if name not in dropped]:
@@ -130,7 +130,7 @@ def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], li
 
 
 def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
-    """Return the segments with the labels of another recording and only the markers it has."""
+    """Return the segments with the labels of another recording. They keep only its markers."""
     labels = recorded_labels(recorded)
     result = []
     for segment in segments:
@@ -141,13 +141,13 @@ def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegm
 
 
 def _equal_line(recorded: Table) -> str:
-    """Return words on the labels that occur twice and are not used; "" without any."""
+    """Return words on the labels that occur twice and are therefore ignored, or ""."""
     names = list(dict.fromkeys(column[:-2] for column in recorded.equal))
     return f"; it has two markers {', '.join(names)}: rename one of each" if names else ""
 
 
 def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
-    """Return the prefixes of a needed marker that occurs under several prefixes."""
+    """Return the prefixes of those needed markers that occur with several prefixes."""
     plain = {plain_label(name) for name in needed}
     result: dict[str, list[str]] = {}
     for label in labels:
@@ -158,7 +158,7 @@ def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
 
 
 def with_prefix(recorded: Table, prefix: str) -> Table:
-    """Return the table with only the markers of one prefix, like "JW" in "JW:RHeel".
+    """Return the table with only the markers that have a prefix, like "JW" in "JW:RHeel".
 
     Raises:
         InputError: no label begins with the prefix.
@@ -188,13 +188,14 @@ def _with_most_markers(leg: Leg, bodies: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Facing:
-    """Directions of a recording's axes, found from how the subject stands.
+    """Anatomical directions of a recording's axes.
 
     Args:
         axes: axes of the file that point forward, up and right, like "-x,+z,+y".
         up_deg: angle between the file's upward axis and the mean upward axis of shank, thigh and
-            pelvis; NaN where `axes` was given.
-        forward_deg: angle between the forward axes in the horizontal plane; NaN likewise.
+            pelvis, deg; NaN if the user stated the axes.
+        forward_deg: angle between the file's forward axis and the segments' mean forward axis in
+            the horizontal plane, deg; NaN if the user stated the axes.
     """
 
     axes: str
@@ -205,8 +206,8 @@ class Facing:
 def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
     """Return the directions of the recording's axes, from the poses of thigh, shank and pelvis.
 
-    The segments' own y axes point up, their x axes forward. Both are averaged over all frames, and
-    the nearest axis of the file is taken.
+    In each segment y points up and x forward. The function averages these axes over all frames and
+    segments, and returns the nearest axes of the file.
 
     Raises:
         InputError: on average the segments are not upright, or face no direction.
@@ -251,7 +252,7 @@ def _axis_name(axis: Array) -> str:
 
 
 def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
-    """Return side -> labels of the markers on that foot; none for a foot that the model lacks.
+    """Return side -> labels of the foot's markers, [] for a foot that the model lacks.
 
     Args:
         leg: the leg of one side.

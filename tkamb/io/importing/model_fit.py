@@ -1,8 +1,8 @@
-"""An OpenSim model fitted to markers by least squares, as by OpenSim's InverseKinematicsTool.
+"""Least-squares fit of an OpenSim model to markers, as in OpenSim's InverseKinematicsTool.
 
-All coordinates are free, except locked ones and the dependent ones of couplers. Their ranges are
-not imposed. `tkamb.io.recordings.inverse_kinematics` solves the least squares; here are the
-residuals and derivatives of the model's joints.
+All coordinates are free, except locked ones and the dependent ones of couplers. The ranges of
+coordinates are not imposed. This module computes residuals and derivatives.
+`tkamb.io.recordings.inverse_kinematics` solves the least-squares problem.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,14 +24,14 @@ from tkamb.io.recordings.tables import Table
 
 @dataclass(frozen=True)
 class ModelFitSettings:
-    """How the poses of a model are fitted to markers."""
+    """Settings of the fit of a model to markers."""
 
     block_frames: int = 128
-    """Number of frames that are fitted in one call. Chosen: their arrays fit into the processor's
-    cache. It changes no result."""
+    """frames: number that is fitted in one call. It does not change the result. Chosen because the
+    arrays then fit into the processor's cache."""
     coarse_stride: int = 8
-    """Every so many frames one is fitted first; the others begin from poses interpolated between
-    these. Chosen: it changes the initial guesses only."""
+    """frames: every `coarse_stride`-th frame is fitted first. Interpolation between these poses
+    gives the initial guesses of the other frames. Chosen freely: it changes only these guesses."""
 
 
 MODEL_FIT = ModelFitSettings()
@@ -59,7 +59,7 @@ class ModelChain:
         self._couplers = [
             (index[c.dependent], index[c.independent], c.function) for c in model.couplers
         ]
-        # Coordinates that move: the free ones first, then those that follow them directly or not.
+        # Free coordinates come first, then those that depend on them through one or more couplers.
         follow: list[int] = []
         for dependent, independent, _ in self._couplers:
             if independent in self.free or independent in follow:
@@ -77,7 +77,7 @@ class ModelChain:
         )
 
     def default(self, frames: int) -> Array:
-        """Return coordinates (f, n) at their defaults, for f frames."""
+        """Return the default values (f, n) of the n coordinates for f frames."""
         return np.tile(self.kinematics.coupled({}), (frames, 1))
 
     def places(self, state: Array) -> Array:
@@ -93,21 +93,21 @@ class ModelChain:
     def normal(self, state: Array, target: Array, weights: Array) -> NormalEquations:
         """Return the normal equations of a fit to measured markers.
 
-        Let s = (a, b) be a coordinate's twist in ground: rotation a, and velocity b of ground's
-        origin. A marker at x beyond its joint has the velocity u = b + a × x. For a coordinate i
-        before j in the chain, with sums over the markers beyond j,
+        Let s = (a, b) be a coordinate's twist in ground: rotation a, and velocity b at ground's
+        origin. A marker at x on the joint's outboard side has the velocity u = b + a × x. For a
+        coordinate i that precedes j in the chain, with sums over the markers that j moves,
 
             (Jᵀ W J)_ij = s_i · Σ w (x × u_j, u_j)
             residuals' curvature_ij = -Σ w r · (a_i × u_j) = -a_i · Σ w u_j × r,   r = p - x
 
-        A coordinate therefore needs only the sums Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ over
-        the markers beyond it, and no marker's Jacobian. The curvature of a joint's splines is
-        neglected.
+        Each coordinate therefore needs only the sums Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ over
+        the markers that it moves. The markers' Jacobians are not computed. The curvature of the
+        joints' splines is neglected.
 
         Args:
-            state: (f, n) coordinates, rad and m.
-            target: (f, m, 3) m, measured positions p of the markers.
-            weights: (f, m) weights w of their squared distances.
+            state: coordinates, rad and m, shape (f, n).
+            target: measured positions p of the markers, m, shape (f, m, 3).
+            weights: weights w of the squared distances, shape (f, m).
         """
         poses, twists = self.kinematics.joint_twists(state)
         twists = twists[:, self._moving]
@@ -136,10 +136,10 @@ class ModelChain:
         """Return the normal equations of the free coordinates.
 
         Args:
-            state: (f, n) coordinates.
-            twists: (f, k, 6) twist of each moving coordinate.
-            carried: (f, k, 25) the sums over the markers beyond each of them.
-            cost: (f,) m², weighted sum of squares.
+            state: coordinates, rad and m, shape (f, n).
+            twists: twists of the moving coordinates, shape (f, k, 6).
+            carried: sums over the markers that each coordinate moves, shape (f, k, 25).
+            cost: weighted sum of squared distances, m², shape (f,).
         """
         a, b = twists[..., :3], twists[..., 3:]
         weight, first, pull = carried[..., :1], carried[..., 1:4], carried[..., 4:7]
@@ -159,16 +159,16 @@ class ModelChain:
         return NormalEquations(cost, matrix, self._free_part(right[..., None], state)[..., 0], bent)
 
     def _symmetric(self, matrix: Array) -> Array:
-        """Return the symmetric matrix (f, n, n) from its entries with i before j in the chain."""
+        """Return the symmetric matrix (f, n, n). Only entries with i before j are read."""
         upper = matrix * self._above
         return np.asarray(upper + upper.swapaxes(1, 2))
 
     def _free_part(self, values: Array, state: Array) -> Array:
         """Return the rows, and for a square matrix also the columns, of the free coordinates.
 
-        By the chain rule, the row (and column) of a dependent coordinate, times the slope of its
-        coupler, is added to that of its independent one. In a chain of couplers the last is added
-        first.
+        By the chain rule, the row of a dependent coordinate is multiplied by the slope of its
+        coupler and added to the row of the independent coordinate. The same holds for columns. In
+        a series of couplers the last is added first.
         """
         square, free = values.shape[1] == values.shape[2], len(self.free)
         for dependent, independent, coordinate, function in reversed(self._after):
@@ -179,7 +179,7 @@ class ModelChain:
         return values[:, :free, :free] if square else values[:, :free]
 
     def moved(self, state: Array, step: Array) -> Array:
-        """Return the coordinates (f, n) after a step (f, k) of the k free ones."""
+        """Return the coordinates (f, n) after a step (f, k) of the k free coordinates."""
         shifted = state.copy()
         shifted[:, self.free] += step
         return self.kinematics.coupled(shifted) if self._couplers else shifted
@@ -189,22 +189,22 @@ class ModelChain:
         return np.asarray(state[frames])
 
     def replaced(self, state: Array, frames: Index, part: Array) -> Array:
-        """Return the coordinates where those of the chosen frames are replaced by `part`."""
+        """Return the coordinates of all frames, with `part` in the chosen frames."""
         return put(state, frames, part)
 
 
 def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
-    """Return which markers and which other coordinates' axes each coordinate moves.
+    """Return the markers and the coordinate axes that each coordinate moves.
 
     Args:
-        kinematics: of the model.
+        kinematics: kinematics of the model.
         at: index of each marker's body.
 
     Returns:
-        (n, m): 1 where coordinate i moves marker j, else 0. (n, n): 1 where coordinate i moves the
-        axis of coordinate j, 1/2 on the diagonal, else 0. Within a joint the translations come
-        before the rotations, because they are along axes of the parent frame. The order is
-        reversed in a joint that the chain passes backwards.
+        Matrix (n, m): 1 where coordinate i moves marker j, else 0. Matrix (n, n): 1 where
+        coordinate i moves the axis of coordinate j, 1/2 on the diagonal, else 0. Within a joint the
+        translations precede the rotations, because they are along axes of the parent frame. The
+        order is reversed in a joint that has its child nearer to ground.
     """
     model, bodies = kinematics.model, kinematics.bodies
     hanging: dict[Joint, set[int]] = {}  # bodies outboard of each joint
@@ -214,7 +214,7 @@ def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
         hanging[joint] = own
     count = len(kinematics.coordinates)
     carries, above = np.zeros((count, len(at))), 0.5 * np.eye(count)
-    order = []  # coordinates from ground outwards, with what hangs on them
+    order = []  # (coordinate, its joint), from ground outwards
     for joint in model.joints:
         axes = (*joint.translations, *joint.rotations)[:: -1 if joint.backwards else 1]
         names = dict.fromkeys(axis.coordinate for axis in axes if axis.coordinate)
@@ -245,12 +245,12 @@ def fit_model(
     Args:
         model: the model.
         recorded: table of markers.
-        weights: name of a marker -> weight (1) of its squared distance; default 1.
-        laboratory_axes: axes of the file that are the model's ground x, y and z (forward, up
-            and right), as "-x,+z,+y".
+        weights: name of a marker -> weight of its squared distance; default 1.
+        laboratory_axes: axes of the file that point along the model's ground x, y and z (forward,
+            up and right), like "-x,+z,+y".
 
     Raises:
-        InputError: fewer than three markers in common.
+        InputError: model and recording share fewer than three markers.
     """
     match = matched_labels(model.markers, recorded_labels(recorded))
     if len(match) < 3:
@@ -266,8 +266,8 @@ def fit_model(
     values = np.array([(weights or {}).get(name, 1.0) for name in match])
     first = int(np.argmax(np.isfinite(measured).all(axis=2).sum(axis=1)))
     begin = fit_chain(chain, measured[first : first + 1], values, chain.default(1))
-    # Some frames first, beginning with the one that shows most markers. They are good initial
-    # guesses for the frames between them.
+    # The frame with most visible markers is the initial guess of every `coarse_stride`-th frame.
+    # Interpolation between those frames gives the initial guesses of the others.
     coarse = np.unique(
         np.append(np.arange(0, len(measured), MODEL_FIT.coarse_stride), len(measured) - 1)
     )

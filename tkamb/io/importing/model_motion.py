@@ -1,4 +1,4 @@
-"""A motion in an OpenSim model's coordinates (`.mot`, `.sto`), turned into knee and shank poses."""
+"""Knee and shank poses from a motion in an OpenSim model's coordinates (`.mot`, `.sto`)."""
 
 from dataclasses import dataclass, replace
 
@@ -27,8 +27,8 @@ COLUMNS = (
     *(f"tibia_rotation_{k}_deg" for k in (1, 2, 3)),
     *(f"tibia_translation_{k}_mm" for k in (1, 2, 3)),
 )
-"""Columns of `motion.csv` after time_s: the knee's coordinates, and the pose of the tibia link in
-the model's ground (intrinsic rotations x, y, z)."""
+"""Columns of `motion.csv` after time_s: the knee coordinates, and the pose of the tibia link in the
+model's ground with intrinsic rotations about x, y, z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +36,10 @@ class ModelMotion:
     """Motion of knee and shank.
 
     Args:
-        time: (n,) s.
-        values: (n, 12) values of `COLUMNS`, mm and deg.
-        missing: coordinates of the model that the file lacks; they stay at their defaults.
-        remarks: lines on how the file was read, for the report.
+        time: times, s, shape (n,).
+        values: values of `COLUMNS`, mm and deg, shape (n, 12).
+        missing: coordinates of the model that the file lacks; they have their default values.
+        remarks: lines for the report on how the file was read.
     """
 
     time: Array
@@ -51,7 +51,7 @@ class ModelMotion:
         """Return the rows between two times (s).
 
         Raises:
-            InputError: there are fewer than two.
+            InputError: there are fewer than two rows.
         """
         inside = (self.time >= start - 1e-9) & (self.time <= end + 1e-9)
         if inside.sum() < 2:
@@ -75,10 +75,10 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
 
     Args:
         links: the links of the leg.
-        recorded: table with a column for each coordinate, named as in the model or by its path.
+        recorded: table of the coordinates. A column has the coordinate's name or path in the model.
 
     Raises:
-        InputError: the knee's flexion is missing, or the unit of angles is unknown.
+        InputError: the column of knee flexion is missing, or the unit of angles is unknown.
     """
     leg = links.leg
     kinematics = Kinematics(leg.model)
@@ -107,7 +107,7 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
 
 
 def model_feet(links: Links, recorded: Table) -> Feet:
-    """Return the positions of the feet in a motion: the mean origin of each foot's bodies."""
+    """Return the positions of the feet in a motion, as mean origin of each foot's bodies."""
     leg = links.leg
     kinematics = Kinematics(leg.model)
     q, _ = read_coordinates(kinematics, recorded)
@@ -130,7 +130,7 @@ def motion_tables(flexion_alone: bool) -> list[str]:
     """Return the scene's tables [motion.columns] and [tibia] for `motion.csv`.
 
     Args:
-        flexion_alone: whether the scene reads only flexion, instead of all six coordinates.
+        flexion_alone: whether the scene reads only flexion; otherwise it reads six coordinates.
     """
     columns = dict(zip(KNEE_COORDINATES, COLUMNS, strict=False))
     names = ("flexion",) if flexion_alone else KNEE_COORDINATES

@@ -1,4 +1,4 @@
-"""Import of a patient: a URDF and a scene from an OpenSim model, a recording and meshes."""
+"""Import of a patient's URDF and scene from an OpenSim model, a recording and meshes."""
 
 import os
 from contextlib import suppress
@@ -37,27 +37,27 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 @dataclass(frozen=True)
 class ModelMassSettings:
-    """How the mass of an OpenSim model becomes the mass of a patient."""
+    """Scaling of an OpenSim model's mass to a patient."""
 
     one_leg_share: float = 0.6
-    """Share (1) of a model's mass: a model with more than this in thigh, shank and foot is a model
-    of one leg. Chosen: in a whole body, one leg has less than a fifth."""
+    """A model is of one leg if thigh, shank and foot have more than this share of its mass.
+    Chosen because one leg has less than a fifth of a whole body's mass."""
     leg_mass_share: float = 0.161
-    """Share (1) of the body's mass in one leg: thigh 0.100, shank 0.0465, foot 0.0145 (Winter,
-    Biomechanics, 2009)."""
+    """Share of the body's mass in one leg, from thigh 0.100, shank 0.0465 and foot 0.0145
+    (Winter, Biomechanics, 2009)."""
     max_reasons: int = 3
-    """Number of unreadable parts for which the report of an import gives the reason. Chosen: the
-    report stays short."""
+    """The report of an import gives reasons for at most this number of unreadable parts. Chosen
+    because the report stays short."""
     same_mass_share: float = 0.01
-    """Share (1) of the subject's mass: if the model's mass differs by less, it is not scaled.
-    Chosen: clothes and rounding make less."""
+    """The model is not scaled if its mass differs from the subject's by less than this share.
+    Chosen because clothes and rounding change the mass by less."""
 
 
 MODEL_MASS = ModelMassSettings()
 
 LEG_SHARES = (0.10, 0.25)
-"""Accepted shares (1) of one leg in the body's mass. Winter (2009) gives 0.161, de Leva (1996)
-0.20; the margin is for individual differences."""
+"""Smallest and largest accepted share of one leg in the body's mass. Winter (2009) gives 0.161, de
+Leva (1996) 0.20. The margin allows for individual differences."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +67,9 @@ class ImportedPatient:
     Args:
         urdf: text of patient.urdf.
         scene: content of the scene file.
-        motion: text of motion.csv; None: the scene reads the recording.
-        report: lines on what was read and what was assumed.
-        ground: text of ground_reaction.csv; None: the scene reads the recorded forces.
+        motion: text of motion.csv; None: the scene reads the recorded motion.
+        report: lines on the files read and the assumptions made.
+        ground: text of ground_reaction.csv; None: the scene reads the recorded forces, if any.
     """
 
     urdf: str
@@ -84,7 +84,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
 
     Args:
         request: the files and options of the import.
-        folder: the scene's future folder.
+        folder: folder in which the scene will be written.
 
     Raises:
         InputError: a file or value cannot be used.
@@ -157,7 +157,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
 
 
 def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | None) -> Trial:
-    """Return the trial, from recorded poses, from markers or from the model's coordinates."""
+    """Return the trial from recorded poses, markers or the model's coordinates."""
     recorded = with_unit(read_table(request.recording), request.units.length)
     if request.prefix is not None:
         recorded = with_prefix(recorded, request.prefix)
@@ -165,7 +165,7 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
     if request.poses is not None:
         if insert is None or request.meshes is None or not labels:
             raise InputError(
-                "needs the meshes whose poses these are, and a recording of markers",
+                "needs the implant's meshes and a recording of markers",
                 "--poses",
                 "give --femoral, --insert, and --c3d or --trc",
             )
@@ -181,10 +181,10 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
 
 
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
-    """Write URDF and scene, load them as a run does, and return remarks on markers and gait.
+    """Write URDF and scene, load them as a check, and return remarks on markers and gait.
 
-    Existing files do not change: scenes may share a file of the same content. If anything fails, no
-    new file remains.
+    Existing files do not change. Scenes may share a file with the same content. If an error occurs,
+    all new files are removed.
 
     Args:
         patient: the result of the import.
@@ -213,20 +213,24 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
             written.append(path)
         case = load_case(load_scene(scene))
         return (*marker_lines(case), *_gait_lines(case, patient.scene.cycle == "plates"))
-    except BaseException:  # also an interrupt: no new file may remain
+    except BaseException:  # includes a keyboard interrupt
         for path in written:
             path.unlink(missing_ok=True)
-        with suppress(OSError):  # not empty, or never made
+        with suppress(OSError):  # The folder is not empty, or does not exist.
             for place in new_folders:
                 place.rmdir()
         raise
 
 
 def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
-    """Return a line on the gait events on the force plates; nothing without any.
+    """Return a line on the foot strikes and toe-offs on the force plates, or no line without any.
+
+    Args:
+        case: the loaded scene.
+        asks_gait: whether the plates must show a gait cycle.
 
     Raises:
-        InputError: `asks_gait`, and the plates show no gait cycle.
+        InputError: the plates do not show the required gait cycle.
     """
     gait = None if case.ground is None else case.ground.gait
     if asks_gait and case.gait_cycle_s is None:
@@ -248,10 +252,10 @@ def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
 
 
 def _same_there(path: Path, text: str) -> bool:
-    """Return whether a file with this content exists.
+    """Return whether the path is a file with this content.
 
     Raises:
-        InputError: the path holds other content, or is not a file.
+        InputError: the path exists with another content, or is not a file.
     """
     if not os.path.lexists(path):
         return False
@@ -263,7 +267,7 @@ def _same_there(path: Path, text: str) -> bool:
 
 
 def marker_lines(case: Case) -> tuple[str, ...]:
-    """Return lines on the fit of the markers by both methods, and on the knee centres' distance."""
+    """Return lines on the marker fits "segments" and "chain" and on the knee centres' distance."""
     result = case.motion.markers
     if result is None:
         rms = case.tibia.residual if case.tibia else None
@@ -297,7 +301,7 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
     """Return the factor on the model's masses, and a remark on it.
 
     Raises:
-        InputError: the masses cannot be the subject's.
+        InputError: the model's leg has no mass, or the masses differ too much.
     """
     model, subject = leg.model.mass_kg, request.mass_kg
     own = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
@@ -326,15 +330,15 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
 def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
     """Return the factor on the masses of a model of one leg, and a remark on it.
 
-    Such a model has the mass of a leg or, if a scaling tool used the subject's mass, that of the
-    whole body. The leg's mass is `MODEL_MASS.leg_mass_share` of the subject's.
+    Such a model has the mass of a leg, or of the whole body if a scaling tool scaled it to the
+    subject's mass. A scaled leg has the share `MODEL_MASS.leg_mass_share` of the subject's mass.
 
     Args:
-        request: states the subject's mass.
-        own: mass (kg) of thigh, shank and foot in the model.
+        request: the import, with the subject's mass.
+        own: mass of thigh, shank and foot in the model, kg.
 
     Raises:
-        InputError: the model has neither mass.
+        InputError: the model has neither a leg's nor a whole body's mass.
     """
     subject = request.mass_kg
     share, target = own / subject, MODEL_MASS.leg_mass_share * subject
@@ -361,7 +365,7 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
 
 
 def _model_lines(model: OpenSimModel) -> list[str]:
-    """Return lines on how the model was read, and on parts that this knee does not need."""
+    """Return notes on reading the model, and lines on unreadable parts that the knee can lack."""
     lines = [f"model: {notice}" for notice in model.notices]
     unread = [f"{one.kind} '{one.name}'" for one in model.unread]
     if unread:

@@ -1,11 +1,10 @@
-"""Recorded forces: which foot exerted them, and when all of that foot's load is known.
+"""Assignment of recorded forces to the feet, and the interval in which a foot's load is measured.
 
-The forces are those of a C3D file's plates, or of a table of ground reactions. Programs name the
+The forces are from the plates of a C3D file, or from a table of ground reactions. Programs name the
 columns of such a table in many ways: `ground_force_1_vx`, `1_ground_force_px`,
-`ground_torque_1_y`, `ground_moment_1_mx`, `ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A name is
-divided into its kind (force, point, moment), its axis, and the rest: the name of its force. A
-column of moments that belongs to no force is an error if moments are needed. The moment is never
-taken as zero instead.
+`ground_torque_1_y`, `ground_moment_1_mx`, `ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A column
+name contains the kind (force, point, moment), the axis, and the name of a force. If a force lacks
+its moment, a moment column without a force is an error. The moment is then not assumed to be zero.
 """
 
 import re
@@ -39,8 +38,8 @@ class TableForce:
     """The columns of one force in a table.
 
     Args:
-        name: common beginning of its column names.
-        columns: role of the column in a scene, like "force_1" or "moment_2" -> its name.
+        name: common beginning of the column names.
+        columns: role of a column in a scene, like "force_1" or "moment_2" -> name of the column.
     """
 
     name: str
@@ -52,13 +51,16 @@ class TableForce:
 
     @property
     def moments(self) -> tuple[str, ...]:
-        """Names of the columns of its moment."""
+        """Names of the columns with the force's moment."""
         return tuple(v for k, v in self.columns.items() if k.startswith("moment"))
 
 
 @dataclass(frozen=True)
 class _Column:
-    """The parts of a column's name; `owner` is the name of its force without the usual words."""
+    """The parts of a column's name.
+
+    `stem` is the name of the column's force; `owner` is this name without words like "ground".
+    """
 
     name: str
     kind: str
@@ -68,10 +70,10 @@ class _Column:
 
 
 def table_forces(table: Table) -> list[TableForce]:
-    """Return the forces of a table, in its order.
+    """Return the forces of a table, in the order of their columns.
 
     Raises:
-        InputError: a column of moments that belongs to no force, or two columns for one axis.
+        InputError: a moment column belongs to no force, or one axis has two columns.
     """
     columns = [c for name in table.columns if (c := _taken_apart(name)) is not None]
     result: dict[str, TableForce] = {}
@@ -104,7 +106,7 @@ def table_forces(table: Table) -> list[TableForce]:
 
 
 def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[TableForce]) -> None:
-    """Raise if columns of moments belong to no force, and some force has no moment."""
+    """Raise an InputError if a moment column belongs to no force and a force has no moment."""
     read = {name for force in forces for name in force.columns.values()}
     others = [
         name
@@ -123,7 +125,7 @@ def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[Table
 
 
 def _taken_apart(name: str) -> _Column | None:
-    """Return the parts of a column's name; None if it is none of force, point and moment."""
+    """Return the parts of a column's name, or None if it is no force, point or moment."""
     plain = name.lower().rstrip()
     if match := _NUMBERED.fullmatch(plain):
         kind, owner, axis = match.groups()
@@ -160,28 +162,28 @@ def _kind_of_words(stem: str) -> str | None:
 
 @dataclass(frozen=True)
 class FootContactSettings:
-    """Which foot stands on which force plate, from forces and markers."""
+    """Assignment of the loads on force plates to the feet, from forces and markers."""
 
     min_force: float = 40.0
-    """N; a plate counts as loaded above this vertical force. Chosen: the noise of a plate is a few
+    """N: a plate is loaded above this vertical force. Chosen because the noise of a plate is a few
     newtons."""
     min_duration: float = 0.1
-    """s; a shorter load is not taken as a step. Chosen: shorter loads are knocks."""
+    """s: a shorter load is not a step. Chosen because shorter loads are knocks on the plate."""
     max_foot_distance: float = 0.25
-    """m; horizontal distance from the centre of pressure to the middle of the foot's markers.
-    Chosen: about the length of a foot."""
+    """m: largest horizontal distance from the centre of pressure to the mean position of the foot's
+    markers. Chosen because a foot is about this long."""
     min_step_height: float = 0.15
-    """m; above this height of its markers over the plate, a foot stands on a step. Chosen: the
-    lowest stair of the data sets is 0.17 m high."""
+    """m: a foot stands on a step if its markers are higher above the plate than this. Chosen
+    because the lowest stair of the data sets is 0.17 m high."""
     marker_height: float = 0.055
-    """m; mean height of a foot's markers above the surface on which it stands. Chosen: a usual
-    value on level ground."""
+    """m: mean height of a foot's markers above the surface under the foot. Chosen because it is a
+    usual value on level ground."""
     same_height: float = 0.05
-    """m; two heights that differ by less belong to one step. Chosen: the steps of stairs differ by
-    more."""
+    """m: two surfaces with a smaller difference in height are one step. Chosen because the steps of
+    stairs differ by more."""
     max_standing_speed: float = 0.15
-    """m/s; a foot that is off the plates and slower than this may stand on an unmeasured surface.
-    Chosen: a swinging foot is faster."""
+    """m/s: a foot off the plates that is slower than this may stand on an unmeasured surface.
+    Chosen because a swinging foot is faster."""
 
 
 FOOT_CONTACT = FootContactSettings()
@@ -194,10 +196,10 @@ class RecordedForce:
     Args:
         key: number of the plate, or name of the table's force.
         title: name in messages.
-        time: (k,) s.
-        wrench: (k, 6) force (N) above moment (N·m) about the laboratory's origin.
-        level: height (m) of the surface.
-        drift: vertical force (N) that it reads while nobody stands on it.
+        time: times, s, shape (k,).
+        wrench: force (N) and moment (N·m) about the laboratory's origin, shape (k, 6).
+        level: height of the plate's surface, m.
+        drift: vertical force that the unloaded plate reads, N.
     """
 
     key: int | str
@@ -209,7 +211,7 @@ class RecordedForce:
 
     @property
     def point(self) -> Array:
-        """(k, 3) m, centre of pressure on the surface; NaN while nobody stands on it."""
+        """(k, 3) m, centre of pressure on the surface; NaN while it is unloaded."""
         force, moment = self.wrench[:, :3], self.wrench[:, 3:]
         vertical = np.where(self.loaded, force[:, 1], np.nan)
         x = (moment[:, 2] + self.level * force[:, 0]) / vertical
@@ -218,7 +220,7 @@ class RecordedForce:
 
     @property
     def loaded(self) -> np.ndarray:
-        """(k,) whether somebody stands on the surface."""
+        """(k,) whether the surface is loaded."""
         return np.asarray(self.wrench[:, 1] - self.drift > FOOT_CONTACT.min_force)
 
 
@@ -230,11 +232,11 @@ class Load:
         plate: number of the plate, or name of the table's force.
         title: name in messages.
         side: "left" or "right" foot; "": no foot's markers are near.
-        start: time (s) of its first sample.
-        end: time (s) of its last sample.
-        distance: median distance (m) between the centre of pressure and the nearest foot's markers.
-        other: median distance (m) to the other foot's markers; NaN without any.
-        surface: approximate height (m) of the step under the foot above the plate; 0: no step.
+        start: time of the load's first sample, s.
+        end: time of the load's last sample, s.
+        distance: median distance from the centre of pressure to the nearest foot's markers, m.
+        other: median distance to the other foot's markers, m; NaN without such markers.
+        surface: approximate height of the step under the foot above the plate, m; 0: no step.
     """
 
     plate: int | str
@@ -253,9 +255,9 @@ class Feet:
 
     Args:
         path: the recording, for messages.
-        time: (n,) s.
-        middles: side -> (n, 3) m, mean of the foot's markers in the laboratory; NaN where no
-            marker is visible.
+        time: times, s, shape (n,).
+        middles: side -> mean position of the foot's markers in the laboratory, m, shape (n, 3);
+            NaN where no marker is visible.
     """
 
     path: Path
@@ -264,10 +266,10 @@ class Feet:
 
 
 def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Feet:
-    """Return the feet of a recording of markers.
+    """Return the positions of the feet in a recording of markers.
 
     Args:
-        recorded: the markers.
+        recorded: table of markers.
         axes: axes of the file that point forward, up and right, like "-x,+z,+y".
         labels: side -> labels of the foot's markers.
     """
@@ -277,7 +279,10 @@ def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Fee
 
 
 def plate_forces(recording: Recording, axes: str) -> list[RecordedForce]:
-    """Return the force of each of a recording's plates, in the laboratory of `axes`."""
+    """Return the forces on a recording's plates, in the laboratory's frame.
+
+    `axes` are the axes of the file that point forward, up and right.
+    """
     rotation = laboratory_rotation(axes, recording.path)
     time = recording.analog_time
     forces = []
@@ -292,7 +297,7 @@ def plate_forces(recording: Recording, axes: str) -> list[RecordedForce]:
 
 
 def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
-    """Return all loads of all forces, each with the foot nearest to it, in order of time."""
+    """Return all loads of all forces in order of time, each with the nearest foot."""
     loads = []
     for one in forces:
         middles = {s: _interpolated(m, feet.time, one.time) for s, m in feet.middles.items()}
@@ -309,7 +314,7 @@ def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
 def _load(
     one: RecordedForce, time: Array, point: Array, force: Array, middles: dict[str, Array]
 ) -> Load:
-    """Return a load; for a foot on a step, the force's line is cut at the step's level."""
+    """Return a load. For a foot on a step, its point is where the force's line meets the step."""
     away, surface = {}, {}
     for side, middle in middles.items():
         above = middle[:, 1] - point[:, 1]
@@ -321,10 +326,10 @@ def _load(
         distance = np.linalg.norm((place - middle)[:, [0, 2]], axis=1)
         away[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
     nearest = min(away, key=lambda side: np.nan_to_num(away[side], nan=np.inf))
-    rest = [distance for side, distance in away.items() if side != nearest]
-    whose = nearest if away[nearest] < FOOT_CONTACT.max_foot_distance else ""
+    others = [distance for side, distance in away.items() if side != nearest]
+    foot = nearest if away[nearest] < FOOT_CONTACT.max_foot_distance else ""
     start, end = float(time[0]), float(time[-1])
-    return Load(one.key, one.title, whose, start, end, away[nearest], rest[0], surface[nearest])
+    return Load(one.key, one.title, foot, start, end, away[nearest], others[0], surface[nearest])
 
 
 def own_plates(
@@ -339,7 +344,7 @@ def own_plates(
         hint: advice in messages.
 
     Raises:
-        InputError: there is none, or both feet stood on one of them.
+        InputError: no plate was under the foot, or both feet stood on one plate.
     """
     own = list(dict.fromkeys(load.plate for load in loads if load.side == side))
     others = {load.plate for load in loads if load.side != side}
@@ -364,7 +369,7 @@ def own_plates(
 
 
 def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
-    """Return the mean height (m) of the step under the foot; 0 where the plates' heights differ."""
+    """Return the mean height of the step under the foot, m, or 0 if the loads' heights differ."""
     heights = [load.surface for load in loads if load.plate in plates]
     return float(np.mean(heights)) if np.ptp(heights) < FOOT_CONTACT.same_height else 0.0
 
@@ -372,7 +377,7 @@ def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
 def known_interval(
     loads: list[Load], plates: tuple[int | str, ...], feet: Feet
 ) -> tuple[float, float]:
-    """Return the times (s) of the first and the last frame in which the foot's plates are loaded.
+    """Return the times, s, of the first and last frame between the foot's first and last load.
 
     Raises:
         InputError: fewer than two frames lie between the first and the last load.
@@ -396,7 +401,7 @@ def unmeasured(
     side: str,
     interval: tuple[float, float],
 ) -> Array:
-    """Return the times (s) of an interval at which the foot is nearly still but on no plate."""
+    """Return the times, s, within an interval at which the foot is nearly still but on no plate."""
     time = feet.time
     speed = np.linalg.norm(np.gradient(feet.middles[side], time, axis=0), axis=1)
     on = np.zeros(len(time), bool)
@@ -408,7 +413,7 @@ def unmeasured(
 
 
 def _middle(table: Table, labels: list[str]) -> Array:
-    """Return the mean position (n, 3) m of the visible markers; NaN without any."""
+    """Return the mean position (n, 3) m of the visible markers; NaN where none is visible."""
     rows = table.rows
     if not labels:
         return np.full((rows, 3), np.nan)

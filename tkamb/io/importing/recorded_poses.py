@@ -1,7 +1,8 @@
-"""Recorded poses of the femoral component in the insert, and the markers that place the shank.
+"""Recorded poses of the femoral component in the insert, and the markers for the shank's pose.
 
-Fluoroscopy or biplane X-ray gives the poses. It does not show where the leg is in the laboratory:
-markers of the shank do, together with joint centres that the neighbouring segments' markers carry.
+Fluoroscopy or biplane X-ray gives the poses of the component, but not the pose of the leg in the
+laboratory. The shank's pose comes from its markers, and from joint centres that are fixed to the
+neighbouring segments' markers.
 """
 
 from collections.abc import Mapping
@@ -31,10 +32,10 @@ class ShankMarkers:
     Args:
         path: the recording.
         axes: axes of the file that point forward, up and right.
-        points: label of a marker -> its place (3,) m in the tibia link.
-        centres: name of a joint centre that is used as a further marker -> the lines of its table
-            [[tibia.joint_centre]].
-        remarks: lines on the joint centres, for the report.
+        points: label of a marker -> its position in the tibia link, m, shape (3,).
+        centres: name of a joint centre that is used as a further marker -> lines of the scene's
+            table [[tibia.joint_centre]].
+        remarks: lines for the report on the joint centres.
     """
 
     path: Path
@@ -61,14 +62,15 @@ def shank_markers(
 ) -> ShankMarkers:
     """Return the points that give the shank's pose.
 
-    They are the shank's markers. If these are fewer than three, joint centres are added: the
-    ankle's centre moves with three or more markers of the foot, the knee's centre with those of the
-    thigh. The knee's centre in the shank is the mean over the recorded poses.
+    With at least three markers, the points are the shank's markers. Otherwise joint centres are
+    added: the ankle centre from at least three markers of the foot, and the knee centre from at
+    least three markers of the thigh. The position of the knee centre in the shank is its mean over
+    the recorded poses.
 
     Args:
         links: the links of the leg.
         segments: name of a segment -> its visible markers.
-        femur: (n, 4, 4) poses, m, of the femur's body in the tibia link.
+        femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
         recording: the file of the markers.
         axes: axes of the file that point forward, up and right.
 
@@ -93,7 +95,7 @@ def shank_markers(
 def _carried(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
 ) -> tuple[dict[str, list[str]], list[str]]:
-    """Return the joint centres that move with markers of foot and thigh, and remarks on them."""
+    """Return the joint centres from the markers of foot and thigh, and remarks on them."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
     centres: dict[str, list[str]] = {}
     text = []
@@ -123,9 +125,10 @@ def _centre_lines(
 
     Args:
         name: name of the joint centre.
-        markers: label of a marker of the neighbouring segment -> its place (3,) m in that frame.
-        centre: (3,) m, the joint centre in the same frame.
-        tibia: (3,) m, the joint centre in the tibia link.
+        markers: label of a marker of the neighbouring segment -> its position in the segment's
+            frame, m, shape (3,).
+        centre: the joint centre in the same frame, m, shape (3,).
+        tibia: the joint centre in the tibia link, m, shape (3,).
     """
     return [
         "[[tibia.joint_centre]]",
@@ -137,25 +140,25 @@ def _centre_lines(
 
 
 ROLES = tuple(f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3))
-"""Roles of the columns of a table of poses, in their order."""
+"""Roles of the columns of a table of poses, in the order of `PoseRecording.columns`."""
 
 
 @dataclass(frozen=True)
 class PoseRecording:
-    """A table of poses of the femoral mesh in the insert mesh's own axes, and how to read it.
+    """A table of poses of the femoral mesh in the insert mesh's axes, and its reading options.
 
     Args:
         file: the table.
-        columns: names of the columns of `ROLES`: three angles in the order of the sequence, then
-            x, y, z.
+        columns: names of the columns with the `ROLES`: three angles in the order of `sequence`,
+            then x, y, z.
         sequence: axes of the rotations, as in scipy: "XYZ" is Rx Ry Rz.
         angle_unit: "deg" or "rad".
         length_unit: "m", "cm" or "mm".
-        turned: roles whose columns are read with the other sign.
-        stride: times (s) of the recording at 0 and 100 % of the file's time column; None: the
-            file's times are those of the recording.
-        stance: start and end, in the file's time column, of the part in which the foot is loaded;
-            None: all of it.
+        turned: roles of the columns that are read with the opposite sign.
+        stride: times of the marker recording at 0 and 100 % of the file's time column, s; None:
+            the file's times are those of the marker recording.
+        stance: start and end of the loaded part, in the unit of the file's time column; None: the
+            foot is loaded in all poses.
     """
 
     file: Path
@@ -168,7 +171,7 @@ class PoseRecording:
     stance: tuple[float, float] | None = None
 
     def keys(self) -> dict[str, Any]:
-        """Return the keys of the scene's [motion], without file, cut-off frequency and columns."""
+        """Return the scene's table [motion] without file, cut-off frequency, interval, columns."""
         result: dict[str, Any] = {
             "interpretation": "pose",
             "sequence": self.sequence,
@@ -188,10 +191,10 @@ class RecordedPoses:
 
     Args:
         given: the table of poses.
-        interval: start and end (s) of the part that is computed; None: all of it.
-        time: (n,) s, times of the recording of markers.
-        femur: (n, 4, 4) poses, m, of the femur's body in the tibia link.
-        in_stance: (n,) whether the foot is loaded.
+        interval: start and end of the part to compute, s; None: the whole recording.
+        time: times in the recording of markers, s, shape (n,).
+        femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
+        in_stance: mask of the poses with a loaded foot, shape (n,).
         remarks: lines for the report.
     """
 
@@ -226,7 +229,7 @@ def read_poses(
 ) -> RecordedPoses:
     """Return recorded poses, converted to poses of the femur's body in the tibia link.
 
-    With the recorded pose P of the femoral mesh in the insert mesh,
+    Let P be the recorded pose of the femoral mesh in the insert mesh. Then
     T_femur_in_tibia = T_insert_in_tibia T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
 
     Args:
@@ -234,8 +237,8 @@ def read_poses(
         links: the links of the leg.
         insert: mesh of the insert about its own origin, in anatomical axes.
         axes: axes of the meshes that point anterior, superior and right.
-        cutoff_Hz: cut-off frequency (Hz) of the scene's low-pass filter.
-        interval: start and end (s) of the part that is computed; None: all of it.
+        cutoff_Hz: cut-off frequency of the scene's low-pass filter, Hz.
+        interval: start and end of the part to compute, s; None: the whole recording.
 
     Raises:
         InputError: file, columns, units or times cannot be used.
@@ -245,7 +248,7 @@ def read_poses(
     side: Literal["right", "left"] = "left" if links.leg.side == "left" else "right"
     motion = load_motion(_motion_table(recording, cutoff_Hz, interval), side, placement, turn)
     knee = knee_pose(motion.raw_coordinates)
-    own_side = mirrored_pose(knee) if side == "left" else knee  # the motion is a right knee's
+    own_side = mirrored_pose(knee) if side == "left" else knee  # coordinates are of a right knee
     femur = links.insert_in_tibia @ own_side @ inverse(links.femur)
     stance = _in_stance(recording, motion)
     return RecordedPoses(

@@ -11,36 +11,36 @@ from tkamb.io.recordings.unit_words import GivenUnits
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """The files and options of an import. None: the import infers it, or it is absent.
+    """The files and options of an import. None: the option is inferred or not used.
 
     Args:
         model: the .osim file.
         side: side of the knee, "left" or "right".
         mass_kg: mass of the subject.
         recording: .c3d or .trc file of markers, or .mot or .sto file of the model's coordinates.
-        grf: table of ground reactions, instead of a C3D file's plates.
-        grf_force: common beginnings of the names of that table's columns for the foot, separated
-            by commas.
+        grf: table of ground reactions, used instead of a C3D file's plates.
+        grf_force: names of the foot's forces in the table `grf`, separated by commas. A force's
+            name is the common beginning of its column names.
         poses: recorded poses of the femoral component in the insert. The markers then give only
             the shank's pose.
-        without: labels of markers that are left out.
-        static: recording of a standing trial, which calibrates the markers' places.
+        without: labels of markers to leave out.
+        static: recording of a standing trial, which calibrates the markers' positions.
         meshes: meshes of the implant.
         knee: name of the femorotibial joint.
         frames: part of the implant -> name of its mesh's frame in the model.
         plates: numbers of the plates under the foot; (): no ground reaction.
-        interval: start and end (s) of the part of the recording.
+        interval: start and end of the part of the recording to use, s.
         laboratory_axes: axes of the file that point forward, up and right.
-        scale_mass: whether the model's masses are scaled to the subject's.
-        method: fit of the markers, "segments" or "chain".
-        cutoff_Hz: cut-off frequency for markers and plates.
+        scale_mass: whether the model's masses are scaled to the subject's mass.
+        method: method of fitting the markers, "segments" or "chain".
+        cutoff_Hz: cut-off frequency of the low-pass filter of markers and plates.
         contact: name of the scene's contact model.
         activity: activity whose published peaks the report shows; None: no peaks.
         notes: the user's notes for the report.
-        prefix: prefix of the markers that are used, if a label occurs under several prefixes.
-        muscles: whether all muscles of the model share the load.
-        cycle: times (s) of 0 and 100 % of the gait cycle; "plates": two foot strikes on the plates.
-        units: units of the recording that its file does not state.
+        prefix: prefix of the markers to use, if a label occurs with several prefixes.
+        muscles: whether all muscles of the model share the load; otherwise only the quadriceps.
+        cycle: times of 0 and 100 % of the gait cycle, s; "plates": two foot strikes on the plates.
+        units: units that the user states because the file of the recording does not.
     """
 
     model: Path

@@ -1,4 +1,4 @@
-"""The scene file that an import writes: TOML that states everything the import has inferred."""
+"""Text of the scene file that an import writes, with all inferred values."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from tkamb.io.toml_text import toml_markers, toml_mm, toml_numbers, toml_text
 from tkamb.units import DEGREE
 
 GROUND_FILE = "ground_reaction.csv"
-"""File beside the scene with the ground reaction, where that is a sum of forces in a table."""
+"""Name of the file in the scene's folder with a ground reaction that is a sum of table forces."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Meshes:
     Args:
         femoral: mesh of the femoral component.
         insert: mesh of the insert.
-        patella: mesh of the patellar button; None without.
+        patella: mesh of the patellar button; None without a button.
         unit: "m", "cm", "mm" or "inch".
         axes: axes of the meshes that point anterior, superior and right, like "+x,+y,+z".
-        femur_bone: mesh of the femur in its own body's axes, for wrapping; None without.
+        femur_bone: mesh of the femur in the axes of the femur's body, for wrapping; None: none.
     """
 
     femoral: Path
@@ -49,11 +49,11 @@ class GroundFile:
         path: the file.
         axes: axes of the file that point forward, up and right.
         plates: numbers of the plates under the foot.
-        columns: (role, name) of the columns of a table.
-        length_unit: unit of lengths in the table; None: as the file states.
-        surface: height (m) of the step under the foot above its plates; 0: no step.
-        units: units that a C3D file does not state.
-        made: text of a table of summed forces that the import writes; None: `path` is read.
+        columns: (role, name) of each column of a table.
+        length_unit: unit of lengths in the table; None: the unit that the file states.
+        surface: height of the step under the foot above its plates, m; 0: no step.
+        units: units that the user states because a C3D file does not.
+        made: text of a table of summed forces that the import writes; None: the scene reads `path`.
     """
 
     path: Path
@@ -68,7 +68,7 @@ class GroundFile:
 
 @dataclass(frozen=True, eq=False)
 class MarkerFile:
-    """A recording of markers, and how the scene reads it.
+    """A recording of markers, and the options with which the scene reads it.
 
     Args:
         path: the file.
@@ -76,9 +76,9 @@ class MarkerFile:
         segments: segments with their markers.
         method: fit of the markers, "segments" or "chain".
         knee: joint of the chain, "hinge" or "free".
-        interval: start and end (s); None: all of it.
-        frames: number of frames, at equal intervals; None: all frames of the recording.
-        length_unit: unit of lengths that the user states; None: as the file states.
+        interval: start and end, s; None: the whole recording.
+        frames: number of frames at equal intervals; None: all frames of the recording.
+        length_unit: unit of lengths that the user states; None: the unit that the file states.
         whole_labels: whether the scene names markers with their prefix.
     """
 
@@ -97,28 +97,28 @@ class MarkerFile:
 class SceneText:
     """Content of the scene.
 
-    The motion comes from `markers`, from `poses` or, without both, from `motion.csv`.
+    The motion comes from `markers` or `poses`, and from `motion.csv` if there is neither.
 
     Args:
         title: comment lines at the top.
-        folder: the scene's future folder; paths in the scene are relative to it.
+        folder: folder in which the scene will be written; paths in the scene are relative to it.
         side: side of the knee, "left" or "right".
         mass_kg: mass of the subject.
         urdf: name of the URDF file, in the same folder.
         cutoff_Hz: cut-off frequency for markers and plates.
         links: the links of the leg.
-        markers: recording of markers for knee and shank; None: without.
-        poses: recorded poses of the femoral component; None: without.
-        shank: markers that give the shank's pose, with `poses`; None: without.
-        ground: the ground reaction; None: without.
-        meshes: the implant; None: without.
+        markers: recording of markers for knee and shank, or None.
+        poses: recorded poses of the femoral component, or None.
+        shank: markers that give the shank's pose, or None; needed with `poses`.
+        ground: the ground reaction, or None.
+        meshes: meshes of the implant, or None.
         tissue: muscles and ligaments.
         contact: name of the contact model.
         activity: activity whose published peaks the report shows; None: no peaks.
         notes: notes for the report.
-        model: the .osim file, if all its muscles act; None: only the quadriceps.
-        coordinates: file of that model's coordinates; None: they are fitted to the markers.
-        cycle: times (s) of 0 and 100 % of the gait cycle; "plates": from foot strikes on the
+        model: the .osim file, if all its muscles act; None: only the quadriceps acts.
+        coordinates: file of the model's coordinates; None: they are fitted to the markers.
+        cycle: times of 0 and 100 % of the gait cycle, s; "plates": from foot strikes on the
             plates; None: results are shown over time.
     """
 
@@ -143,7 +143,7 @@ class SceneText:
     cycle: tuple[float, float] | Literal["plates"] | None = None
 
     def text(self) -> str:
-        """Return the TOML."""
+        """Return the text of the scene file."""
         tables = [
             [f"# {line}" for line in self.title],
             self._patient(),

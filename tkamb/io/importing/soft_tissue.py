@@ -1,4 +1,4 @@
-"""Muscles and ligaments of an OpenSim model that a scene can describe; the rest with a reason."""
+"""Import of an OpenSim model's muscles and ligaments, and reasons for those left out."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,8 @@ class ImportedLigamentSettings:
     """Properties of imported ligaments that an OpenSim model does not state."""
 
     toe_strain: float = 0.06
-    """Strain (1) at which the toe region of the law \"quadratic-toe\" ends: twice eps1 = 0.03
-    (Blankevoort 1991)."""
+    """Strain at the end of the toe region of the law \"quadratic-toe\". It is twice the 0.03
+    of Blankevoort (1991)."""
 
 
 IMPORTED_LIGAMENT = ImportedLigamentSettings()
@@ -23,7 +23,7 @@ IMPORTED_LIGAMENT = ImportedLigamentSettings()
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """An attachment: a point (3,) m of a link of the URDF."""
+    """An attachment: name of a link of the URDF, and a point in it, m, shape (3,)."""
 
     link: str
     point: Array
@@ -31,7 +31,7 @@ class End:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A strand of a ligament whose law the scene has too."""
+    """A ligament strand with the law "quadratic-toe"."""
 
     name: str
     proximal: End
@@ -47,9 +47,9 @@ class SoftTissue:
     Args:
         quadriceps: origin and insertion; None without a patella or a vastus intermedius.
         patellar_ligament: ends on patella and tibia; None without a patellar ligament.
-        ligament_length: length (m) of the patellar ligament.
+        ligament_length: length of the patellar ligament, m; NaN without a patellar ligament.
         bundles: strands of the femorotibial ligaments.
-        remarks: lines on what is imported, what is left out, and why.
+        remarks: lines for the report on imported and omitted tissue, with reasons.
     """
 
     quadriceps: tuple[End, End] | None
@@ -74,7 +74,7 @@ def _end(point: PathPoint) -> End:
 
 
 def _fixed(path: Path, bodies: tuple[str, ...]) -> list[PathPoint]:
-    """Return the fixed points of a path on some bodies."""
+    """Return the points of a path that are always active and fixed to one of some bodies."""
     return [p for p in path.points if type(p) is PathPoint and p.body in bodies]
 
 
@@ -108,7 +108,7 @@ def _patellar_ligament(links: Links, remarks: list[str]) -> tuple[tuple[End, End
             length = constraint.distance
             remarks.append(
                 f"patellar ligament: {length * 1e3:.1f} mm long, by the constraint "
-                f"'{constraint.name}'; resting lengths of its strands are not used"
+                f"'{constraint.name}'; slack lengths of its strands are not used"
             )
             upper = End(body_link(leg.patella), points[leg.patella])
             return (upper, End(body_link(on_tibia[0]), points[on_tibia[0]])), length
@@ -157,7 +157,7 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
         )
     if bundles:
         remarks.append(
-            f"{len(bundles)} femorotibial ligament strands taken, straight from end to end "
+            f"{len(bundles)} femorotibial ligament strands imported as straight lines "
             "(wraps on bone are left out)"
         )
     for reason, names in out.items():
@@ -181,7 +181,7 @@ def _reason_against(ligament: OpenSimLigament, fixed: int) -> str:
 
 
 def _name_muscles(links: Links, remarks: list[str]) -> None:
-    """Add a remark on the muscles that cross the knee but act only with [muscles]."""
+    """Add a remark on the muscles across the knee that act only with the table [muscles]."""
     leg = links.leg
     across = [
         muscle.name
@@ -197,6 +197,6 @@ def _name_muscles(links: Links, remarks: list[str]) -> None:
 
 
 def some_names(names: list[str]) -> str:
-    """Return the first eight names, and how many more there are."""
+    """Return the first eight names, and the number of further names."""
     more = f" and {len(names) - 8} more" if len(names) > 8 else ""
     return ", ".join(names[:8]) + more

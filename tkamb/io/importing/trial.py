@@ -1,4 +1,4 @@
-"""A recorded trial: markers or coordinates, the laboratory's axes, the ground reaction of the foot.
+"""Motion, laboratory axes and ground reaction of a recorded trial.
 
 A standing trial of the same subject can calibrate the positions of the markers.
 """
@@ -42,13 +42,13 @@ from tkamb.io.scene import Scene
 def with_static_markers(
     scene: SceneText, static: Path, segments: list[ModelSegment], length_unit: str | None = None
 ) -> tuple[SceneText, list[str]]:
-    """Return the scene with markers' places calibrated by a standing trial, and remarks on them.
+    """Return the scene with marker positions from a standing trial, and remarks on them.
 
     Args:
         scene: content of the scene, with markers.
         static: recording of the standing trial.
         segments: segments with their markers.
-        length_unit: unit of lengths in the trial; None: as the file states.
+        length_unit: unit of lengths in the trial; None: the unit that the file states.
     """
     assert scene.markers is not None
     stated = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
@@ -83,17 +83,17 @@ def calibrated_markers(
     side: Literal["right", "left"],
     pose_insert_in_tibia: Array,
 ) -> dict[str, dict[str, Array]]:
-    """Return the calibrated places of the markers: segment -> marker -> (3,) m in the segment.
+    """Return calibrated positions: segment -> marker -> position in the segment, m, shape (3,).
 
-    The chain of the leg is fitted to the standing trial, with the markers' places of the table. The
-    mean position of each marker in its fitted segment is its calibrated place. The chain thus gives
-    the pose of the bones, and the markers' places follow from it.
+    The chain of the leg is fitted to the standing trial, with the marker positions of the table.
+    The calibrated position of a marker is its mean position in the fitted segment.
 
     Args:
-        table: markers and joints of the scene. Markers that the trial lacks are left out.
-        recorded: the standing trial.
+        table: markers and joints of the scene. Markers that the trial lacks are ignored.
+        recorded: table of the standing trial.
         side: side of the leg.
-        pose_insert_in_tibia: (4, 4), mirrored for a left leg.
+        pose_insert_in_tibia: pose of the insert frame in the tibia link, shape (4, 4), mirrored
+            for a left leg.
 
     Raises:
         InputError: the trial cannot be read, or its markers do not fit.
@@ -124,11 +124,11 @@ def calibrated_markers(
 
 @dataclass(frozen=True)
 class TrialFrameSettings:
-    """How many frames of a trial an imported scene holds."""
+    """Number of frames of a trial in an imported scene."""
 
     frames_per_period: float = 5.0
-    """Number of frames per period of the cut-off frequency. Chosen: a low-pass-filtered motion has
-    no content between them."""
+    """Number of frames per period of the cut-off frequency. Chosen because a low-pass-filtered
+    motion does not change faster."""
 
 
 TRIAL_FRAMES = TrialFrameSettings()
@@ -142,9 +142,9 @@ class Trial:
         ground: the ground reaction; None: none is modelled.
         remarks: lines for the report.
         markers: recording of markers; None: the motion is not from markers.
-        motion: motion in the model's coordinates; None: not from coordinates.
-        poses: recorded poses of the knee; None: not from poses.
-        shank: markers that give the shank's pose, with `poses`.
+        motion: motion from the model's coordinates; None: the motion is not from coordinates.
+        poses: recorded poses of the knee; None: the motion is not from poses.
+        shank: markers that give the shank's pose; None without `poses`.
     """
 
     ground: GroundFile | None
@@ -156,7 +156,7 @@ class Trial:
 
 
 def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
-    """Return a trial of markers, with plates of a C3D file or with a table of forces.
+    """Return a trial whose motion is from markers.
 
     Raises:
         InputError: markers, plates or interval cannot be used.
@@ -213,10 +213,10 @@ def from_poses(
 
 
 def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
-    """Return a trial in the model's own coordinates.
+    """Return a trial whose motion is in the model's coordinates.
 
     Raises:
-        InputError: it has no flexion of the knee, or no force is the foot's.
+        InputError: the knee flexion is missing, or the forces cannot be assigned to the foot.
     """
     for joint in way_to_pelvis(leg):
         if joint.unread:
@@ -240,7 +240,7 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
 
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
-    """Return remarks on parts of the recording that are not used, or not read as stated."""
+    """Return notes on parts of the recording that are ignored or read in another way."""
     notices = recorded.notices
     if recorded.path.suffix.lower() == ".c3d":
         notices = read_c3d(recorded.path, request.units).all_notices
@@ -277,8 +277,8 @@ def _thinned(
 ) -> tuple[tuple[float, float], int | None, str]:
     """Return the interval, the number of frames in it (None: all), and a remark on them.
 
-    The frames are every k-th frame of the recording, at about `frames_per_period` times the cut-off
-    frequency.
+    The frames are every k-th frame of the recording. Their rate is at least `frames_per_period`
+    times the cut-off frequency, if the recording allows.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
@@ -298,7 +298,7 @@ def _thinned(
 
 
 def _check_within(time: Array, start: float, end: float) -> None:
-    """Raise if an interval reaches beyond the recording by more than one frame at either end."""
+    """Raise an InputError if an interval exceeds the recording by more than one frame."""
     frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if start < time[0] - frame or end > time[-1] + frame:
         raise InputError(

@@ -1,4 +1,4 @@
-"""OpenSim models without OpenSim: their files, poses, muscle paths and generalised forces.
+"""Reading and evaluation of OpenSim models without OpenSim.
 
 - `tkamb.io.opensim.read`: `read_osim(path)` returns an `OpenSimModel`.
 - `tkamb.io.opensim.model`: the data of an `OpenSimModel`.

@@ -1,9 +1,9 @@
-"""An OpenSim file and the files that it names, and the values in their elements.
+"""XML of an OpenSim file and of the files that it includes.
 
-OpenSim's XML reader is lenient. It accepts a bare `&` in a text, bytes that are not UTF-8, `--`
-within a comment and text after the last element. tkamb reads such a file too, with a notice. An
-element with `file="other.xml"` is replaced by the element that the other file holds. A value that
-an element does not state is looked up in the file's <defaults>.
+OpenSim's XML reader accepts a bare `&` in a text, bytes that are not UTF-8, `--` within a comment
+and text after the last element. tkamb reads such a file too, with a notice. An element with
+`file="other.xml"` is replaced by the element in the other file. If an element lacks a value, the
+value is read from the file's <defaults>.
 """
 
 import copy
@@ -35,13 +35,11 @@ Element = ElementTree.Element
 class Document:
     """An OpenSim document, with the default values of its classes.
 
-    OpenSim does not write values that equal the defaults. A missing value is therefore looked up in
-    the defaults.
-
     Args:
         path: the file.
-        defaults: class -> the element with its default values.
-        partial: whether an element that cannot be read is added to `unread` instead of refused.
+        defaults: name of a class -> element with the default values of the class.
+        partial: whether an element that cannot be read is added to `unread`; otherwise it is an
+            error.
         unread: elements that could not be read, each with the reason.
     """
 
@@ -52,7 +50,7 @@ class Document:
 
     @contextmanager
     def reading(self, element: Element) -> Iterator[None]:
-        """Run a block that reads an element; in a partial reading its error goes to `unread`."""
+        """Run a block that reads an element. A partial reading adds its error to `unread`."""
         try:
             yield
         except InputError as error:
@@ -61,7 +59,7 @@ class Document:
             self.unread.append((element, str(error)))
 
     def where(self, element: Element) -> str:
-        """Return words for messages: the file, and the class and name of an element."""
+        """Return the file, class and name of an element, for messages."""
         return f"{self.path}: {element.tag} '{element.get('name', '')}'"
 
     def find(self, element: Element, *tags: str) -> Element | None:
@@ -86,17 +84,17 @@ class Document:
         raise InputError(f"has no <{tags[0]}>", self.where(element))
 
     def socket(self, element: Element, name: str, *old_tags: str, default: str = "") -> str:
-        """Return the path or name of the object that a socket of an element is connected to.
+        """Return the path or name of the object to which a socket of an element is connected.
 
-        The tag depends on the version of the file. Version 4: <socket_NAME>. 30508 to 30515:
-        <connector_NAME_connectee_name> or <socket_NAME_connectee_name>. Before 30508:
-        <connectors> with a <connectee_name> for each. Version 3: a tag for each kind of socket.
+        The tag depends on the file's version. Version 4 has <socket_NAME>. Versions 30508 to 30515
+        have <connector_NAME_connectee_name> or <socket_NAME_connectee_name>. Earlier ones have
+        <connectors> with one <connectee_name> per socket. Version 3 has a tag per kind of socket.
 
         Args:
             element: the element with the socket.
             name: name of the socket, such as "parent_frame".
-            old_tags: its tags in version 3.
-            default: returned where the socket is not connected; "": that is an error.
+            old_tags: tags of the socket in version 3.
+            default: value for an unconnected socket; "": an unconnected socket is an error.
 
         Raises:
             InputError: the socket is not connected, and there is no default.
@@ -117,10 +115,10 @@ class Document:
     def numbers(
         self, element: Element, *tags: str, count: int | None = None, default: str | None = None
     ) -> Array:
-        """Return the numbers (count,) of a child; brackets and commas are allowed.
+        """Return the numbers (count,) in a child's text, which may have brackets and commas.
 
         Raises:
-            InputError: they are missing, are not finite numbers, or are not `count`.
+            InputError: the numbers are missing or not finite, or their number is not `count`.
         """
         text = self.text(element, *tags, default=default)
         try:
@@ -135,7 +133,7 @@ class Document:
         return values
 
     def number(self, element: Element, *tags: str, default: float | None = None) -> float:
-        """Return the number of a child."""
+        """Return the number in a child's text."""
         written = None if default is None else repr(default)
         return float(self.numbers(element, *tags, count=1, default=written)[0])
 
@@ -152,7 +150,7 @@ class Document:
         """Return an element's name.
 
         Raises:
-            InputError: it has none.
+            InputError: the element has no name.
         """
         name = element.get("name", "").strip()
         if not name:
@@ -168,7 +166,7 @@ class Document:
         """Return the function that an element describes.
 
         Raises:
-            InputError: a class of function that is not read, or a malformed function.
+            InputError: the class of the function is not supported, or the function is malformed.
         """
         match element.tag:
             case "Constant":
@@ -195,7 +193,7 @@ class Document:
         )
 
     def held_function(self, element: Element, tag: str) -> Function | None:
-        """Return the function in <tag>, or a child function named `tag`; None without either."""
+        """Return the function in <tag>, or else a child function with the name `tag`, or None."""
         holder = self.find(element, tag)
         if holder is not None and len(holder):
             return self.function(holder[0])
@@ -214,10 +212,10 @@ class Document:
 
 
 def _number_words(text: str, count: int | None) -> list[str]:
-    """Return the words of a list of numbers.
+    """Split a list of numbers into words.
 
-    Like OpenSim's reader, it also accepts `(0 1 0)`, `~[0,1,0]` and `0, 1, 0` for three numbers.
-    Commas separate numbers only if their count fits; otherwise they may be decimal commas.
+    Like OpenSim's reader, this function also splits `(0 1 0)`, `~[0,1,0]` and `0, 1, 0`. Commas
+    separate numbers only if `count` agrees. Otherwise they may be decimal commas.
     """
     if count is None or count < 2:
         return text.split()
@@ -233,13 +231,13 @@ class DocumentSettings:
     """Limits of reading an OpenSim file."""
 
     max_nested_files: int = 5
-    """Depth of files that name further files; OpenSim's own models have a depth of one."""
+    """Largest depth of files that include further files. OpenSim's own models have depth 1."""
 
 
 DOCUMENT = DocumentSettings()
 
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
-"""Sets of which tkamb reads only the names; their files may be absent."""
+"""Sets that tkamb does not model. Their files may be absent."""
 
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[0-9]+|#x[0-9a-fA-F]+);)")
 _COMMENT = re.compile(r"<!--(.*?)-->", re.S)
@@ -249,13 +247,10 @@ _END = re.compile(r"</OpenSimDocument\s*>")
 
 
 def open_document(path: Path) -> tuple[Element, list[str]]:
-    """Return the root of an OpenSim file with the files that it names, and notices.
-
-    Args:
-        path: the file.
+    """Return the root element of an OpenSim file after inclusion of further files, and notices.
 
     Raises:
-        InputError: the file, or a needed file that it names, cannot be read.
+        InputError: the file, or a needed file that it includes, cannot be read.
     """
     notices: list[str] = []
     root = _read(path, notices)
@@ -265,7 +260,7 @@ def open_document(path: Path) -> tuple[Element, list[str]]:
 
 
 def _read(path: Path, notices: list[str]) -> Element:
-    """Return the root of one file: of strict XML, or after repairs where OpenSim is lenient."""
+    """Return the root element of one file. Errors that OpenSim accepts are repaired first."""
     content = read_bytes(path, what=WHAT)
     try:
         return parse_xml(content, path, what=WHAT)
@@ -282,7 +277,7 @@ def _read(path: Path, notices: list[str]) -> Element:
 
 
 def _lenient(content: bytes) -> tuple[str, list[str]]:
-    """Return the text as strict XML without its declaration, and words on each repair."""
+    """Return the text as strict XML without a declaration, and words on each repair."""
     mended = []
     try:
         text = content.decode("utf-8-sig")
@@ -312,7 +307,7 @@ def _lenient(content: bytes) -> tuple[str, list[str]]:
 
 
 def _include(element: Element, path: Path, opened: tuple[Path, ...], notices: list[str]) -> None:
-    """Replace every element that names a file by the content of that file, in place."""
+    """Replace, in place, every element with a `file` attribute by the content of that file."""
     while (name := element.attrib.pop("file", "").strip()) and name.lower() != "unassigned":
         path, opened = _replace(element, name, path, opened, notices)
     for child in element:
@@ -322,7 +317,7 @@ def _include(element: Element, path: Path, opened: tuple[Path, ...], notices: li
 def _replace(
     element: Element, name: str, path: Path, opened: tuple[Path, ...], notices: list[str]
 ) -> tuple[Path, tuple[Path, ...]]:
-    """Fill an element from the file that it names; return that file and the files opened so far."""
+    """Fill an element from the file that it includes. Return this file and all opened files."""
     where = f"{path}: {element.tag} file='{name}'"
     other = path.parent / name.replace("\\", "/")
     if not other.is_file() and element.tag in NOT_NEEDED:
@@ -354,7 +349,7 @@ def _replace(
 
 
 def _apply_defaults(target: Element, defaults: Element | None) -> None:
-    """Write a file's defaults into its own elements, because they do not apply to other files."""
+    """Add a file's defaults to its elements, because the defaults do not apply to other files."""
     by_tag = {} if defaults is None else {entry.tag: entry for entry in defaults}
     inside = set() if defaults is None else set(defaults.iter())
     for element in [e for e in target.iter() if e.tag in by_tag and e not in inside]:

@@ -75,10 +75,10 @@ class Polynomial:
 
 
 class Piecewise:
-    """A piecewise polynomial that is linear beyond its ends, with the slopes there.
+    """A piecewise polynomial with linear extrapolation beyond its ends.
 
     Args:
-        pieces: the polynomials between the knots.
+        pieces: polynomials between the knots.
     """
 
     def __init__(self, pieces: PPoly) -> None:
@@ -121,16 +121,16 @@ class Scaled:
 
 
 def piecewise_linear(x: Array, y: Array) -> Piecewise:
-    """Return the polyline through n >= 2 points x, y (n,), x increasing."""
+    """Return the polyline through n >= 2 points x, y of shape (n,) with increasing x."""
     return Piecewise(PPoly(np.stack([np.diff(y) / np.diff(x), y[:-1]]), x))
 
 
 def simm_spline(x: Array, y: Array) -> Piecewise:
-    """Return SIMM's cubic spline through n >= 2 points x, y (n,), x increasing.
+    """Return SIMM's cubic spline through n >= 2 points x, y of shape (n,) with increasing x.
 
-    Its third derivative in the first interval is that of the cubic through the first four points;
-    in the last interval likewise with the last four. With three points it is zero, with two points
-    the spline is a straight line. A natural spline would have zero curvature at its ends instead.
+    The third derivative in the first interval is that of the cubic through the first four points.
+    The last interval uses the last four points. With three points the third derivative is zero;
+    with two points the spline is a straight line. The spline is not a natural spline.
     """
     if len(x) == 2:
         return piecewise_linear(x, y)
@@ -142,7 +142,7 @@ def simm_spline(x: Array, y: Array) -> Piecewise:
 
 
 def _third_difference(x: Array, y: Array) -> float:
-    """Return the third divided difference of four points: f'''/6 of the cubic through them."""
+    """Return the third divided difference of four points, f'''/6 of the cubic through them."""
     for order in (1, 2, 3):
         y = np.diff(y) / (x[order:] - x[:-order])
     return float(y[0])

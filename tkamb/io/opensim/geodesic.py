@@ -1,20 +1,19 @@
-"""The taut string over an ellipsoid: straight, a geodesic, straight again.
+"""The taut string over an ellipsoid: a straight part, a geodesic, and a second straight part.
 
-With the ellipsoid Σ x²/a² = 1, gradient g = x/a², a geodesic x(s) of unit speed v obeys
+The ellipsoid is Σ x²/a² = 1 with the gradient g = x/a². A geodesic x(s) of unit speed v obeys
 
     x'' = -(v·(v/a²) / g·g) g.
 
 A neighbouring geodesic at the distance j obeys j'' = -K j (the Jacobi field), with the Gaussian
-curvature K = 1/(a₁a₂a₃ g·g)². A string from a point P leaves its straight part on the contour: the
-closed curve of surface points whose tangent plane contains P. The unknowns are the angle φ along
-the contour and the length s of the geodesic. The string arrives where Q lies in the tangent plane
-at the geodesic's end and straight ahead. These are two equations; Newton's method solves them, with
-j for the derivatives.
+curvature K = 1/(a₁a₂a₃ g·g)². A string from a point P to a point Q first touches the ellipsoid on
+the contour of P, the closed curve of points with tangent planes through P. The unknowns are the
+angle φ along the contour and the length s of the geodesic. Two equations state that the tangent at
+the end of the geodesic passes through Q. Newton's method solves them; j gives the derivatives.
 
-Affine maps keep straight lines and tangency: where x is scaled to the unit sphere, contours and
-plane sections are circles. The initial guess is the shortest string that stays in one plane through
-P and Q. On the sphere such a plane cuts out a circle, on which the taut string has a closed form.
-Its length is that of the arc on the ellipsoid.
+An affine map of the ellipsoid to the unit sphere keeps straight lines and tangency. On the sphere,
+contours and plane sections are circles. The initial guess is the shortest string in any plane
+through P and Q. On the circle of such a plane, the touching points of a taut string have a closed
+form. Its length is measured on the ellipsoid.
 
 Reference: Scholz et al., Multibody Syst Dyn 36:195 (2016), doi:10.1007/s11044-015-9451-1, for
 Newton's method with Jacobi fields.
@@ -35,13 +34,13 @@ class PlaneStringSettings:
     """Initial guesses of a string around an ellipsoid, in planes through its end points."""
 
     runge_kutta_steps: int = 6
-    """Number of Runge-Kutta steps along a geodesic. Chosen: the
-    rule (DOP853) has order eight, so that few steps suffice."""
+    """Number of Runge-Kutta steps along a geodesic. Chosen because few steps suffice: the method
+    (DOP853) has order eight."""
     rival_share: float = 0.1
-    """Share (1) of its arc by which a second plane string may exceed the shortest and is still
-    tried. Chosen: it may lead to the shortest geodesic."""
+    """A second plane string is also tried if it is longer than the shortest by less than this
+    share of its arc. Chosen because it may lead to the shortest geodesic."""
     planes: int = 24
-    """Number of half planes through both points that are tried. Chosen: one every 15 deg."""
+    """Number of half planes through both points that are tried. Chosen as one every 15 deg."""
 
 
 PLANE_STRING = PlaneStringSettings()
@@ -56,24 +55,25 @@ _FINE = (
 _FINE_WEIGHTS = _WEIGHTS / PLANE_STRING.runge_kutta_steps
 _NODES, _COARSE_WEIGHTS = np.polynomial.legendre.leggauss(6)
 _COARSE, _ENDS = _NODES, np.array([-1.0, 1.0])
-"""Places on an arc, -1 to 1: Gauss points for its whole length (`_FINE`: for its steps), and its
-ends."""
+"""Parameters -1 to 1 of points on an arc: Gauss points of the whole arc, and the ends. `_FINE`
+contains the Gauss points of each Runge-Kutta step."""
 
 
 def planar_starts(
     p: Array, q: Array, axes: Array, half: Array | None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the shortest plane strings, and the shortest of the other local minima.
+    """Return the shortest plane strings and the second shortest that are local minima.
 
     Args:
-        p: (f, 3) starts, in coordinates in which the ellipsoid is the unit sphere.
-        q: (f, 3) ends, likewise.
-        axes: (3,) m, semi-axes.
+        p: starts of the strings, with the ellipsoid scaled to the unit sphere, shape (f, 3).
+        q: ends of the strings, scaled in the same way, shape (f, 3).
+        axes: semi-axes, m, shape (3,).
         half: as in `shortest_strings`.
 
     Returns:
-        (f, 2, 3): the points where they meet the sphere. (f, 2, s) m: their lengths on the
-        ellipsoid in s steps of equal angle. (f,): whether the second may lead to a shorter string.
+        Points where the two strings meet the sphere, shape (f, 2, 3). Their lengths on the
+        ellipsoid in s steps of equal angle, m, shape (f, 2, s). Mask of the second strings that may
+        lead to a shorter geodesic, shape (f,).
     """
     planes = _Planes.through(p, q)
     points = planes.points(_ENDS)
@@ -103,12 +103,12 @@ class _Planes:
     """k half planes through each line from p to q, and the circles that they cut from the sphere.
 
     Args:
-        along: (f, 1, 3) direction of the line.
-        outward: (f, k, 3) direction in the half plane, normal to the line.
-        centre: (f, k, 3) centre of the circle.
-        radius: (f, k) radius of the circle.
-        ends: (2, f, k) rad, angles from `outward` towards `along` at which the taut string in the
-            plane meets and leaves the circle.
+        along: direction of the line, shape (f, 1, 3).
+        outward: direction in the half plane, normal to the line, shape (f, k, 3).
+        centre: centre of the circle, shape (f, k, 3).
+        radius: radius of the circle, shape (f, k).
+        ends: angles from `outward` towards `along` at which the taut string meets and leaves the
+            circle, rad, shape (2, f, k).
     """
 
     along: Array
@@ -123,7 +123,7 @@ class _Planes:
         along = unit(q - p)
         middle = p - dot(p, along)[:, None] * along
         offset = np.linalg.norm(middle, axis=1)
-        # Where the line passes through the centre, any normal direction will do.
+        # A line through the centre has no preferred normal direction.
         spare = np.eye(3)[np.abs(along).argmin(axis=1)]
         spare = spare - dot(spare, along)[:, None] * along
         first = unit(np.where(offset[:, None] > 1e-9, middle, spare))
@@ -151,18 +151,20 @@ class _Planes:
         )
 
     def points(self, places: Array) -> Array:
-        """Return points (f, k, n, 3) at places (n,) in -1…1 of the arcs."""
+        """Return points (f, k, n, 3) of the arcs at parameters `places` (n,) from -1 to 1."""
         angle, radius = self._angles(places), self.radius[..., None]
         cosine, sine = radius * np.cos(angle), radius * np.sin(angle)
         outward, along = self.outward[:, :, None], self.along[:, :, None]
         return cosine[..., None] * outward + sine[..., None] * along + self.centre[:, :, None]
 
     def speeds(self, places: Array, axes: Array) -> Array:
-        """Return the speed (f, k, n), m per unit of place, of a point along the arcs.
+        """Return the lengths (f, k, n), m, of the arcs' tangents on the ellipsoid.
+
+        A tangent is the derivative of a point of the arc by the parameter.
 
         Args:
-            places: in -1…1 of the arcs.
-            axes: (3,) m, of the ellipsoid.
+            places: parameters of points on the arcs, from -1 to 1, shape (n,).
+            axes: semi-axes of the ellipsoid, m, shape (3,).
         """
         angle, along, outward = self._angles(places), self.along * axes, self.outward * axes
         cosine, sine = np.cos(angle), np.sin(angle)
@@ -173,7 +175,7 @@ class _Planes:
         return size[..., None] * np.sqrt(np.maximum(squared, 0.0))
 
     def _angles(self, places: Array) -> Array:
-        """Return the angles (f, k, n) rad at places (n,) of the arcs."""
+        """Return the angles (f, k, n), rad, at parameters `places` (n,) of the arcs."""
         middle, half = 0.5 * (self.ends[0] + self.ends[1]), 0.5 * (self.ends[1] - self.ends[0])
         return middle[..., None] + half[..., None] * places
 
@@ -190,16 +192,16 @@ def unit(vectors: Array) -> Array:
 
 @dataclass(frozen=True)
 class GeodesicSettings:
-    """The Newton iteration for a geodesic between two points."""
+    """Newton iteration for the taut string over an ellipsoid."""
 
     max_iterations: int = 30
-    """Largest number of Newton steps. Chosen: strings that converge need fewer."""
+    """Largest number of Newton steps. Chosen because strings that converge need fewer."""
     tolerance: float = 1e-11
-    """rad; largest error of the string's direction at its end. Chosen: it moves no touching point
-    noticeably."""
+    """rad: the iteration has converged if the error of the string's direction at its end is
+    smaller. Chosen because the touching points then do not change noticeably."""
     overshoot_below: float = 0.05
-    """rad; with a smaller error, a string whose end lies behind it has overshot and is shortened.
-    Chosen: with larger errors the derivative may have the other sign."""
+    """rad: a string that has passed its end point is shortened if its direction error is smaller
+    than this. Chosen because the derivative may have the wrong sign at larger errors."""
 
 
 GEODESIC = GeodesicSettings()
@@ -210,11 +212,11 @@ class Strings:
     """Strings over an ellipsoid, in its frame.
 
     Args:
-        entry: (f, 3) m, points where they meet it.
-        exit: (f, 3) m, points where they leave it.
-        arc_m: (f,) lengths on it.
-        length_m: (f,) whole lengths.
-        converged: (f,) whether the iteration has converged, so that they are taut.
+        entry: points where the strings meet the ellipsoid, m, shape (f, 3).
+        exit: points where the strings leave the ellipsoid, m, shape (f, 3).
+        arc_m: lengths on the ellipsoid, m, shape (f,).
+        length_m: whole lengths, m, shape (f,).
+        converged: mask of the taut strings, for which the iteration has converged, shape (f,).
     """
 
     entry: Array
@@ -228,13 +230,14 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
     """Return the shortest strings around an ellipsoid.
 
     Args:
-        start: (f, 3) m, points outside the ellipsoid.
-        end: (f, 3) m, points outside; the segment from start to end passes through the ellipsoid.
-        axes: (3,) m, semi-axes.
-        half: (3,) direction of the half on which the string must touch; None: either half.
+        start: points outside the ellipsoid, m, shape (f, 3).
+        end: points outside the ellipsoid, m, shape (f, 3). The segment from start to end passes
+            through the ellipsoid.
+        axes: semi-axes, m, shape (3,).
+        half: direction of the half on which the string must touch, shape (3,); None: either half.
 
     Returns:
-        The strings. One without a taut string on that half is marked as not converged.
+        The strings. If there is no taut string on the half, `converged` is False.
     """
     count = len(start)
     contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)
@@ -261,11 +264,12 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
     """Return the strings that Newton's method finds from initial guesses.
 
     Args:
-        start: (f, 3) m.
-        end: (f, 3) m.
-        axes: (3,) m, semi-axes.
-        contour: (f, 3) initial points on the contour, in coordinates of the unit sphere.
-        pieces: (f, s) m, initial lengths of the s steps along the geodesic.
+        start: starts of the strings, m, shape (f, 3).
+        end: ends of the strings, m, shape (f, 3).
+        axes: semi-axes, m, shape (3,).
+        contour: initial points on the contour, with the ellipsoid scaled to the unit sphere,
+            shape (f, 3).
+        pieces: initial lengths of the s steps along the geodesic, m, shape (f, s).
     """
     p = start / axes
     squared = (p**2).sum(axis=1, keepdims=True)
@@ -295,12 +299,12 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
         if is_converged.all():
             break
         step = -np.linalg.solve(jacobian[~is_converged], residual[~is_converged][..., None])[..., 0]
-        # A string that would turn back has overshot the point where it leaves the surface, by the
-        # distance that it has to return.
+        # `ahead` is negative if the geodesic ends beyond the touching point. The overshoot is then
+        # about as long as the straight part that leads back.
         past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~is_converged]
         step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~is_converged][past]])
         waiting = waiting[~is_converged]
-        # A long step is cut short: far from the solution the derivatives mislead.
+        # Long steps are shortened, because derivatives far from the solution are unreliable.
         share = np.minimum(1.0, 0.4 / np.maximum(np.abs(step[:, 0]), 1e-300))
         share = np.minimum(share, limit / np.maximum(np.abs(step[:, 1]), 1e-300))
         angle[waiting] += share * step[:, 0]
@@ -312,7 +316,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """Geodesics that begin on the contour of `start`, and their error at `end`."""
+    """Geodesics from the contour of `start`, to measure their direction errors at `end`."""
 
     start: Array
     end: Array
@@ -325,13 +329,13 @@ class _Shot:
         """Return the errors of geodesics and their derivatives.
 
         Args:
-            angle: (f,) rad, angle along the contour.
-            pieces: (f, s) m, lengths of the steps along the geodesic.
+            angle: angles along the contour, rad, shape (f,).
+            pieces: lengths of the steps along the geodesic, m, shape (f, s).
 
         Returns:
             Residuals (f, 2); their derivatives (f, 2, 2) by angle and length; entry and exit
-            (f, 3) m; distance (f,) m of `end` ahead of the exit. If that is negative, the string
-            would turn back.
+            points (f, 3), m; distances (f,) of `end` ahead of the exit, m. A negative distance
+            means that the straight part would lead backwards.
         """
         cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
         entry = self.axes * (self.hub + cosine * self.radial + sine * self.sideways)
@@ -363,7 +367,7 @@ class _Shot:
         return residual, jacobian, entry, leave, reach[:, 0] * dot(rest, direction)
 
     def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
-        """Return the rate (f, 3) of the unit normal at a point with a velocity (f, 3)."""
+        """Return the rates (f, 3) of the unit normals at points with velocities (f, 3)."""
         bent = velocity / self.axes**2
         return (bent - dot(bent, normal)[:, None] * normal) / slope[:, None]
 
@@ -379,14 +383,14 @@ def _normal(points: Array, axes: Array) -> tuple[Array, Array]:
 def _follow_geodesics(
     states: Array, pieces: Array, axes: Array, weights: Array, last_weights: Array
 ) -> None:
-    """Integrate geodesics and their Jacobi fields, in place, by an explicit Runge-Kutta rule.
+    """Integrate geodesics and their Jacobi fields, in place, by an explicit Runge-Kutta method.
 
     Args:
-        states: (f, 8) = (x, v, j, j') at the starts; overwritten by those at the ends.
-        pieces: (f, s) m, lengths of the steps.
-        axes: (3,) m, semi-axes.
-        weights: (k, k) weights of the earlier stages in each of the k stages.
-        last_weights: (k,) weights of the stages in a step.
+        states: (x, v, j, j') at the starts, replaced by the values at the ends, shape (f, 8).
+        pieces: lengths of the steps, m, shape (f, s).
+        axes: semi-axes, m, shape (3,).
+        weights: weights of the earlier stages in each of the k stages, shape (k, k).
+        last_weights: weights of the stages in a step, shape (k,).
     """
     count = len(last_weights)
     stages, point, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)

@@ -1,14 +1,15 @@
-"""Poses of an OpenSim model's bodies, and derivatives of points by its coordinates.
+"""Poses of an OpenSim model's bodies, and derivatives of points with respect to its coordinates.
 
-All functions take many coordinate sets at once: q has shape (..., n), in the order of
-`model.coordinates`. Let J be the twist of a body per unit of each coordinate, in ground and at
+All functions accept many coordinate sets at once: q has shape (..., n), in the order of
+`model.coordinates`. Let J be the twists of a body per unit of each coordinate, in ground and at
 ground's origin (angular above linear velocity). Then a point p of the body has the derivative
 
     ∂p/∂q = J_linear + J_angular × p.
 
-The outboard body of a joint has the twist of its inboard body and, for each axis of the joint, a
-term: (d, c × d) du/dq for a rotation by u(q) about the line through c along d, and (0, d) du/dq for
-a translation. The term has the other sign in a joint that the chain passes backwards.
+The twist of a joint's outboard body is that of the inboard body plus a term for each axis of the
+joint. A rotation by u(q) about the line through c along d adds (d, c × d) du/dq. A translation
+along d adds (0, d) du/dq. In a backwards joint, whose child is nearer to ground, the term has the
+opposite sign.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,10 +29,12 @@ class Motion:
     """Poses and twists of bodies in ground, for coordinate sets of leading shape (...).
 
     Args:
-        bodies: name of each body -> its index; ground is first.
-        poses: (..., b, 4, 4) pose of each body in ground.
-        twists: (..., b, 6, n) twist of each body at ground's origin, per unit of each coordinate.
-        axes: (..., a, 6) twist of child against parent frame, per unit of motion along each axis.
+        bodies: name of a body -> its index; ground is first.
+        poses: pose of each body in ground, shape (..., b, 4, 4).
+        twists: twist of each body at ground's origin, per unit of each coordinate, shape
+            (..., b, 6, n).
+        axes: twist of the child frame relative to the parent frame, per unit of motion along each
+            joint axis, shape (..., a, 6).
     """
 
     bodies: dict[str, int]
@@ -44,10 +47,10 @@ class Motion:
 
         Args:
             bodies: names of the m points' bodies.
-            locations: (m, 3) or (..., m, 3) m, the points in their bodies.
+            locations: points in the frames of their bodies, m, shape (m, 3) or (..., m, 3).
 
         Returns:
-            Positions (..., m, 3) m, and their derivatives (..., m, 3, n) by the coordinates.
+            Positions (..., m, 3), m, and their derivatives ∂p/∂q (..., m, 3, n).
         """
         index = [self.bodies[name] for name in bodies]
         poses, twists = self.poses[..., index, :, :], self.twists[..., index, :, :]
@@ -57,7 +60,7 @@ class Motion:
 
 
 def velocities(twists: Array, positions: Array) -> Array:
-    """Return ∂p/∂q (..., 3, n) of points (..., 3) m of bodies with the twists (..., 6, n)."""
+    """Return ∂p/∂q (..., 3, n) of points p (..., 3), m, on bodies with twists (..., 6, n)."""
     return twists[..., 3:, :] + np.cross(twists[..., :3, :], positions[..., None], axis=-2)
 
 
@@ -73,7 +76,7 @@ class Kinematics:
         self.coordinates = {name: k for k, name in enumerate(model.coordinates)}
         self.bodies = {name: k for k, name in enumerate((GROUND, *model.bodies))}
         self._axes = [a for j in model.joints for a in (*j.rotations, *j.translations)]
-        # One product evaluates the linear functions of all axes; the others follow one by one.
+        # One matrix product evaluates all linear functions. Other functions are evaluated singly.
         self._gradients = np.zeros((len(self._axes), len(self.coordinates)))
         self._offsets = np.zeros(len(self._axes))
         self._curved: list[tuple[int, int, JointAxis]] = []
@@ -92,7 +95,7 @@ class Kinematics:
         self._index_joints(model)
 
     def _index_joints(self, model: OpenSimModel) -> None:
-        """Store joint and coordinate of each axis, and the frames at both ends of each joint."""
+        """Store the joint, rank and sign of each axis, and the frames of each joint."""
         joints = model.joints
         self._ends = [(self.bodies[j.inboard], self.bodies[j.outboard]) for j in joints]
         self._backwards = np.array([j.backwards for j in joints], bool).reshape(-1, 1, 1)
@@ -112,10 +115,10 @@ class Kinematics:
         self._signed_gradients = self._signs[:, None] * self._gradients
 
     def vector(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return coordinates (..., n); those that a mapping does not name are at their defaults.
+        """Return coordinates (..., n). Coordinates that are not in a mapping have default values.
 
         Raises:
-            InputError: an unknown coordinate or a wrong number of them.
+            InputError: a coordinate is unknown, or their number is wrong.
         """
         if isinstance(q, Mapping):
             values = np.array([c.default for c in self.model.coordinates.values()])
@@ -140,7 +143,7 @@ class Kinematics:
         return values
 
     def coupling(self, q: ArrayLike) -> Array:
-        """Return the derivatives (..., n, n) of all coordinates by the independent ones.
+        """Return the derivatives (..., n, n) of all coordinates (rows) by the independent ones.
 
         The column of a dependent coordinate is zero.
         """
@@ -174,14 +177,14 @@ class Kinematics:
         return Motion(self.bodies, poses, twists, axis_twists)
 
     def joint_twists(self, q: Array) -> tuple[Array, Array]:
-        """Return poses of all bodies, and the twist of each coordinate's joint.
+        """Return the poses of all bodies, and the twist that each coordinate gives to bodies.
 
         Args:
-            q: (..., n) coordinates, rad and m.
+            q: coordinates, rad and m, shape (..., n).
 
         Returns:
-            Poses (..., b, 4, 4) in ground. Twists (..., n, 6) at ground's origin of the bodies
-            beyond the coordinate's joint, per unit of the coordinate, without couplers.
+            Poses in ground (..., b, 4, 4). Twists (..., n, 6) at ground's origin, per unit of each
+            coordinate, of all bodies outboard of the coordinate's joint. Couplers are ignored.
         """
         poses, axes = self._chain(self.axis_values(q))
         twists = self._signed_gradients.T @ axes
@@ -216,8 +219,8 @@ class Kinematics:
     def _chain(self, values: Array) -> tuple[Array, Array]:
         """Return body poses (..., b, 4, 4), and the twist in ground (..., a, 6) of each axis.
 
-        The motions within all joints are computed at once, the poses of the bodies one by one from
-        ground outwards.
+        The poses within all joints are computed at once. The poses of the bodies are computed one
+        by one from ground outwards.
         """
         moved, before = self._joint_poses(values)
         steps = np.where(self._backwards, inverse(moved), moved)
@@ -240,14 +243,14 @@ class Kinematics:
     def _axis_frames(self, moved: Array) -> Array:
         """Return the poses (..., j, 4, 4) of the joints' parent frames in the inboard bodies.
 
-        In a joint that the chain passes backwards, the parent frame belongs to the outboard body.
+        In a backwards joint, the parent frame belongs to the outboard body.
         """
         return np.asarray(
             np.where(self._backwards, self._inboard_frames @ inverse(moved), self._inboard_frames)
         )
 
     def _joint_poses(self, values: Array) -> tuple[Array, Array]:
-        """Return poses of child frames (..., j, 4, 4) and axes (..., a, 3) in the parent frames.
+        """Return the child frames' poses (..., j, 4, 4) and the axes (..., a, 3) in parent frames.
 
         A rotation by u is I + sin u K + (1 - cos u) K² (Rodrigues), with K the cross-product matrix
         of its axis.
@@ -262,15 +265,15 @@ class Kinematics:
             axes
         ) in self._ranks:  # the first rotations of all joints, then the second, then the third
             owners = self._owner[axes]
-            here = rotation[..., owners, :, :]
-            before[..., axes, :] = (here @ self._directions[axes][..., None])[..., 0]
-            rotation[..., owners, :, :] = here @ turns[..., axes, :, :]
+            previous = rotation[..., owners, :, :]
+            before[..., axes, :] = (previous @ self._directions[axes][..., None])[..., 0]
+            rotation[..., owners, :, :] = previous @ turns[..., axes, :, :]
         shift = np.where(self._turning, 0.0, values)[..., None] * self._directions
         return pose(rotation, self._sums @ shift), before
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return a × b of large arrays (..., 3), in a third of the time of `np.cross`."""
+    """Return a × b of arrays (..., 3). For large arrays this is faster than `np.cross`."""
     x, y, z = np.moveaxis(a, -1, 0)
     u, v, w = np.moveaxis(b, -1, 0)
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)

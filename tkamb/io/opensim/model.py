@@ -1,7 +1,7 @@
-"""An OpenSim model as data: bodies, joints, constraints, markers, muscles, ligaments, wrap objects.
+"""Data of an OpenSim model: bodies, joints, constraints, markers, muscles, ligaments, wrap objects.
 
-Frames are those of the file: each body's own, and "ground". SI and radians. There are no offset
-frames: points and poses are given in the bodies themselves.
+Values are in SI units and rad. Points and poses are in the frames of the bodies or "ground", also
+if the file gives them in offset frames.
 
 References: Delp et al., IEEE Trans Biomed Eng 54:1940 (2007), doi:10.1109/TBME.2007.901024;
 Seth et al., PLoS Comput Biol 14:e1006223 (2018), doi:10.1371/journal.pcbi.1006223.
@@ -38,8 +38,9 @@ class MovingPathPoint:
     Args:
         name: the point's name.
         body: body in whose frame it moves.
-        coordinates: coordinate of x, y and z; None: the function is evaluated at zero.
-        functions: function (m) of x, y and z.
+        coordinates: names of the coordinates on which x, y and z depend; None: the function is
+            evaluated at zero.
+        functions: functions that give x, y and z, m.
     """
 
     name: str
@@ -63,8 +64,9 @@ class WrapObject:
         pose: (4, 4) pose_object_in_body.
         dimensions: m. Cylinder: radius, length; sphere: radius; ellipsoid: semi-axes x, y, z;
             torus: radius of the centre line, radius of the tube.
-        quadrant: axis (0, 1 or 2) and sign (±1) of the half on which paths must lie; None: either.
-        active: whether paths wrap around it.
+        quadrant: axis (0, 1 or 2) and sign (±1) of the half on which paths must lie; None: either
+            half.
+        active: whether paths wrap around the object.
     """
 
     name: str
@@ -82,8 +84,8 @@ class PathWrap:
 
     Args:
         wrap_object: name of the wrap object.
-        first: index of the path point at which the range with wrapping begins.
-        last: index of the path point at which it ends.
+        first: index of the first path point of the part that may wrap.
+        last: index of the last path point of this part.
         method: OpenSim's method for an ellipsoid: "hybrid", "midpoint" or "axial".
     """
 
@@ -95,7 +97,7 @@ class PathWrap:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """The path of a muscle or ligament: points in order, and the wrap objects that it uses."""
+    """The path of a muscle or ligament: its points in order, and its wrap objects."""
 
     points: tuple[AnyPathPoint, ...]
     wraps: tuple[PathWrap, ...]
@@ -108,12 +110,12 @@ class OpenSimMuscle:
     Args:
         name: the muscle's name.
         kind: the file's class, such as "Thelen2003Muscle".
-        path: its path.
+        path: path of the muscle.
         max_isometric_force_N: maximum isometric force.
-        optimal_fibre_length_m: fibre length at that force.
+        optimal_fibre_length_m: fibre length at the maximum isometric force.
         tendon_slack_length_m: tendon slack length.
         pennation_rad: pennation angle at the optimal fibre length.
-        max_contraction_velocity: optimal fibre lengths per second.
+        max_contraction_velocity: maximum contraction velocity, optimal fibre lengths per second.
         enabled: whether the muscle is switched on in the file.
     """
 
@@ -130,21 +132,22 @@ class OpenSimMuscle:
 
 @dataclass(frozen=True, eq=False)
 class OpenSimLigament:
-    """A ligament, by one of two laws.
+    """A ligament with one of two force laws.
 
-    A Blankevoort1991Ligament has `stiffness_N`, `transition_strain` and `damping_s`. A Ligament has
-    the force `scale_N` times `force_length` of its length over its slack length.
+    A Blankevoort1991Ligament has `stiffness_N`, `transition_strain` and `damping_s`. The force of a
+    Ligament is `scale_N` times `force_length(length / slack length)`.
 
     Args:
         name: the ligament's name.
         kind: "Ligament" or "Blankevoort1991Ligament".
-        path: its path.
+        path: path of the ligament.
         slack_length_m: greatest length without force.
-        stiffness_N: force (N) per unit strain in the linear region; None for "Ligament".
-        transition_strain: strain (1) at the end of the toe region; None for "Ligament".
+        stiffness_N: force per unit strain in the linear region, N; None for "Ligament".
+        transition_strain: strain at the end of the toe region; None for "Ligament".
         damping_s: damping coefficient; None for "Ligament".
-        force_length: normalised force over normalised length; None for the other kind.
-        scale_N: factor (N) of the normalised force; None for the other kind.
+        force_length: normalised force as function of normalised length; None for
+            "Blankevoort1991Ligament".
+        scale_N: factor of the normalised force, N; None for "Blankevoort1991Ligament".
         enabled: whether the ligament is switched on in the file.
     """
 
@@ -170,8 +173,8 @@ class Body:
     Args:
         name: the body's name.
         mass_kg: mass.
-        centre: (3,) m, centre of mass in the body's frame.
-        inertia: (3, 3) kg·m² about the centre of mass.
+        centre: centre of mass in the body's frame, m, shape (3,).
+        inertia: inertia tensor about the centre of mass, kg·m², shape (3, 3).
     """
 
     name: str
@@ -187,11 +190,11 @@ class Coordinate:
     Args:
         name: the coordinate's name.
         joint: name of its joint.
-        rotational: whether it is an angle; a file "in degrees" then has it in degrees.
+        rotational: whether the coordinate is an angle. Files "in degrees" state it in degrees.
         default: default value.
         range: smallest and largest value.
-        clamped: whether OpenSim restricts it to the range.
-        locked: whether OpenSim fixes it at its default.
+        clamped: whether OpenSim restricts the coordinate to the range.
+        locked: whether OpenSim fixes the coordinate at its default.
     """
 
     name: str
@@ -208,9 +211,9 @@ class JointAxis:
     """One axis of a joint, with the motion along it as a function of one coordinate.
 
     Args:
-        direction: (3,) unit vector.
+        direction: unit vector of the axis, shape (3,).
         coordinate: the coordinate's name; None: the function is evaluated at zero.
-        function: coordinate -> angle (rad) or translation (m) along the axis.
+        function: function of the coordinate, which gives the angle (rad) or translation (m).
     """
 
     direction: Array
@@ -222,20 +225,21 @@ class JointAxis:
 class Joint:
     """Any OpenSim joint: translations in the parent frame, then up to three successive rotations.
 
-    The pose of the child frame in the parent frame has the rotation R = R_1 R_2 R_3, each about its
-    own axis, and the translation t = Σ u_i a_i.
+    The pose of the child frame in the parent frame has the rotation R = R_1 R_2 R_3, a product of
+    rotations about single axes. Its translation is t = Σ u_i a_i along the axes a_i.
 
     Args:
         name: the joint's name.
         kind: the file's class, such as "PinJoint".
         parent: body of the parent frame.
         child: body of the child frame.
-        pose_parent_frame: (4, 4) pose of the parent frame in the parent body.
-        pose_child_frame: (4, 4) pose of the child frame in the child body.
-        rotations: up to three axes.
-        translations: up to three axes.
+        pose_parent_frame: pose of the parent frame in the parent body, shape (4, 4).
+        pose_child_frame: pose of the child frame in the child body, shape (4, 4).
+        rotations: up to three rotation axes.
+        translations: up to three translation axes.
         backwards: whether the child body is nearer to ground than the parent body.
-        unread: why its motion could not be read; it is then welded. "": it was read.
+        unread: reason for which the joint's motion could not be read. Such a joint is welded.
+            "": the motion was read.
     """
 
     name: str
@@ -272,7 +276,7 @@ class CoordinateCoupler:
 
 @dataclass(frozen=True, eq=False)
 class ConstantDistance:
-    """A constraint that keeps two points (3,) m of two bodies at `distance` (m) from each other."""
+    """A constraint that two points (3,), m, of two bodies have a constant `distance`, m."""
 
     name: str
     bodies: tuple[str, str]
@@ -283,7 +287,7 @@ class ConstantDistance:
 
 @dataclass(frozen=True, eq=False)
 class Marker:
-    """A marker at `location` (3,) m of a body; scaling must not move it if it is `fixed`."""
+    """A marker at `location` (3,), m, of a body. A `fixed` marker does not move with scaling."""
 
     name: str
     body: str
@@ -298,8 +302,8 @@ class Unread:
     Args:
         kind: the file's class.
         name: name of the element.
-        reason: one line that says why.
-        concerns: names of the bodies and coordinates in it.
+        reason: one line with the reason.
+        concerns: names of the bodies and coordinates that occur in the element.
     """
 
     kind: str
@@ -319,19 +323,19 @@ class OpenSimModel:
 
     Args:
         name: the model's name.
-        gravity: (3,) m/s² in ground.
+        gravity: acceleration of gravity in ground, m/s², shape (3,).
         bodies: name -> body, without ground.
         joints: the joints, ordered from ground outwards.
         coordinates: name -> coordinate, in the file's order. Every vector q has this order.
-        couplers: couplers of coordinates, ordered so that an independent coordinate is set before
-            those that depend on it.
-        constant_distances: constraints on the distance of two points.
+        couplers: couplers of coordinates, ordered so that each coordinate is set before the
+            coordinates that depend on it.
+        constant_distances: constraints on the distance between two points.
         markers: name -> marker.
         muscles: name -> muscle.
         ligaments: name -> ligament.
         wrap_objects: name -> wrap object.
         offset_frames: name of an offset frame -> its body, and its pose (4, 4) in that body.
-        left_out: "class 'name'" of each element of the file that has no counterpart here.
+        left_out: "class 'name'" of each element of the file that tkamb does not model.
         unread: elements that a partial reading could not read.
         notices: lines on how the file was read.
     """

@@ -1,14 +1,14 @@
 """A model's coordinates over time, their derivatives, and the generalised forces of the motion.
 
-With the twist J_b of body b per unit of the coordinates (in ground, at ground's origin), its
-momentum h_b there, gravity g at its centre of mass c and the other wrenches w_b that act on it, the
+Let J_b be the twists of body b per unit of the coordinates, h_b its momentum, c its centre of mass
+and w_b the wrench of given loads on it, all in ground at ground's origin. With gravity g, the
 generalised forces are
 
     τ = Σ_b J_bᵀ (dh_b/dt - (c × m g, m g) - w_b).
 
-Accelerations are computed from ground outwards. Each axis s with its angle or translation u(q) adds
-s ü + (v × s) u̇, where v is the twist of the body or axis before it and × the cross product of
-twists. Translations come first, then the rotations in turn, seen from the parent frame.
+Accelerations are computed from ground outwards. A joint axis s with the angle or translation u(q)
+adds s ü + (v × s) u̇. Here v is the twist of the previous body or axis, and × is the cross product
+of twists. Within a joint, the translations precede the rotations.
 
 Reference: Featherstone, Rigid Body Dynamics Algorithms (2008), chapters 2 and 5.
 """
@@ -35,15 +35,15 @@ def inverse_dynamics(
 ) -> Array:
     """Return the generalised forces τ (f, n), N·m and N, one for each coordinate.
 
-    Constraints and couplers are not considered: every coordinate counts as independent.
+    Constraints and couplers are ignored: every coordinate counts as independent.
 
     Args:
         kinematics: the chain of the model.
-        q: (f, n) coordinates, rad and m.
-        rates: (f, n) their first derivatives by time.
-        accelerations: (f, n) their second derivatives by time.
-        wrenches: body -> (f, 6) moment (N·m) above force (N) on the body, in ground at ground's
-            origin, such as the ground reaction on a foot.
+        q: coordinates, rad and m, shape (f, n).
+        rates: first time derivatives of the coordinates, shape (f, n).
+        accelerations: second time derivatives of the coordinates, shape (f, n).
+        wrenches: body -> moment (N·m) above force (N) on the body, in ground at ground's origin,
+            shape (f, 6), for example the ground reaction on a foot.
     """
     motion = kinematics.motion(q)
     needed = required_wrenches(kinematics, motion, q, rates, accelerations, wrenches)
@@ -58,18 +58,19 @@ def required_wrenches(
     accelerations: Array,
     wrenches: Mapping[str, Array] | None = None,
 ) -> Array:
-    """Return the further wrench (f, b, 6) on each body, beside gravity and the given wrenches.
+    """Return the wrench (f, b, 6) that each body needs in addition to gravity and given wrenches.
 
-    It is the moment (N·m) above the force (N), in ground at ground's origin; zero for ground. Its
-    sum over the bodies beyond a joint is the wrench of muscles, ligaments and the joint on them.
+    A wrench is the moment (N·m) above the force (N), in ground at ground's origin; it is zero for
+    ground. The sum over the bodies outboard of a joint is the wrench that muscles, ligaments and
+    the joint exert on them.
 
     Args:
         kinematics: the chain of the model.
         motion: poses and twists at q.
-        q: (f, n) coordinates.
-        rates: (f, n) their first derivatives by time.
-        accelerations: (f, n) their second derivatives by time.
-        wrenches: body -> (f, 6), as in `inverse_dynamics`.
+        q: coordinates, rad and m, shape (f, n).
+        rates: first time derivatives of the coordinates, shape (f, n).
+        accelerations: second time derivatives of the coordinates, shape (f, n).
+        wrenches: given wrenches, as in `inverse_dynamics`.
     """
     twists = np.einsum("fbin,fn->fbi", motion.twists, rates)
     result = np.zeros_like(twists)
@@ -104,7 +105,7 @@ def _accelerations(
         inboard, outboard = kinematics.bodies[joint.inboard], kinematics.bodies[joint.outboard]
         carrier = twists[:, kinematics.bodies[joint.parent]]
         total = np.zeros_like(carrier)
-        # Translations lie in the parent frame, beneath the rotations.
+        # Translation axes are fixed to the parent frame, so that they precede the rotations.
         for a in (*range(first + count, last), *range(first, first + count)):
             axis, speed = motion.axes[:, a], speeds[:, a, None]
             total += axis * axis_accelerations[:, a, None] + _cross(carrier, axis) * speed
@@ -116,7 +117,7 @@ def _accelerations(
 
 
 def _cross(twist: Array, axis: Array) -> Array:
-    """Return the cross product (f, 6) of twists: the rate of an axis that moves with a twist."""
+    """Return the cross product (f, 6) of twists, the rate of an axis that moves with a twist."""
     omega, speed = twist[:, :3], twist[:, 3:]
     linear = np.cross(omega, axis[:, 3:]) + np.cross(speed, axis[:, :3])
     return np.hstack([np.cross(omega, axis[:, :3]), linear])
@@ -127,13 +128,13 @@ class AngleUnitSettings:
     """Limits to distinguish angles in degrees from angles in radians."""
 
     max_radians: float = 6.5
-    """rad: largest joint angle that can be in radians. Chosen: a joint never exceeds a whole turn,
-    6.28; in degrees the number is larger in most movements."""
+    """rad: a larger joint angle cannot be in radians. Chosen because no joint exceeds a whole turn,
+    6.28, while angles in degrees are larger in most movements."""
     min_rotation_deg: float = 0.2
-    """deg; a joint that rotates by less in a whole recording does not move, in either unit. Chosen:
-    the noise of a recording has this size."""
+    """deg: a joint that rotates by less in a whole recording is considered fixed. Chosen because
+    the noise of a recording is about as large."""
     max_angle: float = 2.0 * np.pi
-    """rad; no joint of a leg rotates further. Chosen: a whole turn."""
+    """rad: no joint of a leg rotates further. Chosen as a whole turn."""
 
 
 ANGLE_UNIT = AngleUnitSettings()
@@ -144,10 +145,10 @@ class CoordinateMotion:
     """Coordinates over time, in the model's order.
 
     Args:
-        time: (f,) s.
-        q: (f, n) coordinates, rad and m.
-        rates: (f, n) their first derivatives, per s.
-        accelerations: (f, n) their second derivatives, per s².
+        time: times, s, shape (f,).
+        q: coordinates, rad and m, shape (f, n).
+        rates: first time derivatives of the coordinates, per s, shape (f, n).
+        accelerations: second time derivatives of the coordinates, per s², shape (f, n).
     """
 
     time: Array
@@ -157,15 +158,15 @@ class CoordinateMotion:
 
 
 def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tuple[str, ...]]:
-    """Return recorded coordinates, and the names of those that the table lacks.
+    """Return recorded coordinates, and the names of coordinates that the table lacks.
 
     Args:
         kinematics: the chain of the model.
-        recorded: table (`.mot`, `.sto`) with a column for each coordinate, named as in the model or
-            by its path.
+        recorded: table (`.mot`, `.sto`) of the coordinates. A column has the coordinate's name or
+            path in the model.
 
     Returns:
-        Coordinates (f, n), rad and m; those that the table lacks are at their defaults.
+        Coordinates (f, n), rad and m, and names. Missing coordinates have their default values.
 
     Raises:
         InputError: the unit of angles is unknown or impossible, or a column has a gap.
@@ -183,7 +184,7 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
 
 
 def _column_of(name: str, recorded: Table) -> str | None:
-    """Return the column of a coordinate's value, by its name or by its path in a states file.
+    """Return the column of a coordinate's value, or None.
 
     A states file has `/jointset/knee/flexion/value` and `/jointset/knee/flexion/speed`.
     """
@@ -201,7 +202,7 @@ def _column_of(name: str, recorded: Table) -> str | None:
 
 
 def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
-    """Return radians per unit of the angles, from the file's header.
+    """Return the factor from the angles' unit to rad, from the file's header.
 
     Raises:
         InputError: the header does not state the unit, or the angles contradict it.
@@ -231,7 +232,7 @@ def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str,
     Args:
         kinematics: the chain of the model.
         recorded: the table.
-        q: (f, n) coordinates from the table, rad and m.
+        q: coordinates from the table, rad and m, shape (f, n).
     """
     coordinates = kinematics.model.coordinates
     own = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
@@ -260,10 +261,10 @@ def coordinate_motion(
 
     Args:
         kinematics: the chain of the model.
-        time: (m,) s.
-        q: (m, n) coordinates, rad and m; those of dependent coordinates are ignored.
-        cutoff_Hz: as in `differentiate_coordinates`, which also states the errors.
-        at: (f,) s, times of the result; None: `time`.
+        time: times of the samples, s, shape (m,).
+        q: coordinates, rad and m, shape (m, n). Values of dependent coordinates are ignored.
+        cutoff_Hz: cut-off frequency, as in `differentiate_coordinates`, which raises the errors.
+        at: times of the result, s, shape (f,); None: `time`.
         name: name of the data in messages.
     """
     values, rates, second = differentiate_coordinates(time, q, cutoff_Hz, at, name=name)

@@ -1,14 +1,13 @@
 """Lengths and moment arms of muscles and ligaments, by the virtual work of a taut string.
 
-A unit tension acts on each point that the string passes, with the change of its direction there. It
-acts on the wrap objects at the points where the string meets and leaves them. With the wrench w_b
-of all these forces on body b and its twist J_b per unit of the coordinates,
+A string of unit tension exerts a force on each path point, and on each wrap object at the points
+where the string meets and leaves it. Let w_b be the wrench of these forces on body b, and J_b the
+body's twist per unit of the coordinates q. The moment arms are
 
-    -dL/dq = Σ_b w_b · J_b,
+    -dL/dq = Σ_b w_b · J_b.
 
-the moment arms about q. This is exact for a taut string, because sliding along a surface does not
-change its length to first order. For a path point that moves in its body, the work of the tension
-on that motion is added.
+This is exact for a taut string, because sliding along a surface does not change its length to first
+order. For a path point that moves in its body, the work of the tension on this motion is added.
 
 Reference: Sherman, Seth & Delp, Proc ASME IDETC (2013), doi:10.1115/DETC2013-13633.
 """
@@ -34,13 +33,13 @@ from tkamb.io.opensim.wrapping import WrappedStrings, strings_over
 
 @dataclass(frozen=True, eq=False)
 class StraightParts:
-    """The p straight parts of paths that lead from one body to another.
+    """The p straight parts of paths between different bodies.
 
     Args:
-        frame: (p,) index of the coordinate set, in flattened order.
-        line: (p,) index of the muscle or ligament.
-        bodies: (p, 2) index of the body at the beginning and at the end of the part.
-        ends: (p, 2, 3) m, beginning and end of the part in ground.
+        frame: index of the coordinate set, in flattened order, shape (p,).
+        line: index of the muscle or ligament, shape (p,).
+        bodies: indices of the bodies at the start and end of each part, shape (p, 2).
+        ends: start and end of each part in ground, m, shape (p, 2, 3).
     """
 
     frame: Index
@@ -69,10 +68,10 @@ class Tension:
     """Forces of strings of unit tension on path points and bodies, summed part by part.
 
     Args:
-        points: (f, k, 3) m, path points in ground.
-        lines: (k,) line that each point belongs to.
-        bodies: (k,) body that carries it.
-        count: number of lines and of bodies.
+        points: path points in ground, m, shape (f, k, 3).
+        lines: index of each point's muscle or ligament, shape (k,).
+        bodies: index of each point's body, shape (k,).
+        count: number of muscles and ligaments, and number of bodies.
     """
 
     def __init__(self, points: Array, lines: Index, bodies: Index, count: tuple[int, int]) -> None:
@@ -83,7 +82,7 @@ class Tension:
         self._parts: list[tuple[Index, Index, Index, Index, Array, Array]] = []
 
     def pull(self, rows: Index, first: Index, second: Index) -> None:
-        """Add straight strings between points of some rows."""
+        """Add straight strings between the path points `first` and `second` in frames `rows`."""
         start, end = self.points[rows, first], self.points[rows, second]
         u, distance = _direction(start, end)
         self.lengths[rows, first] += distance
@@ -94,7 +93,10 @@ class Tension:
     def pull_wrapped(
         self, rows: Index, k: int, there: Index, strings: WrappedStrings, bodies: Index
     ) -> None:
-        """Add strings from point k to others of some rows, over objects fixed to bodies."""
+        """Add strings from path point k to points `there` in frames `rows`, over wrap objects.
+
+        `bodies` are the indices of the wrap objects' bodies.
+        """
         owner, at = int(self.lines[k]), np.arange(len(rows))
         place, last = self.points[rows, k], np.full(len(rows), -1)
         for gap in range(len(bodies) + 1):
@@ -124,7 +126,7 @@ class Tension:
             place = strings.exit[at, last]
 
     def press_points(self) -> None:
-        """Add the pulls on the path points to the wrenches."""
+        """Add the forces on the path points to the wrenches."""
         wrenches = np.concatenate([np.cross(self.points, self.pulls), self.pulls], axis=-1)
         count = self.wrenches.shape[2]
         place = self.lines * count + self.bodies
@@ -150,7 +152,10 @@ class Tension:
 
 
 def _direction(start: Array, end: Array) -> tuple[Array, Array]:
-    """Return unit vectors (f, 3) from start to end, 0 where they coincide, and distances (f,)."""
+    """Return unit vectors (f, 3) from start to end, and distances (f,).
+
+    The vector is zero if start and end coincide.
+    """
     step = end - start
     distance = np.linalg.norm(step, axis=-1)
     return step / np.maximum(distance, 1e-300)[:, None], distance
@@ -158,13 +163,13 @@ def _direction(start: Array, end: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class PathSettings:
-    """How the paths of muscles and ligaments are evaluated."""
+    """Settings of the evaluation of muscle and ligament paths."""
 
     condition_tolerance: float = 1e-5
-    """rad or m; margin of the range of a conditional path point, as in OpenSim."""
+    """rad or m: margin of the range of a conditional path point, as in OpenSim."""
     block_frames: int = 256
-    """Number of frames that are evaluated in one call. Chosen: it limits arrays to some tens of
-    megabytes and changes no result."""
+    """frames: number that is evaluated in one call. It does not change the result. Chosen because
+    it limits the arrays to some tens of megabytes."""
 
 
 PATH = PathSettings()
@@ -176,8 +181,9 @@ class Lines:
 
     Args:
         names: names of the m muscles or ligaments.
-        lengths_m: (..., m); NaN where no taut string was found.
-        moment_arms: (..., m, n) -dL/dq, m per rad or per m, coordinates in the model's order.
+        lengths_m: lengths, shape (..., m); NaN if no taut string was found.
+        moment_arms: -dL/dq, m per rad or m per m, shape (..., m, n), with the coordinates in the
+            model's order.
     """
 
     names: tuple[str, ...]
@@ -187,13 +193,13 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Pulls(Lines):
-    """Taut paths, and the wrenches of unit tension in them on g groups of bodies.
+    """Taut paths, and the wrenches that unit tensions in them exert on g groups of bodies.
 
     Args:
-        wrenches: (..., m, g, 6) moment (N·m per N) above force (N per N) on each group, in ground
-            at ground's origin.
-        crossings: straight parts from one group to another. Their `bodies` are indices of groups,
-            -1 for bodies of no group.
+        wrenches: moment (N·m per N) above force (N per N) on each group, in ground at ground's
+            origin, shape (..., m, g, 6).
+        crossings: straight parts between different groups. Their `bodies` are indices of groups;
+            -1 means a body outside all groups.
     """
 
     wrenches: Array
@@ -205,10 +211,10 @@ class LineSet:
 
     Args:
         kinematics: the chain of the model.
-        names: names of its muscles and ligaments; None: all muscles.
+        names: names of muscles and ligaments; None: all muscles.
 
     Raises:
-        InputError: the model has no muscle or ligament of a name.
+        InputError: the model has no muscle or ligament with one of the names.
     """
 
     def __init__(self, kinematics: Kinematics, names: Iterable[str] | None = None) -> None:
@@ -241,7 +247,7 @@ class LineSet:
         """Return lengths, moment arms, wrenches on groups of bodies, and crossings between groups.
 
         Args:
-            q: (..., n) coordinates, rad and m.
+            q: coordinates, rad and m, shape (..., n).
             groups: names of the bodies in each of the g groups.
         """
         q = self.kinematics.vector(q)
@@ -263,13 +269,13 @@ class LineSet:
         return Pulls(self.names, length, arm, wrench, StraightParts.joined(parts))
 
     def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
-        """Yield blocks of frames: index of the first frame, and coordinates (f, n)."""
+        """Yield, for each block of frames, the index of its first frame and coordinates (f, n)."""
         flat = q.reshape(-1, q.shape[-1])
         for first in range(0, len(flat), PATH.block_frames):
             yield first, flat[first : first + PATH.block_frames]
 
     def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
-        """Return blocks (f, m, ...) joined to arrays with the leading shape of q."""
+        """Join blocks (f, m, ...) to arrays with the leading shape of q."""
         whole = [np.concatenate(parts) for parts in columns]
         return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in whole]
 
@@ -304,7 +310,10 @@ class LineSet:
         return lengths, arms, work
 
     def _own_motion(self, q: Array) -> tuple[Array, list[tuple[int, int, Array]]]:
-        """Return points (f, k, 3) in their bodies, and (point, coordinate, dp/dq (f, 3))."""
+        """Return the points (f, k, 3) in their bodies, and derivatives of moving points.
+
+        A derivative is a tuple (index of the point, index of the coordinate, dp/dq (f, 3)).
+        """
         locations = np.broadcast_to(self._locations, (len(q), *self._locations.shape)).copy()
         rates = []
         for k, point in enumerate(self._points):
@@ -320,7 +329,7 @@ class LineSet:
         return locations, rates
 
     def _followers(self, q: Array) -> Index:
-        """Return the index (f, k) of the active point that follows each active point; -1: none."""
+        """Return the index (f, k) of the next active point after each active point; -1: none."""
         follower = np.full((len(q), len(self._points)), -1)
         ends = set(self._last.tolist())
         upcoming = np.full(len(q), -1)
@@ -351,7 +360,7 @@ class LineSet:
         motion: Motion,
         work: Tension,
     ) -> None:
-        """Add the strings from point k to points `there` of some rows, over the path's wraps."""
+        """Add strings from point k to points `there` in frames `rows`, over the path's wraps."""
         objects = self.kinematics.model.wrap_objects
         usable = [w for w in path.wraps if first + w.first <= k and objects[w.wrap_object].active]
         wraps = [objects[w.wrap_object] for w in usable]

@@ -1,8 +1,8 @@
-"""An .osim file read into an `OpenSimModel`, without OpenSim.
+"""Reading of an .osim file into an `OpenSimModel`, without OpenSim.
 
 tkamb reads the layout of OpenSim 4 (sockets, offset frames, sets of joints), the older layout
 (joints nested in their bodies), and sets in separate files. An element that cannot be read is an
-error or, in a partial reading, listed in `unread`. Elements without a counterpart here, such as
+error. A partial reading lists it in `unread` instead. Elements that tkamb does not model, such as
 contact forces, are listed in `left_out`.
 """
 
@@ -34,7 +34,7 @@ UNITS = {
     "length_units": ("meters", "meter", "metres", "metre", "m"),
     "force_units": ("n", "newton", "newtons"),
 }
-"""Spellings of metre and newton in public models."""
+"""Tag of a unit -> accepted spellings of metre and newton."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class ModelReadSettings:
     """Limits on the OpenSim models that are read."""
 
     oldest_version: int = 20302
-    """Oldest version of a file: that of OpenSim 2.3.2. Older files use other names."""
+    """Oldest version of a file that is read, from OpenSim 2.3.2. Older files use other names."""
     massless_below: float = 2e-14
-    """kg; a lighter body has no inertia, as in OpenSim's Body::getInertia."""
+    """kg: a lighter body has no inertia, as in OpenSim's Body::getInertia."""
 
 
 MODEL_READ = ModelReadSettings()
@@ -56,7 +56,7 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
     Args:
         path: the file.
         partial: whether joints, constraints, forces, wrap objects and markers that cannot be read
-            are listed in `unread`, instead of an error. A joint is welded if only its motion
+            are listed in `unread`; otherwise they are errors. A joint is welded if only its motion
             cannot be read.
 
     Raises:
@@ -122,7 +122,7 @@ def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element
     """Return the document and its <Model>.
 
     Raises:
-        InputError: it is no OpenSim model, too old, or in other units than metres and newtons.
+        InputError: the file is no OpenSim model, is too old, or has units other than m and N.
     """
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
@@ -171,7 +171,7 @@ def _bodies(document: Document, model: Element) -> dict[str, Body]:
 
 
 def _inertia(document: Document, element: Element) -> Array:
-    """Return the inertia (3, 3) kg·m² about the centre of mass, from either layout."""
+    """Return the inertia (3, 3), kg·m², about the centre of mass, from an old or new file."""
     if document.find(element, "inertia") is not None:
         xx, yy, zz, xy, xz, yz = document.numbers(element, "inertia", count=6)
     else:
@@ -212,7 +212,7 @@ def _constraints(
 def _check_follower(
     document: Document, element: Element, new: CoordinateCoupler, others: list[CoordinateCoupler]
 ) -> None:
-    """Raise if a coordinate would depend on two coordinates or, through couplers, on itself."""
+    """Raise an InputError if a coordinate would depend on two coordinates or on itself."""
     leads = {coupler.dependent: coupler.independent for coupler in others}
     if new.dependent in leads:
         raise InputError(
@@ -226,7 +226,7 @@ def _check_follower(
 
 
 def _followers_last(couplers: list[CoordinateCoupler]) -> tuple[CoordinateCoupler, ...]:
-    """Return the couplers in an order that sets each independent coordinate before it is used."""
+    """Return the couplers, ordered so that each coordinate is set before others depend on it."""
     ordered: list[CoordinateCoupler] = []
     waiting = list(couplers)
     while waiting:

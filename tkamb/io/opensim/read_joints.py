@@ -1,4 +1,4 @@
-"""Frames and joints of an OpenSim document, and the order of the joints from ground outwards."""
+"""Reading of frames and joints from an OpenSim document, and ordering of the joints."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -27,11 +27,11 @@ STANDARD_JOINTS: dict[str, tuple[tuple[Array, ...], tuple[Array, ...]]] = {
     "GimbalJoint": ((X, Y, Z), ()),
     "FreeJoint": ((X, Y, Z), (X, Y, Z)),
 }
-"""Class of a joint -> its axes of rotation and of translation, each with its own coordinate."""
+"""Class of a joint -> its rotation axes and translation axes. Each axis has one coordinate."""
 
 
 def offset_pose(rotation_xyz: Array, translation: Array) -> Array:
-    """Return the pose (4, 4) of intrinsic x, y, z rotations (3,) rad and a translation (3,) m."""
+    """Return the pose (4, 4) with intrinsic x, y, z rotations, rad, and a translation, m."""
     return pose(Rotation.from_euler("XYZ", rotation_xyz).as_matrix(), translation)
 
 
@@ -39,14 +39,14 @@ def offset_pose(rotation_xyz: Array, translation: Array) -> Array:
 class Frames:
     """Bodies and the offset frames that are fixed to them.
 
-    A frame's name is unique only within its owner: several joints may have frames of the same name
-    with different values. Frames are therefore stored by owner and name.
+    Several joints may have frames of the same name with different values. Frames are therefore
+    stored by owner and name.
 
     Args:
         document: the document, for messages.
         bodies: names of the bodies, including ground.
-        offsets: (owner, frame) -> the frame's parent, and its pose (4, 4) in the parent.
-        unread: name of a frame -> why it could not be read.
+        offsets: (owner, frame) -> the frame's parent, and the frame's pose (4, 4) in the parent.
+        unread: name of a frame -> reason for which it could not be read.
     """
 
     document: Document
@@ -75,15 +75,16 @@ class Frames:
         return cls(document, frozenset(bodies), offsets, unread)
 
     def resolve(self, user: Element, socket: str, owner: str = "") -> tuple[str, Array]:
-        """Return the body of a socket's frame, and the pose (4, 4) of that frame in the body.
+        """Return the body of a socket's frame, and the pose (4, 4) of the frame in the body.
 
         Args:
             user: the element with the socket, for messages.
-            socket: "/bodyset/tibia", "tibia", "tibia_offset", "/jointset/knee/tibia_offset" …
-            owner: joint whose frames are searched first.
+            socket: path or name of a frame, such as "/bodyset/tibia", "tibia", "tibia_offset" or
+                "/jointset/knee/tibia_offset".
+            owner: joint with the frames that are searched first.
 
         Raises:
-            InputError: no such frame.
+            InputError: the frame does not exist or could not be read.
         """
         steps = [step for step in socket.split("/") if step not in ("", ".", "..")]
         in_body = np.eye(4)
@@ -104,13 +105,13 @@ class Frames:
         raise InputError(f"names a frame '{socket}' that is not there", self.document.where(user))
 
     def point(self, user: Element, socket: str, location: Array) -> tuple[str, Array]:
-        """Return the body of a socket's frame, and a point (3,) m of that frame in the body."""
+        """Convert a point (3,), m, of a socket's frame to its body. Return body and point."""
         body, in_body = self.resolve(user, socket)
         return body, transform(in_body, location)
 
 
 def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
-    """Yield the name of the owning body, joint or frame, and the element, of every frame."""
+    """Yield, for every frame, the name of the owning body, joint or frame, and the element."""
     for child in element:
         if child.tag in FRAMES:
             yield owner, child
@@ -119,7 +120,7 @@ def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
 
 
 def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
-    """Return name -> all stations and markers of that name in the model."""
+    """Return name -> all stations and markers with this name in the model."""
     result: dict[str, list[Element]] = {}
     for element in model.iter():
         if element.tag in ("Station", "Marker"):
@@ -130,14 +131,15 @@ def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
 def _station_defined(
     document: Document, element: Element, owner: str, stations: Mapping[str, list[Element]]
 ) -> tuple[str, Array]:
-    """Return the parent of a frame that four stations define, and its pose (4, 4) in the parent.
+    """Return the parent of a frame that four stations define, and the pose (4, 4) in the parent.
 
-    With the points a, b, c: e1 along b - a, e2 along (b - a) × (c - a). The frame's axis `ab_axis`
-    has the direction of e1, `ab_x_ac_axis` that of e2, and the third axis completes a right-handed
-    frame (OpenSim's StationDefinedFrame, https://opensim-org.github.io).
+    Three stations are the points a, b, c; the fourth is the origin. The frame's axis `ab_axis` is
+    along b - a, and its axis `ab_x_ac_axis` is along (b - a) × (c - a). The third axis completes a
+    right-handed frame (OpenSim's StationDefinedFrame, https://opensim-org.github.io).
 
     Raises:
-        InputError: no such station, stations in different frames, or collinear points.
+        InputError: a station does not exist, stations are in different frames, or points are
+            collinear.
     """
     where, points, parents = document.where(element), [], set()
     for name in ("point_a", "point_b", "point_c", "origin_point"):
@@ -177,7 +179,7 @@ def read_joints(
     """Return the joints and coordinates in the file's order.
 
     Raises:
-        InputError: a joint is of a class that is not read, or is malformed.
+        InputError: the class of a joint is not supported, or a joint is malformed.
     """
     joints: list[Joint] = []
     coordinates: dict[str, Coordinate] = {}
@@ -195,7 +197,7 @@ def read_joints(
 def _joint(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[Joint, dict[str, Coordinate]]:
-    """Return a joint and its coordinates; in a partial reading, welded if its motion is unread."""
+    """Return a joint and its coordinates. A partial reading welds a joint of unreadable motion."""
     (parent, in_parent), (body, in_child) = _joint_frames(document, element, frames, child)
     entries = [*document.objects(element, "CoordinateSet"), *element.findall("coordinates/*")]
     names = [document.name(entry) for entry in entries]
@@ -212,14 +214,14 @@ def _joint(
         coordinate = _coordinate(document, entry, name, axes[0])
         if coordinate.name in own:
             raise InputError("is there twice", document.where(entry), "rename one")
-        # A coordinate without an axis moves nothing, so that no motion can change it.
+        # A coordinate without an axis moves no body, so that it is treated as locked.
         still = coordinate.name not in coordinates
         own[coordinate.name] = replace(coordinate, locked=True) if still else coordinate
     return Joint(name, element.tag, parent, body, in_parent, in_child, *axes, unread=unread), own
 
 
 def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Element, str | None]]:
-    """Yield each joint with the name of its child body in the old layout, else with None."""
+    """Yield each joint, and the name of its child body (old layout) or None (OpenSim 4)."""
     for element in document.objects(model, "JointSet"):
         yield element, None
     for body in document.objects(model, "BodySet"):
@@ -230,7 +232,7 @@ def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Elemen
 def _joint_frames(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[tuple[str, Array], tuple[str, Array]]:
-    """Return the body and the pose (4, 4) of the joint's frame in it, for parent and child."""
+    """Return, for parent and child, the body and the pose (4, 4) of the joint's frame in it."""
     if child is None:
         name = document.name(element)
         sockets = (document.socket(element, f"{end}_frame") for end in ("parent", "child"))
@@ -270,7 +272,7 @@ def _standard_axes(
 def _custom_axes(
     document: Document, element: Element, names: list[str]
 ) -> tuple[tuple[JointAxis, ...], tuple[JointAxis, ...]]:
-    """Return the axes of a <SpatialTransform>, without those that have no effect."""
+    """Return the rotation and translation axes of a <SpatialTransform> that have an effect."""
     kinds: dict[str, list[JointAxis]] = {"rotation": [], "translation": []}
     transform_element = document.find(element, "SpatialTransform")
     if transform_element is None:
@@ -279,8 +281,8 @@ def _custom_axes(
         axis = _axis(document, element, entry, names)
         if k >= 6:
             raise InputError("has more than six axes", document.where(element))
-        at_rest = axis.coordinate is None and axis.function(np.zeros(1))[0] == 0.0
-        if not at_rest:
+        no_effect = axis.coordinate is None and axis.function(np.zeros(1))[0] == 0.0
+        if not no_effect:
             kinds["rotation" if k < 3 else "translation"].append(axis)
     return tuple(kinds["rotation"]), tuple(kinds["translation"])
 
@@ -316,7 +318,7 @@ def _coordinate(
 
 
 def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
-    """Return whether a coordinate is the angle of a rotation, and not only its function's input."""
+    """Return whether the angle about an axis equals a coordinate, apart from sign and offset."""
     function = axis.function
     straight = isinstance(function, Linear) and abs(function.gradient) == 1.0
     return axis.coordinate == coordinate and straight
@@ -325,8 +327,8 @@ def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
 def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
     """Return the joints in order from ground outwards, with `backwards` set.
 
-    In a partial reading, a joint that closes a loop is left out. A body without a chain of joints
-    to ground is welded to ground by a joint that is marked as unread.
+    A partial reading leaves out a joint that closes a loop. It welds a body without a chain of
+    joints to ground, and marks the weld as unread.
 
     Raises:
         InputError: the joints form a loop, or a body has no chain of joints to ground.
@@ -361,7 +363,7 @@ def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> 
 def _hold_still(
     document: Document, body: str, reason: str, ordered: list[Joint], hint: str | None = None
 ) -> None:
-    """Weld a body to ground in a partial reading, and record the reason; otherwise raise."""
+    """Weld a body to ground and record the reason. Unless the reading is partial, raise."""
     weld = Element("WeldJoint", {"name": f"{body} held still"})
     weld.text = body
     with document.reading(weld):

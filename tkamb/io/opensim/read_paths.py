@@ -1,4 +1,4 @@
-"""Muscles, ligaments, their paths and wrap objects from an OpenSim document."""
+"""Reading of muscles, ligaments, their paths and wrap objects from an OpenSim document."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -35,7 +35,7 @@ MUSCLES = (
     "DeGrooteFregly2016Muscle",
     "RigidTendonMuscle",
 )
-"""Classes of muscles. They differ in their curves; the parameters that are read are the same."""
+"""Supported classes of muscles. They share the parameters that tkamb reads."""
 
 SHAPES: dict[str, tuple[Shape, tuple[str, ...]]] = {
     "WrapCylinder": ("cylinder", ("radius", "length")),
@@ -48,10 +48,10 @@ METHODS = ("hybrid", "midpoint", "axial")
 
 
 def read_wrap_objects(document: Document, model: Element) -> dict[str, WrapObject]:
-    """Return name -> wrap object of all bodies; if two have one name, the first, as in OpenSim.
+    """Return name -> wrap object, of all bodies. The first of equal names counts, as in OpenSim.
 
     Raises:
-        InputError: a shape that is not read, or a dimension that is not positive.
+        InputError: a shape is not supported, or a dimension is not positive.
     """
     result: dict[str, WrapObject] = {}
     ground = [] if (element := model.find("Ground")) is None else [element]
@@ -103,10 +103,10 @@ def read_forces(
     coordinates: Mapping[str, Coordinate],
     wraps: Mapping[str, WrapObject],
 ) -> tuple[dict[str, OpenSimMuscle], dict[str, OpenSimLigament], list[str]]:
-    """Return muscles, ligaments, and "class 'name'" of the forces left out.
+    """Return muscles, ligaments, and "class 'name'" of each force that is left out.
 
     Raises:
-        InputError: a class of muscle or ligament that is not read, or an error in a path.
+        InputError: a class of muscle or ligament is not supported, or a path is malformed.
     """
     muscles: dict[str, OpenSimMuscle] = {}
     ligaments: dict[str, OpenSimLigament] = {}
@@ -185,7 +185,7 @@ def _ligament(document: Document, element: Element, path: Path) -> OpenSimLigame
 
 
 class _PathReader:
-    """Reads the path of a muscle or ligament."""
+    """Reader of muscle and ligament paths."""
 
     def __init__(
         self,

@@ -1,28 +1,30 @@
 """Taut strings between two points over wrap objects: cylinder, sphere, ellipsoid, torus.
 
-One object at a time, in its own frame and for many strings at once. A string touches an object
-where the straight line would pass through it or, if a half is prescribed, on the wrong side of it.
-A string with an end inside the object ignores the object, as in OpenSim. Lengths are those of the
-shortest string, so that dL/dq follows from the directions at its ends alone.
+The strings around a single object are computed in its frame, many strings at once. A string touches
+an object if the straight line would pass through it. If the half of the object is prescribed, a
+string also touches if the straight line passes on the wrong side. A string with an end inside the
+object ignores the object, as in OpenSim. Each string is the shortest, so that dL/dq follows from
+its directions at the ends alone.
 
-Around a circle of radius r, from the distance d₁ to d₂, swept angle Δ about the centre:
+Let r be the radius of a circle, d₁ and d₂ the distances of the string's ends from its centre, and Δ
+the angle between the ends. The arc θ and the length S are
 
     θ = Δ - acos(r/d₁) - acos(r/d₂),   S = √(d₁² - r²) + r θ + √(d₂² - r²),   touching if θ > 0.
 
-A cylinder is unrolled: L = √(S² + Δz²), z linear in S.
+A cylinder is unrolled: L = √(S² + Δz²), with z linear in S.
 
-A path point of another body may move into an ellipsoid. In OpenSim the string then ignores the
-ellipsoid at once, and its length jumps by up to 14 mm. Here the ellipsoid shrinks with the point,
-so that the length is continuous. With the size k = |P/a|, and L homogeneous of degree one in P, Q
-and k,
+A path point P of another body may move into an ellipsoid. In OpenSim the string then ignores the
+ellipsoid at once, and its length jumps by up to 14 mm. In tkamb the ellipsoid shrinks with the
+point by the factor k = |P/a|, so that the length is continuous. L is homogeneous of degree one in
+P, Q and k, so that
 
     ∂L/∂k = (L + P·u_P - Q·u_Q) / k,
 
-where u_P and u_Q are the string's directions at P and Q. The point is pushed out by -∂L/∂k ∂k/∂P.
+where u_P and u_Q are the string's directions at P and Q. The force on the point is -∂L/∂k ∂k/∂P.
 
-Several objects are passed in turn, with the touching points on the others fixed, until no touching
-point moves. Then every straight part is tangent to the objects at both its ends, and the string is
-taut.
+For several objects, the iteration updates the touching points on one object after the other. It has
+converged when no touching point moves. Then every straight part is tangent to the objects at its
+ends, so that the string is taut.
 """
 
 from collections.abc import Sequence
@@ -40,11 +42,11 @@ class WrapSettings:
     """Wrapping of a string around a single wrap object."""
 
     ring_places: int = 48
-    """Number of places on a torus's ring that are tried in the search for the string's place.
-    Chosen: one every 7.5 deg."""
+    """Number of angles on a torus's ring at which the string is tried. Chosen as one every 7.5
+    deg."""
     ellipsoid_clearance: float = 1e-3
-    """Share (1) of its size: gap between a shrunken ellipsoid and the point that moves into it.
-    Chosen: above rounding, and without effect on a muscle's length."""
+    """Gap between a shrunken ellipsoid and the point inside the original one, as a share of the
+    ellipsoid's size. Chosen because it exceeds rounding and hardly changes a muscle's length."""
 
 
 WRAP = WrapSettings()
@@ -55,11 +57,11 @@ class WrapTouch:
     """Touching points of f strings on a wrap object, in its frame.
 
     Args:
-        touches: (f,) whether a string touches; the other values hold only for strings that do.
-        entry: (f, 3) m, point where the string meets the object.
-        exit: (f, 3) m, point where it leaves.
-        arc_m: (f,) length on the object.
-        push: (f, 2, 3) force of a shrinking object on start and end, per unit tension.
+        touches: mask of the strings that touch, shape (f,). Other values hold only for these.
+        entry: points where the strings meet the object, m, shape (f, 3).
+        exit: points where the strings leave the object, m, shape (f, 3).
+        arc_m: lengths on the object, m, shape (f,).
+        push: force of a shrinking object on start and end, per unit tension, shape (f, 2, 3).
     """
 
     touches: Mask
@@ -74,9 +76,10 @@ def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> WrapTouch:
 
     Args:
         wrap: the object.
-        start: (f, 3) m, in the object's frame.
-        end: (f, 3) m, in the object's frame.
-        moves: (f, 2) whether start and end are path points of another body than the object's.
+        start: starts of the strings in the object's frame, m, shape (f, 3).
+        end: ends of the strings in the object's frame, m, shape (f, 3).
+        moves: whether start and end are path points of another body than the object's, shape
+            (f, 2).
     """
     if wrap.shape == "cylinder":
         return _cylinder(start, end, wrap.dimensions[0], wrap.dimensions[1], wrap.quadrant)
@@ -92,7 +95,7 @@ def _no_push(start: Array) -> Array:
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
-    """Return distance (f,) m and angle (f,) rad of points (f, 3) m from the z axis."""
+    """Return distances (f,), m, from the z axis and polar angles (f,), rad, of points (f, 3), m."""
     return np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
 
 
@@ -107,13 +110,14 @@ def _around(
     """Return a taut string around a circle.
 
     Args:
-        distances: (f,) m, distances of start and end from the centre.
-        sweep: (f,) rad, signed angle about the centre from start to end, on the string's side.
-        radius: radius (m).
+        distances: distances of start and end from the centre, m, each of shape (f,).
+        sweep: signed angle about the centre from start to end, on the string's side, rad, shape
+            (f,).
+        radius: radius of the circle, m.
 
     Returns:
-        Signed angle (f,) rad on the circle, 0 where the string does not touch; angle (f,) rad from
-        the start to the touching point; lengths (f,) m of both straight parts.
+        Signed angle of the arc (f,), rad, zero if the string does not touch; angle (f,) from the
+        start to the touching point, rad; lengths of the two straight parts (f,), m.
     """
     first, second = (np.sqrt(np.maximum(d**2 - radius**2, 0.0)) for d in distances)
     away = np.arctan2(first, radius), np.arctan2(second, radius)
@@ -125,12 +129,13 @@ def _around(
 def _cylinder(
     start: Array, end: Array, radius: float, length: float, quadrant: tuple[int, int] | None
 ) -> WrapTouch:
-    """Return strings around a cylinder along z; one that passes beyond its ends does not touch."""
+    """Return strings around a cylinder along z. A string beyond its ends does not touch."""
     (near, angle), (far, last) = _polar(start), _polar(end)
     if quadrant is None or quadrant[0] == 2:
         sweep = _wrapped(last - angle)
     else:
-        # Angles are relative to the middle of the half: no string crosses the other half's middle.
+        # Angles are relative to the middle of the prescribed half. A string thus never crosses the
+        # middle of the other half.
         axis, sign = quadrant
         middle = 0.5 * np.pi * axis + (np.pi if sign < 0 else 0.0)
         sweep = _wrapped(last - middle) - _wrapped(angle - middle)
@@ -150,8 +155,8 @@ def _cylinder(
 def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> WrapTouch:
     """Return strings around a sphere, each in the plane of its ends and the centre.
 
-    With a prescribed half, a string takes the long way round if only that way passes on the half,
-    unless both its ends lie on that half.
+    If a half is prescribed and the short way passes on the other half, a string takes the long way.
+    It takes the short way if both ends lie on the prescribed half.
     """
     near, far = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
     along, towards = start / near[:, None], end / far[:, None]
@@ -177,13 +182,13 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
 def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     """Return strings through a torus about z, in contact with the inside of its ring.
 
-    The ring is replaced by a cylinder along its tangent at one place: the place at which the string
-    is longest. There the length is stationary, so that the place does not enter dL/dq.
+    The ring is replaced by a cylinder along its tangent, at the angle at which the string is
+    longest. The length is stationary there, so that dL/dq does not depend on the angle's change.
     """
     rows = np.arange(len(start))
 
     def at(places: Array) -> tuple[WrapTouch, Array, Array]:
-        """Return touching points, lengths (f,) m and frames of cylinders at angles (f,) rad."""
+        """Return touching points, lengths (f,), m, and frames of cylinders at angles (f,), rad."""
         inward = -np.column_stack([np.cos(places), np.sin(places), np.zeros_like(places)])
         up = np.broadcast_to([0.0, 0.0, 1.0], inward.shape)
         frame = np.stack([inward, up, np.cross(inward, up)], axis=1)
@@ -213,7 +218,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
 def _ellipsoid(
     start: Array, end: Array, axes: Array, quadrant: tuple[int, int] | None, moves: Mask
 ) -> WrapTouch:
-    """Return strings around an ellipsoid: geodesics, if the straight line would cut it."""
+    """Return strings around an ellipsoid. A string touches if its straight line would cut it."""
     p, q = start / axes, end / axes
     depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
     size = np.where(moves, depth / (1.0 + WRAP.ellipsoid_clearance), 1.0).min(axis=1)
@@ -246,14 +251,14 @@ class StringSettings:
     """Iteration for the taut string over several wrap objects."""
 
     max_sweeps: int = 100
-    """Largest number of sweeps over all objects; a string that has not converged by then fails.
-    Chosen: strings that converge need fewer."""
+    """Largest number of sweeps over all objects. A string that needs more fails. Chosen because
+    strings that converge need fewer."""
     max_extrapolation: float = 10.0
-    """Largest extrapolation, as a multiple of the last step. Chosen: two sweeps do not support
-    more."""
+    """Largest extrapolation, as a multiple of the last step. Chosen because two sweeps do not
+    support a larger one."""
     tolerance: float = 1e-10
-    """m; a string has converged when a sweep moves no coordinate of a touching point by more.
-    Chosen: far below what changes a muscle's length."""
+    """m: a string has converged if a sweep changes no coordinate of a touching point by more.
+    Chosen because such a change does not matter to a muscle's length."""
 
 
 STRING = StringSettings()
@@ -264,11 +269,12 @@ class WrappedStrings:
     """f strings over w objects.
 
     Args:
-        order: (f, w) indices of the objects that a string touches, from start to end, then -1.
-        entry: (f, w, 3) m, point where the string meets an object.
-        exit: (f, w, 3) m, point where it leaves the object.
-        arc_m: (f, w) length on the object; NaN where the iteration has not converged.
-        push: (f, w, 2, 3) force of a shrinking object on start and end, per unit tension.
+        order: indices of the objects that a string touches, from start to end, then -1, shape
+            (f, w).
+        entry: points where the strings meet the objects, m, shape (f, w, 3).
+        exit: points where the strings leave the objects, m, shape (f, w, 3).
+        arc_m: lengths on the objects, m, shape (f, w); NaN if the iteration has not converged.
+        push: force of a shrinking object on start and end, per unit tension, shape (f, w, 2, 3).
     """
 
     order: Index
@@ -286,15 +292,15 @@ def strings_over(
     allowed: Mask,
     moves: Mask,
 ) -> WrappedStrings:
-    """Return the taut strings between points, over the objects in their way.
+    """Return the taut strings between points, over the objects between them.
 
     Args:
         wraps: w objects, in the order in which they are tried.
-        poses: (f, w, 4, 4) poses of the objects in the frame of the points.
-        start: (f, 3) m, first points.
-        end: (f, 3) m, last points.
-        allowed: (f, w) whether a string may touch an object.
-        moves: (f, w, 2) whether the start and the end belong to another body than object w.
+        poses: poses of the objects in the frame of the points, shape (f, w, 4, 4).
+        start: first points, m, shape (f, 3).
+        end: last points, m, shape (f, 3).
+        allowed: whether a string may touch an object, shape (f, w).
+        moves: whether start and end belong to another body than object w, shape (f, w, 2).
     """
     strings = _Strings(wraps, poses, start, end, moves)
     if len(wraps) == 1:
@@ -320,9 +326,9 @@ def strings_over(
 
 
 def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array) -> Array:
-    """Return the extrapolation (f, 6w) m from the last two sweeps (Aitken, Anderson).
+    """Return the extrapolation (f, 6w), m, from the last two sweeps (Aitken, Anderson).
 
-    It is zero before two sweeps over the same objects, and where it would be too large.
+    It is zero until two sweeps touch the same objects, and if it would be too large.
     """
     change = residual - last_residual
     squared = np.maximum((change**2).sum(axis=1), 1e-300)
@@ -333,7 +339,7 @@ def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array
 
 
 class _Strings:
-    """State of the iteration of `strings_over`, which describes the arguments."""
+    """State of the iteration in `strings_over`, with the same arguments."""
 
     def __init__(
         self, wraps: Sequence[WrapObject], poses: Array, start: Array, end: Array, moves: Mask
@@ -350,13 +356,13 @@ class _Strings:
         return WrappedStrings(self.order, self.entry, self.exit, self.arc, self.push)
 
     def places(self) -> Array:
-        """Return the touching points (f, 6w) m, one row for each string."""
+        """Return the touching points of each string in one row, m, shape (f, 6w)."""
         return np.concatenate([self.entry, self.exit], axis=2).reshape(len(self.start), -1)
 
     def place(self, places: Array) -> None:
-        """Set the touching points from rows (f, 6w) m."""
-        both = places.reshape(*self.order.shape, 6)
-        self.entry, self.exit = both[..., :3].copy(), both[..., 3:].copy()
+        """Set the touching points from rows (f, 6w), m."""
+        points = places.reshape(*self.order.shape, 6)
+        self.entry, self.exit = points[..., :3].copy(), points[..., 3:].copy()
 
     def sweep(self, rows: Index, allowed: Mask) -> None:
         """Update the touching points of some strings on each allowed object (f, w) in turn."""
@@ -366,9 +372,9 @@ class _Strings:
 
     def remove(self, w: int, rows: Index) -> None:
         """Remove object w from the path of some strings."""
-        kept = np.where(self.order[rows] == w, -1, self.order[rows])
-        closed = np.argsort(kept < 0, axis=1, kind="stable")
-        self.order[rows] = np.take_along_axis(kept, closed, axis=1)
+        order = np.where(self.order[rows] == w, -1, self.order[rows])
+        closed = np.argsort(order < 0, axis=1, kind="stable")
+        self.order[rows] = np.take_along_axis(order, closed, axis=1)
 
     def insert(self, w: int, free: Index) -> None:
         """Wrap some strings around object w, in the first straight part that meets it."""

@@ -1,4 +1,4 @@
-"""The scene file, and the case that is read from it."""
+"""The scene file, and the case: the scene with the content of its files."""
 
 from tkamb.io.scene.scene import Scene, load_scene, scene_schema, with_overrides, with_preset
 

@@ -1,4 +1,4 @@
-"""A case: a scene and the content of its files, in SI, as a right knee."""
+"""A case: a scene and the content of its files, in SI units. A left knee is mirrored."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -36,25 +36,26 @@ logger = logging.getLogger("tkamb")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """The input of a run. Parts that are not in the scene are None.
+    """The input of a run. Parts that are absent from the scene are None.
 
     Args:
         scene: the scene of the file.
         chain: kinematic chain of the patient.
-        motion: knee (and recorded patella) coordinates per frame.
-        tibia: the shank in the laboratory; None: it is upright and does not move.
+        motion: coordinates of the knee, and of a recorded patella, per frame.
+        tibia: motion of the shank in the laboratory; None: the shank is upright and does not move.
         ground: ground reaction in the laboratory.
         femoral: femoral component in the femur link's frame.
-        insert: insert in the insert frame, without its post if that is a separate surface.
+        insert: insert in the insert frame, without its post if `post` is given.
         patella: patellar button in the patella link's frame.
-        ligaments: the bundles, also generic ones; slack length NaN if the scene has none.
+        ligaments: the bundles, including generic ones; the slack length is NaN if the scene does
+            not state it.
         muscles: the muscles.
         patellar_ligament: the patellar ligament.
         measured: forces that an instrumented implant measured.
         emg: envelopes of the muscles' surface EMG.
         post: the insert's post in the insert frame, if the scene has [contact] post.
-        insert_placement: (4, 4) m, pose in the insert frame of the insert's mesh in anatomical
-            axes, about its own origin and not mirrored; None if not needed.
+        insert_placement: pose in the insert frame of the insert's mesh, turned to anatomical axes
+            about the mesh origin and not mirrored, m, shape (4, 4); None if not needed.
     """
 
     scene: Scene
@@ -75,22 +76,27 @@ class Case:
 
     @cached_property
     def split(self) -> float | None:
-        """z (m, femoral frame) between the condyles; None if there is only one."""
+        """z coordinate between the condyles, m, femoral frame; None with only one condyle."""
         from tkamb.geometry.condyles import condyle_split
 
         return condyle_split(self.femoral) if self.femoral else None
 
     def rates(self, time: Array, places: Array) -> tuple[Array, Array, Array]:
-        """Return filtered coordinates of the patella (n, 3), as recorded ones, and derivatives."""
+        """Filter coordinates of the patella like recorded ones, and differentiate them twice.
+
+        Args:
+            time: times, s, shape (n,).
+            places: coordinates of the patella, shape (n, 3).
+        """
         cutoff = self.scene.motion.cutoff_Hz
         check_frames(self.motion.time, cutoff, self.scene.motion.frames)
         return differentiate_coordinates(time, places, cutoff, name="places of the patella")
 
     @property
     def gait_cycle_s(self) -> tuple[float, float] | None:
-        """Times of 0 and 100 % of the gait cycle (s), from the scene or else the force plates.
+        """Times of 0 and 100 % of the gait cycle, s, from the scene or else the force plates.
 
-        None if neither states them, or if the motion's time column is per cent of a cycle.
+        None if neither states them, or if the motion's time column is in per cent of a cycle.
         """
         if self.motion.cycle_percent is not None:
             return None
@@ -103,23 +109,23 @@ class Case:
 
     @property
     def bone(self) -> "Surface | None":
-        """The bone that a muscle wraps, femur link; None without one."""
+        """The bone that a muscle wraps, in the femur link's frame, or None."""
         return next((m.wrap.bone for m in self.muscles if m.wrap and m.wrap.bone), None)
 
     @property
     def body_mass(self) -> float:
-        """kg, of the patient at the scene's scale."""
+        """Body mass of the patient at the scene's scale, kg."""
         return self.scene.patient.mass_kg * self.scene.patient.scale**3
 
     @property
     def height_mm(self) -> float | None:
-        """Body height at the scene's scale, if the scene has one."""
+        """Body height at the scene's scale, mm, or None."""
         patient = self.scene.patient
         return None if patient.height_mm is None else patient.height_mm * patient.scale
 
     @property
     def body_weight(self) -> float:
-        """N."""
+        """Body weight at the scene's scale, N."""
         return self.body_mass * -float(self.chain.model.gravity.linear[1])
 
 
@@ -156,10 +162,10 @@ def _recordings(
 
 
 def _common_part(scene: Scene) -> MotionTable | None:
-    """Return the part of the motion that the ground reaction covers; None if there is none.
+    """Return the table [motion] with the interval that the ground reaction covers.
 
-    A scene without an interval asks for the whole recording, but the clocks of two files may
-    begin and end at slightly different times.
+    A scene without an interval uses the whole recording, but its two files may begin and end at
+    slightly different times. The result is None if the interval cannot or need not be changed.
     """
     if scene.ground_reaction is None or scene.motion.interval_s or scene.motion.cycle_s:
         return None
@@ -183,14 +189,14 @@ def _common_part(scene: Scene) -> MotionTable | None:
 
 
 def load_case(scene: Scene) -> Case:
-    """Read the files that the scene names, and no other.
+    """Read the files that the scene names.
 
     Raises:
-        InputError: whatever is wrong with them, in one line.
+        InputError: a file cannot be read or used.
     """
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
-    # Tables are read before meshes, which take longer, so that their errors come at once.
+    # Meshes take longer to read than tables. Tables come first, so that their errors come at once.
     parts = ImplantParts(scene) if scene.motion.interpretation == "pose" else None
     try:
         motion, tibia, ground = _recordings(scene, scene.motion, chain, parts)
@@ -239,7 +245,7 @@ def load_case(scene: Scene) -> Case:
 
 
 def with_insert(case: Case, mesh: Path) -> Case:
-    """Return a case with the insert of another mesh file of the same unit and axes.
+    """Return a case with another mesh file of the insert, in the same unit and axes.
 
     Raises:
         InputError: the file cannot be used.
@@ -260,7 +266,7 @@ def with_insert(case: Case, mesh: Path) -> Case:
 
 
 def _derived(scene: Scene, motion: KneeMotion, parts: ImplantParts) -> KneeMotion:
-    """Return the motion with coordinates that follow from the surfaces (seat, roll and slip)."""
+    """Return the motion with coordinates from the surfaces: initial guess, or roll and slip."""
     table = scene.motion
     if motion.unrecorded or table.motion == "roll-slip":
         check_frames(motion.time, table.cutoff_Hz, table.frames)

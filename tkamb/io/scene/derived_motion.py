@@ -1,4 +1,4 @@
-"""Partly computed motions: the femur placed on the insert, or rolling and slipping over it."""
+"""Partly computed motions: the femur is placed on the insert, or rolls and slips over it."""
 
 from dataclasses import replace
 
@@ -19,19 +19,18 @@ def seated_motion(
 ) -> KneeMotion:
     """Return the motion with an initial guess of the coordinates that were not recorded.
 
-    Unrecorded rotations are zero. Unrecorded AP and ML put the mean of the condyles' lowest points
-    over the insert's origin; unrecorded SI lowers the femur to first touch. The solution for the
-    released coordinates starts there in each frame. Velocities and accelerations, which enter
-    inertia and the direction of sliding, are those of this guess.
+    Unrecorded rotations are zero. Unrecorded AP and ML place the mean of the condyles' lowest
+    points above the insert's origin. Unrecorded SI lowers the femur to first touch. The velocities
+    and accelerations of this guess determine the inertia forces and the direction of sliding.
 
     Args:
-        motion: as recorded; `motion.unrecorded` names the missing coordinates.
+        motion: recorded motion; `motion.unrecorded` names the missing coordinates.
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
-        cutoff: Hz, low-pass of the differentiation.
+        cutoff: cut-off frequency of the low-pass filter, Hz.
 
     Raises:
-        InputError: the femur does not come to lie over the insert.
+        InputError: the femur is not above the insert in some frame.
     """
     places = motion.coordinates.copy()
     lowest = LowestPoints(femoral, condyle_split(femoral))
@@ -58,17 +57,17 @@ def seated_motion(
 def rolling_motion(
     motion: KneeMotion, femoral: Surface, insert: Surface, slip_share: float, cutoff: Cutoff
 ) -> KneeMotion:
-    """Return the motion with its AP and SI coordinates replaced by those of roll and slip.
+    """Return the motion with AP and SI from rolling and slipping of the femur on the insert.
 
-    SI lowers the femur to first touch of one condyle. Rotations and ML do not change. The two new
-    coordinates are filtered and differentiated like recorded ones, but never as a closed cycle.
+    SI lowers the femur until one condyle touches. Rotations and ML do not change. The new AP and SI
+    are filtered and differentiated like recorded coordinates, but never as a closed cycle.
 
     Args:
-        motion: as recorded and filtered.
+        motion: recorded and filtered motion.
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
-        slip_share: share of the condyles' mean slip in the recorded motion; 0 is pure rolling.
-        cutoff: Hz, low-pass of the differentiation.
+        slip_share: share of the recorded motion's mean slip of the condyles; 0 is pure rolling.
+        cutoff: cut-off frequency of the low-pass filter, Hz.
 
     Raises:
         InputError: the femur rolls off the insert.
@@ -88,7 +87,7 @@ def rolling_motion(
 
 
 def _first_lost(places: Array, time: Array) -> float | None:
-    """Return the first time (s) at which a coordinate (f, 6) is NaN; None without any."""
+    """Return the first time, s, at which a coordinate of `places` (f, 6) is not finite, or None."""
     missing = np.flatnonzero(~np.isfinite(places).all(axis=1))
     return float(time[missing[0]]) if len(missing) else None
 
@@ -96,7 +95,7 @@ def _first_lost(places: Array, time: Array) -> float | None:
 def _with_coordinates(
     motion: KneeMotion, places: Array, columns: list[int], cutoff: Cutoff
 ) -> KneeMotion:
-    """Return the motion with `columns` replaced by those of `places` (f, 6), differentiated."""
+    """Return the motion with `columns` from `places` (f, 6), filtered and differentiated."""
     values = (motion.coordinates.copy(), motion.velocity.copy(), motion.acceleration.copy())
     result = differentiate_coordinates(motion.time, places[:, columns], cutoff)
     for value, new in zip(values, result, strict=True):

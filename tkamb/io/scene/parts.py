@@ -1,4 +1,4 @@
-"""The parts of a scene's knee, in SI, as a right knee: implants, muscles and ligaments."""
+"""Implants, muscles and ligaments of a scene, in SI units. A left knee is mirrored."""
 
 from typing import TYPE_CHECKING
 
@@ -31,11 +31,11 @@ NAN = float("nan")
 class ImplantParts:
     """The implant's surfaces in the frames of their links, and the poses of their meshes.
 
-    Only the parts that the scene needs are read; the others are None.
+    Parts that the scene does not need are None.
 
     Args:
         scene: the scene.
-        insert_alone: whether only the insert is read.
+        insert_alone: whether the insert is the only part to read.
     """
 
     def __init__(self, scene: Scene, insert_alone: bool = False) -> None:
@@ -65,7 +65,7 @@ class ImplantParts:
                 from tkamb.geometry.post import divide_insert
 
                 self.insert, self.post = divide_insert(self.insert)
-        elif implant.insert and scene.muscles is not None:  # its placement is needed
+        elif implant.insert and scene.muscles is not None:  # [muscles] needs the placement
             self._place_insert(scene)
         if insert_alone:
             return
@@ -134,7 +134,7 @@ class ImplantParts:
 
 
 def muscle_tables(scene: Scene) -> tuple[MuscleTable, ...]:
-    """Return the scene's [[muscle]] tables, with [quadriceps] as one more of them."""
+    """Return the scene's [[muscle]] tables, including one made from [quadriceps]."""
     short = scene.quadriceps
     if short is None:
         return scene.muscle
@@ -172,7 +172,7 @@ def read_muscles(scene: Scene, chain: Chain) -> "tuple[Muscle, ...]":
 
 
 def read_patellar_ligament(scene: Scene) -> "PatellarLigament | None":
-    """Return the patellar ligament; None where the scene has none."""
+    """Return the patellar ligament, or None if the scene has none."""
     from tkamb.knee.muscles import PatellarLigament, SagittalWrap
 
     table, is_left = scene.patellar_ligament, scene.patient.side == "left"
@@ -188,10 +188,10 @@ def read_patellar_ligament(scene: Scene) -> "PatellarLigament | None":
 
 
 def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Ligament, ...]":
-    """Return the bundles of the [[ligament]] tables, then those of [generic_ligaments].
+    """Return the bundles of the [[ligament]] tables, then the bundles of [generic_ligaments].
 
     Raises:
-        InputError: a collateral ligament runs on the wrong side of the knee.
+        InputError: a collateral ligament is on the wrong side of the knee.
     """
     if not (scene.ligament or scene.generic_ligaments):
         return ()
@@ -208,7 +208,7 @@ def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Li
 
 
 def ligament(table: LigamentTable, left: bool = False) -> "Ligament":
-    """Return one bundle."""
+    """Return the bundle that a table describes, mirrored if `left`."""
     from tkamb.knee.ligaments import Ligament
 
     stiffness = table.stiffness_N_per_strain

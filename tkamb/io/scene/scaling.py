@@ -1,9 +1,8 @@
-"""A case of another size: a synthetic subject of the same shape.
+"""Scaling of a case to a synthetic subject of the same shape.
 
-With a scale factor s, lengths, implants and knee translations are multiplied by s, masses and
-ground reaction by s³ (equal density), moments of the plate by s⁴ and inertias by s⁵. The tissue is
-the same: stiffness per length E A / L is multiplied by s, force per strain E A by s². Angles and
-times do not change.
+A scale factor s multiplies lengths by s, masses and ground reaction by s³ (equal density), moments
+of the plate by s⁴ and inertias by s⁵. The tissue's modulus E does not change: stiffness E A / L is
+multiplied by s, force per strain E A and muscle strength by s². Angles and times do not change.
 """
 
 from dataclasses import replace
@@ -27,11 +26,11 @@ PATELLA_TRANSLATIONS = [0, 1]
 
 
 def scaled_case(case: "Case") -> "Case":
-    """Return the case with its scene's `[patient] scale`.
+    """Return the case at the size of its scene's `[patient] scale`.
 
     Raises:
-        InputError: the scene has [muscles] or markers, whose models have their own size, or
-        [measured], which belongs to the unscaled subject.
+        InputError: the scene has [muscles], markers or [measured], which are of the unscaled
+            subject.
     """
     s = case.scene.patient.scale
     for place, table in (

@@ -1,7 +1,8 @@
-"""The scene: what exists and what is to be modelled. An absent table is not modelled.
+"""The scene: the file that says what exists and what is modelled.
 
-A scene is a TOML file. Units are in the key names, paths are relative to the file, an
-unknown key is an error. `load_scene` reads and validates it; nothing else is opened.
+A scene is a TOML file. Units are in the key names, paths are relative to the file, and an unknown
+key is an error. If a table is absent, its subject is not modelled. `load_scene` reads and validates
+a scene, but not the files that the scene names.
 """
 
 import json
@@ -44,13 +45,13 @@ if TYPE_CHECKING:
 
 
 class Scene(SceneTable):
-    """The content of a scene file; see the tables."""
+    """The content of a scene file. Each table has a class of its own."""
 
     base: str | None = Field(
         None,
         description=(
-            "name of another scene file in the same folder: its keys hold where this file does "
-            "not give them, table by table; lists are replaced whole"
+            "name of another scene file in the same folder. Its keys apply unless this file gives "
+            "them. Tables are merged; lists are replaced as a whole"
         ),
     )
     patient: PatientTable
@@ -76,31 +77,31 @@ class Scene(SceneTable):
 
     @property
     def overrides(self) -> dict[str, Any]:
-        """Return dotted key -> value that `load_scene` put in the place of the file's."""
+        """Dotted key -> value that replaces the file's value."""
         return dict(self._overrides)
 
     @property
     def identity_json(self) -> str:
-        """All that a run depends on, as JSON, without the keys that only `tkamb wear` reads."""
+        """The scene as JSON, without the keys that only `tkamb wear` reads."""
         unused = {"wear"} if self.material else {"wear", "material"}
         return self.model_dump_json(exclude=unused)
 
     @property
     def insert_material(self) -> dict[str, Any]:
-        """What the insert is made of, as `tkamb.io.given_material` takes it."""
+        """Material of the insert, as argument of `tkamb.io.given_material`."""
         if self.material is not None:
             return self.material.model_dump()
         return {} if self.contact is None else {"base": self.contact.material}
 
     @property
     def yield_stress_MPa(self) -> float:
-        """Yield stress of the insert: [material]'s, else [output]'s."""
+        """Yield stress of the insert, from [material] or else [output]."""
         own = self.material.yield_stress_MPa if self.material else None
         return self.output.yield_stress_MPa if own is None else own
 
     @property
     def preset(self) -> "AppliedPreset | None":
-        """Return the preset that was laid over the scene, if any."""
+        """The preset that was applied to the scene, or None."""
         return self._preset
 
     def __repr__(self) -> str:
@@ -174,11 +175,11 @@ def load_scene(
         preset: name of a preset (`tkamb.io.presets`), applied before the overrides.
 
     Raises:
-        InputError: unreadable file, unknown key, missing unit, value out of range, no such
-            preset, or a scene that lacks what the preset needs.
+        InputError: the file cannot be read, a key is unknown or missing, a value is out of range,
+            the preset does not exist, or the scene lacks data for it.
     """
     path = Path(path)
-    if os.path.isfile(path / "scene.toml"):  # False too for a name that no file can have
+    if os.path.isfile(path / "scene.toml"):  # also False for an invalid name, unlike Path.is_file
         raise InputError("is a folder, not a file", path, f"give {path / 'scene.toml'}")
     content = _content(path)
     applied = None if preset is None else _apply_preset(content, preset, overrides or {}, path)
@@ -194,15 +195,15 @@ def load_scene(
 
 
 def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = None) -> Scene:
-    """Return a scene with a preset applied; its own overrides are kept.
+    """Return a scene with a preset applied. The scene's overrides stay.
 
     Args:
-        scene: as read.
+        scene: the scene.
         preset: name of a preset (`tkamb.io.presets`).
-        overrides: dotted key -> value that replaces the preset's.
+        overrides: dotted key -> value that replaces the preset's value.
 
     Raises:
-        InputError: no such preset, or the scene lacks what it needs.
+        InputError: the preset does not exist, or the scene lacks data for it.
     """
     content = scene.model_dump(exclude_unset=True)
     more = scene.overrides | (overrides or {})
@@ -216,11 +217,11 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
     """Return a scene with overrides applied, as `load_scene` applies them to a file.
 
     Args:
-        scene: as read; its own overrides and its preset stay.
+        scene: the scene; its overrides and its preset stay.
         overrides: dotted key -> value; a relative path is relative to the working directory.
 
     Raises:
-        InputError: an unknown key, or a value out of range.
+        InputError: a key is unknown, or a value is out of range.
     """
     found = _changed(scene.model_dump(exclude_unset=True), scene.overrides | overrides)
     found._preset = scene.preset
@@ -228,7 +229,7 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
 
 
 def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
-    """Return the scene of a content with overrides applied."""
+    """Return the scene with a content and overrides applied to it."""
     _apply_overrides(content, overrides)
     try:
         result = Scene.model_validate(content)
@@ -239,7 +240,10 @@ def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
 
 
 def _apply_overrides(content: dict[str, Any], overrides: Mapping[str, Any]) -> None:
-    """Lay overrides over a content; a material or yield stress replaces the one given elsewhere."""
+    """Apply overrides to a content, in place.
+
+    An override of a material or yield stress removes the same quantity from its other table.
+    """
     for key, value in overrides.items():
         _override(content, key, value)
     tables = {key.partition(".")[0] for key in overrides}
@@ -267,13 +271,13 @@ def _apply_preset(
 
 
 def scene_files(path: Path) -> list[Path]:
-    """Return a scene file that could be read and, if it stands on one, its base."""
+    """Return a readable scene file and its base file, if it has one."""
     base = _parse(path).get("base")
     return [path] if base is None else [path, path.parent / base]
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Return what a scene file says, on top of what its base says."""
+    """Return the keys of a scene file, merged with the keys of its base."""
     content = _parse(path)
     if "base" not in content:
         return content
@@ -287,7 +291,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return the base's keys with one's own in their place; tables are merged."""
+    """Return the keys of `base`, replaced by the keys of `own`. Tables are merged."""
     merged = base | own
     for key, value in own.items():
         if isinstance(value, dict) and isinstance(base.get(key), dict):
@@ -316,7 +320,7 @@ def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
 
 
 def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) -> InputError:
-    """Return the mistake to correct first: an unknown key may be a misspelt missing one."""
+    """Return the error to correct first. Unknown keys come first: they may be misspelt keys."""
     result = error.errors()
     rank = {"extra_forbidden": 0, "missing": 2}
     first = min(result, key=lambda one: rank.get(one["type"], 1))
@@ -340,7 +344,7 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
 
 
 def _as_list(key: str, value: Any, from_command_line: bool) -> str:
-    """Return how to write a list where a single value was given."""
+    """Return words on how to write a single value as a list."""
     if isinstance(value, dict):
         return f"is one table; write [[{key}]], with two brackets, above each"
     words = json.dumps(value, default=str)
@@ -373,14 +377,14 @@ def _model_at(place: tuple[int | str, ...]) -> type[BaseModel] | None:
 
 
 def _table_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the table's class in an annotation: itself, optional, or in a tuple."""
+    """Return the table's class in an annotation, such as `T`, `T | None` or `tuple[T, ...]`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((t for a in get_args(annotation) if (t := _table_in(a)) is not None), None)
 
 
 def _tables_with(complaint: ErrorDetails) -> str:
-    """Return in which other tables the key would be known."""
+    """Return words on the other tables that have an unknown key, or ""."""
     key = complaint["loc"][-1]
     own = _model_at(complaint["loc"][:-1])
     tables = {name: _model_at((name,)) for name in Scene.model_fields}
@@ -389,7 +393,7 @@ def _tables_with(complaint: ErrorDetails) -> str:
 
 
 def _resolve_paths(model: Any, folder: Path) -> Any:
-    """Return the model with its paths made absolute against the scene's folder."""
+    """Return the model with absolute paths, from paths relative to the scene's folder."""
     changed: dict[str, Any] = {}
     for name in type(model).model_fields:
         value = getattr(model, name)

@@ -1,7 +1,7 @@
-"""The tables of the scene file: what each key means, its unit and its limits.
+"""The tables of the scene file, with the meaning, unit and limits of each key.
 
-Units are in the key names; unknown keys are errors; every table is frozen. The tables of what was
-recorded are in `recording_tables`.
+Units are in the key names. Unknown keys are errors. All tables are frozen. The tables of recordings
+are in `recording_tables`.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ from tkamb.io.recordings.scene_table import (
 
 
 class FemoralImplantTable(SceneTable):
-    """Femoral component: its mesh and where it sits on the femur link."""
+    """Femoral component: its mesh and its pose on the femur link."""
 
     mesh: Path
     unit: LengthUnit
@@ -56,7 +56,7 @@ class InsertImplantTable(SceneTable):
 
 
 class PatellarImplantTable(SceneTable):
-    """Patellar button: its mesh and where it sits on the patella link."""
+    """Patellar button: its mesh and its pose on the patella link."""
 
     mesh: Path
     unit: LengthUnit
@@ -135,7 +135,7 @@ class GenericLigamentsTable(SceneTable):
     """
 
     ligaments: tuple[Literal["MCL", "LCL", "PCL", "ACL"], ...] = Field(
-        ("MCL", "LCL", "PCL"), min_length=1, description="those that the patient has"
+        ("MCL", "LCL", "PCL"), min_length=1, description="ligaments that the patient has"
     )
 
 
@@ -231,7 +231,7 @@ class MusclesTable(SceneTable):
         ge=0,
         le=0.2,
         description="lower bound of every muscle's activation, its resting tone. It loads the knee "
-        "even where no external load does",
+        "even without an external load",
     )
     law: Literal["isometric", "hill"] = Field(
         "isometric",
@@ -250,7 +250,7 @@ class PatellarLigamentTable(SceneTable):
     distal: Attachment
     # Half the shortest measured length to twice the longest (25 to 65 mm).
     length_mm: Annotated[Number | None, within(12, 130, "give it in millimetres")] = Field(
-        None, description="its constant length; needed where the patella is solved"
+        None, description="constant length; needed if the patella's motion is solved"
     )
     wrap: Switch = True
     half_thickness_mm: HalfThickness = Field(2.5)

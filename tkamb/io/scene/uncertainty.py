@@ -15,8 +15,8 @@ Length = Annotated[Number, Field(ge=0, le=50)]
 Angle = Annotated[Number, Field(ge=0, le=20)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 
-_OF_POSE = "of the recorded pose; default: that of the recording, fluoroscopy or skin markers"
-_GIVE = "; no default: give what your laboratory knows"
+_OF_POSE = "of the recorded pose; default: the value for fluoroscopy or for skin markers"
+_GIVE = "; 0 by default: give the value of your laboratory"
 _TISSUE = (
     "; default: an assumption, for a Monte Carlo study of the kind of Smith et al. (PMC4755512)"
 )
@@ -47,10 +47,10 @@ class FluoroscopyErrorSettings:
 
 @dataclass(frozen=True)
 class SkinMarkerErrorSettings:
-    """Standard deviations of a pose from skin markers, and of the markers themselves.
+    """Standard deviations of a pose from skin markers, and of the markers.
 
-    A coordinate that is computed from the markers varies with them (`thigh_mm`, `shank_mm`). The
-    other fields are used for the coordinates that were not recorded.
+    The error of a coordinate from markers follows from the errors `thigh_mm` and `shank_mm` of the
+    markers. The other fields are used for coordinates that were not recorded.
 
     References: doi:10.1016/j.gaitpost.2005.04.012 (Benoit et al. 2006, eight men with pins in
     femur and tibia: knee rotations off by up to 4.4 deg and translations by up to 13 mm in
@@ -60,7 +60,7 @@ class SkinMarkerErrorSettings:
     """
 
     ap_mm: float = 5.0
-    """mm; an assumption: the largest error of Benoit et al. is 2.6 of it."""
+    """mm; an assumption: the largest error of Benoit et al. is 2.6 times this value."""
     si_mm: float = 1.0
     """mm; an assumption: contact keeps the condyles on the insert."""
     ml_mm: float = 3.0
@@ -74,10 +74,10 @@ class SkinMarkerErrorSettings:
     markers: their own deviation then counts."""
     thigh_mm: float = 10.0
     """mm, of each thigh marker in each direction; an assumption: a rigid fit of three markers
-    240 mm apart is then off by 3 deg and 6 mm, a third of the largest errors in PMC8631460."""
+    240 mm apart then errs by 3 deg and 6 mm, a third of the largest errors in PMC8631460."""
     shank_mm: float = 6.0
-    """mm, of each shank marker in each direction; an assumption: likewise 2 deg and 3.5 mm, a third
-    to a fifth of the largest errors in PMC8631460, which stand in swing."""
+    """mm, of each shank marker in each direction; an assumption: a rigid fit then errs by 2 deg and
+    3.5 mm, a third to a fifth of the largest errors in PMC8631460, which occur in swing."""
 
 
 FLUOROSCOPY_ERROR = FluoroscopyErrorSettings()
@@ -111,7 +111,9 @@ class UncertaintyTable(SceneTable):
     names.
     """
 
-    seed: Count = Field(1, ge=0, description="of all draws; the same seed gives the same samples")
+    seed: Count = Field(
+        1, ge=0, description="seed of all random draws; the same seed gives the same samples"
+    )
     ap_mm: Length | None = Field(None, description=_OF_POSE)
     si_mm: Length | None = Field(None, description=_OF_POSE)
     ml_mm: Length | None = Field(None, description=_OF_POSE)
@@ -125,8 +127,8 @@ class UncertaintyTable(SceneTable):
     )
     correlation_s: Annotated[Number, Field(ge=0, le=100)] = Field(
         0.1,
-        description="correlation time of that noise: AR(1) with exp(-dt/correlation_s); 0 is "
-        "white. An assumption, without a source",
+        description="correlation time of the noise per frame: AR(1) with exp(-dt/correlation_s); 0 "
+        "is white noise. An assumption, without a source",
     )
     markers_mm: Length | None = Field(
         None,
@@ -183,8 +185,8 @@ class UncertaintyTable(SceneTable):
     )
     yield_stress: Share = Field(
         0.0,
-        description="relative, of [output] yield_stress_MPa, which tells overloaded area; 0: the "
-        "limit stands as it is stated",
+        description="relative, of the yield stress above which area counts as overloaded; 0: the "
+        "limit does not vary",
     )
     wear_factor: Share = Field(
         0.44,
@@ -210,20 +212,18 @@ class UncertaintyTable(SceneTable):
     )
     dome_mm: Length = Field(
         1.0,
-        description="AP and SI each: where a recorded patella, the dome of its button, is on the "
-        "femur" + _ASSUMED,
+        description="AP and SI each: position of a recorded patella on the femur" + _ASSUMED,
     )
     correlation: tuple[CorrelationTable, ...] = Field(
         (), description="inputs that err together; needs a positive semi-definite matrix"
     )
 
     def completed(self, from_markers: bool) -> Self:
-        """Return the table with the pose's deviations of its kind of recording.
-
-        What the table gives stays.
+        """Return the table with default deviations for the pose coordinates that it lacks.
 
         Args:
-            from_markers: whether the knee's motion is taken from skin markers; else fluoroscopy.
+            from_markers: whether the knee's motion is from skin markers; otherwise the defaults
+                are of fluoroscopy.
         """
         defaults = asdict(SKIN_MARKER_ERROR if from_markers else FLUOROSCOPY_ERROR)
         own = {

@@ -1,4 +1,4 @@
-"""`tkamb new`: a folder with a commented scene and its files, ready to run."""
+"""The command `tkamb new`, which writes a folder with a commented scene and its files."""
 
 import argparse
 import shutil
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def lay_out(directory: Path, person: "Person | None" = None) -> Path:
-    """Write the starter scene with its files into a new or empty folder; return the scene.
+    """Write the starter scene with its files into a new or empty folder. Return the scene's path.
 
     The folder is written completely or not at all.
 
@@ -70,7 +70,7 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _person(options: argparse.Namespace) -> "Person | None":
-    """Return the patient that the options describe; None: the default patient."""
+    """Return the patient that the options describe, or None for the default patient."""
     given = {
         "side": options.side,
         "mass": options.mass_kg,

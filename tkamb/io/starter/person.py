@@ -1,10 +1,11 @@
-"""The starter's files for a patient of given mass, height, sex and side.
+"""The files of `tkamb new` for a patient of given mass, height, sex and side.
 
 Lengths are shares of body height (Drillis and Contini 1966, as in Winter 2009, figure 4.1): ankle
-0.039, shank 0.246, thigh 0.245. Masses and inertias are those of de Leva (1996),
-`tkamb.io.recordings.patient`. The implant is not scaled. Joint centres, attachments on the shafts,
-the ground reaction and its point are scaled; attachments near the knee move with it. A left leg is
-the mirror image: positions along z, the force to the right, and the meshes.
+0.039, shank 0.246, thigh 0.245. Masses and inertias are from de Leva (1996), see
+`tkamb.io.recordings.patient`. Joint centres, attachments on the femoral shaft, the ground reaction
+and its point are scaled. The implant and attachments near the knee are not scaled, but move with
+the knee. A left leg is the mirror image: positions along z, the force to the right, and the meshes
+change sign.
 
 References: Winter (2009), Biomechanics and Motor Control of Human Movement, 4th ed., Wiley,
 doi:10.1002/9780470549148; de Leva (1996), J Biomech 29:1223, doi:10.1016/0021-9290(95)00178-6.
@@ -30,28 +31,27 @@ MESHES = ("femoral_component", "insert", "patellar_button")
 
 @dataclass(frozen=True)
 class LegProportionSettings:
-    """Lengths of a leg as shares of body height, and how the implant sits in it."""
+    """Lengths of a leg as shares of body height, and the position of the implant in it."""
 
     ankle: float = 0.039
-    """Height of the ankle's centre above ground, as a share (1) of body height; Winter (2009)."""
+    """Height of the ankle's centre above ground, as a share of body height; Winter (2009)."""
     shank: float = 0.246
-    """Distance from ankle centre to knee centre, as a share (1) of body height; Winter (2009)."""
+    """Distance from ankle centre to knee centre, as a share of body height; Winter (2009)."""
     thigh: float = 0.245
-    """Distance from knee centre to hip centre, as a share (1) of body height; Winter (2009)."""
+    """Distance from knee centre to hip centre, as a share of body height; Winter (2009)."""
     insert_below_knee: float = 0.018662
-    """m: depth of the insert's bottom below the knee's centre. Chosen: as in the shipped
-    patient."""
+    """m: depth of the insert's bottom below the knee's centre, as in the shipped patient."""
     hip_below_thigh_end: float = 0.004367
     """m: height of the femoral component's origin above the knee's centre, as in the shipped
     patient."""
     lightest: float = 20.0
-    """kg; smallest accepted mass. Chosen: it excludes masses in other units."""
+    """kg: smallest accepted mass. Chosen because it excludes masses in other units."""
     heaviest: float = 300.0
-    """kg; greatest accepted mass. Chosen: it excludes masses in other units."""
+    """kg: greatest accepted mass. Chosen because it excludes masses in other units."""
     shortest: float = 1.0
-    """m; smallest accepted height. Chosen: it excludes heights in other units."""
+    """m: smallest accepted height. Chosen because it excludes heights in other units."""
     tallest: float = 2.3
-    """m; greatest accepted height. Chosen: it excludes heights in other units."""
+    """m: greatest accepted height. Chosen because it excludes heights in other units."""
 
 
 LEG_PROPORTIONS = LegProportionSettings()
@@ -59,12 +59,12 @@ LEG_PROPORTIONS = LegProportionSettings()
 
 @dataclass(frozen=True)
 class Person:
-    """The patient of the starter's files.
+    """A patient for the files of `tkamb new`.
 
     Args:
         side: side of the knee.
-        mass: body mass (kg).
-        height: body height (m).
+        mass: body mass, kg.
+        height: body height, m.
         sex: "female" or "male", which selects the table of de Leva (1996).
 
     Raises:
@@ -87,16 +87,16 @@ class Person:
 
     @property
     def knee_height(self) -> float:
-        """Height (m) of the insert's bottom above the ankle's centre."""
+        """Height of the insert's bottom above the ankle's centre, m."""
         return LEG_PROPORTIONS.shank * self.height - LEG_PROPORTIONS.insert_below_knee
 
     @property
     def hip_height(self) -> float:
-        """Height (m) of the hip's centre above the femoral component's origin."""
+        """Height of the hip's centre above the femoral component's origin, m."""
         return LEG_PROPORTIONS.thigh * self.height - LEG_PROPORTIONS.hip_below_thigh_end
 
     def inertias(self) -> dict[str, RigidInertia]:
-        """Return the inertias of tibia (shank and foot) and femur, each in its link's frame."""
+        """Return link -> its inertia in its frame: "tibia" (shank and foot) and "femur"."""
         ankle, knee = np.zeros(3), np.array([0.0, self.knee_height, 0.0])
         hip = np.array([0.0, self.hip_height, 0.0])
         shank = segment_inertia("shank", self.sex, self.mass, knee, ankle)
@@ -146,7 +146,7 @@ def patient_urdf(text: str, person: Person) -> str:
         name, axis = joint.get("name", ""), joint.find("axis")
         if name in heights:
             _child(joint, "origin").set("xyz", f"0 {heights[name]:.6f} 0")
-        # In a mirrored leg, rotations about the anterior and superior axes have the other sign.
+        # In a mirrored leg, rotations about the anterior and superior axes have the opposite sign.
         if person.side == "left" and axis is not None and joint.get("type") == "revolute":
             x, y, z = (float(value) for value in axis.get("xyz", "").split())
             axis.set("xyz", f"{-x:g} {-y:g} {z:g}".replace("-0 ", "0 "))
@@ -178,7 +178,7 @@ def scene_text(text: str, person: Person) -> str:
         if match["link"] == "tibia":
             y += knee_up  # all attachments on the tibia are near the knee
         elif match["link"] == "femur" and y > LEG_PROPORTIONS.insert_below_knee * 1e3:
-            y *= thigh  # on the shaft; points near the joint do not move relative to the implant
+            y *= thigh  # on the shaft; points near the knee keep their distance from the implant
         z = mirror * z + 0.0
         return f'link = "{match["link"]}", point_mm = [{x:g}, {round(y, 3):g}, {z:g}]'
 
@@ -206,7 +206,7 @@ def _numbers(values: Array) -> str:
 
 
 def _scale(path: Path, factors: dict[str, float]) -> None:
-    """Multiply columns of a table by factors; the other columns keep their text."""
+    """Multiply columns of a table by factors. Other columns keep their text."""
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
     factor_of: list[Callable[[str], str]] = [
@@ -224,7 +224,7 @@ def _scale(path: Path, factors: dict[str, float]) -> None:
 
 
 def _mirror_mesh(path: Path) -> None:
-    """Mirror a mesh in the sagittal plane; its triangles still face outwards."""
+    """Mirror a mesh in the sagittal plane, with its triangles facing outwards."""
     import trimesh
 
     mesh = trimesh.load_mesh(path, process=False)
