@@ -206,7 +206,7 @@ def test_positions_of_a_profile_are_relative_to_the_dwell_position(profile, scen
         [-1e-3, 1e-3, -3e-3]
     )
     assert setup.motion.load[[0, 15, 70]] == pytest.approx([300, 1800, 200])
-    # the dwell position of two spheres on two dishes is the middle, apart from the facets
+    # two spheres lie lowest in the middle of two dishes, apart from the effect of facets
     assert (coordinates[0, 0], coordinates[0, 2]) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 

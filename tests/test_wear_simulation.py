@@ -106,7 +106,7 @@ def test_a_ball_swinging_in_a_trough_wears_k_F_R_angle():
     """Sliding at the contact is R times the angle, so the work is F R angle for any shape."""
     case = ball_case(shapes.trough(0.03), 20 * MM, swing(0.5, 5, 500.0), K, 2.0, facets=5)
     row = last(case, 100_000, 1)[1]
-    # off the lowest point of the ball sliding is about half a per cent smaller
+    # off the ball's lowest point, sliding is about half a per cent smaller
     assert row["volume_mm3"] == pytest.approx(K * 500.0 * 20e-3 * 1.0 * 1e5, rel=0.01)
     assert row["mesh_volume_lost_mm3"] == pytest.approx(row["volume_mm3"], rel=1e-9)
 

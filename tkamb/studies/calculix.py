@@ -188,7 +188,7 @@ class PeerAnswer:
         run: output and cost of the process.
         prepare_seconds: time to make the grid, the initial guess and the deck, s.
         nodes: number of nodes of the insert.
-        balance: sum of the vertical contact forces over the load.
+        balance: sum of the vertical contact forces, divided by the load.
     """
 
     result: ContactResult
@@ -259,7 +259,7 @@ def press_by_calculix(
 
 
 def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, float]:
-    """Return the contact result of a run, and the sum of its contact forces over the load.
+    """Return the contact result of a run, and its vertical contact force over the load.
 
     Raises:
         ComputationError: contact extends beyond the femoral patch of the deck, or the forces do not

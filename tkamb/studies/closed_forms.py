@@ -12,7 +12,7 @@ and nu Poisson's ratio.
   to prevent rigid motion. This stiffens the block by up to 2 %.
 - kept: the plate with the operator cache on disk, which already contains the operator of another
   modulus. Each modulus must have its own operator.
-- layer: a rigid sphere on a linear layer bonded to a rigid base (`elastic_layer`).
+- layer: a rigid sphere on a linear layer bonded to a rigid base (`sphere_on_layer`).
 - bed: a paraboloid on a bed of springs of pressure p(e), F = 2 pi R h int_0^(d/h) p(e) de.
 - hertz: the sphere on a half-space, a³ = 3 F R / (4 E*), d = a²/R, p0 = 3 F / (2 pi a²).
 

@@ -136,10 +136,10 @@ class MeasureSettings:
     """s: time limit of a job. A longer job is stopped and has no result. Chosen because the study
     should take minutes."""
     repeats: int = 3
-    """Maximum of timed preparations and first presses, and minimum of timed warm presses. Chosen
-    for a median."""
+    """Largest number of timed preparations and first presses, and smallest number of timed warm
+    presses. Chosen because the median of three ignores one slow press."""
     warm_presses: int = 7
-    """Maximum of timed warm presses. Chosen for a median."""
+    """Largest number of timed warm presses. Chosen because their median ignores slow ones."""
     enough_seconds: float = 3.0
     """s: measured time after which only warm presses are repeated, up to `repeats`. Chosen because
     the study should take minutes."""

@@ -7,8 +7,8 @@ therefore a piece of a torus, with the sagittal radius at the ridge and the coro
 it. If the J-curves of the two condyles differ, the surface blends from one to the other in the
 groove.
 
-A posterior-stabilised component has a cam: a cylinder across the box that is joined to its walls.
-The cylinder is exact up to `CAM.flange_mm` from a wall. From there it widens to the edge of an
+A posterior-stabilised component has a cam: a cylinder that joins the two walls of the box. The
+cylinder is exact up to `CAM.flange_mm` from a wall. From there it widens to the edge of an
 opening in the wall, so the mesh is one closed body without self-intersection.
 """
 
@@ -298,7 +298,7 @@ class FemoralComponent:
         return np.asarray(top + (self.width_half - top) * self._taper(phi))
 
     def notch(self, phi: ArrayLike) -> Array:
-        """Return the ML distance of the notch's edge from the middle. Its front is elliptic."""
+        """Return the ML distance of the notch's edge from the middle. The front is elliptic."""
         start, end = np.radians(self.notch_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         s = np.where(s < 1e-9, 0.0, s)

@@ -187,7 +187,7 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
 def thinnable(case: Case) -> bool:
     """Return whether each frame can be computed without the other frames of the motion.
 
-    A solved patella needs them for its derivatives in time, a reference strain for the frame to
+    A solved patella needs them for its derivatives in time. A reference strain needs the frame to
     which it refers.
     """
     solved = case.scene.patella is not None and case.scene.patella.motion == "solved"

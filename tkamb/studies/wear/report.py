@@ -343,7 +343,7 @@ LABELS = {
 def draw_wear(
     surface: Surface, maps: dict[str, Array], rows: Sequence[Mapping[str, float]], path: Path
 ) -> None:
-    """Draw the maps of the insert in a superior view, with anterior at the top and right at right.
+    """Draw the maps of the insert in a superior view, anterior at the top and right on the right.
 
     The last panel shows the worn volume over the cycles, with its band if the rows have one.
 
