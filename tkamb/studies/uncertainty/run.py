@@ -202,7 +202,7 @@ def estimate_uncertainty(
         progress: wrapper of the iterator of the finished samples.
 
     Raises:
-        InputError: the input is invalid, the folder holds another run, or cannot be claimed.
+        InputError: the input is invalid, or the folder holds another run or is in use.
         ComputationError: a worker process ended during a sample.
         KeyboardInterrupt: interrupted. The finished samples stay in the folder.
     """

@@ -213,7 +213,7 @@ def check_factor(value: Any, where: str) -> float:
     """Return a wear factor or coefficient after a check.
 
     Raises:
-        InputError: it is negative, not finite, or above `WEAR_LAW.max_wear_factor`.
+        InputError: the value is negative, not finite, or above `WEAR_LAW.max_wear_factor`.
     """
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and math.isfinite(value) and 0 <= value <= WEAR_LAW.max_wear_factor):
