@@ -268,8 +268,8 @@ def cell_forces(
 
     Args:
         bulk_modulus: K, Pa.
-        residuals: (mu - mu_s) K_d u of each cell, N, shape (c, 24), written: the force that the
-            linear solid carries in excess.
+        residuals: overwritten by (mu - mu_s) K_d u of each cell, N, shape (c, 24). The linear solid
+            carries this force in excess.
         internal: nodal forces, N, shape (n, 3). mu_s K_d u + K V g (g · u) of the cells is added.
     """
     u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))

@@ -52,7 +52,7 @@ class MemoryNeedSettings:
     cell_size_step: float = 0.05e-3
     """m: proposed cell sizes are multiples of it. Chosen because it gives round numbers."""
     largest_cell_size: float = 5e-3
-    """m: largest cell size that is proposed. Chosen because a condyle's contact would be two cells
+    """m: largest cell size that is proposed. Chosen because a condyle's contact is then two cells
     wide."""
 
 
@@ -82,7 +82,7 @@ class TooLittleMemoryError(ComputationError):
         if least_size > MEMORY_NEED.largest_cell_size:
             return "free some memory"
         step = MEMORY_NEED.cell_size_step
-        # Rounded up, so that the proposed size fits; with 1e-9, a multiple of the step stays.
+        # Rounded up, so that the proposed size fits. An exact multiple stays, because of the 1e-9.
         proposal = np.ceil(least_size / step * (1.0 - 1e-9)) * step
         return f"take {proposal / MILLIMETRE:g} mm or coarser"
 
@@ -125,7 +125,7 @@ def factor_memory(
         tree: dissection of n nodes.
         joined: pattern of the joined nodes, shape (n, n).
         touched: mask of the contact nodes, shape (n,).
-        itemsize: bytes of a stored number; the factor is computed with 8.
+        itemsize: bytes of a stored number. A computed number has 8 bytes.
     """
     rank = np.empty(joined.shape[0], np.int64)
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
@@ -283,7 +283,7 @@ def fixed_unknowns(
         bearing: "fixed" or "mobile".
         piece: number of each node's piece, shape (n,); None: there is one piece.
         ends_held: whether x and z of both end nodes are held, as in Sharma (2008), section 4.5.4.
-            Then the insert cannot widen, and a uniform pressure is uneven by up to 10 %.
+            Then the insert cannot widen. A pressure that should be uniform varies by up to 10 %.
     """
     fixed = np.zeros((len(nodes), 3), bool)
     if bearing == "fixed":
