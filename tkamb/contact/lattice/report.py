@@ -104,7 +104,7 @@ def edge_flags(
     sharpness = zip(peaks, map(_sharpness, normals), strict=True)
     return tuple(
         f"the {side} peak pressure lies at an edge of the femoral component, which {words} "
-        f"within {distance.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
+        f"within {distance.max() / MILLIMETRE:.2g} mm: the peak rises as cells shrink"
         for side, words in sharpness
         if words
     )
@@ -145,7 +145,7 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
     Args:
         state: prepared contact.
         result: result of a press.
-        depth: distance of the femoral component below the first contact node, m.
+        depth: travel of the femoral component since it touched the first contact node, m.
     """
     unseen = result.approach - depth
     if unseen > max(
@@ -247,10 +247,10 @@ def _pressures(
 def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
     """Return the gaps (c,), m.
 
-    They belong to the deformed insert in and beside the contact and where the undeformed bodies
-    overlap, and to the undeformed insert elsewhere. Which nodes are candidates depends on the
-    initial guess. So the gap of a node beside the contact is computed even if it is no candidate:
-    the edge of contact depends on it.
+    Gaps of the deformed insert are used in and beside the contact, and where the undeformed bodies
+    overlap. Elsewhere the insert is undeformed. The edge of contact depends on the gaps beside the
+    contact, but the candidates depend on the initial guess. So the gap of a node beside the contact
+    is computed even if it is no candidate.
 
     Args:
         state: prepared contact.
