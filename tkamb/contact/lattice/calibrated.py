@@ -85,7 +85,7 @@ def _split_displacement(
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Return the mean gradient G = sum u_i g_iᵀ of a cell row by row; write u and u - G x.
 
-    The eight corners of an axis lie side by side, so that they fill the processor's vector
+    The eight values of an axis are adjacent in memory, so that they fill the processor's vector
     registers. G is in nine registers. The arguments are those of `_shear_force`.
     """
     first = nodes[0]

@@ -45,8 +45,8 @@ class LatticeFlagSettings:
     """1: a result with a smaller principal strain is flagged. Chosen because the material law does
     not prevent strains below -1, and measured curves end before -0.4."""
     max_unseen_height: float = 0.2e-3
-    """m: a press is flagged if first touch lies this far above the first contact node. Chosen
-    because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm."""
+    """m: a press is flagged if its travel from first touch to the first contact node is larger.
+    Chosen because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm."""
     collapse_strain: float = -1.0
     """1: principal strain at which a cell has no thickness left. The result is then out of range.
     By definition of the strain."""
@@ -140,7 +140,7 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
 
 
 def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
-    """Yield a flag if the meshes touch far above the first contact node.
+    """Yield a flag if the meshes touch long before any node does.
 
     Args:
         state: prepared contact.

@@ -40,7 +40,8 @@ class MemoryNeedSettings:
     unknowns_per_node: int = 3
     """Unknowns of a node. By definition; held unknowns are counted too."""
     cell_bytes: int = 20_000
-    """Bytes for a cell during the assembly of the stiffness. Measured: 9 to 22 kB."""
+    """Bytes for a cell during the assembly of the stiffness. Measured: 9 to 22 kB, which
+    `safety_factor` covers."""
     entry_bytes: int = 36
     """Bytes for an entry of the stiffness matrix: 20 for the entry and its copy in elimination
     order, 16 for the arrays of the compliance. Measured: without these 16 the estimate is 12 %

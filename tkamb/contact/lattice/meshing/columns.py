@@ -197,7 +197,7 @@ class ColumnSettings:
     ray exactly on a rough wall may miss the part."""
     max_height_change: float = 0.75
     """Cells: largest change of a surface's height when a node moves sideways. If it is larger, the
-    ray has hit another surface. Chosen because the height changes by less where cells follow it."""
+    ray has hit another surface. Chosen because slopes that cells follow cause smaller changes."""
 
 
 COLUMN = ColumnSettings()

@@ -354,7 +354,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
 
 
 def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
-    """Return the usable cells (c, 8), as flat grid numbers, and the number of omitted cells."""
+    """Return the usable cells (c, 8) of the flattened grid, and the number of omitted cells."""
     shape = field.member.shape
     corner = np.argwhere(_all_corners(field.member))
     grid = corner[:, None, :] + CORNERS
@@ -407,7 +407,7 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
 
 
 def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
-    """Return the class of every grid node (flat). Inner nodes belong to 8 cells."""
+    """Return the class of every node of the flattened grid. Inner nodes belong to 8 cells."""
     on_surface = np.bincount(cells.ravel(), minlength=field.member.size) < 8
     result = np.where(on_surface, OTHER, INTERNAL).astype(np.int8)
     result[field.top.ravel()] = CONTACT
@@ -416,7 +416,7 @@ def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
 
 
 def _on_bottom(field: NodeField) -> Mask:
-    """Return the mask of grid nodes (flat) in the flat bottom."""
+    """Return the mask, over the flattened grid, of nodes in the flat bottom."""
     height = field.points[..., 1].ravel()
     flat = np.abs(height) <= max(GRID.bottom_tolerance, 0.02 * field.spacing[1])
     return field.lower_end.ravel() & flat

@@ -2,7 +2,7 @@
 
 A lattice can lose features that are thinner than a cell, and whole parts of a faulty mesh. The
 results of a contact do not show this. So `whole_lattice` compares the volumes of lattice and mesh,
-and rejects a lattice if they differ.
+and rejects a lattice if they differ by more than 2 %.
 """
 
 import logging
