@@ -32,7 +32,7 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
 
 LEAST_DIVISOR = 1e-300
-"""m²: smallest divisor. It avoids a division by zero."""
+"""m²: smallest divisor, against division by zero."""
 
 
 @compiled

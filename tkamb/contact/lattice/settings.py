@@ -31,8 +31,7 @@ class LatticeSolverSettings:
     max_passes: int = 40
     """Largest number of passes, and of steps of the full Newton iteration. Knees take 1 to 8
     passes. Smaller: slow presses need the full Newton iteration, or do not converge. Larger: more
-    of them converge, but a press that cannot converge takes longer. It has no effect on presses
-    that converge earlier."""
+    of them converge, but a press that cannot converge takes longer."""
     anderson_depth: int = 6
     """Number of differences that Anderson's method uses. Smaller: more passes of a softened
     contact. Larger: fewer passes, more memory."""
@@ -47,8 +46,7 @@ class LatticeSolverSettings:
     max_expansions: int = 8
     """Largest number of candidate sets. A press is repeated with more candidates if its approach
     goes beyond them. Smaller: a press fails (out of range) if its expected approach was far too
-    small. Larger: it is repeated more often before it fails. It has no effect on presses that need
-    fewer sets."""
+    small. Larger: it is repeated more often before it fails."""
 
 
 LATTICE_SOLVER = LatticeSolverSettings()
