@@ -48,7 +48,7 @@ def test_sphere_on_a_thick_layer_agrees_with_hertz():
     assert approach == pytest.approx(exact**2 / RADIUS, rel=3e-3)
 
 
-def test_hertz_pressure_at_one_millimetre():
+def test_hertz_pressure_at_one_millimetre_is_accurate():
     """The mean error over eight sub-cell offsets is below 3 % (peak) and 10 % (L2)."""
     errors = hertz_errors(16e-3, 8e-3, 1e-3, OFFSETS)
     assert errors[:, 0].mean() < 0.10
@@ -171,7 +171,7 @@ def test_candidates_are_added_before_newton_s_method_is_tried(monkeypatch):
 
 
 def test_active_nodes_end_on_the_femoral_surface():
-    """New rays give gaps within the tolerance, on a rough femoral component."""
+    """New rays give gaps within four tolerances, on a rough femoral component."""
     label = "load_N=20000.0, rough_mm=0.01"
     rough = next(x for x in extremes() if (x.model, x.label) == ("lattice", label))
     model = contact_model("lattice", rough.resolution_mm)
@@ -297,7 +297,7 @@ def test_source_loops_agree_with_the_default_solver():
 
 
 def test_source_pressure_rule_shares_the_overlap_evenly():
-    """Sum of p A = F n with A = overlap / N."""
+    """Nodes in contact have equal areas. The sum of p A is the load."""
     model = contact_model("lattice-linear", 1.5, pressure_rule="source")
     bodies = pair(sphere_cap(RADIUS), box_insert(20e-3, 8e-3, 20e-3), LINEAR)
     result = model.press(model.prepare(bodies), 500.0, above())

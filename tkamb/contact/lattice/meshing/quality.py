@@ -2,7 +2,7 @@
 
 A lattice can lose features that are thinner than a cell, and whole parts of a faulty mesh. The
 results of a contact do not show this. So `whole_lattice` compares the volumes of lattice and mesh,
-and rejects a lattice with another volume.
+and rejects a lattice if they differ by more than 2 %.
 """
 
 import logging
@@ -90,7 +90,7 @@ def _smaller_cells(target_size: float, share: float, error: float) -> str:
 def _volume_refusal(
     lattice: Lattice, error: float, insert: Surface, target_size: float
 ) -> InputError:
-    """Return the error about a lattice that has another volume than its mesh."""
+    """Return the error about a lattice whose volume differs from that of its mesh."""
     part = missing_part(lattice.nodes, lattice.cells, lattice.spacing, insert)
     lacks = f"; it lacks {part}" if error < 0 and part is not None else ""
     return InputError(
