@@ -301,6 +301,16 @@ def test_shear_of_a_sheared_lattice_is_its_angle():
         assert sheared == pytest.approx((0.2, 0.2, 0.2))
 
 
+def test_the_volume_of_overlapping_bodies_counts_once():
+    block, inner = box_insert(0.04, 0.008, 0.06), box_insert(0.02, 0.004, 0.03)
+    vertices = np.concatenate([block.vertices, inner.vertices + [0.0, 3e-3, 0.0]])
+    faces = np.concatenate([block.faces, inner.faces + len(block.vertices)])
+    insert = Surface(vertices, faces, "block with a second body in it")
+    quality = measure_quality(build_grid(insert, 2e-3), insert)
+    assert quality.mesh_volume == pytest.approx(0.04 * 0.008 * 0.06, rel=1e-3)
+    assert abs(quality.volume_error) < 1e-3
+
+
 def test_a_post_has_cells_and_a_notice():
     surface = dished_block(post=(-0.008, 0.002, -0.005, 0.005, 0.025))
     lattice = build_grid(surface, 1e-3)

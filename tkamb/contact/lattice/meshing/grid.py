@@ -65,7 +65,8 @@ def connected_pieces(cells: Index) -> Index:
 def standing_pieces(cells: Index, bottom: Mask) -> Mask:
     """Return the mask (c,) of the cells of large pieces that stand on the bottom.
 
-    A piece that does not stand on the bottom has no fixed node, and its stiffness is singular.
+    A piece that does not stand on the bottom has no fixed node, and its stiffness is singular. If
+    no piece stands on the bottom, the largest one is kept.
 
     Args:
         cells: nodes of the cells, shape (c, 8).

@@ -16,6 +16,7 @@ from tkamb.contact.lattice.meshing.grid import (
     log_corrections,
     make_grid,
     missing_part,
+    solid_volume,
     volume_error,
 )
 from tkamb.errors import InputError
@@ -161,7 +162,7 @@ def measure_quality(lattice: Lattice, insert: Surface) -> LatticeQuality:
         cells=len(lattice.cells),
         springs=len(lattice.springs.ends),
         volume=float(cell_volumes(points).sum()),
-        mesh_volume=insert.volume,
+        mesh_volume=solid_volume(insert, points.mean(axis=1)),
         edge_ratio=_spread(_edge_ratios(points)),
         shear=_spread(_shear(points)),
         least_jacobian=float(scaled_jacobians(points).min()),
