@@ -148,18 +148,16 @@ def test_constraint_forces_cancel_the_forces_on_prescribed_coordinates():
     external = push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3])
     joint = demand(external, ("adduction", "ap"))
     place, contact = np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]), push([5.0, -800.0, 9.0])
-    (residual,) = joint.whole(place[None], contact)
+    (residual,) = joint.forces_on_all_coordinates(place[None], contact)
     assert np.abs(np.delete(residual, joint.released)).max() < 1e-10
-    assert residual[list(joint.released)] == pytest.approx(
-        joint.imbalance(place, contact), abs=1e-9
-    )
+    assert residual[list(joint.released)] == pytest.approx(joint.residual(place, contact), abs=1e-9)
 
 
 def test_contact_gain_is_the_derivative_of_the_residual():
     joint = demand(push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3]), ("adduction", "ap"))
     place, contact = np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]), push([5.0, -800.0, 9.0])
-    steps = np.stack([joint.imbalance(place, contact + unit) for unit in np.eye(6)], axis=1)
-    change = steps - joint.imbalance(place, contact)[:, None]
+    steps = np.stack([joint.residual(place, contact + unit) for unit in np.eye(6)], axis=1)
+    change = steps - joint.residual(place, contact)[:, None]
     assert joint.contact_gain(place) == pytest.approx(change, abs=1e-9)
 
 

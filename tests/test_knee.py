@@ -401,7 +401,7 @@ def test_inconsistent_arguments_are_refused_in_one_line(read):
         (lambda: knee_of(read, joints=["root_joint"]), "not part of the knee"),
         (lambda: knee_of(read, implant=tkamb.Implant(plain.femoral)), "no insert mesh"),
         (lambda: knee_of(read, implant=tkamb.Implant(mesh, plain.insert)), "metres"),
-        (lambda: knee_of(read, implant=tkamb.Implant("femur.stl", plain.insert)), "no mesh"),
+        (lambda: knee_of(read, implant=tkamb.Implant("femur.stl", plain.insert)), "not a mesh"),
         (lambda: knee_of(read, ligaments=[bundle]), "slack length"),
         (lambda: knee_of(read, ligaments=[lost]), "universe"),
         (lambda: knee_of(read, friction=-0.1), "friction"),

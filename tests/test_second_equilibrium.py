@@ -45,7 +45,9 @@ def found(knee, recorded, *previous):
     pair = SimpleNamespace(first_touch_height=lambda pose: 0.0)
     instant = SimpleNamespace(coordinates=np.array([recorded, 0, 0, 0, 0, 0.0]), muscles=None)
     poses = InitialPoses(knee, pair, None)
-    return poses.rest(instant, [equilibrium([place, 0, 0, 0, 0, 0.0]) for place in previous], {})
+    return poses.equilibrium(
+        instant, [equilibrium([place, 0, 0, 0, 0, 0.0]) for place in previous], {}
+    )
 
 
 def test_a_search_that_follows_the_last_frame_is_not_repeated():

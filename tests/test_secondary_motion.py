@@ -99,7 +99,7 @@ def test_flexion_and_coordinates_that_are_not_released_stay_recorded(bend):
 )
 def test_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(bend, resting, away):
     home = resting[60][1].equilibrium.coordinates
-    start = bend.starts.on_the_insert(home + np.append(away, 0.0))
+    start = bend.starts.at_first_touch(home + np.append(away, 0.0))
     again = bend.released.find(bend.mechanics.instant(60), start)
     assert again.problem == ""
     assert np.abs((again.coordinates - home) * SCALE).max() < 2e-5
@@ -120,14 +120,14 @@ def test_a_frame_that_needs_flexors_has_a_slack_quadriceps(bend):
         assert knee.balance.status is BalanceStatus.OK and knee.patella.status.found
         assert body.loads.values["residual_flexion"] < -10.0
         away = np.array([2e-3, 0, 1e-3, 0, np.radians(1), 0])
-        start = side.starts.on_the_insert(knee.coordinates + away)
+        start = side.starts.at_first_touch(knee.coordinates + away)
         again = side.released.find(side.mechanics.instant(k), start)
         assert np.abs((again.coordinates - knee.coordinates) * SCALE).max() < 2e-5
 
 
 def test_a_guess_beyond_the_rim_is_reported_as_failed(bend, resting):
     home = resting[60][1].equilibrium.coordinates
-    start = bend.starts.on_the_insert(home + np.array([-8e-3, 0, 8e-3, np.radians(-8), 0, 0]))
+    start = bend.starts.at_first_touch(home + np.array([-8e-3, 0, 8e-3, np.radians(-8), 0, 0]))
     ended = bend.released.find(bend.mechanics.instant(60), start)
     assert ended.problem == "released: out of the contact model's range"
 

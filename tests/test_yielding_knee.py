@@ -10,9 +10,9 @@ from tkamb.contact.foundation import LinearFoundation
 from tkamb.geometry.frames import knee_pose
 from tkamb.knee import released
 from tkamb.knee.balance import BalanceStatus, Trial, find_balance
-from tkamb.knee.released import RELEASED_KNEE, ReleasedKnee, ahead
+from tkamb.knee.released import RELEASED_KNEE, ReleasedKnee, remaining_distance
 from tkamb.knee.released_forces import SCALE
-from tkamb.knee.starts import INITIAL_POSE, carried_on
+from tkamb.knee.starts import INITIAL_POSE, extrapolated
 
 CELL = 1e-3
 
@@ -47,12 +47,12 @@ def test_a_rough_search_meets_its_residual_share_and_reports_it():
     rest = find_balance(springs, start)
     rough = find_balance(springs, start, residual_share=0.1)
     assert rest.status is rough.status is BalanceStatus.OK
-    assert rest.at_rest
-    assert not rough.at_rest
+    assert rest.converged
+    assert not rough.converged
     assert rough.trials < rest.trials
     missed = np.linalg.norm(rough.coordinates - rest.coordinates)
     assert 0 < missed < 0.15 * np.linalg.norm(rough.coordinates - start)
-    assert find_balance(springs, rest.coordinates, residual_share=0.1).at_rest
+    assert find_balance(springs, rest.coordinates, residual_share=0.1).converged
 
 
 def test_a_rough_search_does_not_end_at_an_unstable_state():
@@ -67,28 +67,30 @@ def test_a_rough_search_does_not_end_at_an_unstable_state():
 def test_the_remaining_distance_of_converging_passes_is_a_series(ratio):
     ways = 1e-3 * ratio ** np.arange(60)
     for k in range(2, 8):
-        assert ahead(ways[k - 2 : k + 1]) * ways[k] == pytest.approx(ways[k + 1 :].sum(), rel=1e-6)
+        assert remaining_distance(ways[k - 2 : k + 1]) * ways[k] == pytest.approx(
+            ways[k + 1 :].sum(), rel=1e-6
+        )
 
 
 def test_passes_that_do_not_converge_have_no_extrapolation():
     """One short pass after a long one does not show convergence."""
     short = 1.5 * RELEASED_KNEE.knee_tolerance
     for ways in ([np.inf, np.inf, short], [np.inf, 1e-3, short], [1e-3, 0.9e-3, short]):
-        assert ahead(ways) == 1.0
-    assert ahead([1e-3, 4e-4, 3e-4]) == 1.0
+        assert remaining_distance(ways) == 1.0
+    assert remaining_distance([1e-3, 4e-4, 3e-4]) == 1.0
     # alternating q = 0.4, 0.02: the larger ratio bounds the remaining distance
     ways = 1e-3 * np.cumprod([1.0, *([0.4, 0.02] * 5)])
     for k in range(2, len(ways) - 1):
-        assert ahead(ways[k - 2 : k + 1]) * ways[k] >= ways[k + 1 :].sum()
+        assert remaining_distance(ways[k - 2 : k + 1]) * ways[k] >= ways[k + 1 :].sum()
 
 
 def test_the_initial_guess_extrapolates_steady_frames_up_to_a_limit():
     step = np.array([3e-4, -1e-4, 2e-4, 4e-3, 1e-3, 0.0])
     steady = [np.zeros(6), step, 2 * step]
-    assert carried_on(steady) == pytest.approx(3 * step, abs=1e-15)
-    assert np.array_equal(carried_on(steady[:1]), steady[0])
-    assert np.array_equal(carried_on([np.zeros(6), step, np.zeros(6)]), np.zeros(6))
-    leap = carried_on([np.zeros(6), 50 * step, 100 * step]) - 100 * step
+    assert extrapolated(steady) == pytest.approx(3 * step, abs=1e-15)
+    assert np.array_equal(extrapolated(steady[:1]), steady[0])
+    assert np.array_equal(extrapolated([np.zeros(6), step, np.zeros(6)]), np.zeros(6))
+    leap = extrapolated([np.zeros(6), 50 * step, 100 * step]) - 100 * step
     assert np.linalg.norm(leap * SCALE) == pytest.approx(INITIAL_POSE.max_extrapolation, rel=1e-9)
 
 
