@@ -17,8 +17,7 @@ The result has a flag if a change of the recorded pose by `AdjustmentSettings.in
 change the decision to restore the orientation.
 
 The adjustment should leave the total force unchanged (Sharma 2008, 5.2.2: less than 0.001 BW).
-`adjustment_effect` compares the loads of the adjusted and the recorded contact points. A run flags
-a frame if the total force differs.
+`adjustment_effect` compares the loads with and without adjustment.
 """
 
 from collections.abc import Mapping
@@ -47,8 +46,7 @@ class SplitSensitivitySettings:
 
     adduction_step: float = 0.02 * DEGREE
     """rad: step of the finite difference. Chosen because it shifts about 60 N between the condyles,
-    thirty times the lattice's tolerance, and 0.2 deg or more unload a condyle. Results with steps
-    of 0.005 to 0.1 deg agree within 5 to 15 %."""
+    thirty times the lattice's tolerance, and 0.2 deg or more unload a condyle."""
 
 
 SPLIT_SENSITIVITY = SplitSensitivitySettings()

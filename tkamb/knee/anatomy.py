@@ -218,6 +218,7 @@ def _shank(
     """
     shank = {tibia, *path} - {femur}
     excluded = {0, femur} | (set() if patella is None else {patella.joint})
+    # Parents and children join the shank until no body is added.
     grows = True
     while grows:
         count = len(shank)

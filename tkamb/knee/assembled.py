@@ -1,4 +1,4 @@
-"""A knee on a user's model: its parts, and their poses at a configuration."""
+"""The parts of a knee on a user's model, and their poses at a configuration."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -46,7 +46,7 @@ PATELLAR_LIGAMENT = "patellar_ligament"
 class KneeData:
     """Data that a caller passes from call to call to save time; `Knee.create_data` makes it.
 
-    It changes a result at most within the solver's tolerance.
+    Results change at most within the solver's tolerance.
 
     Args:
         data: Pinocchio data of the user's model.

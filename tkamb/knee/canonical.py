@@ -305,6 +305,7 @@ class Bridge:
         jacobian = pin.computeJointJacobian(model, cache, q, joint)[:, columns]
         v = np.zeros(model.nv)
         v[columns] = _solved(jacobian, twist)
+        # With zero joint accelerations the acceleration of the child body is J' qd.
         pin.forwardKinematics(model, cache, q, v, np.zeros(model.nv))
         acceleration = _solved(jacobian, rate - cache.a[joint].vector)
         return np.stack([coordinates, v[columns], acceleration])

@@ -53,7 +53,7 @@ class CondylePoint:
     def direction(self, friction: float) -> Array:
         """Return the contact force on the femur (3,) per unit normal force.
 
-        It is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v. This is Coulomb
+        The result is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
         friction that fades below v0 = 1 mm/s.
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal

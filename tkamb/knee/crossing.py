@@ -19,8 +19,7 @@ With fixed contact points and lines the equations are linear in all loads. This 
    group, and -Q_0/h is the moment that all muscles together supply. If coordinates are released,
    contact points and the medial-lateral split depend on the muscles. The row then comes from the
    tension of the patellar ligament, which the tangent of contact and ligaments makes linear in the
-   muscle forces (`ReleasedForces.tension_per_wrench`, `yielding_flexion_row`). This row changes
-   smoothly if a condyle lifts off.
+   muscle forces (`ReleasedForces.tension_per_wrench`, `yielding_flexion_row`).
 
 2. A normal force is the sum of the contributions of all loads (`condyle_contributions`),
 

@@ -141,7 +141,6 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
 
     If several states have no wrong sign, the state with the fewest zero loads is used, and
     `ambiguous` is true. If every state has a wrong sign, there is no solution.
-    `tkamb.knee.unknowns` describes the load states.
 
     Args:
         geometry: the frame.
@@ -150,7 +149,7 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     lifted = geometry.lifted
     extensors = geometry.extensor.muscles if geometry.extensor else ()
     first, *others = load_states(geometry.condyles, lifted, extensors)
-    # The state in which all loads act is solved first. Most frames need no other state.
+    # Most frames need only the state in which all loads act.
     full = KneeSystem(geometry, friction, first)
     condition = full.solution.condition
     if not full.solution.regular:
@@ -199,15 +198,13 @@ def dome_sensitivity(
     The patellofemoral force passes through the contact of the button with the femur. The moment
     arms about this line of action decide the ratio of muscle and patellar-ligament tension. A
     button that is higher or lower on the patella (y axis) shifts the line sideways and changes the
-    arms. A deeper button (x axis) shifts the line along itself and changes little. The position of
-    the button is known to about a millimetre only.
+    arms. The position of the button is known to about a millimetre only.
 
     Here the line is shifted along the patella's y axis, and the patella does not move. With the
     frame's equations A x = b the change is dx = -A⁻¹ dA x. On the shipped knee, from extension to
     120 deg, the tension of the quadriceps changes by 1.6 to 5.6 % per millimetre, and the
-    patellofemoral force by 1.0 to 4.3 %. A patella that moves to its new equilibrium rotates by up
-    to 1 deg per millimetre and cancels most of this change: the tension then changes by 1.6 % at
-    most. The value for the quadriceps is therefore an upper estimate.
+    patellofemoral force by 1.0 to 4.3 %. If the patella rotated to its new equilibrium, the tension
+    would change by 1.6 % at most. The value for the quadriceps is therefore an upper estimate.
 
     Args:
         geometry: the frame.

@@ -204,7 +204,7 @@ class ExtensorLines:
         """Raise an error if a fixed end of a line lies inside the outline that the line wraps."""
         ends, name = [], self.muscle.name
         if self.muscle.wrap is not None:
-            last = self.muscle.points[self.muscle.wrap.stretch]
+            last = self.muscle.points[self.muscle.wrap.segment]
             origin = transform(self._chain.link_in(last.link, "femur"), last.position)
             low, high = self._parts.femoral.bounds[:, 2]
             femoral_outline = sagittal_outline(
@@ -226,8 +226,8 @@ class ExtensorLines:
     def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
         """Return the mechanism, and its prepared contact."""
         parts, chain = self._parts, self._chain
-        stretch = off_femur(self.muscle.points, chain)
-        origin, insertion = self.muscle.points[stretch : stretch + 2]
+        segment = off_femur(self.muscle.points, chain)
+        origin, insertion = self.muscle.points[segment : segment + 2]
         joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
         prepared = _patellar_contact(parts.femoral, parts.button, joint.tobytes())
         mechanism = ExtensorMechanism(
@@ -336,7 +336,7 @@ class ExtensorFrames:
         touch the femur and the moments would not balance.
 
         The filter needs coordinates in lost frames: a shape-preserving cubic interpolates them. An
-        error of 1 m/s² in an acceleration changes the force on a patella of 0.1 kg by 0.1 N.
+        error of 1 m/s² changes the inertial force of a patella of 0.1 kg by 0.1 N.
         """
         coordinates = np.array([state.coordinates for state in self.states])
         solved_frames = np.flatnonzero(np.isfinite(coordinates).all(axis=1))

@@ -70,6 +70,7 @@ def post_contact(
     if cam_post is None:
         return None
     post = cam_post.at(pose)
+    # With AP released, equilibrium determines the overlap.
     if "ap" in released or post.problem or not post.gap < -POST_SIDE.pose_error:
         return post
     flag = (

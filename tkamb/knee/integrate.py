@@ -75,7 +75,6 @@ def implicit_step(
 
     Raises:
         ComputationError: Newton's method does not converge, or the contact model is out of range.
-            A shorter step may converge.
     """
     model, data = knee.model, knee.create_data() if data is None else data
     viscosity = np.zeros(model.nv) if friction_of_joints is None else friction_of_joints

@@ -4,8 +4,7 @@
     tau = pin.rnea(model, data, q, v, a, knee.external_forces(q, v))
 
 All units are SI. Arguments and results are NumPy arrays and Pinocchio types. A call reads no files,
-prints nothing, and does not change the result of the next call. To save time, a caller creates a
-`KneeData` and passes it to each call.
+prints nothing, and does not change the result of the next call.
 """
 
 from collections.abc import Mapping, Sequence

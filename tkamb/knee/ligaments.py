@@ -12,9 +12,8 @@ toe does not.
 
 `generic_ligaments` scales a set of bundles to the implant, for a patient without measured
 ligaments. Positions of the femoral ends are relative to the axis of the posterior condyles, because
-collaterals are nearly isometric near this axis. Positions of the distal ends are relative to the
-insert's flat bottom. The proportions are those of an average knee: check the strain table before
-using any force.
+collaterals are nearly isometric near this axis. The proportions are those of an average knee: check
+the strain table before using any force.
 
 References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998) (stiffness); Blankevoort & Huiskes,
 J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883 (law, strains at extension).

@@ -108,12 +108,12 @@ class Wrap:
     Args:
         link: name of the link with the outline; the reaction acts on this link.
         outline: convex polygon in the link's x-y plane, shape (n, 2), m.
-        stretch: number of the segment; segment 0 is between the first two points.
+        segment: number of the segment; segment 0 is between the first two points.
     """
 
     link: str
     outline: Array
-    stretch: int = 0
+    segment: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class Line:
         positions = [transform(poses[point.link], point.position) for point in self.points]
         segments = []
         for i, (start, end) in enumerate(pairwise(positions)):
-            wrapped = self.wrap if self.wrap and self.wrap.stretch == i else None
+            wrapped = self.wrap if self.wrap and self.wrap.segment == i else None
             outline, link = (wrapped.outline, wrapped.link) if wrapped else (None, None)
             pose = np.eye(4) if link is None else np.asarray(poses[link], float)
             try:
@@ -168,10 +168,11 @@ class Line:
         """
         links = [point.link for point in self.points]
         if self.wrap:
-            index = self.wrap.stretch + 1
+            index = self.wrap.segment + 1
             links[index:index] = [self.wrap.link] * (len(path.points) - len(links))
         directions = path.directions
         forces = np.concatenate([directions[:1], np.diff(directions, axis=0), -directions[-1:]])
+        # Several inner points on one link become one load.
         inner = np.array(links[1:-1])
         return (
             PointForces(links[0], path.points[:1], forces[:1]),
@@ -206,14 +207,14 @@ def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
     """
     if muscle.wrap is None:
         return Line(muscle.name, muscle.points)
-    stretch = off_femur(muscle.points, chain)
-    last = muscle.points[stretch]
+    segment = off_femur(muscle.points, chain)
+    last = muscle.points[segment]
     outline = muscle.wrap.outline(
         femoral,
         float(chain.patella_joint_in_femur[2, 3]),
         below=float(transform(chain.link_in(last.link, "femur"), last.position)[1]),
     )
-    return Line(muscle.name, muscle.points, Wrap("femur", outline, stretch))
+    return Line(muscle.name, muscle.points, Wrap("femur", outline, segment))
 
 
 def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:

@@ -126,7 +126,7 @@ class _Closing:
     """Newton steps for gap and ligament length at a constant rotation, with Broyden's slopes.
 
     The first slopes are the contact's unit normal and the ligament's direction. On the flanks of
-    the groove the slope of the gap is up to a fifth smaller. Broyden's updates correct this.
+    the groove the slope of the gap is up to a fifth smaller.
     """
 
     def __init__(self, ligament_length: float) -> None:
@@ -319,8 +319,8 @@ class _Search(PatellaFrame):
     def first_touch(self, rotation: float) -> PatellaBalance:
         """Return the balance at a rotation (rad) near first touch.
 
-        At a constant rotation the patella swings on its ligament about the tuberosity, from
-        anterior to posterior, until the button touches the femur.
+        The patella swings on its ligament about the tuberosity, from anterior to posterior, until
+        the button touches the femur.
 
         Raises:
             ComputationError: the button does not touch the femur, or there is no balance near the
@@ -329,8 +329,7 @@ class _Search(PatellaFrame):
         mechanism = self.mechanism
         rotated = mechanism.contact.pose(np.array([0.0, 0.0, rotation]))
         proximal = transform(rotated, mechanism.ligament_proximal)
-        # The ligament has a constant length: its proximal end moves on a circle about the
-        # tuberosity.
+        # The proximal end of the ligament moves on a circle about the tuberosity.
         radius = np.sqrt(
             max(mechanism.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8)
         )

@@ -105,7 +105,7 @@ class PatellofemoralContact:
     """Contact between button and femoral component, prepared for many positions.
 
     The distance of a sample is computed again only if the sample can have a weight at the new
-    position. This saves time and does not change the result.
+    position. The result does not change.
 
     Args:
         femoral: surface of the femoral component in the patellar joint's frame, with shared

@@ -46,8 +46,8 @@ class ReleasedKneeSettings:
     """Tolerances and limits of the passes between knee, patella and muscles."""
 
     knee_tolerance: float = 2e-6
-    """m: movement of the knee between passes below which they have converged. Chosen equal to the
-    step tolerance of the search."""
+    """m: movement of the knee between passes below which the passes have converged. Chosen equal to
+    the step tolerance of the search."""
     contact_force_tolerance: float = 0.1
     """N: change of the contact force below which passes have converged, or `contact_force_share` of
     the force if that is larger. Chosen as a ten-thousandth of a usual contact force."""
@@ -68,8 +68,8 @@ class ReleasedKneeSettings:
     """1: remaining step of a pass with muscles, as a share of the knee's movement in this pass, at
     which the pass ends. Chosen because more passes follow in any case."""
     muscle_force_range: float = 3e-3
-    """m: distance from the initial guess within which the muscle forces of the last frame are a
-    good guess. Chosen because the knee moves by less from frame to frame."""
+    """m: distance from the initial guess at which a pass ends if the last frame gave the muscle
+    forces. Chosen because the knee moves by less from frame to frame."""
     slack_force: float = 1e-3
     """N: an extensor group with a smaller tension is slack. Chosen because it is far below the
     resolution of the reports."""

@@ -216,9 +216,9 @@ def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
 
 
 def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
-    """Return the wrench (6,) of ground, weight and inertia on the shank, insert frame.
+    """Return the wrench (6,) of ground reaction, weight and inertia on the shank, insert frame.
 
-    It does not depend on the knee coordinates.
+    The wrench does not depend on the knee coordinates of the geometry.
     """
     state = geometry.state
     hip = unknowns.hip(state.point("hip", np.zeros(3)))

@@ -177,6 +177,7 @@ def _map(
     share = np.clip(contact.pressure / peak_pressure, 0.0, 1.0)
     ramp = np.linspace(0.0, 1.0, len(PRESSURE_COLOURS))
     colours = np.stack([np.interp(share, ramp, channel) for channel in PRESSURE_COLOURS.T], axis=1)
+    # Above the insert's surface, which would hide a part of the map.
     points = in_world(contact.points + 1e-4 * contact.normals)
     material = geometry.MeshBasicMaterial(vertexColors=True, side="DoubleSide")
     node.set_object(geometry.TriangularMeshGeometry(points, loaded, colours), material)

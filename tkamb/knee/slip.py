@@ -13,7 +13,7 @@ forwards on the insert. The rate of the slip is the x velocity of the femur's co
 to the insert, without the axial part. `sliding_velocity` computes this rate without arcs.
 
 If the tangent of a profile turns by d between two points, the arc is chord (d/2)/sin(d/2). This is
-exact on a circle. On a profile of changing curvature the error is of third order in the step.
+exact on a circle. On other profiles the error is of third order in the step.
 """
 
 from dataclasses import dataclass
@@ -138,8 +138,7 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
     """Return the arcs (f-1,), m, between successive lowest points, on the femoral surface.
 
     At a lowest point the normal of the surface is the insert's -y. The tangent of the profile
-    therefore turns by the rotation of the femur about its ML axis. An arc is positive backwards.
-    The chord of an arc lies in the insert's sagittal plane.
+    therefore turns by the rotation of the femur about its ML axis.
 
     Args:
         points: lowest points, insert frame, shape (f, 3), m.

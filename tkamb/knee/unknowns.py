@@ -35,9 +35,8 @@ class UnknownsSettings:
     max_condition: float = 1e4
     """1: condition number (unit columns) above which a frame counts as singular. The number is
     about 7 to 9 m / d, where d is the moment arm of the patellar ligament about the femorotibial
-    contact. The shipped knee has d = 43 to 45 mm and condition numbers of 148 to 218. Chosen
-    because at the limit, d = 0.8 mm, an error of 1 mm in a line of action changes the force by more
-    than 100 %."""
+    contact. Chosen because at the limit, d = 0.8 mm, an error of 1 mm in a line of action changes
+    the force by more than 100 %."""
 
 
 UNKNOWNS = UnknownsSettings()

@@ -163,8 +163,7 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
     """Return the taut path's points (m, 3), length and turn, and the end inside the outline.
 
     The path is straight if the segment misses the outline. Otherwise it touches the outline from
-    the corner of the tangent through the start to the corner of the tangent through the end. At
-    these corners the outline's edges change from visible to hidden.
+    the corner of the tangent through the start to the corner of the tangent through the end.
 
     Args:
         start: start of the path, shape (3,), m.
