@@ -114,7 +114,7 @@ def whole_body(plain, left=False, leg_first=False):
         root = model.getJointId("root_joint")
     hip = turn(pin.SE3(np.eye(3), (anatomy.hip.placement).translation))
     on_thigh = pin.SE3(pin.utils.rpyToMatrix(0.3, -0.2, 0.5), np.array([0.01, 0.02, -0.03]))
-    # the joint's frame is at the hip; the thigh's frame is rotated relative to it
+    # the joint's frame is at the hip; the thigh's frame is shifted
     thigh = hip.inverse()
     ball = model.addJoint(
         root, pin.JointModelSpherical(), pin.SE3(np.eye(3), np.array([0, 0.1, -0.1])), "hip_ball"

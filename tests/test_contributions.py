@@ -26,7 +26,7 @@ GROUND_POINTS = {
 }
 
 
-def solved(where, least=0.05):
+def solved(where, least_activation=0.05):
     """Return geometry and loads of the bent knee with 700 N of ground reaction and ligaments."""
     ground = PointForces("tibia", np.array([GROUND_POINTS[where]]), 700 * UP[None])
     strap = np.array([0.0, 0.01, 0.04]), 90 * UP
@@ -35,12 +35,16 @@ def solved(where, least=0.05):
         PointForces("femur", strap[0][None], -strap[1][None]),
     )
     knee = replace(bent_knee(), ground=ground, ligaments=pull)
-    return SharedMuscles(two_flexors(1, reserve=2.0, least=least)).frame(0).solve(knee, FRICTION)
+    return (
+        SharedMuscles(two_flexors(1, reserve=2.0, least=least_activation))
+        .frame(0)
+        .solve(knee, FRICTION)
+    )
 
 
 @pytest.mark.parametrize("where", GROUND_POINTS)
 def test_contributions_add_up_to_the_normal_forces(where):
-    geometry, loads = solved(where, least=0.0 if where == "slack" else 0.05)
+    geometry, loads = solved(where, least_activation=0.0 if where == "slack" else 0.05)
     assert loads.slack == (where == "slack")
     assert bool(loads.lifted) == (where == "one side")
     parts = condyle_contributions(geometry, loads, FRICTION)

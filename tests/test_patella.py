@@ -93,34 +93,46 @@ def knee_at(flexion_deg: float) -> Array:
 
 
 def three_force(flexion_deg: float, guess: Array) -> tuple[Array, float, float]:
-    """Return the closed-form coordinates, PL/Q and PF/Q of three concurrent forces."""
+    """Return coordinates (3,), PL/Q and PF/Q with which the three forces meet in one point."""
     tuberosity = transform(inverse(knee_at(flexion_deg)), TUBEROSITY)[:2]
 
-    def place(unknown: Array) -> tuple[Array, Array, Array, Array]:
+    def points_at(unknown: Array) -> tuple[Array, Array, Array, Array]:
         angle, rotation = unknown
-        out = np.array([np.cos(angle), np.sin(angle)])
-        turn = np.array(
+        radial = np.array([np.cos(angle), np.sin(angle)])
+        rotation_matrix = np.array(
             [[np.cos(rotation), -np.sin(rotation)], [np.sin(rotation), np.cos(rotation)]]
         )
-        at = (TROCHLEA + DOME) * out - turn @ CENTRE[:2]
-        return at, out, at + turn @ INSERTION[:2], at + turn @ PROXIMAL[:2]
+        position = (TROCHLEA + DOME) * radial - rotation_matrix @ CENTRE[:2]
+        return (
+            position,
+            radial,
+            position + rotation_matrix @ INSERTION[:2],
+            position + rotation_matrix @ PROXIMAL[:2],
+        )
 
     def errors(unknown: Array) -> list[float]:
-        _, out, insertion, proximal = place(unknown)
-        pull, hold = ORIGIN[:2] - insertion, tuberosity - proximal
-        meet = (
+        _, radial, insertion, proximal = points_at(unknown)
+        muscle, patellar = ORIGIN[:2] - insertion, tuberosity - proximal
+        intersection = (
             insertion
-            + pull * np.linalg.solve(np.column_stack([pull, -hold]), proximal - insertion)[0]
+            + muscle
+            * np.linalg.solve(np.column_stack([muscle, -patellar]), proximal - insertion)[0]
         )
-        return [100 * (np.linalg.norm(hold) - LENGTH), 100 * (meet[0] * out[1] - meet[1] * out[0])]
+        return [
+            100 * (np.linalg.norm(patellar) - LENGTH),
+            100 * (intersection[0] * radial[1] - intersection[1] * radial[0]),
+        ]
 
     at_guess = guess[:2] + CENTRE[:2]
     angle, rotation = fsolve(errors, [np.arctan2(at_guess[1], at_guess[0]), guess[2]], xtol=1e-13)
-    at, out, insertion, proximal = place(np.array([angle, rotation]))
-    pull, hold = ORIGIN[:2] - insertion, tuberosity - proximal
-    pull, hold = pull / np.linalg.norm(pull), hold / np.linalg.norm(hold)
-    ligament, normal = np.linalg.solve(np.column_stack([hold, out]), -pull)
-    return np.append(at, rotation), float(ligament), float(normal)
+    position, radial, insertion, proximal = points_at(np.array([angle, rotation]))
+    muscle, patellar = ORIGIN[:2] - insertion, tuberosity - proximal
+    muscle, patellar = (
+        muscle / np.linalg.norm(muscle),
+        patellar / np.linalg.norm(patellar),
+    )
+    ligament, normal = np.linalg.solve(np.column_stack([patellar, radial]), -muscle)
+    return np.append(position, rotation), float(ligament), float(normal)
 
 
 def solved(mechanism: ExtensorMechanism, angles: list[float]) -> list[PatellaState]:

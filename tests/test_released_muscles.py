@@ -173,9 +173,9 @@ def share_of(force):
 def test_relaxation_converges_where_plain_iteration_diverges(slope):
     """With f' = 100 + slope f and a slope below -1, plain iteration diverges."""
     relaxation = Relaxation()
-    applied = relaxation.mixed(share_of(0.0))
+    applied = relaxation.relaxed_forces(share_of(0.0))
     for _ in range(6):
-        applied = relaxation.mixed(share_of(100.0 + slope * applied.force[0]))
+        applied = relaxation.relaxed_forces(share_of(100.0 + slope * applied.force[0]))
         if relaxation.converged:
             break
     assert relaxation.converged
@@ -188,21 +188,21 @@ def test_the_compliance_converges_where_plain_iteration_oscillates(steepness):
     relaxation, compliance = Relaxation(), None
     for _ in range(10):
         measured = np.full(6, 3.0) if compliance is None else 1.0 + steepness * (compliance - 1.0)
-        compliance = relaxation.yielding(measured)
+        compliance = relaxation.compliance(measured)
     np.testing.assert_allclose(compliance, 1.0, atol=0.25)
     assert relaxation.compliance_error == pytest.approx(
         np.abs(measured - compliance).max() / np.abs(compliance).max()
     )
-    assert relaxation.yielding(None) is None
+    assert relaxation.compliance(None) is None
     assert relaxation.compliance_error == 0.0
 
 
 def test_the_last_compliance_is_constant_and_its_difference_is_reported():
     relaxation, compliance = Relaxation(), None
     for k in range(20):
-        compliance = relaxation.yielding(np.full(6, 1.0 if k % 2 else 2.0))
+        compliance = relaxation.compliance(np.full(6, 1.0 if k % 2 else 2.0))
     assert relaxation.compliance_error > 0.1
-    np.testing.assert_array_equal(compliance, relaxation.yielding(np.full(6, 9.0)))
+    np.testing.assert_array_equal(compliance, relaxation.compliance(np.full(6, 9.0)))
 
 
 @pytest.mark.slow

@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EquationSettings:
-    """The equations of motion of the leg."""
+    """Sensitivity of the loads to the residuals."""
 
     residual_shift: float = 0.010
-    """m: shift along y of the point where the residuals act. It defines the column
+    """m: shift along y of the point where the residuals act, for the column
     `residual_sensitivity_N`."""
 
 

@@ -136,17 +136,17 @@ class _Closing:
         self.errors: Array = np.full(2, np.inf)
 
     @property
-    def closed(self) -> bool:
+    def converged(self) -> bool:
         return bool(np.abs(self.errors).max() < PATELLA_SEARCH.length_tolerance)
 
     def step(self, balance: PatellaBalance) -> Array:
         """Return the next step (2,) in ap and si, m, limited to 5 mm."""
-        before, stretch = self.errors, balance.ligament.length - self._length
+        last_errors, stretch = self.errors, balance.ligament.length - self._length
         self.errors = np.array([balance.contact.gap, stretch])
-        error, last_error = float(np.abs(self.errors).max()), float(np.abs(before).max())
+        error, last_error = float(np.abs(self.errors).max()), float(np.abs(last_errors).max())
         improves = error < 0.5 * last_error < np.inf
         if improves:
-            update_error = self.errors - before - self._slopes @ self._step
+            update_error = self.errors - last_errors - self._slopes @ self._step
             self._slopes += np.outer(update_error, self._step) / (self._step @ self._step)
         if not improves or abs(np.linalg.det(self._slopes)) < PATELLA.least_determinant:
             self._slopes = _slopes_in_plane(balance)
@@ -172,7 +172,7 @@ class _Search(PatellaFrame):
         for _ in range(40):
             balance = self.balance(coordinates)
             step = closing.step(balance)
-            if closing.closed:
+            if closing.converged:
                 return balance
             coordinates = coordinates + np.append(step, 0.0)
         worst = np.argmax(np.abs(closing.errors))

@@ -52,7 +52,7 @@ difference from the measured compliance."""
 TURNS = np.array(
     [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
 )
-"""1 and m: factors that make the responses to forces and moments comparable."""
+"""1 and m: factors that make the compliances to forces and moments comparable."""
 
 
 class Relaxation:
@@ -65,12 +65,12 @@ class Relaxation:
 
     def __init__(self) -> None:
         self._applied: MuscleShare | None = None
-        self._last: Array | None = None
+        self._last_difference: Array | None = None
         self._factor, self.converged = MOST, True
-        self._yields: Array | None = None
+        self._compliance: Array | None = None
         self._passes, self.compliance_error = 0, 0.0
 
-    def yielding(self, measured: Array | None) -> Array | None:
+    def compliance(self, measured: Array | None) -> Array | None:
         """Return the compliance of the knee, 1 and 1/m, for the next pass.
 
         Args:
@@ -78,7 +78,7 @@ class Relaxation:
                 shape (6,); None: unknown.
         """
         self._passes, self.compliance_error = self._passes + 1, 0.0
-        last_compliance, self._yields = self._yields, measured
+        last_compliance, self._compliance = self._compliance, measured
         step = next((part for until, part in STEPS if self._passes <= until), 0.0)
         if last_compliance is None or measured is None or step == 1.0:
             return measured
@@ -88,10 +88,10 @@ class Relaxation:
         )
         if difference > 0.0:
             self.compliance_error = difference / size if size > 0.0 else np.inf
-        self._yields = relaxed
+        self._compliance = relaxed
         return relaxed
 
-    def mixed(self, required: "MuscleShare") -> "MuscleShare":
+    def relaxed_forces(self, required: "MuscleShare") -> "MuscleShare":
         """Return the forces of the next pass.
 
         Args:
@@ -101,11 +101,15 @@ class Relaxation:
         if applied is None:
             return required
         difference = required.force - applied.force
-        if self._last is not None:
-            change = difference - self._last
-            factor = -self._factor * float(self._last @ change) / max(float(change @ change), 1e-12)
+        if self._last_difference is not None:
+            change = difference - self._last_difference
+            factor = (
+                -self._factor
+                * float(self._last_difference @ change)
+                / max(float(change @ change), 1e-12)
+            )
             self._factor = float(np.clip(factor, LEAST, MOST))
-        self._last = difference
+        self._last_difference = difference
         self.converged = bool(np.abs(difference).max() < MUSCLE_ITERATION.muscle_force_tolerance)
         if not self.converged:
             self._applied = replace(

@@ -212,12 +212,12 @@ class ReleasedKnee:
                     middle,
                     slack,
                 )
-                if knee.problem or knee.residual <= self._allowed(knee.contact):
+                if knee.problem or knee.residual <= self._residual_limit(knee.contact):
                     return knee
         assert knee is not None
         return replace(knee, problem="the iteration between knee and patella does not converge")
 
-    def _allowed(self, contact: "ProbedContact") -> float:
+    def _residual_limit(self, contact: "ProbedContact") -> float:
         """Return the residual (N) below which a frame has converged."""
         share = max(RELEASED_KNEE.residual_share, contact.accuracy)
         force = float(np.linalg.norm(contact.wrench[:3]))
@@ -293,7 +293,7 @@ class ReleasedKnee:
         if muscles is not None and not geometry.problems:
             applied = None if last_contact is None or before is None else before.geometry.share
             applied = None if applied is None else muscles.at(applied)
-            share = relaxation.mixed(
+            share = relaxation.relaxed_forces(
                 self._share(instant, geometry, joint, last_contact, applied, relaxation)
             )
             geometry, joint = replace(geometry, share=share), replace(joint, share=share)
@@ -357,7 +357,7 @@ class ReleasedKnee:
         if applied is not None:
             forces = self._forces(instant, replace(joint, share=applied), coordinates)
             smooth = self._probe.smoothed(knee_pose(coordinates), contact)
-            compliance = relaxation.yielding(forces.tension_per_wrench(smooth))
+            compliance = relaxation.compliance(forces.tension_per_wrench(smooth))
         if applied is not None and compliance is not None:
             muscle_wrench = applied.wrench(
                 geometry.state.pose("tibia"), geometry.state.pose("femur")
