@@ -303,7 +303,8 @@ def test_shear_of_a_sheared_lattice_is_its_angle():
 
 def test_the_volume_of_overlapping_bodies_counts_once():
     block, inner = box_insert(0.04, 0.008, 0.06), box_insert(0.02, 0.004, 0.03)
-    vertices = np.concatenate([block.vertices, inner.vertices + [0.0, 3e-3, 0.0]])
+    raised = inner.vertices + np.array([0.0, 3e-3, 0.0])
+    vertices = np.concatenate([block.vertices, raised])
     faces = np.concatenate([block.faces, inner.faces + len(block.vertices)])
     insert = Surface(vertices, faces, "block with a second body in it")
     quality = measure_quality(build_grid(insert, 2e-3), insert)
