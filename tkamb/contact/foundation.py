@@ -309,8 +309,8 @@ class FoundationProbe:
         samples, (gap, _, face) = self._columns(pose)
         near = gap < WIDEST_EDGE
         samples, gap, femoral = samples.part(near), gap[near], self._state.pair.femoral
-        met = transform(inverse(pose), samples.points + gap[:, None] * samples.normals)
-        normals = rotate(pose, femoral.smooth_normals(met, face[near]))
+        femoral_points = transform(inverse(pose), samples.points + gap[:, None] * samples.normals)
+        normals = rotate(pose, femoral.smooth_normals(femoral_points, face[near]))
         cosine = np.abs(np.einsum("ij,ij->i", normals, samples.normals))
         change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
         edge = np.clip(change, FOUNDATION.approach_step, WIDEST_EDGE)
