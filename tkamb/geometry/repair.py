@@ -383,8 +383,10 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
         part = np.intersect1d(body, wall)
         if not len(part):
             continue
-        whole = Surface(vertices, faces[part], merged=True)
-        points = whole.triangles.mean(axis=1) + INNER_WALL.probe_distance * whole.face_normals
+        wall_part = Surface(vertices, faces[part], merged=True)
+        points = (
+            wall_part.triangles.mean(axis=1) + INNER_WALL.probe_distance * wall_part.face_normals
+        )
         for b in range(len(bodies)):
             if group[a] != group[b] and skins[b].winding.inside(points).any():
                 group = [group[a] if each == group[b] else each for each in group]
