@@ -50,8 +50,8 @@ class AdjustmentSettings:
     """Condition that restores the recorded rotation. "both": penetration and coronal angle after
     the press both exceed the adjustment (Sharma 2008). "either": one of them does."""
     input_change: float = 0.1 * MILLIMETRE
-    """m: error of a recorded gap. A frame is flagged if this error decides whether the femur is
-    turned. Chosen: a fifth of the error of fluoroscopy."""
+    """m: error of a recorded gap. A frame is flagged if this error decides whether the recorded
+    rotation is changed. Chosen: a fifth of the error of fluoroscopy."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
     """m: if both condyles are farther from the insert, the pose is refused. Chosen because it is
     more than the errors of fluoroscopy."""
@@ -149,9 +149,9 @@ def _limited_turn(
     if abs(largest - limit) <= margin:
         outcome = "turned level" if largest < limit else "left as lift-off"
         flags = (
-            f"coronal angle of {largest / DEGREE:.2f} deg is {outcome}: the limit of "
-            f"{limit / DEGREE:g} deg is so near that {settings.input_change / MILLIMETRE:g} mm at "
-            "a condyle would cross it, and the medial-lateral split jumps there",
+            f"coronal angle of {largest / DEGREE:.2f} deg is {outcome}: an error of "
+            f"{settings.input_change / MILLIMETRE:g} mm at a condyle would cross the limit of "
+            f"{limit / DEGREE:g} deg, where the medial-lateral split jumps",
         )
     return (turn if largest < limit else 0.0), flags
 

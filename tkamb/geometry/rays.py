@@ -270,7 +270,7 @@ def _first_crossings(
     least: float,
     outside: float,
 ) -> tuple[Array, Index, Array]:
-    """Return the first crossing of each ray; the lowest number of equally near triangles.
+    """Return the first crossing of each ray; of equally near triangles the lowest number.
 
     Args:
         boxes: (2 p, 6) m, see `TriangleTree`.

@@ -117,9 +117,9 @@ def repair(vertices: Array, faces: Index) -> Repair:
     return Repair(vertices, faces, messages, holes, _forks(faces), one_sided)
 
 
-def _notice(count: int, noun: str, what: str) -> str:
+def _notice(count: int, noun: str, action: str) -> str:
     several = noun.replace("vertex", "vertice") + "s"
-    return f"{count} {noun if count == 1 else several} {what}" if count else ""
+    return f"{count} {noun if count == 1 else several} {action}" if count else ""
 
 
 def _merged(vertices: Array, faces: Index) -> tuple[Array, Index]:
