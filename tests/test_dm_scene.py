@@ -65,7 +65,7 @@ def test_frames_changed_by_the_filter_are_in_swing_or_at_the_seam():
     assert set(np.flatnonzero(rough)) <= {0, 99, 100, *range(62, 96)}
 
 
-def test_condylar_gaps_of_the_recorded_poses():
+def test_condylar_gaps_of_the_recorded_poses_agree_with_the_notes():
     query = ClosestPointQuery(case().femoral, case().insert, case().split)
     result = [query.at(pose) for pose in knee_pose(case().motion.raw_coordinates[::5])]
     for side, stated in (("medial", MEDIAL_MM), ("lateral", LATERAL_MM)):
@@ -156,7 +156,7 @@ def test_centre_of_pressure_lies_between_heel_and_toe_markers():
 
 
 def test_stride_is_the_most_representative_one():
-    """Its distance to the mean of ground reaction and shank lean is the smallest of all strides."""
+    """Of all strides it is the nearest to the mean of ground reaction and shank lean."""
     scene = case().scene
     plate = read_table(scene.ground_reaction.file)
     vertical = plate.column("ground_force_2_vy")

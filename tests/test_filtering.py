@@ -180,7 +180,7 @@ def test_filtered_orientation_does_not_depend_on_the_axes():
         (np.linspace(0, 2, 5), np.zeros(5), "none", "5 samples are too few"),
     ],
 )
-def test_unusable_samples(time, value, cutoff, message):
+def test_unusable_samples_are_refused(time, value, cutoff, message):
     with pytest.raises(InputError, match=message) as caught:
         differentiate_coordinates(time, value, cutoff, name="gait.csv")
     assert "gait.csv" in str(caught.value)
@@ -189,7 +189,7 @@ def test_unusable_samples(time, value, cutoff, message):
 def test_too_few_frames_for_the_cutoff_are_refused_with_the_number_needed():
     time = np.linspace(0.0, 2.0, 26)
     check_frames(time, 6.0, 26)
-    differentiate_coordinates(time, np.zeros(26), 6.0)  # the number that the message gives does
+    differentiate_coordinates(time, np.zeros(26), 6.0)  # the number in the message is accepted
     with pytest.raises(InputError, match=r"frames = 25 resamples to 12 Hz.*give 26 or more"):
         check_frames(np.linspace(0.0, 2.0, 25), 6.0, 25)
     check_frames(np.linspace(0.0, 2.0, 25), "none", 25)

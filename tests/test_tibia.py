@@ -70,7 +70,7 @@ def test_markers_give_pose_and_rates(tmp_path):
     np.testing.assert_allclose(tibia.velocity[:, 3:], spin, atol=2e-3)
 
 
-def test_laboratory_axes_of_a_walk_towards_minus_x(tmp_path):
+def test_laboratory_axes_turn_a_walk_towards_minus_x(tmp_path):
     backwards = pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)) @ shank(STAMPS)
     file = marker_file(tmp_path / "s.trc", backwards)
     tibia = load_tibia(marker_table(file, laboratory_axes="-x,+y,-z"), AT, "right", "none")
@@ -119,7 +119,7 @@ def test_the_ankle_centre_replaces_a_missing_marker(tmp_path):
         load_tibia(marker_table(file, markers_mm=two), AT, "right", "none")
 
 
-def test_columns_of_poses(tmp_path):
+def test_columns_of_poses_are_read(tmp_path):
     poses = shank(STAMPS)
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZXY", degrees=True)
     names = ["time", *(f"{w}_{k}" for w in ("rotation", "translation") for k in (1, 2, 3))]
@@ -181,7 +181,7 @@ def test_a_gap_outside_the_interval_has_no_influence(tmp_path):
         load_tibia(marker_table(file), AT + 0.3, "right", "none")
 
 
-def test_refusals(tmp_path):
+def test_contradictory_marker_tables_are_refused(tmp_path):
     file = marker_file(tmp_path / "s.trc", shank(STAMPS))
     with pytest.raises(InputError, match="no column 'uper_x'; did you mean upper_x"):
         load_tibia(
