@@ -151,8 +151,8 @@ def test_centre_of_pressure_lies_between_heel_and_toe_markers():
         heel, toe = feet["R"]
         assert heel[k, 0] - 0.02 < ground.point[k, 0] < toe[k, 0] + 0.02
         assert abs(ground.point[k, 2] - 0.5 * (heel[k, 2] + toe[k, 2])) < 0.05
-        left = 0.5 * (feet["L"][0][k] + feet["L"][1][k])
-        assert abs(ground.point[k, 2] - left[2]) > 0.1
+        left_foot = 0.5 * (feet["L"][0][k] + feet["L"][1][k])
+        assert abs(ground.point[k, 2] - left_foot[2]) > 0.1
 
 
 def test_stride_is_the_most_representative_one():

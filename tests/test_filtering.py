@@ -58,9 +58,9 @@ def test_uneven_samples_give_the_same_curve():
     def signal(t):
         return np.sin(2 * np.pi * t) + 0.2 * np.cos(2 * np.pi * 2.3 * t)
 
-    one = differentiate_coordinates(even, signal(even), CUTOFF, at)
-    two = differentiate_coordinates(uneven, signal(uneven), CUTOFF, at)
-    for first, second, scale in zip(one, two, (1.0, 10.0, 100.0), strict=True):
+    from_even = differentiate_coordinates(even, signal(even), CUTOFF, at)
+    from_uneven = differentiate_coordinates(uneven, signal(uneven), CUTOFF, at)
+    for first, second, scale in zip(from_even, from_uneven, (1.0, 10.0, 100.0), strict=True):
         np.testing.assert_allclose(first, second, atol=1e-3 * scale)
 
 
@@ -161,11 +161,13 @@ def test_filtered_orientation_does_not_depend_on_the_axes():
     poses[:, :3, :3] = poses[:, :3, :3] @ noise
     left, right = (Rotation.random(random_state=k).as_matrix() for k in (4, 5))
     turned = pose(left @ poses[:, :3, :3] @ right, poses[:, :3, 3] @ left.T)
-    one, velocity, _ = differentiate_poses(t, poses, CUTOFF)
-    two, velocity_turned, _ = differentiate_poses(t, turned, CUTOFF)
-    np.testing.assert_allclose(left @ one[:, :3, :3] @ right, two[:, :3, :3], atol=1e-9)
+    filtered, velocity, _ = differentiate_poses(t, poses, CUTOFF)
+    filtered_turned, velocity_turned, _ = differentiate_poses(t, turned, CUTOFF)
+    np.testing.assert_allclose(
+        left @ filtered[:, :3, :3] @ right, filtered_turned[:, :3, :3], atol=1e-9
+    )
     np.testing.assert_allclose(velocity[:, 3:] @ right, velocity_turned[:, 3:], atol=1e-7)
-    error = Rotation.from_matrix(np.swapaxes(one[:, :3, :3], 1, 2) @ moving(t)[:, :3, :3])
+    error = Rotation.from_matrix(np.swapaxes(filtered[:, :3, :3], 1, 2) @ moving(t)[:, :3, :3])
     assert np.median(error.magnitude()) < 0.01
 
 

@@ -97,15 +97,15 @@ def test_a_larger_side_wall_gives_a_notice(caplog):
 
 
 def test_two_possible_bottoms_are_refused_with_their_places():
-    two = joined(box(0.03, 0.01, 0.03), box(0.03, 0.01, 0.03, (0.031, 0.002, 0.0)))
+    bodies = joined(box(0.03, 0.01, 0.03), box(0.03, 0.01, 0.03, (0.031, 0.002, 0.0)))
     with pytest.raises(InputError, match="two flats that could be its bottom") as caught:
-        insert_placement(two)
+        insert_placement(bodies)
     assert str(caught.value).count("900 mm²") == 2
 
 
 def test_the_clearly_larger_of_two_levels_is_the_bottom():
-    two = joined(box(0.03, 0.01, 0.03), box(0.02, 0.008, 0.03, (0.026, 0.001, 0.0)))
-    assert find_flat_bottom(two).area == pytest.approx(9e-4)
+    bodies = joined(box(0.03, 0.01, 0.03), box(0.02, 0.008, 0.03, (0.026, 0.001, 0.0)))
+    assert find_flat_bottom(bodies).area == pytest.approx(9e-4)
 
 
 def test_a_sphere_has_no_flat_bottom():

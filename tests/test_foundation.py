@@ -281,14 +281,14 @@ def test_near_columns_go_out_of_range_like_all_columns(share, monkeypatch):
 
     monkeypatch.setattr(ElasticFoundation, "evaluate", counted)
     result = model.press(state, share * largest_load, lowered(0))
-    few = len(evaluations)
+    near_count = len(evaluations)
     expected = press_by_search(model, state, share * largest_load, lowered(0))
     assert result.status is expected.status
     assert (result.status is ContactStatus.OK) == (share < 1.0)
     assert result.flags == expected.flags
     np.testing.assert_allclose(result.approach, expected.approach, rtol=1e-6)
     assert (
-        few <= 2 < len(evaluations) - few
+        near_count <= 2 < len(evaluations) - near_count
     )  # all columns are evaluated at the end, and once at the end of the range
 
 

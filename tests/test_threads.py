@@ -97,11 +97,11 @@ def test_a_press_does_not_depend_on_the_number_of_threads(with_threads, name):
         with_threads(count)
         model = contact_model(name, 2.0)
         result.append(model.press(model.prepare(bodies), 2000.0, pose))
-    one, two = result
-    assert one.status is two.status is ContactStatus.OK
-    assert one.pose.tobytes() == two.pose.tobytes()
-    assert one.pressure.tobytes() == two.pressure.tobytes()
-    assert (one.pressure > 0).any()
+    single, double = result
+    assert single.status is double.status is ContactStatus.OK
+    assert single.pose.tobytes() == double.pose.tobytes()
+    assert single.pressure.tobytes() == double.pressure.tobytes()
+    assert (single.pressure > 0).any()
 
 
 @pytest.mark.parametrize("seed", range(20))

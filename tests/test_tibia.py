@@ -103,20 +103,22 @@ def test_the_ankle_centre_replaces_a_missing_marker(tmp_path):
     ankle_in_foot = np.array([10.0, 30.0, -5.0])
     flex = Rotation.from_euler("ZX", np.stack([np.sin(5 * STAMPS), 0.2 * STAMPS], 1)).as_matrix()
     turned = shank(STAMPS) @ pose(flex, np.zeros(3)) @ pose(np.eye(3), -ankle_in_foot * 1e-3)
-    two = {name: MARKERS[name] for name in ("lower", "front")}
+    shank_markers = {name: MARKERS[name] for name in ("lower", "front")}
     points = [
         transform(poses, np.broadcast_to(np.array(list(m.values())) * 1e-3, (241, len(m), 3)))
-        for poses, m in ((shank(STAMPS), two), (turned, foot))
+        for poses, m in ((shank(STAMPS), shank_markers), (turned, foot))
     ]
-    file = write_trc(tmp_path / "s.trc", np.concatenate(points, axis=1) * 1e3, [*two, *foot])
+    file = write_trc(
+        tmp_path / "s.trc", np.concatenate(points, axis=1) * 1e3, [*shank_markers, *foot]
+    )
     ankle = JointCentreTable(
         name="ankle", markers_mm=foot, centre_mm=tuple(ankle_in_foot), tibia_mm=(0, 0, 0)
     )
-    table = marker_table(file, markers_mm=two, joint_centre=(ankle,))
+    table = marker_table(file, markers_mm=shank_markers, joint_centre=(ankle,))
     tibia = load_tibia(table, AT, "right", "none")
     np.testing.assert_allclose(tibia.pose, shank(AT), atol=1e-8)
     with pytest.raises(InputError, match="markers of the tibia fix no orientation"):
-        load_tibia(marker_table(file, markers_mm=two), AT, "right", "none")
+        load_tibia(marker_table(file, markers_mm=shank_markers), AT, "right", "none")
 
 
 def test_columns_of_poses_are_read(tmp_path):

@@ -141,14 +141,14 @@ def clearance(upper, lower):
     """Return the smallest clearance of two triangles, at corners and crossings of edges in plan
     view.
     """
-    apart = [*(upper[:, 1] - heights_over(upper, lower))]
-    apart += [*(heights_over(lower, upper) - lower[:, 1])]
+    clearances = [*(upper[:, 1] - heights_over(upper, lower))]
+    clearances += [*(heights_over(lower, upper) - lower[:, 1])]
     for i, j in np.ndindex(3, 3):
         (p, q), (r, s) = upper[[i, i - 1]], lower[[j, j - 1]]
         along, across = np.linalg.solve(np.stack([q - p, r - s], axis=1)[[0, 2]], (r - p)[[0, 2]])
         if min(along, across) >= 0.0 and max(along, across) <= 1.0:
-            apart.append(p[1] + along * (q - p)[1] - r[1] - across * (s - r)[1])
-    return np.nan_to_num(apart, nan=np.inf).min()
+            clearances.append(p[1] + along * (q - p)[1] - r[1] - across * (s - r)[1])
+    return np.nan_to_num(clearances, nan=np.inf).min()
 
 
 @settings(max_examples=40, deadline=None)

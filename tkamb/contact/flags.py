@@ -179,10 +179,10 @@ def edge_of_insert_flags(
             continue
         # A pressure below this share of the peak makes no contact at the edge.
         loaded = np.flatnonzero(side_pressure > settings.share * highest)
-        away = edge.distance(points[loaded])
-        if away.min() > settings.reach:
+        distances = edge.distance(points[loaded])
+        if distances.min() > settings.reach:
             continue
-        peak = float(away[np.argmax(side_pressure[loaded])])
+        peak = float(distances[np.argmax(side_pressure[loaded])])
         where = (
             "its peak pressure lies there"
             if peak <= settings.reach

@@ -112,8 +112,8 @@ class ElasticFoundation(ContactModel):
         gap = gaps_along_normals(samples, state.pair.femoral, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if (deep := strain >= DEEPEST).any():
-            whole = (samples.depth >= samples.thickness)[deep].any()
-            return ContactResult.failed(state, pose, TOO_DEEP if whole else OVER_THE_EDGE)
+            full_depth = (samples.depth >= samples.thickness)[deep].any()
+            return ContactResult.failed(state, pose, TOO_DEEP if full_depth else OVER_THE_EDGE)
         pressure = layer_pressure(self.law, state.pair.material, strain)
         medial = medial_points(samples.points, pose, state.pair.split)
         flags = narrow_flags(

@@ -276,10 +276,10 @@ def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) ->
     centres = np.array(
         [np.bincount(patch, weight * x)[large] / force[large] for x in surface.points[loaded].T]
     ).T
-    apart = np.linalg.norm(centres[:, None] - centres, axis=2).max(initial=0.0)
-    if apart > CONTACT_RESULT.least_patch_distance:
+    distance = np.linalg.norm(centres[:, None] - centres, axis=2).max(initial=0.0)
+    if distance > CONTACT_RESULT.least_patch_distance:
         yield (
-            f"contact in separate patches {apart / MILLIMETRE:.0f} mm apart, but the femoral "
+            f"contact in separate patches {distance / MILLIMETRE:.0f} mm apart, but the femoral "
             "component shows one condyle: all of it is called medial; check the meshes' axes"
         )
 

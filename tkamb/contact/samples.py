@@ -224,8 +224,8 @@ def _cells(
     )
     count = covered.sum(axis=1)
     mean = np.einsum("ij,ijk->ik", covered, rays) / np.maximum(count, 1)[:, None]
-    away = np.where(covered, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
-    nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
+    distance = np.where(covered, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
+    nearest = rays[np.arange(len(rim)), distance.argmin(axis=1)]
     mean_covered = np.isfinite(_first(caster, mean)[0])[:, None]
     xz, share = centres.copy(), all_hit.ravel().astype(float)
     # The point of a partly covered cell is the centroid of its covered part, or the nearest ray

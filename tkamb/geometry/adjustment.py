@@ -195,8 +195,8 @@ def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
     """Return coronal angle (rad) and intercondylar distance (m); zero and NaN for one condyle."""
     if gaps.lateral is None:
         return 0.0, math.nan
-    apart = gaps.lateral.point_on_femoral - gaps.medial.point_on_femoral
-    distance = math.hypot(apart[1], apart[2])
+    separation = gaps.lateral.point_on_femoral - gaps.medial.point_on_femoral
+    distance = math.hypot(separation[1], separation[2])
     return (gaps.lateral.gap - gaps.medial.gap) / distance, distance
 
 

@@ -277,8 +277,8 @@ def _grown(
             )
             tolerance = min(max(3 * spread, 1e-6), FLAT_BOTTOM.flatness)
             cone = min(max(6 * lean, math.radians(0.5)), _CONE)
-        apart = np.abs(corners @ normal - offset).max(axis=1)
-        chosen = (apart <= tolerance) & (normals[near] @ normal > math.cos(cone))
+        distance = np.abs(corners @ normal - offset).max(axis=1)
+        chosen = (distance <= tolerance) & (normals[near] @ normal > math.cos(cone))
         if chosen.sum() == 0:
             return None
         normal, offset = _plane(corners[chosen], weight[chosen], normal)

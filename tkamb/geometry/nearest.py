@@ -347,7 +347,7 @@ def _nearest_place(
     reach: float,
     guess: int,
     stack: Index,
-    apart: Array,
+    squares: Array,
 ) -> tuple[int, float, float, float]:
     """Return the triangle nearest to a point, and the point on it.
 
@@ -362,7 +362,7 @@ def _nearest_place(
         guess: position in `faces` of a triangle that is probably near, which saves time; -1 for
             none.
         stack: (`DEEPEST`,) work array, boxes on the stack.
-        apart: (`DEEPEST`,) work array, squared distances of these boxes (m²).
+        squares: (`DEEPEST`,) work array, squared distances of these boxes (m²).
 
     Returns:
         Position in `faces`, -1 if none is within reach; squared distance (m²); barycentrics 2 and 3
@@ -375,11 +375,11 @@ def _nearest_place(
         square, s, t = _foot(corners[guess], point)
         if square <= best:
             place, best, second, third = guess, square, s, t
-    stack[0], apart[0] = 1, 0.0
+    stack[0], squares[0] = 1, 0.0
     while size > 0:
         size -= 1
         box = stack[size]
-        if apart[size] > best:
+        if squares[size] > best:
             continue
         if box >= leaves:
             for row in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
@@ -393,10 +393,10 @@ def _nearest_place(
         if far < near:
             near_box, far_box, near, far = far_box, near_box, far, near
         if far <= best:
-            stack[size], apart[size] = far_box, far
+            stack[size], squares[size] = far_box, far
             size += 1
         if near <= best:
-            stack[size], apart[size] = near_box, near
+            stack[size], squares[size] = near_box, near
             size += 1
     return place, best, second, third
 
@@ -414,13 +414,13 @@ def _nearest_points(
     count = len(points)
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
-    stack, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), int(NO_TRIANGLE)
+    stack, squares, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), int(NO_TRIANGLE)
     for n in range(count):
         point = points[n]
         if not np.isfinite(point[0] + point[1] + point[2]):
             continue
         place, square, s, t = _nearest_place(
-            boxes, faces, corners, point, reach, guess, stack, apart
+            boxes, faces, corners, point, reach, guess, stack, squares
         )
         if place >= 0:
             guess = place  # the next point is often close to this one

@@ -148,8 +148,8 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     polygon, rank = counted(np.maximum(ends - starts - 2, 0))
     first = starts[polygon]
     fans = np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
-    many = np.flatnonzero(ends - starts > 3)
-    if not len(many):
+    larger_polygons = np.flatnonzero(ends - starts > 3)
+    if not len(larger_polygons):
         return fans
     a, b, c = np.moveaxis(vertices[fans], 1, 0)
     cross = np.cross(b - a, c - a)
