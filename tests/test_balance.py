@@ -57,9 +57,11 @@ def test_linear_springs_reach_their_equilibrium():
     root = rng.normal(size=(4, 4))
     stiffness = 1e5 * (root @ root.T + 0.1 * np.eye(4))
     load = rng.normal(size=4) * 20
-    for given in (True, False):
+    for with_stiffness in (True, False):
         end = find_balance(
-            lambda x, given=given: Trial(load - stiffness @ x, stiffness if given else None),
+            lambda x, with_stiffness=with_stiffness: Trial(
+                load - stiffness @ x, stiffness if with_stiffness else None
+            ),
             np.full(4, 1e-3),
         )
         assert end.status is BalanceStatus.OK
@@ -87,7 +89,7 @@ def hardening(guide=None):
 
 
 @pytest.mark.parametrize(
-    ("guide", "most"),
+    ("guide", "max_trials"),
     [
         (lambda tangent: 1.3 * tangent, 14),
         (lambda tangent: tangent + 1e6, 14),
@@ -95,7 +97,7 @@ def hardening(guide=None):
         (lambda tangent: -tangent, 100),
     ],
 )
-def test_an_inexact_stiffness_leads_to_the_same_equilibrium(guide, most):
+def test_an_inexact_stiffness_leads_to_the_same_equilibrium(guide, max_trials):
     """A tangent with an error of a third needs fewer trials than differences. With a wrong tangent
     the search converges, too.
     """
@@ -107,8 +109,8 @@ def test_an_inexact_stiffness_leads_to_the_same_equilibrium(guide, most):
         assert end.status is BalanceStatus.OK
         assert len(end.work) <= end.steps < end.trials
         assert end.coordinates == pytest.approx(equilibrium, abs=5e-8)
-    assert by_stiffness.trials <= most
-    assert most > 20 or by_stiffness.trials < by_differences.trials
+    assert by_stiffness.trials <= max_trials
+    assert max_trials > 20 or by_stiffness.trials < by_differences.trials
 
 
 def test_forces_without_a_potential_converge():
@@ -293,8 +295,8 @@ def test_split_and_tilt_follow_the_adduction_moment(flat, share):
     assert contact.condyles["lateral"].force == pytest.approx(lateral, abs=0.5)
     tilt = (sphere_depth(medial) - sphere_depth(lateral)) / (2 * HALF)
     assert place[4] == pytest.approx(tilt, abs=0.02 * sphere_depth(LOAD) / HALF)
-    sunk = HEIGHT + BALL - place[1]
-    assert sunk == pytest.approx((sphere_depth(lateral) + sphere_depth(medial)) / 2, rel=0.03)
+    approach = HEIGHT + BALL - place[1]
+    assert approach == pytest.approx((sphere_depth(lateral) + sphere_depth(medial)) / 2, rel=0.03)
 
 
 def test_a_condyle_lifts_off_at_zero_force_and_lands_again(flat):
@@ -318,8 +320,8 @@ def test_a_condyle_lifts_off_at_zero_force_and_lands_again(flat):
         assert balance.status is BalanceStatus.OK
         assert min(balance.work, default=1.0) > 0
         tension = np.linalg.norm(strap.wrench(knee_pose(place))[:3])
-        carried = {side: c.wrench[1] for side, c in contact.condyles.items()}
-        assert max(carried.values()) < 0
+        vertical_forces = {side: c.wrench[1] for side, c in contact.condyles.items()}
+        assert max(vertical_forces.values()) < 0
         states.append((share, place, "medial" in contact.condyles, tension))
     for share, _, medial, tension in states:
         slackened = tension < 1e-9
@@ -348,10 +350,10 @@ def test_a_knee_without_constraints_is_indeterminate(flat):
 # Two spheres in two dishes
 
 
-@pytest.mark.parametrize("aside", [(0.0, 0.0), (0.2, 0.0), (0.0, 0.15)])
-def test_spheres_in_dishes_follow_the_direction_of_the_load(dished, aside):
+@pytest.mark.parametrize("inclination", [(0.0, 0.0), (0.2, 0.0), (0.0, 0.15)])
+def test_spheres_in_dishes_follow_the_direction_of_the_load(dished, inclination):
     """The centre of a sphere moves like a pendulum of length R_dish - R_ball + depth."""
-    force = np.array([aside[0] * LOAD, LOAD, aside[1] * LOAD])
+    force = np.array([inclination[0] * LOAD, LOAD, inclination[1] * LOAD])
     level = np.array([0, HEIGHT + BALL, 0])
     place, contact, balance = find_equilibrium(
         *dished, push(force, level), [0, TOUCH, 0, 0, 0, 0.3], ("ap", "ml")
@@ -359,8 +361,8 @@ def test_spheres_in_dishes_follow_the_direction_of_the_load(dished, aside):
     assert balance.status is BalanceStatus.OK
     assert min(balance.work, default=1.0) > 0
     depth = sphere_depth(LOAD / 2)
-    hanging = -(DISH - BALL + depth) * force / np.linalg.norm(force)
-    assert np.allclose(place[[0, 2]], hanging[[0, 2]], atol=2e-4)
+    expected = -(DISH - BALL + depth) * force / np.linalg.norm(force)
+    assert np.allclose(place[[0, 2]], expected[[0, 2]], atol=2e-4)
     assert contact.wrench[0] == pytest.approx(-force[0], abs=0.1)
 
 
@@ -371,12 +373,12 @@ STARTS = [
 ]
 
 
-@pytest.mark.parametrize("away", STARTS)
-def test_initial_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(dished, away):
+@pytest.mark.parametrize("offset", STARTS)
+def test_initial_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(dished, offset):
     external = push([40.0, LOAD, -30.0], [1e-3, 0, 4e-3])
-    home = np.array([0, TOUCH, 0, 0, 0, 0.3])
-    near, _, first = find_equilibrium(*dished, external, home)
-    far, contact, balance = find_equilibrium(*dished, external, home + np.append(away, 0.0))
+    neutral = np.array([0, TOUCH, 0, 0, 0, 0.3])
+    near, _, first = find_equilibrium(*dished, external, neutral)
+    far, contact, balance = find_equilibrium(*dished, external, neutral + np.append(offset, 0.0))
     assert first.status is BalanceStatus.OK
     assert balance.status is BalanceStatus.OK
     assert distance_between(near, far) < 1e-5

@@ -67,8 +67,8 @@ def test_a_condyle_beside_the_insert_has_no_touch():
     medial, lateral = FirstTouch(femoral, flat_insert(10e-3), -30e-3).at(np.eye(4))
     assert medial is None
     assert lateral.travel == pytest.approx(-30e-3, abs=1e-6)
-    away = pose(np.eye(3), [1.0, 0, 0])
-    assert np.isnan(FirstTouch(femoral, flat_insert(10e-3)).travel(away))
+    beside = pose(np.eye(3), [1.0, 0, 0])
+    assert np.isnan(FirstTouch(femoral, flat_insert(10e-3)).travel(beside))
 
 
 def test_travel_depends_on_the_pose_and_not_on_the_femoral_frame():

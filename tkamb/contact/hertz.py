@@ -240,8 +240,8 @@ def map_pressure(
         return pressure, 1.0
     beyond = np.abs(offset @ contact.axes.T) - [patch.long_axis, patch.short_axis]
     # Another surface of the insert below or above the contact (post, lip) is not in contact.
-    low = np.abs(offset @ contact.normal) < patch.long_axis + samples.resolution
-    near = np.flatnonzero((beyond.max(axis=1) < 2 * samples.resolution) & low)
+    same_surface = np.abs(offset @ contact.normal) < patch.long_axis + samples.resolution
+    near = np.flatnonzero((beyond.max(axis=1) < 2 * samples.resolution) & same_surface)
     pressure[near] = patch.peak_pressure * _cell_means(samples, near, contact, patch)
     force_on_map = float((pressure * samples.area) @ samples.normals[:, 1])
     return (
