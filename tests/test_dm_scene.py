@@ -240,4 +240,4 @@ def test_a_misplaced_shank_marker_is_asked_about():
     places = scene.tibia.markers_mm
     places["R_Shank_Inferior"] = tuple(np.array(places["R_Shank_Inferior"]) + 50.0)
     (question,) = marker_questions(load_case(scene))
-    assert question.text.startswith("the shank's markers lie ")
+    assert question.text.startswith("the markers of the shank lie ")

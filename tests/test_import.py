@@ -71,7 +71,7 @@ def test_markers_of_another_subject_are_asked_about(tmp_path, off, asked):
             one.markers_mm[name] = tuple(larger * np.array(place))
     questions = [str(one) for one in marker_questions(load_case(scene))]
     assert len(questions) == asked
-    assert all("thigh's markers lie 14 mm (rms)" in one for one in questions)
+    assert all("the markers of shank and thigh lie 14 mm (rms)" in one for one in questions)
 
 
 def test_what_is_inferred_stands_in_the_scene(tmp_path):

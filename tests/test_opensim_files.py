@@ -110,7 +110,7 @@ def test_a_files_own_defaults_hold_for_its_own_elements(tmp_path):
         (None, "does not exist"),
         ("<ForceSet><objects/></ForceSet>", "instead of a <JointSet>"),
         ("<OpenSimDocument><ForceSet/></OpenSimDocument>", "without a <JointSet>"),
-        ('<JointSet file="JointSet.xml"/>', "names it in turn"),
+        ('<JointSet file="JointSet.xml"/>', "includes this one"),
         ("<JointSet><objects>", "no element found: line 1"),
     ],
 )

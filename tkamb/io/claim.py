@@ -123,7 +123,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
     Args:
         path: the folder; it is made if it does not exist.
-        force: whether the folder may hold foreign files, which do not change, or another command's
+        force: whether the folder may hold foreign files, which stay unchanged, or another command's
             output.
         command: tkamb command that writes into the folder; "": any command's output is allowed.
 
@@ -169,7 +169,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
 
 def settle(folder: Path) -> None:
-    """Complete a killed process's file changes in a folder. Call it before reading the folder.
+    """Complete a killed process's file changes in a folder, which may then be read.
 
     Raises:
         InputError: the changes cannot be completed.
@@ -290,8 +290,8 @@ OWN_MARK = b"tkamb"
 MARK_WITHIN = 4096
 """Number of bytes at the beginning of a file that are searched for the mark."""
 PICTURES = {".png": b"\x89PNG", ".gif": b"GIF8"}
-"""Suffix of a picture file -> its first bytes. Pictures have no mark of tkamb, so that a picture
-may replace any picture of its format."""
+"""Suffix of a picture file -> its first bytes. Pictures have no mark of tkamb. A picture may
+therefore replace any picture of its format."""
 
 
 def check_output_file(path: str | Path | None, force: bool = False) -> None:
@@ -327,14 +327,14 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
 def _object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file, or {} if the file is unreadable or holds no object."""
     try:
-        claim = read_json(path)
+        content = read_json(path)
     except InputError:
         return {}
-    return claim if isinstance(claim, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except (OSError, ValueError):  # The name is too long or has a NUL; `mkdir` reports this later.
+    except (OSError, ValueError):  # `mkdir` later reports a name that is too long or has a NUL.
         return True

@@ -2,7 +2,7 @@
 
 The HDF5 library cannot close a file after a failed write: it tries again, fails, and ends the
 process. tkamb lets the library write through a Python file object. This object records the first
-failure and ignores later writes, so that the library can close the file. Then `new_hdf5` raises.
+failure and ignores later writes. The library can then close the file, and `new_hdf5` raises.
 """
 
 import os

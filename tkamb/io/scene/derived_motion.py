@@ -81,7 +81,7 @@ def rolling_motion(
         raise InputError(
             f"the femur rolls off the insert at {gap:.3g} s",
             "[motion] motion = 'roll-slip'",
-            "give it more of the recorded slip (slip_share) or take motion = 'recorded'",
+            "increase slip_share, or take motion = 'recorded'",
         )
     return _with_coordinates(motion, rolled, [0, 1], cutoff)
 
