@@ -43,7 +43,7 @@ def holder(tmp_path):
     process.communicate()
 
 
-def test_one_process_at_a_time(tmp_path, holder):
+def test_only_one_process_writes_at_a_time(tmp_path, holder):
     with (
         pytest.raises(InputError, match="another tkamb is writing"),
         claimed_directory(tmp_path / "out"),
@@ -112,9 +112,9 @@ def test_bad_input_leaves_no_new_file_or_folder(tmp_path, there):
 def test_only_the_folders_own_temporary_files_are_removed(tmp_path):
     with claimed_directory(tmp_path) as folder:
         token = folder_token(folder)
-    own = tmp_path / f".tkamb-{token}-12ab.part"
+    temporary = tmp_path / f".tkamb-{token}-12ab.part"
     others = [".results.csv.12.part", ".tkamb-0123456789abcdef-12ab.part", ".backup.part"]
-    for name in (own.name, *others):
+    for name in (temporary.name, *others):
         (tmp_path / name).write_text("x")
     link = tmp_path / f".tkamb-{token}-link.part"
     link.symlink_to(tmp_path / ".backup.part")

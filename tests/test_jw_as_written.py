@@ -18,13 +18,13 @@ pytestmark = pytest.mark.skipif(
     not JW.is_dir(), reason="subject JW's files are not beside the project"
 )
 INTO = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""From the file's axes, z up, to a table's, y up."""
+"""Rotation from the file's axes, z up, to a table's axes, y up."""
 
 
 def imported(folder, *options):
     """Import JW's leg without implant, and return the case."""
-    given = ["--side", "right", "--mass-kg", "66.7", "--out", str(folder)]
-    assert main(["import", str(JW / "JW.osim"), *map(str, options), *given]) == 0
+    arguments = ["--side", "right", "--mass-kg", "66.7", "--out", str(folder)]
+    assert main(["import", str(JW / "JW.osim"), *map(str, options), *arguments]) == 0
     return load_case(load_scene(folder / "scene.toml"))
 
 
@@ -38,8 +38,8 @@ def assert_same(case, reference, N=1e-3, Nm=1e-3):
     np.testing.assert_allclose(case.motion.coordinates, reference.motion.coordinates, atol=1e-5)
     np.testing.assert_allclose(case.ground.force, reference.ground.force, atol=N)
     about = [
-        one.ground.moment + np.cross(one.ground.point, one.ground.force)
-        for one in (case, reference)
+        each.ground.moment + np.cross(each.ground.point, each.ground.force)
+        for each in (case, reference)
     ]
     np.testing.assert_allclose(*about, atol=Nm)
 
@@ -60,7 +60,7 @@ def equal_channels(whole):
 
 
 def metres_and_volts(whole):
-    """Type 4 in a file in metres: the matrix gives N and N·m."""
+    """Write plates of type 4 in metres and volts, with a calibration matrix to N and N·m."""
     whole["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
     whole["data"]["points"][:3] *= 1e-3
     plates, analog = whole["parameters"]["FORCE_PLATFORM"], whole["parameters"]["ANALOG"]
@@ -74,7 +74,7 @@ def metres_and_volts(whole):
 
 
 def a_plate_that_nobody_reads(whole):
-    """A fourth plate of a type that is not read, far from the walkway."""
+    """Add a fourth plate of a type that is not read, far from the walkway."""
     plates = whole["parameters"]["FORCE_PLATFORM"]
     plates["USED"]["value"], plates["TYPE"]["value"] = [4], [2, 2, 2, 21]
     for key in ("CORNERS", "ORIGIN", "CHANNEL"):
@@ -108,14 +108,16 @@ def drift_with_a_baseline(whole):
     whole["parameters"]["FORCE_PLATFORM"]["ZERO"]["value"] = [1, 20]
 
 
-def test_a_drift_is_taken_off_where_the_file_says_when_nobody_stood_there(tmp_path, reference):
+def test_a_drift_is_subtracted_if_the_file_states_unloaded_frames(tmp_path, reference):
     whole = ezc3d.c3d(str(TRIAL))
     drift_with_a_baseline(whole)
     whole.write(str(tmp_path / "og3.c3d"))
     assert_same(imported(tmp_path / "out", "--c3d", tmp_path / "og3.c3d"), reference, Nm=2e-3)
 
 
-def test_a_drift_is_told_and_only_acts_under_the_foot(tmp_path, reference, capsys):
+def test_a_drift_without_a_baseline_is_reported_and_stays_under_the_foot(
+    tmp_path, reference, capsys
+):
     whole = ezc3d.c3d(str(TRIAL))
     drift_without_a_baseline(whole)
     whole.write(str(tmp_path / "og3.c3d"))
@@ -126,7 +128,7 @@ def test_a_drift_is_told_and_only_acts_under_the_foot(tmp_path, reference, capsy
     assert case.ground.drift == pytest.approx({2: 5.0, 3: 5.0}, abs=0.01)
 
 
-def test_a_standing_trial_needs_its_markers_alone(tmp_path):
+def test_a_standing_trial_needs_only_its_markers(tmp_path):
     standing = JW / "motion" / "jw_1legstand1.c3d"
     whole = ezc3d.c3d(str(standing))
     whole["data"]["analogs"][0, :, -51:] = np.nan
@@ -145,9 +147,9 @@ def test_markers_and_a_table_of_three_plates_give_the_case_of_the_c3d(tmp_path, 
     for plate in recording.plates:
         force, about = plate.force @ INTO.T, plate.wrench[:, 3:] @ INTO.T
         point = np.zeros_like(force)
-        on = force[:, 1] > 20
-        point[on, 0] = about[on, 2] / force[on, 1]  # the plates lie at height 0
-        point[on, 2] = -about[on, 0] / force[on, 1]
+        loaded = force[:, 1] > 20
+        point[loaded, 0] = about[loaded, 2] / force[loaded, 1]  # The plates are at height 0.
+        point[loaded, 2] = -about[loaded, 0] / force[loaded, 1]
         moment = about - np.cross(point, force)
         for kind, values in (("force_{}_v", force), ("force_{}_p", point), ("moment_{}_m", moment)):
             for k, axis in enumerate("xyz"):
@@ -155,12 +157,12 @@ def test_markers_and_a_table_of_three_plates_give_the_case_of_the_c3d(tmp_path, 
     write_storage(tmp_path / "g.mot", columns, in_degrees=False)
     points = {label: recording.points[:, k] @ INTO.T for k, label in enumerate(recording.labels)}
     write_trc(tmp_path / "og3.trc", recording.time, points, recording.rate_Hz)
-    given = ("--trc", tmp_path / "og3.trc", "--grf", tmp_path / "g.mot")
-    assert_same(imported(tmp_path / "found", *given), reference, N=0.05, Nm=0.15)
-    beside = ("--c3d", TRIAL, "--grf", tmp_path / "g.mot")  # z points up there, y in the table
-    assert_same(imported(tmp_path / "beside", *beside), reference, N=0.05, Nm=0.15)
+    arguments = ("--trc", tmp_path / "og3.trc", "--grf", tmp_path / "g.mot")
+    assert_same(imported(tmp_path / "found", *arguments), reference, N=0.05, Nm=0.15)
+    options_c3d = ("--c3d", TRIAL, "--grf", tmp_path / "g.mot")  # z points up there, y in the table
+    assert_same(imported(tmp_path / "beside", *options_c3d), reference, N=0.05, Nm=0.15)
     named = ("--grf-force", "ground_force_2,ground_force_3", "--interval", "2.075:3.9333334")
-    assert_same(imported(tmp_path / "named", *given, *named), reference, N=0.05, Nm=0.15)
+    assert_same(imported(tmp_path / "named", *arguments, *named), reference, N=0.05, Nm=0.15)
 
 
 def test_emg_of_a_recording_without_markers_is_read(tmp_path):

@@ -37,7 +37,7 @@ def test_generalised_forces_of_a_trial_are_those_of_opensims_tool(tools):
     own = inverse_dynamics(chain, motion.q, motion.rates, motion.accelerations, trial.loads)
     assert np.abs(theirs).max() > 500.0
     np.testing.assert_allclose(own, theirs, atol=0.1)
-    # tkamb's own spline through the same samples ends otherwise: apart at the ends alone
+    # The spline of tkamb has other end conditions, which matter only near the ends.
     second = differentiate_coordinates(motion.time, motion.q, "none")
     own = inverse_dynamics(chain, *second, trial.loads)
     np.testing.assert_allclose(own[8:-8], theirs[8:-8], atol=0.1)
@@ -55,10 +55,10 @@ class Compared:
         path = tools.write_model(names, dict.fromkeys(balanced, RESERVE), wraps)
         self.own = solve_trial(read_osim(path), trial.motion, trial.loads, sharing=SHARING)
         self.span = float(time[0]), float(time[-1]), every
-        found, self.seconds = tools.static_optimisation(*self.span)
-        self.frames = [int(np.argmin(np.abs(time - t))) for t in found["time"]]
-        self.theirs = np.stack([found[name] for name in self.own.muscles], axis=1)
-        reserve = np.stack([found[f"reserve_{name}"] for name in balanced], axis=1)
+        activations, self.seconds = tools.static_optimisation(*self.span)
+        self.frames = [int(np.argmin(np.abs(time - t))) for t in activations["time"]]
+        self.theirs = np.stack([activations[name] for name in self.own.muscles], axis=1)
+        reserve = np.stack([activations[f"reserve_{name}"] for name in balanced], axis=1)
         least = (self.own.activation**2).sum(1) + (self.own.reserve**2).sum(1) / RESERVE**2
         self.excess = ((self.theirs**2).sum(1) + (reserve**2).sum(1)) / least[self.frames]
         self.optimal = self.excess < 1.1
@@ -80,39 +80,39 @@ class Compared:
 
 @needs_jw
 def test_activations_and_knee_reaction_are_those_of_opensim_on_straight_lines(tools):
-    both = Compared(tools, wraps=False, every=22)
-    assert both.optimal.all()
-    assert both.rms(both.own.activation[both.frames]) < 0.002
-    away = np.linalg.norm(both.own_reaction() - both.reaction, axis=1)
-    assert (away / np.linalg.norm(both.reaction, axis=1)).max() < 0.01
+    comparison = Compared(tools, wraps=False, every=22)
+    assert comparison.optimal.all()
+    assert comparison.rms(comparison.own.activation[comparison.frames]) < 0.002
+    errors = np.linalg.norm(comparison.own_reaction() - comparison.reaction, axis=1)
+    assert (errors / np.linalg.norm(comparison.reaction, axis=1)).max() < 0.01
 
 
 @needs_jw
 @pytest.mark.slow
 def test_wrapped_lines_differ_by_their_moment_arms_alone(tools):
-    both = Compared(tools, wraps=True, every=6)
-    own = both.own
-    assert both.optimal.mean() > 0.8
-    assert both.rms(own.activation[both.frames]) < 0.02
+    comparison = Compared(tools, wraps=True, every=6)
+    own = comparison.own
+    assert comparison.optimal.mean() > 0.8
+    assert comparison.rms(own.activation[comparison.frames]) < 0.02
     muscles = [tools.trial.kinematics.model.muscles[name] for name in own.muscles]
     strength = np.array([muscle.max_isometric_force_N for muscle in muscles])
     force = np.zeros_like(own.force_N)
-    force[both.frames] = both.theirs * strength
-    away = np.linalg.norm(both.own_reaction(force) - both.reaction, axis=1)
-    assert away.max() < 0.02 * np.linalg.norm(both.reaction, axis=1).max()
-    theirs = tools.moment_arms(own.coordinates, *both.span)
+    force[comparison.frames] = comparison.theirs * strength
+    errors = np.linalg.norm(comparison.own_reaction(force) - comparison.reaction, axis=1)
+    assert errors.max() < 0.02 * np.linalg.norm(comparison.reaction, axis=1).max()
+    theirs = tools.moment_arms(own.coordinates, *comparison.span)
     arms = np.stack(
         [np.stack([theirs[c][m] for m in own.muscles], axis=1) for c in own.coordinates], axis=2
     )
-    shape = len(both.frames), len(muscles)
+    shape = len(comparison.frames), len(muscles)
     problems = FrameProblems(
         muscles,
         own.coordinates,
         SHARING,
-        own.moment[both.frames],
+        own.moment[comparison.frames],
         arms,
         np.broadcast_to(strength, shape),
         np.zeros(shape),
     )
-    fed = np.array([problems.solved(k)[0] for k in range(len(both.frames))])
-    assert both.rms(fed) < 0.002
+    activation = np.array([problems.solved(k)[0] for k in range(len(comparison.frames))])
+    assert comparison.rms(activation) < 0.002

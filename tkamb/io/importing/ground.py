@@ -176,8 +176,8 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     forceplate_axes = {"x": "+x", "z": "+y", "y": "-z"}
     result = []
     for axis in axes.split(","):
-        sign, letter = forceplate_axes[axis[-1]]
-        result.append(("+" if sign == axis[0] else "-") + letter)
+        table_axis = forceplate_axes[axis[-1]]
+        result.append(("+" if table_axis[0] == axis[0] else "-") + table_axis[1])
     return ",".join(result)
 
 
