@@ -98,15 +98,15 @@ def test_folders_of_earlier_releases_are_recognised(tmp_path, name, text, ours):
         pass
 
 
-@pytest.mark.parametrize("there", [False, True])
-def test_bad_input_leaves_no_new_file_or_folder(tmp_path, there):
+@pytest.mark.parametrize("exists", [False, True])
+def test_bad_input_leaves_no_new_file_or_folder(tmp_path, exists):
     out = tmp_path / "a" / "out"
-    if there:
+    if exists:
         out.mkdir(parents=True)
     with pytest.raises(InputError), claimed_directory(out):
         raise InputError("bad")
-    assert names(tmp_path) == ({"a"} if there else set())
-    assert not there or not names(out)
+    assert names(tmp_path) == ({"a"} if exists else set())
+    assert not exists or not names(out)
 
 
 def test_only_the_folders_own_temporary_files_are_removed(tmp_path):

@@ -57,8 +57,8 @@ def poses(motion):
 def patella(motion):
     """Return pose_patella_in_femur of every frame, m."""
     c, s = (f(np.radians(motion["patella_rotation_deg"])) for f in (np.cos, np.sin))
-    o, one = np.zeros_like(c), np.ones_like(c)
-    rotation = np.stack([c, -s, o, s, c, o, o, o, one], axis=1).reshape(-1, 3, 3)
+    o, ones = np.zeros_like(c), np.ones_like(c)
+    rotation = np.stack([c, -s, o, s, c, o, o, o, ones], axis=1).reshape(-1, 3, 3)
     place = np.stack([motion["patella_ap_mm"], motion["patella_si_mm"], o], axis=1)
     return pose(rotation, place * 1e-3)
 

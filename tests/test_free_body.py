@@ -153,8 +153,8 @@ def test_the_free_bodies_notice_a_load_that_is_wrong_by_one_per_cent(shipped):
     reference = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
     leg.ground = lambda t: 1.01 * ground(t)
     try:
-        more = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
+        changed = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
     finally:
         leg.ground = ground
-    assert abs(more["muscle_quadriceps"] - reference["muscle_quadriceps"]) > 10 * FORCE
-    assert np.abs(more["hip_moment"] - reference["hip_moment"]).max() > 5 * MOMENT
+    assert abs(changed["muscle_quadriceps"] - reference["muscle_quadriceps"]) > 10 * FORCE
+    assert np.abs(changed["hip_moment"] - reference["hip_moment"]).max() > 5 * MOMENT

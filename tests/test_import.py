@@ -115,10 +115,10 @@ def check_normal_equations(model):
     for k in range(len(chain.free)):
         step = np.zeros((3, len(chain.free)))
         step[:, k] = 1e-6
-        moved = [chain.moved(q, s * step) for s in (1, -1)]
-        ahead, behind = (chain.places(state) for state in moved)
+        shifted = [chain.moved(q, s * step) for s in (1, -1)]
+        ahead, behind = (chain.places(state) for state in shifted)
         jacobian[..., k] = (ahead - behind) / 2e-6
-        ahead, behind = (chain.normal(state, target, weights).right for state in moved)
+        ahead, behind = (chain.normal(state, target, weights).right for state in shifted)
         hessian[..., k] = -(ahead - behind) / 2e-6
     result = chain.normal(q, target, weights)
     offset = target - chain.places(q)
@@ -367,9 +367,9 @@ def test_storage_and_trc_come_back_as_written(tmp_path):
     places = np.random.default_rng(0).normal(0, 1, (5, 3))
     places[2] = np.nan
     write_trc(tmp_path / "a.trc", time, {"A": places, "B": places + 1}, 50.0)
-    back = read_table(tmp_path / "a.trc")
-    result = np.stack([back.columns[f"B_{a}"] for a in "xyz"], axis=1)
+    table = read_table(tmp_path / "a.trc")
+    result = np.stack([table.columns[f"B_{a}"] for a in "xyz"], axis=1)
     np.testing.assert_allclose(result * 1e-3, places + 1, atol=1e-8)
-    np.testing.assert_allclose(back.columns["time"], time)
+    np.testing.assert_allclose(table.columns["time"], time)
     with pytest.raises(InputError, match="blank"):
         write_storage(tmp_path / "b.sto", {"time": time, "a b": time}, in_degrees=False)

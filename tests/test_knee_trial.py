@@ -73,7 +73,7 @@ def test_slsqp_finds_the_same_forces_in_gait(jw):
         problem = problems.frame(k)
         activation, reserve, _, status = problems.solved(k)
         assert status == "ok"
-        other = minimize(
+        optimum = minimize(
             problem.cost,
             np.full(len(activation), 0.1),
             jac=problem.gradient,
@@ -81,9 +81,9 @@ def test_slsqp_finds_the_same_forces_in_gait(jw):
             method="SLSQP",
             options={"ftol": 1e-13, "maxiter": 300},
         )
-        assert problem.cost(activation) <= problem.cost(other.x) * (1 + 1e-9)
-        np.testing.assert_allclose(activation, other.x, atol=2e-4)
-        np.testing.assert_allclose(problem.others(other.x), reserve, atol=0.02)
+        assert problem.cost(activation) <= problem.cost(optimum.x) * (1 + 1e-9)
+        np.testing.assert_allclose(activation, optimum.x, atol=2e-4)
+        np.testing.assert_allclose(problem.others(optimum.x), reserve, atol=0.02)
 
 
 def walked(names, time, left):

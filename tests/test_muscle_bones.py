@@ -66,7 +66,7 @@ def test_work_at_the_attachments_is_the_change_of_length(walking):
     names = [result.muscles[k] for k in np.flatnonzero(np.abs(pull).max(axis=(0, 2)) > 1e-6)]
     assert len(names) == 13
     some = solve_trial(chain.model, still(chain, q), {}, sharing=Sharing(tuple(names))).bones
-    first = {bone: own[0] for bone, own in leg_bones(find_leg(chain.model, "right")).items()}
+    first = {bone: bodies[0] for bone, bodies in leg_bones(find_leg(chain.model, "right")).items()}
     towards = {"tibia": (None, "femur", "patella", "foot"), "foot": (None, "femur", "tibia")}
     attached = {b: [some.attachments(b, o) for o in others] for b, others in towards.items()}
     shifted = np.tile(q, (len(KNEE_AXES), 2, 1, 1))
@@ -107,9 +107,9 @@ def test_knee_and_patella_reactions_about_flexion_equal_the_reserve(walking):
         ends.append(chain.poses(shifted))
     rate = (ends[0] - ends[1]) / (2.0 * STEP)
     total = 0.0
-    own = result.bones.demand_of(("patella",), "patella")
-    own = own - result.muscle_wrench(("patella",), "patella")
-    for bone, wrench in (("tibia", result.knee_reaction()), ("patella", own)):
+    reaction = result.bones.demand_of(("patella",), "patella")
+    reaction = reaction - result.muscle_wrench(("patella",), "patella")
+    for bone, wrench in (("tibia", result.knee_reaction()), ("patella", reaction)):
         b = chain.bodies[bone]
         turn = chain.poses(q)[:, b, :3, :3]
         spin = np.einsum("fji,fjk->fik", turn, rate[:, b, :3, :3])
@@ -123,17 +123,17 @@ def test_knee_and_patella_reactions_about_flexion_equal_the_reserve(walking):
 def test_forces_on_shank_and_foot_are_mass_times_acceleration(walking):
     """Forces of knee, muscles, ground and gravity on shank and foot are mass x acceleration."""
     trial, result = walking
-    chain, both = trial.kinematics, ("tibia", "foot")
+    chain, bones = trial.kinematics, ("tibia", "foot")
     pose = result.bones.poses[:, result.bones.index("tibia")]
-    turned = result.knee_reaction()[:, 3:] + result.muscle_wrench(both, "tibia")[:, 3:]
-    force = np.einsum("fij,fj->fi", pose[:, :3, :3], turned) + trial.loads["calcaneus"][:, 3:]
+    rotated = result.knee_reaction()[:, 3:] + result.muscle_wrench(bones, "tibia")[:, 3:]
+    force = np.einsum("fij,fj->fi", pose[:, :3, :3], rotated) + trial.loads["calcaneus"][:, 3:]
     leg = find_leg(chain.model, "right")
     inertia = 0.0
     for body in (*leg.tibia, *leg.foot):
-        own, b = chain.model.bodies[body], chain.bodies[body]
-        place = chain.poses(trial.motion.q)[:, b] @ np.append(own.centre, 1.0)
+        inertial, b = chain.model.bodies[body], chain.bodies[body]
+        place = chain.poses(trial.motion.q)[:, b] @ np.append(inertial.centre, 1.0)
         second = np.gradient(np.gradient(place[:, :3], 1 / 120, axis=0), 1 / 120, axis=0)
-        inertia = inertia + own.mass_kg * (second - chain.model.gravity)
+        inertia = inertia + inertial.mass_kg * (second - chain.model.gravity)
     inner = slice(4, -4)
     np.testing.assert_allclose(force[inner], inertia[inner], atol=1.0)  # N, for finite differences
 
@@ -147,10 +147,10 @@ def test_a_muscle_from_femur_to_foot_exerts_no_force_on_the_tibia():
     shifted = result.attachments("foot", "femur")
     np.testing.assert_allclose(shifted.points[0, 0], [-0.05, -0.03, 0.0], atol=1e-15)
     assert np.isnan(result.attachments("tibia", "femur").points).all()
-    back = result.attachments("femur", "foot")
+    opposite = result.attachments("femur", "foot")
     femur, foot = (result.poses[0, result.index(bone)] for bone in ("femur", "foot"))
-    turned = rotate(inverse(foot) @ femur, back.directions[0])
-    np.testing.assert_allclose(turned, -shifted.directions[0], atol=1e-14)
+    rotated = rotate(inverse(foot) @ femur, opposite.directions[0])
+    np.testing.assert_allclose(rotated, -shifted.directions[0], atol=1e-14)
 
 
 def test_quadriceps_that_end_on_the_patella_are_named():

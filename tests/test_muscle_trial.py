@@ -74,8 +74,8 @@ def test_a_moment_on_the_foot_changes_the_knee_moment():
     with_it = solve_trial(model, still_leg(model, -0.5), push, sharing=sharing)
     without = solve_trial(model, still_leg(model, -0.5), {}, sharing=sharing)
     assert with_it.moment[0, 0] - without.moment[0, 0] == pytest.approx(-40.0)
-    more = (with_it.force_N - without.force_N)[0, 0]
-    assert more == pytest.approx(-40.0 / with_it.moment_arm_m[0, 0, 0])
+    difference = (with_it.force_N - without.force_N)[0, 0]
+    assert difference == pytest.approx(-40.0 / with_it.moment_arm_m[0, 0, 0])
 
 
 def test_muscle_moments_and_reserves_sum_to_the_joint_moment():
@@ -130,8 +130,8 @@ def test_fibres_beyond_their_curves_fail_by_name():
 
 
 def test_hill_muscles_pull_passively_and_with_less_strength():
-    own = hamstring(optimal_fibre_length_m=0.08, tendon_slack_length_m=0.2)
-    model = plane_leg(own)
+    muscle_ = hamstring(optimal_fibre_length_m=0.08, tendon_slack_length_m=0.2)
+    model = plane_leg(muscle_)
     trial = solve_trial(
         model, still_leg(model, -0.3), {}, sharing=Sharing(law="hill", reserve=FREE)
     )
@@ -144,11 +144,11 @@ def test_hill_muscles_pull_passively_and_with_less_strength():
 
 
 def _line(model, knee):
-    own = model.muscles["hamstring"].path.points
+    points = model.muscles["hamstring"].path.points
     points, _ = (
         Kinematics(model)
         .motion([0.0, knee, 0.0])
-        .points([p.body for p in own], [p.location for p in own])
+        .points([p.body for p in points], [p.location for p in points])
     )
     return points[1] - points[0]
 

@@ -237,12 +237,12 @@ def test_couplers_in_a_chain_do_not_depend_on_their_order(tmp_path, order):
     target = chain.places(state) + 0.01
     equations = chain.normal(state, target, np.ones((1, len(model.markers))))
     step, knee = 1e-6, chain.free.index(place["knee_r_0"])
-    both = []
+    costs = []
     for sign in (1, -1):
         move = np.zeros((1, len(chain.free)))
         move[0, knee] = sign * step
-        both.append(((target - chain.places(chain.moved(state, move))) ** 2).sum())
-    slope = -(both[0] - both[1]) / (4 * step)
+        costs.append(((target - chain.places(chain.moved(state, move))) ** 2).sum())
+    slope = -(costs[0] - costs[1]) / (4 * step)
     assert equations.right[0, knee] == pytest.approx(slope, rel=1e-5)
 
 

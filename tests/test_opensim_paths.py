@@ -86,8 +86,8 @@ def test_strings_are_tangent_and_found_always(axes):
     for point, other in ((strings.entry, start), (strings.exit, end)):
         np.testing.assert_allclose(((point / axes) ** 2).sum(1), 1.0, atol=1e-5)
         normal = point / np.square(axes)
-        away = (other - point) / np.linalg.norm(other - point, axis=1, keepdims=True)
-        slope = (away * normal).sum(1) / np.linalg.norm(normal, axis=1)
+        direction = (other - point) / np.linalg.norm(other - point, axis=1, keepdims=True)
+        slope = (direction * normal).sum(1) / np.linalg.norm(normal, axis=1)
         np.testing.assert_allclose(slope, 0.0, atol=1e-9)
     back = shortest_strings(end, start, np.array(axes))
     np.testing.assert_allclose(back.length_m, strings.length_m, atol=1e-6)
@@ -132,18 +132,18 @@ def test_ring_turns_a_string_at_its_inside():
 
 def test_two_objects_share_a_tangent():
     """Between two equal spheres the string is horizontal."""
-    radius, apart = 0.03, 0.1
+    radius, distance = 0.03, 0.1
     sphere = wrap("sphere", radius)
     poses = np.tile(np.eye(4), (1, 2, 1, 1))
-    poses[0, :, 0, 3] = (apart / 2, -apart / 2)
+    poses[0, :, 0, 3] = (distance / 2, -distance / 2)
     start, end = np.array([[-0.12, 0.01, 0.0]]), np.array([[0.12, 0.01, 0.0]])
     allowed = np.ones((1, 2), bool)
     result = strings_over([sphere, sphere], poses, start, end, allowed, np.ones((1, 2, 2), bool))
     np.testing.assert_array_equal(result.order, [[1, 0]])
-    np.testing.assert_allclose(result.exit[0, 1], [-apart / 2, radius, 0.0], atol=1e-9)
-    np.testing.assert_allclose(result.entry[0, 0], [apart / 2, radius, 0.0], atol=1e-9)
-    side = np.hypot(0.12 - apart / 2, 0.01)
-    sweep = np.pi / 2 - np.arctan2(0.01, 0.12 - apart / 2)
+    np.testing.assert_allclose(result.exit[0, 1], [-distance / 2, radius, 0.0], atol=1e-9)
+    np.testing.assert_allclose(result.entry[0, 0], [distance / 2, radius, 0.0], atol=1e-9)
+    side = np.hypot(0.12 - distance / 2, 0.01)
+    sweep = np.pi / 2 - np.arctan2(0.01, 0.12 - distance / 2)
     arc = radius * (sweep - np.arccos(radius / side))
     np.testing.assert_allclose(result.arc_m, arc, atol=1e-10)
 

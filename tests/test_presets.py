@@ -140,8 +140,8 @@ def test_the_scene_of_results_is_read_again_with_its_preset(scene_file, tmp_path
     case = case_of_results(results)
     assert case.scene.motion.motion == "roll-slip"
     assert case.scene.contact.adjust
-    again = run_again(results.summary)
-    assert f"{scene_file} --as {SOURCE} --set" in again
+    command = run_again(results.summary)
+    assert f"{scene_file} --as {SOURCE} --set" in command
 
 
 class MyStudy(Preset):

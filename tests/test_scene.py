@@ -136,10 +136,10 @@ def test_a_scene_replaces_only_its_own_keys_of_a_base(tmp_path):
 
 def test_signs_turned_is_the_recording_with_its_columns_negated(tmp_path):
     path = write_scene(tmp_path)
-    whole = load_case(load_scene(path)).motion.raw_coordinates
+    coordinates = load_case(load_scene(path)).motion.raw_coordinates
     turned = load_case(load_scene(path, {"motion.signs_turned": ["ml", "adduction"]})).motion
     signs = [-1.0 if name in ("ml", "adduction") else 1.0 for name in KNEE_COORDINATES]
-    np.testing.assert_allclose(turned.raw_coordinates, whole * signs, atol=1e-12)
+    np.testing.assert_allclose(turned.raw_coordinates, coordinates * signs, atol=1e-12)
     with pytest.raises(InputError, match="unknown role 'rotation_1'"):
         load_case(load_scene(path, {"motion.signs_turned": ["rotation_1"]}))
 

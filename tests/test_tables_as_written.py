@@ -177,15 +177,20 @@ def force_table(folder, columns):
 def test_moments_are_found_by_the_name_of_their_force(tmp_path, force):
     point = force.replace("v{}", "p{}").replace("F{}", "P{}").replace("f1", "p1")
     names = [p.format(a) for p in (force, point, FORCES[force]) for a in "xyz"]
-    (found,) = table_forces(force_table(tmp_path, dict.fromkeys(names, 1.0)))
+    (force_columns,) = table_forces(force_table(tmp_path, dict.fromkeys(names, 1.0)))
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
-    assert found.columns == dict(zip(roles, names, strict=True))
+    assert force_columns.columns == dict(zip(roles, names, strict=True))
 
 
 def test_one_axis_of_the_moment_alone_is_used(tmp_path):
     names = [f"ground_force_{kind}{a}" for kind in "vp" for a in "xyz"]
-    (found,) = table_forces(force_table(tmp_path, dict.fromkeys([*names, "ground_torque_y"], 1.0)))
-    assert found.moments == ("ground_torque_y",) and found.columns["moment_2"] == "ground_torque_y"
+    (force_columns,) = table_forces(
+        force_table(tmp_path, dict.fromkeys([*names, "ground_torque_y"], 1.0))
+    )
+    assert (
+        force_columns.moments == ("ground_torque_y",)
+        and force_columns.columns["moment_2"] == "ground_torque_y"
+    )
 
 
 @pytest.mark.parametrize(
@@ -246,8 +251,8 @@ def test_a_tables_force_is_matched_to_the_foot_by_where_it_acts(tmp_path, capsys
 def test_several_forces_under_one_foot_are_summed(tmp_path):
     arguments = recorded_leg(tmp_path)
     path = two_forces(tmp_path)
-    both = changed(arguments, grf=path, grf_force="ground_force_1,ground_force_2")
-    assert main(both) == 2  # Their sum acts half a metre from the ankle.
+    arguments_of_two = changed(arguments, grf=path, grf_force="ground_force_1,ground_force_2")
+    assert main(arguments_of_two) == 2  # Their sum acts half a metre from the ankle.
     single = changed(arguments, grf=path, grf_force="ground_force_2")
     assert main(single) == 0
     case = load_case(load_scene(tmp_path / "out" / "scene.toml"))
@@ -261,13 +266,13 @@ def test_several_forces_under_one_foot_are_summed(tmp_path):
             if "_v" in name or "_m" in name.partition("_1")[2]:
                 halved[name] = halved[name] / 2
     write_storage(tmp_path / "halves.mot", halved, in_degrees=False)
-    both = changed(
+    arguments_of_two = changed(
         arguments,
         grf=str(tmp_path / "halves.mot"),
         grf_force="ground_force_1,ground_force_2",
         out=str(tmp_path / "sum"),
     )
-    assert main(both) == 0
+    assert main(arguments_of_two) == 0
     summed = load_case(load_scene(tmp_path / "sum" / "scene.toml"))
     np.testing.assert_allclose(summed.ground.force, case.ground.force, atol=1e-5)
     np.testing.assert_allclose(summed.ground.moment, case.ground.moment, atol=1e-5)
@@ -303,8 +308,10 @@ def test_files_without_a_common_time_are_refused(tmp_path, capsys):
 def twice_prefixed(tmp_path):
     arguments = recorded_leg(tmp_path)
     _, markers = moving_leg(tmp_path / "plain.osim")
-    both = {f"{who}:{name}": path for who in ("S", "Model") for name, path in markers.items()}
-    write_trc(tmp_path / "leg.trc", np.arange(60) / 60.0, both, 60.0)
+    arguments_of_two = {
+        f"{who}:{name}": path for who in ("S", "Model") for name, path in markers.items()
+    }
+    write_trc(tmp_path / "leg.trc", np.arange(60) / 60.0, arguments_of_two, 60.0)
     return arguments
 
 
@@ -344,8 +351,8 @@ def test_a_states_files_speeds_are_no_coordinates(tmp_path, path, turned):
     q, missing = read_coordinates(chain, table)
     np.testing.assert_allclose(q[:, chain.coordinates["knee_flexion_r"]], [0.1, 0.2, 0.3])
     assert "knee_flexion_r" not in missing
-    alone = Table(tmp_path / "q.sto", {"time": np.arange(3.0), **speed}, in_degrees=False)
-    assert "knee_flexion_r" in read_coordinates(chain, alone)[1]
+    speeds_only = Table(tmp_path / "q.sto", {"time": np.arange(3.0), **speed}, in_degrees=False)
+    assert "knee_flexion_r" in read_coordinates(chain, speeds_only)[1]
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def _frames_of(folder: Path) -> tuple[str, str]:
 def _rows_of(folder: Path) -> tuple[str, str]:
     """Return the command of a folder's unfinished study ("" without one), and the study's file."""
     name = "rows.jsonl"
-    if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
+    if any((folder / summary).is_file() for summary in ("tradeoff.json", "stability.json")):
         return "", name
     try:
         first = read_text(folder / name, FILE_LIMITS.table_bytes).partition("\n")[0]

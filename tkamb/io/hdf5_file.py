@@ -63,10 +63,10 @@ class NotingFile:
     def write(self, content: Any) -> int:
         """Write all bytes; after a failure, only move the position."""
         view = memoryview(content).cast("B")
-        done = 0
-        while done < len(view) and self.failure is None:
+        written = 0
+        while written < len(view) and self.failure is None:
             try:
-                done += os.pwrite(self._descriptor, view[done:], self._place + done)
+                written += os.pwrite(self._descriptor, view[written:], self._place + written)
             except OSError as error:
                 self.failure = error
         self._place += len(view)

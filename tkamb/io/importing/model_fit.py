@@ -130,21 +130,19 @@ class ModelChain:
             state, twists, self._carries @ moments, np.einsum("fmi,fmi->f", pull, residual)
         )
 
-    def _assembled(
-        self, state: Array, twists: Array, carried: Array, cost: Array
-    ) -> NormalEquations:
+    def _assembled(self, state: Array, twists: Array, sums: Array, cost: Array) -> NormalEquations:
         """Return the normal equations of the free coordinates.
 
         Args:
             state: coordinates, rad and m, shape (f, n).
             twists: twists of the moving coordinates, shape (f, k, 6).
-            carried: sums over the markers that each coordinate moves, shape (f, k, 25).
+            sums: sums over the markers that each coordinate moves, shape (f, k, 25).
             cost: weighted sum of squared distances, m², shape (f,).
         """
         a, b = twists[..., :3], twists[..., 3:]
-        weight, first, pull = carried[..., :1], carried[..., 1:4], carried[..., 4:7]
-        second = carried[..., 7:16].reshape(*weight.shape[:2], 3, 3)
-        turning = carried[..., 16:25].reshape(*weight.shape[:2], 3, 3)
+        weight, first, pull = sums[..., :1], sums[..., 1:4], sums[..., 4:7]
+        second = sums[..., 7:16].reshape(*weight.shape[:2], 3, 3)
+        turning = sums[..., 16:25].reshape(*weight.shape[:2], 3, 3)
         force = weight * b + cross(a, first)
         moment = cross(first, b) + _trace(second) * a - _product(second, a)
         matrix = twists @ np.concatenate([moment, force], axis=-1).swapaxes(1, 2)

@@ -413,13 +413,13 @@ def _title(request: ImportRequest) -> tuple[str, ...]:
 def _notes(
     request: ImportRequest, scale: float, trial: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
-    alone = (
+    quadriceps_note = (
         "Without [muscles] only the quadriceps acts. When hamstrings and gastrocnemius act too, "
         "the contact force is too low, and the quadriceps force is the least that the joint moment "
         "needs."
     )
     notes = [
-        *(() if request.muscles else (alone,)),
+        *(() if request.muscles else (quadriceps_note,)),
         *_motion_notes(request, trial),
         "Foot and shank are one body with the ankle at its neutral angle.",
     ]

@@ -321,22 +321,22 @@ def _replace(
 ) -> tuple[Path, tuple[Path, ...]]:
     """Fill an element from the file that it includes. Return this file and all opened files."""
     where = f"{path}: {element.tag} file='{name}'"
-    other = path.parent / name.replace("\\", "/")
-    if not other.is_file() and element.tag in NOT_NEEDED:
+    included = path.parent / name.replace("\\", "/")
+    if not included.is_file() and element.tag in NOT_NEEDED:
         notices.append(f"{element.tag} is left out: its file {name} does not exist")
         return path, opened
-    if other.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
+    if included.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
         raise InputError("names a file that includes this one, or nests files too deep", where)
-    if not other.exists():
+    if not included.exists():
         raise InputError(
-            f"names a file that does not exist ({other})", where, "put it beside the model"
+            f"names a file that does not exist ({included})", where, "put it beside the model"
         )
-    root = _read(other, notices)
+    root = _read(included, notices)
     target = root
     if root.tag == "OpenSimDocument":
         matches = [child for child in root if child.tag == element.tag]
         if not matches:
-            raise InputError(f"names a file without a <{element.tag}> ({other})", where)
+            raise InputError(f"names a file without a <{element.tag}> ({included})", where)
         target = matches[0]
     if target.tag != element.tag:
         raise InputError(f"names a file with a <{target.tag}> instead of a <{element.tag}>", where)
@@ -347,7 +347,7 @@ def _replace(
     for key, value in target.attrib.items():
         element.attrib.setdefault(key, value)
     notices.append(f"{element.tag} read from {name}")
-    return other, (*opened, other.resolve())
+    return included, (*opened, included.resolve())
 
 
 def _apply_defaults(target: Element, defaults: Element | None) -> None:

@@ -277,8 +277,8 @@ class LineSet:
 
     def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
         """Join blocks (f, m, ...) to arrays with the leading shape of q."""
-        whole = [np.concatenate(parts) for parts in columns]
-        return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in whole]
+        arrays = [np.concatenate(parts) for parts in columns]
+        return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in arrays]
 
     def _measure(self, q: Array) -> tuple[Array, Array, Tension]:
         """Return lengths (f, m), moment arms (f, m, n) and forces at coordinates q (f, n)."""
@@ -304,8 +304,8 @@ class LineSet:
         twists = motion.twists.reshape(len(q), -1, q.shape[1])
         arms = work.wrenches.reshape(shape) @ twists
         for k, c, rate in rates:
-            moved = np.einsum("fij,fj->fi", poses[:, k, :3, :3], rate)
-            arms[:, self._owner[k], c] += (work.pulls[:, k] * moved).sum(axis=1)
+            velocity = np.einsum("fij,fj->fi", poses[:, k, :3, :3], rate)
+            arms[:, self._owner[k], c] += (work.pulls[:, k] * velocity).sum(axis=1)
         lengths = np.add.reduceat(work.lengths, self._first, axis=1)
         arms[np.isnan(lengths)] = np.nan
         return lengths, arms, work

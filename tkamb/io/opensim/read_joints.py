@@ -90,8 +90,8 @@ class Frames:
         in_body = np.eye(4)
         for _ in range(len(self.offsets) + 1):
             name = steps[-1] if steps else owner  # ".." is the owner of the frame
-            above = steps[-2] if len(steps) > 1 else owner
-            key = (above, name) if (above, name) in self.offsets else ("", name)
+            owner_name = steps[-2] if len(steps) > 1 else owner
+            key = (owner_name, name) if (owner_name, name) in self.offsets else ("", name)
             if key not in self.offsets:
                 if name in self.bodies:
                     return name, in_body

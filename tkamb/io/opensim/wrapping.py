@@ -205,9 +205,9 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     high = low + 2.0 * tried[1]
     golden = 0.5 * (np.sqrt(5.0) - 1.0)
     for _ in range(40):
-        left, right = high - golden * (high - low), low + golden * (high - low)
-        shorter = at(left)[1] < at(right)[1]
-        low, high = np.where(shorter, left, low), np.where(shorter, high, right)
+        inner_low, inner_high = high - golden * (high - low), low + golden * (high - low)
+        shorter = at(inner_low)[1] < at(inner_high)[1]
+        low, high = np.where(shorter, inner_low, low), np.where(shorter, high, inner_high)
     result, lengths, frame = at(0.5 * (low + high))
     centre = -ring * frame[rows, 0]
     entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (result.entry, result.exit))

@@ -290,10 +290,10 @@ def _content(path: Path) -> dict[str, Any]:
     return _merge(base, content)
 
 
-def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of `base`, replaced by the keys of `own`. Tables are merged."""
-    merged = base | own
-    for key, value in own.items():
+def _merge(base: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of `base`, replaced by the keys of `content`. Tables are merged."""
+    merged = base | content
+    for key, value in content.items():
         if isinstance(value, dict) and isinstance(base.get(key), dict):
             merged[key] = _merge(base[key], value)
     return merged
