@@ -169,7 +169,6 @@ def test_files_change_together(tmp_path):
 
 
 def test_interrupted_renames_are_completed_later(tmp_path, monkeypatch):
-    """A process is killed after some of its renames. The next process completes them."""
     for renames in range(1, 4):
         folder = tmp_path / str(renames)
         folder.mkdir()

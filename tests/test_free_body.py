@@ -5,7 +5,6 @@ tables, markers and STL, apply the documented smoothing spline, and fit the shan
 compute the poses of all segments from the URDF's joints, the accelerations by differences of those
 poses, the ground reaction as a wrench, ligament tensions, and the direction of sliding. Their
 equations are in the laboratory: 6 for shank with foot, 3 for the patella, 6 for thigh with patella.
-tkamb has 15 generalised equations instead.
 
 tkamb supplies geometry: contact points and normals of condyles and patella, the lines of quadriceps
 and patellar ligament, unloaded condyles, and whether the quadriceps is slack. For DM it also
@@ -147,7 +146,6 @@ def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):
 
 
 def test_the_free_bodies_notice_a_load_that_is_wrong_by_one_per_cent(shipped):
-    """The comparison fails if the ground reaction changes by one per cent."""
     leg, mechanics, time = shipped
     k, ground = SHIPPED_FRAMES[3], leg.ground
     reference = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()

@@ -42,7 +42,7 @@ needs_dm = pytest.mark.skipif(
 
 
 def write_poses(path: Path, time: np.ndarray, poses: np.ndarray) -> Path:
-    """Write poses (n, 4, 4) m of the femoral mesh in the insert mesh, rad."""
+    """Write poses (n, 4, 4), m, of the femoral mesh in the insert mesh, with angles in rad."""
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("XYZ")
     values = np.concatenate([angles, poses[:, :3, 3]], axis=1)
     write_storage(path, {"time": time} | dict(zip(ROLES, values.T, strict=True)), in_degrees=False)

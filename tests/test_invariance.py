@@ -101,7 +101,6 @@ def test_any_rotation_of_laboratory_and_gravity_changes_nothing():
 
 @pytest.mark.parametrize("axes", ["+y,+z,+x", "-x,+y,-z"])
 def test_a_laboratory_with_other_axes_gives_the_same(tmp_path, axes):
-    """The same measurements are in files with other `laboratory_axes`."""
     to_laboratory = np.zeros((3, 3))
     for row, axis in enumerate(axes.split(",")):
         to_laboratory[row, "xyz".index(axis[1])] = -1.0 if axis[0] == "-" else 1.0

@@ -73,7 +73,7 @@ def metres_and_volts(content):
     content.add_parameter("FORCE_PLATFORM", "CAL_MATRIX", matrices)
 
 
-def a_plate_that_nobody_reads(content):
+def a_plate_of_unknown_type(content):
     """Add a fourth plate of a type that is not read, far from the walkway."""
     plates = content["parameters"]["FORCE_PLATFORM"]
     plates["USED"]["value"], plates["TYPE"]["value"] = [4], [2, 2, 2, 21]
@@ -82,16 +82,16 @@ def a_plate_that_nobody_reads(content):
         plates[key]["value"] = np.concatenate([value, value[..., -1:]], axis=-1)
 
 
-WRITTEN = [
+CHANGES = [
     units_of_one_maker,
     equal_labels_of_the_arms,
     equal_channels,
     metres_and_volts,
-    a_plate_that_nobody_reads,
+    a_plate_of_unknown_type,
 ]
 
 
-@pytest.mark.parametrize("change", WRITTEN)
+@pytest.mark.parametrize("change", CHANGES)
 def test_the_same_trial_in_another_form_gives_the_same_case(tmp_path, reference, change):
     content = ezc3d.c3d(str(TRIAL))
     change(content)

@@ -69,7 +69,6 @@ def test_another_contact_model_does_not_get_the_lattices_options(scene_file):
 
 
 def test_a_preset_can_be_applied_to_a_loaded_scene(scene_file):
-    """The scene is the same as from the file, and keeps its own overrides."""
     read = load_scene(scene_file, FAST)
     assert with_preset(read, SOURCE) == load_scene(scene_file, FAST, SOURCE)
     assert with_preset(read, SOURCE).preset == load_scene(scene_file, FAST, SOURCE).preset

@@ -60,7 +60,6 @@ def storage(folder, rows="2", degrees="yes", more="", encoding="utf-8"):
 
 
 def test_a_header_that_states_another_number_of_rows_is_noticed(tmp_path):
-    """A file with fewer rows than its header states is read with a notice."""
     assert storage(tmp_path).notices == ()
     for rows in ("1", "5"):
         (notice,) = storage(tmp_path, rows).notices
@@ -237,7 +236,7 @@ def two_forces(tmp_path, moments=True, at="pressure", rate=60.0, span=(0.0, 1.0)
 
 
 @pytest.mark.parametrize("at", ["pressure", "plate", "file"])
-def test_a_tables_force_is_matched_to_the_foot_by_where_it_acts(tmp_path, capsys, at):
+def test_a_tables_force_is_assigned_to_the_foot_at_its_point_of_application(tmp_path, capsys, at):
     """Forces at the centre of pressure, the plate's origin or the file's origin give one wrench."""
     arguments = recorded_leg(tmp_path)
     assert main(changed(arguments, grf=two_forces(tmp_path, at=at))) == 0
@@ -397,7 +396,7 @@ def test_a_motion_is_cut_to_the_time_of_its_force(tmp_path, capsys):
     arguments = motion_of_the_leg(tmp_path)
     assert main([*arguments, "--grf", two_forces(tmp_path, span=(-0.5, 0.6))]) == 0
     output = capsys.readouterr().out
-    assert "ground_force_2_v*" in output and "by where they act" in output
+    assert "ground_force_2_v*" in output and "by their points of application" in output
     time = read_table(tmp_path / "out" / "motion.csv").column("time_s")
     assert time[0] == 0.0 and 0.5 < time[-1] <= 0.6
 

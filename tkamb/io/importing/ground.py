@@ -155,7 +155,7 @@ def _from_table(
     chosen = [force for force in forces if force.name in names]
     foot_forces = [force for force in recorded if force.key in names]
     lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
-    lines += [_columns_line(path, side, chosen, "by where they act"), *notices]
+    lines += [_columns_line(path, side, chosen, "by their points of application"), *notices]
     lines += [*_unmeasured_line(loads, names, feet, side, interval), *_drift_lines(recorded, names)]
     return FoundGround(_table_file(path, axes, chosen, foot_forces), interval, span, lines)
 
