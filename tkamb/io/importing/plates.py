@@ -3,8 +3,8 @@
 The forces are from the plates of a C3D file, or from a table of ground reactions. Programs name the
 columns of such a table in many ways: `ground_force_1_vx`, `1_ground_force_px`,
 `ground_torque_1_y`, `ground_moment_1_mx`, `ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A column
-name contains the kind (force, point, moment), the axis, and the name of a force. A moment column
-that belongs to no force is an error if a force lacks its moment, which may then not be zero.
+name contains the kind (force, point, moment), the axis, and the name of a force. If a force has no
+moment, a moment column that belongs to no force is an error.
 """
 
 import re

@@ -295,7 +295,7 @@ def _thinned(
     if stride == 1 or not even or count < 8:
         return (float(inside[0]), float(inside[-1])), None, f"frames: all {len(inside)}"
     last = float(inside[(count - 1) * stride])
-    line = f"frames: every {stride}th of the recording, {count} at {rate / stride:g} Hz"
+    line = f"frames: one in {stride} of the recording, {count} at {rate / stride:g} Hz"
     return (float(inside[0]), last), count, line
 
 
