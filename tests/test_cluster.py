@@ -67,9 +67,9 @@ def test_without_dask_the_error_gives_the_install_command(monkeypatch):
 
 
 def test_the_number_of_workers_is_limited():
-    for wrong in (0, 1000):
+    for count in (0, 1000):
         with pytest.raises(InputError, match="workers"):
-            PoolOptions(wrong)
+            PoolOptions(count)
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ WRITTEN = {"cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.ht
 
 @pytest.fixture
 def file(tmp_path):
-    """Return a cohort file with two subjects and one whose motion file is missing, no implants."""
+    """Return a cohort file without implants. One of its three subjects lacks its motion file."""
     for name in ("patient.urdf", "motion.csv", "tibia.csv", "ground_reaction.csv"):
         shutil.copy(KNEE / name, tmp_path)
     scene = (KNEE / "scene.toml").read_text()
@@ -67,7 +67,7 @@ def file(tmp_path):
     return path
 
 
-def test_the_table_of_a_cohort_equals_its_runs_and_lists_failures(file, tmp_path, capsys):
+def test_a_cohort_has_the_results_of_its_runs_and_lists_failures(file, tmp_path, capsys):
     folder = tmp_path / "out"
     assert main(["cohort", str(file), "--out", str(folder)]) == 0
     output = capsys.readouterr()
@@ -311,20 +311,20 @@ def test_cyclic_references_are_freed_between_runs():
         gc.enable()
 
 
-def worn(pressure, area_scale=1.0):
+def worn(pressure_scale, wear_scale=1.0):
     original = outcome(1.0, 11)
     columns = dict(original.columns)
     for side in ("medial", "lateral"):
         name = f"{side}_peak_pressure_MPa"
-        columns[name] = columns[name] * pressure
+        columns[name] = columns[name] * pressure_scale
     wear = {
-        f"volume_mm3_per_Mc{end}": area_scale * v
+        f"volume_mm3_per_Mc{end}": wear_scale * v
         for end, v in (("", 8.0), ("_low", 4.0), ("_high", 16.0))
     }
     return replace(original, columns=columns, wear=wear)
 
 
-DESIGNS = """
+WITHOUT_DESIGNS = """
         [[trial]]
         name = "bend"
         scene = "scene.toml"
@@ -342,7 +342,7 @@ DESIGNS = """
 
 @pytest.fixture
 def two_by_two(tmp_path):
-    """Return a cohort of two thicknesses by two conformities and two subjects."""
+    """Return a cohort of two subjects and four designs: two thicknesses, two conformities."""
     for path in KNEE.iterdir():
         shutil.copy(path, tmp_path)
     entries = [
@@ -352,7 +352,7 @@ def two_by_two(tmp_path):
         for t in (6, 10)
     ]
     path = tmp_path / "two.toml"
-    path.write_text(DESIGNS.replace("        ", "") + "".join(entries))
+    path.write_text(WITHOUT_DESIGNS.replace("        ", "") + "".join(entries))
     return load_cohort(path)
 
 

@@ -35,7 +35,7 @@ def bodies():
     return femoral, insert
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_first_touch_is_just_below_the_clearance_of_the_vertices(seed):
     """Edges may touch before vertices, by less than the sagitta of the facets."""
     rng = np.random.default_rng(seed)

@@ -119,7 +119,7 @@ def test_arrays_of_gigabytes_are_not_unpacked():
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("x.npy", b"")
     content = bytearray(packed.getvalue())
-    offset = content.rindex(b"PK\x01\x02") + 24  # of the uncompressed size in the directory
+    offset = content.rindex(b"PK\x01\x02") + 24  # offset of the uncompressed size
     content[offset : offset + 4] = (3 * 10**9).to_bytes(4, "little")
     with pytest.raises(ValueError, match="too large"):
         read_arrays(bytes(content))

@@ -107,8 +107,15 @@ def narrow(found):
     return bool([flag for flag in found.flags if "too narrow for the cells" in flag])
 
 
-@pytest.mark.parametrize("name", ["lattice-linear", "fe"])
-@pytest.mark.parametrize("size", [1.0, 2.0])
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("lattice-linear", 1.0),
+        ("lattice-linear", 2.0),
+        ("fe", 2.0),
+        pytest.param("fe", 1.0, marks=pytest.mark.slow),
+    ],
+)
 def test_a_contact_is_flagged_as_narrow_or_has_an_accurate_peak(name, size):
     model = contact_model(name, size)
     state = model.prepare(pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), LINEAR))

@@ -150,6 +150,8 @@ def test_a_command_replaces_its_own_file_alone(tmp_path, meshes, capsys, name):
         ("a.png", b"\x89PNG\r\n\x1a\n picture", True),
         ("a.png", b"notes", False),
         ("a.gif", b"GIF89a", True),
+        ("a.mp4", b"\x00\x00\x00\x20ftypisom", True),
+        ("a.mp4", b"notes", False),
         ("a.html", b"<html>my page</html>", False),
         ("a.html", b'<html><meta name="generator" content="tkamb">', True),
         ("a.inp", b"*HEADING\nmy own deck", False),

@@ -49,9 +49,9 @@ def test_an_undeformed_insert_has_the_gaps_of_its_smooth_surface():
     problem = press_problem(bodies, 500.0, knee_pose(np.zeros(6)), 1.0)
     displacement = np.zeros((len(problem.lattice.nodes), 4))
     displacement[:, 0] = np.arange(1, len(displacement) + 1)
-    bent = peer._bent(problem, PeerRun({"NINSERT": displacement}, 0.0, 0.0, 0))
+    deformed = peer._deformed_map(problem, PeerRun({"NINSERT": displacement}, 0.0, 0.0, 0))
     pose = knee_pose([0, 40e-3, 0, 0, 0, 0])
-    gap = peer._gaps(problem, pose, bent)
+    gap = peer._gaps(problem, pose, deformed)
     x, y, z = problem.map.points.T
     smooth = y + problem.map.lift
     near = np.hypot(x, z) < 5e-3

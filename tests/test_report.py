@@ -159,6 +159,11 @@ def test_cycle_axis_is_cut_where_it_starts_anew(gait):
     assert np.isnan(y[30])
 
 
+def test_a_single_frame_has_a_place_on_the_cycle_axis(gait):
+    results = Results({name: values[:1] for name, values in gait.columns.items()}, {}, None)
+    assert horizontal_axis(results, "cycle").values == pytest.approx([0.0])
+
+
 def test_round_steps():
     assert [round_step(v) for v in (0.09, 10, 10.1, 17, 31, 60)] == [0.1, 10, 15, 20, 50, 100]
     axis = horizontal_axis(make_run("bend", maps=False))

@@ -80,7 +80,7 @@ def test_both_scenes_of_dm_raise_no_question_of_sign(scene):
     [
         ("scene.toml", "rotation_1"),
         ("scene.toml", "rotation_2"),
-        ("mirrored.toml", "rotation_1"),
+        pytest.param("mirrored.toml", "rotation_1", marks=pytest.mark.slow),
         ("mirrored.toml", "rotation_2"),
     ],
 )

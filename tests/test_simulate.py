@@ -181,6 +181,12 @@ def test_refused_frames_are_refused_with_the_available_range():
         simulate(fast_scene(), frames=slice(0, 3000, 10))
 
 
+def test_frames_keep_their_place_on_the_cycle_axis_without_a_known_cycle():
+    overrides = {"output.axis": "cycle"}
+    summary = simulate(fast_scene(), overrides=overrides, frames=slice(25, 26)).summary
+    assert summary["cycle_percent_s"] == pytest.approx([0.0, 4.0])
+
+
 def test_a_folder_instead_of_a_scene_is_refused_with_the_name_of_its_scene():
     with pytest.raises(InputError, match=r"is a folder, not a file; give .*scene\.toml"):
         simulate(MODEL)

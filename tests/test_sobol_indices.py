@@ -18,7 +18,7 @@ A, B = 7.0, 0.1
 
 
 def ishigami(normal):
-    """Return Ishigami's function; standard normal values (n, 3) give its inputs within ±pi."""
+    """Return Ishigami's function of inputs within ±pi, from standard normal values (n, 3)."""
     x = np.pi * (2.0 * ndtr(normal) - 1.0)
     return np.sin(x[:, 0]) + A * np.sin(x[:, 1]) ** 2 + B * x[:, 2] ** 4 * np.sin(x[:, 0])
 
@@ -65,7 +65,7 @@ def test_rows_with_a_failed_sample_are_omitted_and_a_constant_has_no_index():
     points = crossed_points(normal[:, :2], normal[:, 2:])
     x = np.array([point.normal for point in points])
     y = x @ [2.0, 1.0]
-    y[[5, 300, 600]] = np.nan  # of A, of B, of A with the first column of B
+    y[[5, 300, 600]] = np.nan  # in A, in B, in A with the first column of B
     (first, second) = sobol_indices(["y"], ["a", "b"], y[:, None, None], 256, 1)
     assert (first.rows, second.rows) == (253, 254)
     assert first.total == pytest.approx(0.8, abs=0.08)
@@ -82,7 +82,7 @@ def test_a_constant_result_has_no_rows(level):
 
 @pytest.mark.parametrize("count", [60, 240])
 def test_an_input_without_effect_has_the_share_of_chance(count):
-    """The share is 2/n of the variance of n samples, which is noise here."""
+    """The result is noise. In n samples chance explains 2/n of its variance."""
     random, shares = np.random.default_rng(2), []
     for _ in range(100):
         errors = random.standard_normal((count, 1, 3))
@@ -101,7 +101,7 @@ def test_a_crossed_column_brings_the_noise_of_its_sample():
     np.testing.assert_array_equal(crossed_noise[:, 1], noise(5, time, 2, 0.1, seed=1)[:, 1])
 
 
-def stiff_knee():
+def knee_with_varied_loads():
     """Return the knee without contact, in which only segment mass and ground reaction vary."""
     constant = {f"uncertainty__{key}": 0.0 for key in ("ap_mm", "si_mm", "ml_mm", "friction")}
     constant |= {
@@ -120,7 +120,7 @@ def test_first_order_and_total_index_agree_for_additive_loads(tmp_path, monkeypa
     monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "page")
     folder = tmp_path / "out"
     analysis = estimate_uncertainty(
-        stiff_knee(),
+        knee_with_varied_loads(),
         samples=64,
         method="sobol",
         indices=True,
@@ -143,7 +143,7 @@ def test_first_order_and_total_index_agree_for_additive_loads(tmp_path, monkeypa
 
 
 def test_screening_gives_central_differences_largest_first():
-    scene, frames = stiff_knee(), slice(40, 41)
+    scene, frames = knee_with_varied_loads(), slice(40, 41)
     rows = [row for row in screen(scene, frames=frames) if row.result == "force_total_BW"]
     assert [row.varied.name for row in rows] == ["ground_reaction", "segment_mass"]
     assert rows[0].minus < 0 < rows[0].plus

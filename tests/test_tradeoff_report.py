@@ -57,7 +57,7 @@ def made_up_rows():
     return with_fronts(rows)
 
 
-def test_rows_table_and_advice():
+def test_the_rows_of_a_study_give_json_table_and_advice():
     rows = made_up_rows()
     assert [row.on_front for row in rows[:5]] == [True, False, True, True, False]
     content = json.loads(as_json(rows))
@@ -178,14 +178,14 @@ def test_held_out_cases_do_not_affect_the_known_errors():
     rows = error_cases_rows()
     changed = [replace(r, errors=dict.fromkeys(r.errors, 9.0)) if r.held_out else r for r in rows]
     study = read_rows(MEASURED / "tradeoff.json")
-    stated, other_statement = (
+    entries, changed_entries = (
         json.loads(known_errors_json(study, subset)) for subset in (rows, changed)
     )
-    for entry, other_entry in zip(stated, other_statement, strict=True):
+    for entry, changed_entry in zip(entries, changed_entries, strict=True):
         assert {k: v for k, v in entry.items() if k != "covered"} == {
-            k: v for k, v in other_entry.items() if k != "covered"
+            k: v for k, v in changed_entry.items() if k != "covered"
         }
-        assert other_entry["covered"] in (None, 0.0)
+        assert changed_entry["covered"] in (None, 0.0)
 
 
 @pytest.mark.parametrize("contact", ["lattice", "fe", "lattice-linear"])

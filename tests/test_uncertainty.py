@@ -125,7 +125,7 @@ def test_a_frame_that_failed_in_most_samples_has_no_band():
     assert columns["force_total_N_p50"][1] == pytest.approx(54.5)  # samples 10 to 99
 
 
-def test_the_share_of_measured_frames_inside_the_band():
+def test_the_share_inside_the_band_counts_only_frames_with_force_and_band():
     nan = float("nan")
     columns = {"measured_total_N": np.array([100.0, 300.0, nan, 120.0, 90.0])}
     bands = {
@@ -305,7 +305,7 @@ def test_causes_of_failure_are_counted_without_their_numbers():
 
 
 def test_a_failed_sample_has_its_reason(monkeypatch):
-    """After 60 deviations laterally both condyles touch one wall of the insert."""
+    """After a lateral shift of 60 standard deviations both condyles touch one wall."""
     sampler = Sampler(knee(), range(60, 61), ["force_total_N"])
     monkeypatch.setattr(sampler, "draw", lambda point: draw_of(sampler, ml=60.0))
     sample = sampler(0, Point.of(0, np.zeros(0)))

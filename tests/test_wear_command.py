@@ -50,8 +50,8 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory, profile, scene):
     out = tmp_path_factory.mktemp("wear") / "out"
-    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK]
-    assert main([*worn, "--cycles", "1e5", "--out", str(out)]) == 0
+    wear_command = ["wear", str(scene), "--simulator", str(profile), *QUICK]
+    assert main([*wear_command, "--cycles", "1e5", "--out", str(out)]) == 0
     return out
 
 
@@ -85,8 +85,11 @@ def test_table_summary_maps_and_mesh_have_the_same_volume(written, scene):
 
 def test_doubling_the_wear_factor_doubles_the_wear(capsys, tmp_path, profile, scene, written):
     single = json.loads((written / "wear.json").read_text())
-    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--json"]
-    assert main([*worn, "--cycles", "100", "--wear-factor", "5.2e-7", "--out", str(tmp_path)]) == 0
+    wear_command = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--json"]
+    assert (
+        main([*wear_command, "--cycles", "100", "--wear-factor", "5.2e-7", "--out", str(tmp_path)])
+        == 0
+    )
     double = json.loads(capsys.readouterr().out)
     assert double["volume_mm3_per_Mc"] == pytest.approx(2 * single["volume_mm3_per_Mc"], rel=0.01)
     assert double["law_parameters"]["wear_factor_mm3_per_Nm"] == 5.2e-7
@@ -96,8 +99,8 @@ def test_doubling_the_wear_factor_doubles_the_wear(capsys, tmp_path, profile, sc
 def test_an_interrupted_simulation_is_resumed_to_the_same_result(
     monkeypatch, capsys, tmp_path, profile, scene
 ):
-    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--cycles", "60000"]
-    assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
+    wear_command = ["wear", str(scene), "--simulator", str(profile), *QUICK, "--cycles", "60000"]
+    assert main([*wear_command, "--out", str(tmp_path / "whole")]) == 0
     keep, stops = wear_run.keep_state, iter([True])
 
     def keep_and_stop(*arguments):
@@ -106,13 +109,13 @@ def test_an_interrupted_simulation_is_resumed_to_the_same_result(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(wear_run, "keep_state", keep_and_stop)
-    assert main([*worn, "--out", str(tmp_path / "part")]) == 130
+    assert main([*wear_command, "--out", str(tmp_path / "part")]) == 130
     assert "go on with --resume" in capsys.readouterr().err
     monkeypatch.undo()
-    other = [*worn[:-1], "70000", "--out", str(tmp_path / "part"), "--resume"]
+    other = [*wear_command[:-1], "70000", "--out", str(tmp_path / "part"), "--resume"]
     assert main(other) == 2
     assert "another simulation" in capsys.readouterr().err
-    assert main([*worn, "--out", str(tmp_path / "part"), "--resume"]) == 0
+    assert main([*wear_command, "--out", str(tmp_path / "part"), "--resume"]) == 0
     complete, resumed = (
         (tmp_path / name / "wear.csv").read_text(encoding="utf-8") for name in ("whole", "part")
     )
@@ -121,18 +124,29 @@ def test_an_interrupted_simulation_is_resumed_to_the_same_result(
 
 @pytest.mark.slow
 def test_a_killed_simulation_is_resumed_to_the_same_result(tmp_path, profile, scene):
-    worn = ["wear", str(scene), "--simulator", str(profile), *QUICK[:-1], "6", "--cycles", "60000"]
-    assert main([*worn, "--out", str(tmp_path / "whole")]) == 0
+    wear_command = [
+        "wear",
+        str(scene),
+        "--simulator",
+        str(profile),
+        *QUICK[:-1],
+        "6",
+        "--cycles",
+        "60000",
+    ]
+    assert main([*wear_command, "--out", str(tmp_path / "whole")]) == 0
     part = tmp_path / "part"
     command = [sys.executable, "-c", "import sys; from tkamb.cli import main; sys.exit(main())"]
-    process = subprocess.Popen([*command, *worn, "--out", str(part)], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [*command, *wear_command, "--out", str(part)], stderr=subprocess.DEVNULL
+    )
     while not (part / STATE_NAME).exists():
         assert process.poll() is None
         time.sleep(0.01)
     process.kill()
     assert process.wait() == -signal.SIGKILL
     assert not (part / "wear.csv").exists()
-    assert main([*worn, "--out", str(part), "--resume"]) == 0
+    assert main([*wear_command, "--out", str(part), "--resume"]) == 0
     for name in ("wear.csv", "worn_insert.stl", "wear.vtp"):
         assert (part / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
@@ -192,7 +206,7 @@ def test_positions_of_a_profile_are_relative_to_the_dwell_position(profile, scen
         [-1e-3, 1e-3, -3e-3]
     )
     assert setup.motion.load[[0, 15, 70]] == pytest.approx([300, 1800, 200])
-    # the dwell position of two spheres on two dishes is the middle, apart from the facets
+    # two spheres lie lowest in the middle of two dishes, apart from the effect of facets
     assert (coordinates[0, 0], coordinates[0, 2]) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 

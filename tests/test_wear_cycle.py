@@ -189,7 +189,7 @@ def lenses_scene(tmp_path_factory):
 
 @pytest.mark.parametrize("rows", [TRIANGLE, SAWTOOTH, SPIKE, UNEVEN])
 def test_the_wear_of_a_profile_agrees_with_archard(tmp_path, lenses_scene, rows):
-    """For the triangle it is 2e-7 mm³/(N m) · 1000 N · 20 mm · 10^6 = 4.000 mm³."""
+    """The triangle wears 2e-7 mm³/(N m) · 1000 N · 20 mm · 10^6 = 4.000 mm³."""
     run = prepare_wear(
         lenses_scene,
         cycles=1_000_000,

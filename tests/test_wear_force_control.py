@@ -31,7 +31,7 @@ from tkamb.studies.wear.simulator import (
 from tkamb.studies.wear.worn_surface import ArticularSurface
 from wear_bodies import DENSITY, MM, balls, balls_scene
 
-AP, SI, ML, TURN = 0, 1, 2, 3
+AP, SI, ML, AXIAL_ROTATION = 0, 1, 2, 3
 CYCLE = """cycle_percent,axial_force_N,flexion_deg,ap_force_N,axial_torque_Nm
 0,300,0,0,0
 25,1500,15,-60,1
@@ -99,12 +99,12 @@ def test_on_a_flat_plate_the_spring_balances_the_ap_force(force, gap):
 def test_on_a_flat_plate_the_spring_balances_the_axial_torque(torque, gap):
     stiffness = np.degrees(0.4)  # 0.4 N·m/deg
     applied = [0, -900.0, 0, torque, 0, 0]
-    drive = machine(applied, (SI, TURN), {"axial_rotation": Spring(stiffness, gap)})
+    drive = machine(applied, (SI, AXIAL_ROTATION), {"axial_rotation": Spring(stiffness, gap)})
     plate = flat_insert(10 * MM, 15 * MM, 34 * MM)
     coordinates, reason = equilibrium(plate, balls(), drive, 900.0)
     assert not reason
     rotation = np.sign(torque) * (abs(torque) / stiffness + gap)
-    assert coordinates[TURN] == pytest.approx(rotation, abs=1e-4)
+    assert coordinates[AXIAL_ROTATION] == pytest.approx(rotation, abs=1e-4)
 
 
 def test_a_force_without_resistance_has_no_equilibrium():
@@ -258,8 +258,8 @@ def command(tmp_path_factory):
 
 
 def test_the_report_has_control_springs_and_released_coordinates(command):
-    machine = {"simulator": command[3], "springs": command[-1], "resolution_mm": 4.0, "frames": 5}
-    run = wear_run.prepare_wear(command[1], cycles=100, updates=1, **machine)
+    options = {"simulator": command[3], "springs": command[-1], "resolution_mm": 4.0, "frames": 5}
+    run = wear_run.prepare_wear(command[1], cycles=100, updates=1, **options)
     report = run.compute()
     content = json.loads(json.dumps(report.as_dict()))
     assert any(line.startswith("force control: ap ") for line in report.lines())

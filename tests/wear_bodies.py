@@ -69,7 +69,7 @@ class Pressed:
     def maps(self, insert: Surface, motion: CycleMotion) -> CycleMaps:
         points = insert.vertices[insert.vertices[:, 1] > insert.bounds[1, 1] / 2]
         if points[:, 1].min() < self.fails_below:
-            return CycleMaps(points, None, None, motion.poses, {0: "it is gone"})
+            return CycleMaps(points, None, None, motion.poses, {0: "no contact is left"})
         inside = [self.under(transform(inverse(pose), points)) for pose in motion.poses]
         pressure = np.array(inside, float) * 1e6
         return CycleMaps(points, np.zeros((0, 3), np.int64), pressure, motion.poses, {})

@@ -289,9 +289,9 @@ OWN_MARK = b"tkamb"
 """Mark near the beginning of every page, map and deck that tkamb writes."""
 MARK_WITHIN = 4096
 """Number of bytes at the beginning of a file that are searched for the mark."""
-PICTURES = {".png": b"\x89PNG", ".gif": b"GIF8"}
-"""Suffix of a picture file -> its first bytes. Pictures have no mark of tkamb. A picture may
-therefore replace any picture of its format."""
+PICTURES = {".png": (0, b"\x89PNG"), ".gif": (0, b"GIF8"), ".mp4": (4, b"ftyp")}
+"""Suffix of a picture or film -> (offset, bytes) that identify its format. Pictures and films have
+no mark of tkamb. One may therefore replace any other of its format."""
 
 
 def check_output_file(path: str | Path | None, force: bool = False) -> None:
@@ -302,23 +302,22 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
         force: whether any file may be replaced.
 
     Raises:
-        InputError: the path holds a file that tkamb did not write, other than an .mp4 file, or is
-            not a file.
+        InputError: the path is not a file, or holds a file that tkamb did not write.
     """
     if path is None or not os.path.lexists(path):
         return
     path = Path(path)
     if not path.is_file():
         raise InputError("exists already and is not a file", path, "give another name")
-    if force or path.suffix.lower() == ".mp4":
+    if force:
         return
     try:
         with open(path, "rb") as file:
             head = file.read(MARK_WITHIN)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path, "give another name") from None
-    magic = PICTURES.get(path.suffix.lower())
-    if not head or (OWN_MARK in head if magic is None else head.startswith(magic)):
+    offset, magic = PICTURES.get(path.suffix.lower(), (0, None))
+    if not head or (OWN_MARK in head if magic is None else head.startswith(magic, offset)):
         return
     what = "exists already, and tkamb did not write it"
     raise InputError(what, path, "give another name, or force=True to replace it")

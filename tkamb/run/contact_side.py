@@ -229,7 +229,9 @@ class ContactSide:
         if len(released.released) < 5:
             points = mechanics.knee.nearest_points(instant.coordinates)
         try:
-            knee = self.starts.rest(instant, [c.equilibrium for c in good if c.equilibrium], points)
+            knee = self.starts.equilibrium(
+                instant, [c.equilibrium for c in good if c.equilibrium], points
+            )
         except ComputationError as error:
             contact = self.failed(error.what)
             body = mechanics.frame(k)
@@ -310,13 +312,13 @@ class ContactSide:
 def _equilibrium_flags(knee: "KneeEquilibrium") -> tuple[str, ...]:
     """Return the flags of an equilibrium: a second equilibrium, an inaccurate compliance."""
     second = (knee.second,) if knee.second else ()
-    if knee.doubt <= COUPLING.stiffness_error:
+    if knee.compliance_error <= COUPLING.stiffness_error:
         return second
     return (
         *second,
-        "the response of the knee's coordinates to the muscles has not converged "
-        f"(relative error {100 * knee.doubt:.0f} %): with other initial guesses such frames "
-        "differed by up to 3 % in the total force and 60 N in the force of one condyle",
+        "the response of the knee's coordinates to the muscles has not converged (relative error "
+        f"{100 * knee.compliance_error:.0f} %): with other initial guesses such frames differed by "
+        "up to 3 % in the total force and 60 N in the force of one condyle",
     )
 
 

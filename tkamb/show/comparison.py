@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PairingSettings:
-    """When frames of two runs are the same instant."""
+    """Condition on which frames of two runs are the same instant."""
 
     tolerance: float = 1e-6
-    """deg, per cent or s: frames nearer on the axis are the same instant of one recording. Chosen:
-    above the rounding of files."""
+    """deg, per cent or s: frames with a smaller distance on the axis are the same instant of one
+    recording. Chosen because it is above the rounding of files."""
 
 
 PAIRING = PairingSettings()
@@ -36,13 +36,13 @@ PAIRING = PairingSettings()
 
 @dataclass(frozen=True, eq=False)
 class Pairing:
-    """Where the frames of a first run lie in another: f frames, those without a place among them.
+    """Places of the f frames of the first run among the frames of another run.
 
     Args:
-        lower: (f,) the other's frame at or before the place; -1 without a place.
-        upper: (f,) the frame after it, or the same.
-        weight: (f,) of the upper frame, 0 to 1.
-        exact: every pair is one frame of each run at one time: nothing is interpolated.
+        lower: frame of the other run at or before the place, shape (f,); -1: no place.
+        upper: frame of the other run at or after the place, shape (f,).
+        weight: weight of the upper frame, 0 to 1, shape (f,).
+        exact: True: each frame has a partner at the same time, and nothing is interpolated.
     """
 
     lower: Index
@@ -51,7 +51,7 @@ class Pairing:
     exact: bool
 
     def values(self, column: Array) -> Array:
-        """Return the other run's column at the first one's frames (f,); NaN where there is none."""
+        """Return a column of the other run at the frames (f,) of the first; NaN without a place."""
         low, high = column[self.lower], column[self.upper]
         between = (1.0 - self.weight) * low + self.weight * high
         return np.where(self.lower < 0, np.nan, np.where(self.weight > 0, between, low))
@@ -68,10 +68,10 @@ def pair_frames(
 ) -> Pairing | None:
     """Pair the frames of two runs.
 
-    If all frames of the shorter run have a match at the same time and place on the axis, the runs
-    are of one recording and these frames are paired. Otherwise the other run is interpolated
-    linearly between neighbouring frames, within its range. That needs axes that rise, or fall,
-    throughout. None where they do not, because places are then not unique.
+    If every frame of the shorter run has a match at the same time and place on the axis, both runs
+    have the same recording and these frames are paired. Otherwise the other run is interpolated
+    linearly within its range. This needs axes that rise or fall throughout. The result is None for
+    other axes, because their places are not unique.
     """
     same = _same_frames(first["time_s"], first_axis.values, other["time_s"], other_axis.values)
     if same is not None:
@@ -94,7 +94,7 @@ def pair_frames(
 def _same_frames(
     first_time: Array, first_place: Array, other_time: Array, other_place: Array
 ) -> Index | None:
-    """Return the other's frame of each frame (f,), -1 without one; None: not one recording."""
+    """Return the matching frame (f,) of the other run, -1 without one; None: other recording."""
     at = {float(time): k for k, time in enumerate(other_time)}
     result = np.array([at.get(float(time), -1) for time in first_time], np.int64)
     paired = result >= 0
@@ -122,10 +122,10 @@ VERSIONS = "identity"
 
 @dataclass(frozen=True)
 class CompareSettings:
-    """How many runs are compared."""
+    """Limit of a comparison."""
 
     max_runs: int = 8
-    """Number of runs in a picture. Chosen: so many can be told apart by colour."""
+    """Largest number of runs in a picture. Chosen because more colours are hard to distinguish."""
 
 
 COMPARE = CompareSettings()
@@ -136,11 +136,11 @@ class Run:
     """One folder of results.
 
     Args:
-        label: short and unlike the others'.
+        label: short name, unique among the runs.
         folder: folder of the results.
-        results: what it holds.
-        axis: on which it is drawn.
-        pairing: the places of the first run's frames in it; None: they are not unique.
+        results: results in the folder.
+        axis: horizontal axis of its curves.
+        pairing: places of the first run's frames in this run; None: they are not unique.
     """
 
     label: str
@@ -152,19 +152,19 @@ class Run:
 
 @dataclass(frozen=True)
 class Difference:
-    """How one column of a run differs from the first run's: the run less the first.
+    """Difference of one column: a run minus the first run.
 
     Args:
         run: label of the run.
-        column: name, with its unit.
+        column: name of the column, with its unit.
         max_abs: largest absolute difference.
         percent: largest difference, % of the largest absolute value of the first run; NaN if that
             value is zero.
         at_frame: frame of the first run with the largest difference.
-        at: the place of that frame, deg, per cent or s.
+        at: place of that frame on the axis, deg, per cent or s.
         rms: root mean square of the differences.
         mean: mean of the signed differences.
-        frames: how many were compared.
+        frames: number of compared frames.
     """
 
     run: str
@@ -180,12 +180,12 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Runs side by side; the others are compared with the first.
+    """Comparison of runs with the first of them.
 
     Args:
-        runs: at least two.
+        runs: at least two runs.
         kind: kind of the axis: "flexion", "cycle" or "time".
-        notes: differences of the runs' settings, and what could not be compared, a sentence each.
+        notes: sentences on different settings and on columns that cannot be compared.
         differences: one per column of each run after the first.
     """
 
@@ -195,7 +195,7 @@ class Comparison:
     differences: tuple[Difference, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `tkamb compare --json` prints."""
+        """Return the content that `tkamb compare --json` prints."""
         return {
             "axis": self.kind,
             "runs": [
@@ -222,15 +222,15 @@ class Comparison:
 
 
 def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> Comparison:
-    """Read folders of results and compare the others with the first.
+    """Read folders of results and compare each with the first.
 
     Args:
-        folders: two to eight that `tkamb run` wrote.
-        axis: "flexion", "cycle" or "time"; default: the one that all of them ask for.
+        folders: two to eight folders that `tkamb run` wrote.
+        axis: "flexion", "cycle" or "time"; default: the axis of all the runs.
 
     Raises:
-        InputError: fewer than two or too many folders, one that holds no results, or runs that
-            ask for different axes.
+        InputError: there are fewer than two or too many folders, a folder has no results, or the
+            runs have different axes.
     """
     if not 2 <= len(folders) <= COMPARE.max_runs:
         what = f"needs two to {COMPARE.max_runs} folders of results, not {len(folders)}"
@@ -266,13 +266,13 @@ def _labels(paths: Sequence[Path]) -> list[str]:
         labels = ["/".join(part[-count:]) for part in parts]
         if len(set(labels)) == len(labels):
             return labels
-    return [f"{path} ({k})" for k, path in enumerate(paths, 1)]  # one folder, given twice
+    return [f"{path} ({k})" for k, path in enumerate(paths, 1)]  # the same folder twice
 
 
 def differences(first: Run, run: Run) -> list[Difference]:
-    """Return how the columns that both runs model differ; none where frames do not pair.
+    """Return the differences of all columns of both runs; empty if no frames can be paired.
 
-    A frame that failed in one of them holds NaN there and is not compared.
+    A frame that failed in one run is not compared.
     """
     if run.pairing is None:
         return []
@@ -304,7 +304,7 @@ def differences(first: Run, run: Run) -> list[Difference]:
 
 
 def _notes(runs: Sequence[Run]) -> list[str]:
-    """Return what a reader must know before comparing, a sentence each."""
+    """Return sentences on settings and columns that limit the comparison."""
     notes = []
     for key, words in SETTINGS.items():
         notes += _unlike(runs, words, [run.results.summary.get(key) for run in runs])

@@ -37,7 +37,7 @@ class CompareFigureSettings:
 
     failed_row_height: float = 0.03
     """1: height of the crosses of failed frames above the bottom, and their distance from run to
-    run, as a share of the picture's height. Chosen by looks."""
+    run, as a share of the picture's height. Chosen by eye."""
 
 
 COMPARE_FIGURE = CompareFigureSettings()

@@ -1,9 +1,9 @@
 """A picture of the leg at three frames, in the laboratory, with the plate's force.
 
-Rows: the whole leg from its lateral side and from the front, and the knee from both. Each is
-labelled anterior and posterior, or medial and lateral; the last row names the ligaments.
-The laboratory's y is up; forward is the mean direction of the insert's x over the three frames.
-A left knee is mirrored at input and mirrored back in the picture.
+The rows show the whole leg from the lateral side and from the front, then the knee from both
+directions. The last row names the ligaments. The laboratory's y is up. Forward is the mean
+direction of x of the insert over the three frames. A left knee is mirrored at input and mirrored
+back in the picture.
 """
 
 from contextlib import suppress
@@ -42,11 +42,11 @@ class LegPictureSettings:
     """Sizes in the picture of a leg."""
 
     arrow_metres_per_BW: float = 0.35
-    """m per body weight: length of the force's arrow. Chosen: it fits beside the leg."""
+    """m per body weight: length of the force arrow. Chosen because it fits beside the leg."""
     knee_half_width: float = 0.085
-    """m: half width of the picture of the knee around its middle. Chosen: a total knee fits."""
+    """m: half width of the picture of the knee. Chosen because a total knee fits."""
     margin: float = 0.08
-    """m: margin around what is shown. Chosen: labels fit."""
+    """m: margin around the leg or knee. Chosen because labels fit."""
 
 
 LEG_PICTURE = LegPictureSettings()
@@ -64,12 +64,13 @@ class LegFrame:
 
     Args:
         frame: frame of the motion.
-        joints: (3, 3) hip, knee, ankle; the knee is the insert frame's origin.
-        bodies: the implant's surfaces with their colours.
-        lines: (n, 3) ligaments and tendons, with their colours and the ligaments' names.
-        force: (3,) N on the foot; None without a plate.
-        point: (3,) where it acts.
-        loaded: whether the foot stands on the plate; else no arrow is drawn.
+        joints: centres of hip, knee and ankle, shape (3, 3). The knee is the origin of the insert
+            frame.
+        bodies: surfaces of the implant with their colours.
+        lines: ligaments and tendons, each with points (n, 3), its colour and its name.
+        force: force on the foot, N, shape (3,); None without a plate.
+        point: point of application of the force, shape (3,).
+        loaded: whether the foot stands on the plate; otherwise no arrow is drawn.
     """
 
     frame: int
@@ -82,10 +83,10 @@ class LegFrame:
 
 
 def shown_frames(case: Case) -> list[int]:
-    """Return three frames (fewer of a short motion), apart from each other, in time order.
+    """Return three distinct frames in time order, or fewer for a short motion.
 
-    They are the first, the one of the largest ground reaction and the one of the most flexion;
-    where one lies near another, the last or the middle one instead.
+    They are the first frame, the frame of the largest ground reaction and the frame of the largest
+    flexion. A frame that is near another one is replaced by the last or the middle frame.
     """
     count = len(case.motion.time)
     frames = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
@@ -99,7 +100,7 @@ def shown_frames(case: Case) -> list[int]:
 
 
 def leg_frame(case: Case, mechanics: Mechanics, k: int) -> LegFrame:
-    """Return the leg at frame k."""
+    """Return the leg in frame k."""
     state = mechanics.geometry(k).state
     to_laboratory = state.insert_in_laboratory
     in_insert = [state.point("hip", np.zeros(3)), np.zeros(3), state.point("tibia", np.zeros(3))]
@@ -128,9 +129,9 @@ def leg_frame(case: Case, mechanics: Mechanics, k: int) -> LegFrame:
 
 
 def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, str]]:
-    """Return ligaments, muscle line and patellar ligament, insert frame; colours and names.
+    """Return lines in the insert frame, with colour and name: ligaments, muscle, patellar ligament.
 
-    Only a ligament's first strand has its name.
+    Only the first strand of a ligament has its name.
     """
     segments: list[tuple[Array, str, str]] = []
     named: set[str] = set()
@@ -140,7 +141,7 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, st
         segments.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
         named.add(name)
     if mechanics.extensor is not None:
-        with suppress(ComputationError):  # no patella at this frame: the run reports it
+        with suppress(ComputationError):  # no patella is found in this frame; a run reports this
             quadriceps, ligament = mechanics.extensor.lines.paths(state)
             segments.append((quadriceps.points, QUADRICEPS, ""))
             segments.append((ligament.points, PATELLAR_LIGAMENT, ""))
@@ -149,14 +150,14 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, st
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Directions of a picture: to the right of the page and out of it; the laboratory's y is up.
+    """Directions of a picture in the laboratory frame, whose y is up.
 
     Args:
-        across: (3,) horizontal, to the right of the page; turned over for a left knee, which
-            is computed as a right one and so drawn as it is.
-        towards: (3,) horizontal, towards the reader.
-        left: what lies to the left of the page, in words.
-        right: what lies to its right.
+        across: horizontal direction (3,) to the right of the page. It is reversed for a left knee,
+            which is computed as a right one.
+        towards: horizontal direction (3,) towards the reader.
+        left: anatomical direction to the left of the page, for example "anterior".
+        right: anatomical direction to the right of the page.
     """
 
     across: Array
@@ -165,12 +166,12 @@ class View:
     right: str
 
     def page(self, points: Array) -> Array:
-        """Return points (..., 3) m on the page (..., 2), m."""
+        """Return the page coordinates (..., 2), m, of points (..., 3), m."""
         return np.stack([points @ self.across, points[..., 1]], axis=-1)
 
 
 def draw_leg(case: Case, mechanics: Mechanics) -> Figure:
-    """Return the picture of a case: three frames across; leg from two sides, and the knee."""
+    """Return the picture of a case: three frames side by side, four views below each other."""
     frames = [leg_frame(case, mechanics, k) for k in shown_frames(case)]
     ahead = np.mean([_ahead(mechanics, one.frame) for one in frames], axis=0)
     ahead /= np.linalg.norm(ahead)
@@ -206,7 +207,7 @@ def draw_leg(case: Case, mechanics: Mechanics) -> Figure:
 
 
 def _ahead(mechanics: Mechanics, k: int) -> Array:
-    """Return the horizontal part (3,) of where the insert's x points in the laboratory."""
+    """Return the horizontal part (3,) of the insert's x axis in the laboratory frame."""
     state = mechanics.geometry(k).state
     return state.insert_in_laboratory[:3, 0] * np.array([1.0, 0.0, 1.0])
 
@@ -223,7 +224,7 @@ def _caption(case: Case, one: LegFrame) -> str:
 
 
 def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
-    """Draw one frame: the implant, the joint centres, lines of action and the plate's force."""
+    """Draw implant, joint centres, lines of action and ground reaction of one frame."""
     joints = view.page(one.joints)
     axes.plot(*joints.T, color=BLACK, linewidth=3, alpha=0.35, solid_capstyle="round")
     axes.plot(*joints.T, "o", color=BLACK, markersize=4)
@@ -257,9 +258,14 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
 
 
 def _name_sides(axes: Axes, view: View) -> None:
-    """Write what lies to the left and to the right of the page."""
+    """Label the anatomical directions to the left and to the right of the page."""
     ends = ((0.02, 0.015, "left", view.left), (0.98, 0.05, "right", view.right))
-    for place, height, align, words in ends:  # at two heights: a leg from the front is narrow
+    for (
+        place,
+        height,
+        align,
+        words,
+    ) in ends:  # the labels have two heights, because a leg from the front is narrow
         axes.text(
             place, height, words, ha=align, va="bottom", fontsize=8, color=GREY,
             transform=axes.transAxes, gid=f"side-{align}",
@@ -279,7 +285,7 @@ def _name_ligaments(axes: Axes, one: LegFrame, view: View) -> None:
 
 
 def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None:
-    """Draw a surface's triangles, the farthest first, those that face the reader the lightest."""
+    """Draw the triangles of a surface, the farthest first and those that face the reader lightest."""
     lean = surface.face_normals @ view.towards
     facing = np.flatnonzero(lean > 0)
     corners = surface.triangles[facing]
@@ -295,14 +301,14 @@ def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None
 
 
 def _close_up(axes: Axes, one: LegFrame, view: View) -> None:
-    """Show the knee alone."""
+    """Limit the axes to the knee."""
     centre = view.page(one.joints[1]) + np.array([0.0, 15 * MILLIMETRE])
     axes.set_xlim(centre[0] - LEG_PICTURE.knee_half_width, centre[0] + LEG_PICTURE.knee_half_width)
     axes.set_ylim(centre[1] - LEG_PICTURE.knee_half_width, centre[1] + LEG_PICTURE.knee_half_width)
 
 
 def _same_limits(row: Array) -> None:
-    """Give pictures of a row one scale: the widest and the tallest of them."""
+    """Give all pictures of a row the same scale, so that the largest fits."""
     width = max(np.ptp(axes.get_xlim()) for axes in row)
     low = min(axes.get_ylim()[0] for axes in row)
     high = max(axes.get_ylim()[1] for axes in row)

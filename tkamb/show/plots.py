@@ -47,13 +47,13 @@ class PlotSettings:
     """Looks of the report's plots."""
 
     label_offset_points: float = 12.0
-    """Points from a plot's edge to the near side of an axis' label. Chosen by looks."""
+    """Points from a plot's edge to the near side of an axis' label. Chosen by eye."""
     side_gap: float = 0.01
-    """1: gap between axes and the text beside them, as a share of the width. Chosen by looks."""
+    """1: gap between axes and the text beside them, as a share of the width. Chosen by eye."""
     band_opacity: float = 0.16
-    """1: opacity of the band around a line, 0 to 1. Chosen by looks."""
+    """1: opacity of the band around a line, 0 to 1. Chosen by eye."""
     wide_band_opacity: float = 0.07
-    """1: opacity of the band that includes the model's discrepancy, 0 to 1. Chosen by looks."""
+    """1: opacity of the band that includes the model's discrepancy, 0 to 1. Chosen by eye."""
 
 
 PLOT = PlotSettings()

@@ -1,7 +1,7 @@
 """Pressure on the insert seen from above, and the paths of the centres of pressure.
 
-Anterior is up and the subject's right is on the right of the page, as one looks down on the
-insert; for a left knee, which is mirrored at input, the picture is mirrored back.
+The view is from above: anterior is up, and the subject's right is on the right of the page. A left
+knee is mirrored at input and mirrored back in the picture.
 """
 
 from collections.abc import Sequence
@@ -37,39 +37,39 @@ class PressurePictureSettings:
     """Looks of the pressure maps."""
 
     margin_mm: float = 2.0
-    """mm: margin around the insert in a picture. Chosen by looks."""
+    """mm: margin around the insert in a picture. Chosen by eye."""
     step_mm: float = 0.3
-    """mm: distance of the points of the grid that pressures are drawn on. Chosen: no steps are
-    seen."""
+    """mm: spacing of the grid on which pressures are drawn. Chosen because steps are then
+    invisible."""
     rim_share: float = 0.03
-    """1: share of the scale over which a flat map fades at its rim; elsewhere it fades from one
-    point of the grid to the next. Chosen: no steps are seen."""
+    """1: share of the scale over which a map with small gradients fades at its rim. A steeper map
+    fades over one spacing of the grid. Chosen because steps are then invisible."""
     outline_margin: int = 8
-    """Number of grid points around the insert on which its smooth outline may lie. Chosen:
-    smoothing moves it by less."""
+    """Number of grid points around the insert within which its smooth outline lies. Chosen because
+    smoothing moves the outline by less."""
     outline_width: float = 0.7
-    """Of the map's edge length: standard deviation of the average that smooths the outline. Chosen:
-    half an edge leaves the steps visible, a whole one rounds the notch."""
+    """1: standard deviation of the filter that smooths the outline, as a share of the map's edge
+    length. Chosen because 0.5 leaves steps visible and 1 rounds the notch."""
 
 
 PRESSURE_PICTURE = PressurePictureSettings()
 
 LABEL_GAP_MM, LABEL_STEP_MM = 4.0, 2.6
-"""From a path to its labels, and between two of them."""
+"""mm: distance from a path to its labels, and between two labels."""
 EDGE, ABOVE, BELOW, BETWEEN = 3.0, 17.0, 18.0, 6.0
-"""Points: left of maps, over each for its title, under each for its scale, between two beside each
-other."""
+"""Points: space to the left of maps, above each map for its title, below each map for its scale,
+and between adjacent maps."""
 BAR_LABELS, BAR_RATIO = 41.0, 30.0
-"""Points right of a colour bar for its labels; its height over its width."""
+"""Space to the right of a colour bar for its labels, points; ratio of its height to its width."""
 
 
 class TopView:
-    """The insert as one looks down on it, in page coordinates (mm, right and up).
+    """The insert from above, in page coordinates (mm; to the right and up).
 
     Args:
-        maps: points and triangles.
-        side: "right" or "left": the subject's knee.
-        lateral: what insert z points to, "lateral" or "medial".
+        maps: pressure maps with their points and triangles.
+        side: side of the knee, "right" or "left".
+        lateral: direction of z of the insert frame, "lateral" or "medial".
     """
 
     def __init__(self, maps: ContactMaps, side: str, lateral: str) -> None:
@@ -84,15 +84,15 @@ class TopView:
         self.grey = self.grid.sample(_shade(points, self.triangles))
 
     def page_coordinates(self, ap: Array, ml: Array) -> tuple[Array, Array]:
-        """Return page coordinates (mm) of insert x and z (mm)."""
+        """Return the page coordinates (mm) of x and z in the insert frame (mm)."""
         return self.sign * ml, ap
 
     @cached_property
     def insert_picture(self) -> tuple[Array, Array]:
-        """Return grey and opacity (rows, columns) of the insert, some points beyond the grid.
+        """Return grey level and opacity (rows, columns) of the insert, on a grid with a margin.
 
-        The map's triangles end in steps of their own size. The outline is where the signed
-        distance from their rim, averaged over such a step, is zero.
+        The rim of the map's triangles has steps. The outline is smoother: on it the signed distance
+        from the rim, averaged over about one triangle, is zero.
         """
         from scipy.ndimage import distance_transform_edt, gaussian_filter  # takes 0.1 s to load
 
@@ -106,20 +106,20 @@ class TopView:
 
     @property
     def across_limits(self) -> tuple[float, float]:
-        """Left and right end of the picture, mm."""
+        """Return the left and right end of the picture, mm."""
         return float(self.across.min() - PRESSURE_PICTURE.margin_mm), float(
             self.across.max() + PRESSURE_PICTURE.margin_mm
         )
 
     @property
     def up_limits(self) -> tuple[float, float]:
-        """Lower and upper end of the picture, mm."""
+        """Return the lower and upper end of the picture, mm."""
         return float(self.up.min() - PRESSURE_PICTURE.margin_mm), float(
             self.up.max() + PRESSURE_PICTURE.margin_mm
         )
 
     def draw_insert(self, axes: Axes) -> None:
-        """Draw the insert in greys that show its dishes, and dress the axes."""
+        """Draw the insert in greys that show its dishes, and set up the axes."""
         grey, opacity = self.insert_picture
         picture = colormaps["gray"](grey, bytes=True)
         picture[..., 3] = np.round(255 * opacity)
@@ -133,7 +133,7 @@ class TopView:
         axes.set_axis_off()
 
     def draw_labels(self, axes: Axes) -> None:
-        """Write where anterior, medial and lateral are, and a 10 mm scale."""
+        """Draw the labels anterior, medial and lateral, and a scale of 10 mm."""
         left, right = ("medial", "lateral") if self.side == "right" else ("lateral", "medial")
         style: Any = {"fontsize": 7.5, "color": GREY, "transform": axes.transAxes}
         axes.text(0.0, -0.01, left, ha="left", va="top", **style)
@@ -154,7 +154,7 @@ def top_view(results: "Results") -> TopView | None:
 
 
 def mapped_frames(results: "Results", axis: HorizontalAxis, count: int = 8) -> list[int]:
-    """Return at most `count` frames with a pressure map, spread over the motion.
+    """Return at most `count` frames that have a pressure map, spread over the motion.
 
     The frame of the largest pressure is one of them.
     """
@@ -171,7 +171,7 @@ def mapped_frames(results: "Results", axis: HorizontalAxis, count: int = 8) -> l
 
 
 def frame_of_peak(results: "Results") -> int | None:
-    """Return the frame of the largest pressure; None where it has no map."""
+    """Return the frame of the largest pressure; None if this frame has no map."""
     largest = peak_of(results, "<side>_peak_pressure_MPa")
     return largest.frame if largest is not None and largest.frame in map_rows(results) else None
 
@@ -179,7 +179,7 @@ def frame_of_peak(results: "Results") -> int | None:
 def draw_maps(
     results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
-    """Return pressure maps of these frames on one colour scale, 0 to the run's largest."""
+    """Return a figure of pressure maps of some frames, on a scale from 0 to the run's largest."""
     largest = float(np.nanmax(_pressure(results)))
     scale = Normalize(0.0, largest if largest > 0 else 1.0)
     across = min(4, len(frames))
@@ -208,7 +208,7 @@ def draw_map(
     frame: int,
     scale: Normalize,
 ) -> None:
-    """Draw the pressure of a frame that has a map on the insert, with its centres."""
+    """Draw the pressure map and the centres of pressure of a frame on the insert."""
     assert results.maps is not None
     row = map_rows(results)[frame]
     view.draw_insert(axes)
@@ -218,9 +218,9 @@ def draw_map(
 
 
 def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list[Axes], Axes]:
-    """Return axes for maps, row by row, and for their colour bar, `gap` points beside them.
+    """Return the axes of maps, row by row, and of their colour bar, `gap` points beside them.
 
-    The sizes of the labels around maps are known, so that no layout engine is needed.
+    No layout engine is needed, because the sizes of the labels are known.
     """
     figure.set_layout_engine("none")
     width, height = 72 * figure.get_size_inches()
@@ -242,7 +242,7 @@ def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list
 
 
 def pressure_bar(figure: Figure, scale: Normalize, **place: Any) -> Colorbar:
-    """Return the colour bar of pressure maps on one scale (MPa), in a place of `colorbar`."""
+    """Return the colour bar of pressure maps with a common scale, MPa."""
     bar = figure.colorbar(ScalarMappable(scale, PRESSURE_MAP), **place)
     bar.set_label("contact pressure (MPa)")
     return bar
@@ -251,7 +251,7 @@ def pressure_bar(figure: Figure, scale: Normalize, **place: Any) -> Colorbar:
 def draw_paths(
     results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
-    """Return the paths of both centres of pressure over the insert, in time order."""
+    """Return a figure of the paths of both centres of pressure on the insert."""
     with settings():
         figure = new_figure(5.4, 3.7)
         axes = figure.add_subplot()
@@ -283,7 +283,7 @@ def _edge_length_mm(points: Array, triangles: NDArray[np.int64]) -> float:
 
 
 def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
-    """Return a grey level (n,) per point, lit obliquely from above."""
+    """Return a grey level (n,) per point, for light that falls obliquely from above."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal *= np.where(normal[:, 1:2] < 0, -1.0, 1.0)
@@ -302,11 +302,12 @@ def draw_pressure(
     """Colour the insert with a pressure (n,), in the scale's unit.
 
     Args:
-        axes: axes in which the insert is drawn.
+        axes: axes that show the insert.
         view: top view of the insert.
-        pressure: (n,).
-        scale: colour scale that begins at 0, MPa.
-        gap: (n,) m; says where between the points the contact ends.
+        pressure: pressure at the map points, shape (n,), in the scale's unit.
+        scale: colour scale that begins at 0.
+        gap: gap at the map points, m, shape (n,). It locates the edge of the contact between the
+            points.
     """
     peak = float(scale.vmax or 1.0)
     apart = None if gap is None else gap[None]
@@ -315,7 +316,7 @@ def draw_pressure(
         part = touched_part(level > 0)
         level = level[part]
         picture = colormaps[PRESSURE_MAP](np.maximum(level, 0.0), bytes=True)
-        change = np.hypot(*np.gradient(level))  # from point to point of the grid
+        change = np.hypot(*np.gradient(level))  # change over one spacing of the grid
         picture[..., 3] = 255 * np.clip(
             0.5 + level / np.maximum(change, PRESSURE_PICTURE.rim_share), 0.0, 1.0
         )
@@ -328,7 +329,7 @@ def _show(
     extent: tuple[float, float, float, float],
     height: float,
 ) -> None:
-    """Draw a picture (rows, columns, 4) of a grid's points as it is; the page smooths it."""
+    """Draw a picture (rows, columns, 4), one pixel per grid point. The page smooths it."""
     axes.imshow(picture, extent=extent, interpolation="none", zorder=height, clip_on=False)
 
 
@@ -350,7 +351,7 @@ def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
 def _label_stops(
     axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
 ) -> None:
-    """Write beside a path where the motion is at its dots, its first and its last place."""
+    """Label the dots, the first and the last point of a path with their place in the motion."""
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(finite):
         return
@@ -376,7 +377,7 @@ def _label_stops(
 
 
 def _spread(heights: Array, step: float) -> Array:
-    """Return rising heights moved apart to at least a step, near their original places."""
+    """Return rising heights, moved apart so that neighbours differ by at least `step`."""
     count = np.arange(len(heights))
     pressed = np.maximum.accumulate(heights - step * count) + step * count
     return pressed - 0.5 * float(np.mean(pressed - heights))

@@ -39,7 +39,7 @@ class DesignFigureSettings:
 
     spread: float = 0.5
     """1: share of the width of a place on the horizontal axis over which its dots stand side by
-    side. Chosen by looks."""
+    side. Chosen by eye."""
 
 
 DESIGN_FIGURE = DesignFigureSettings()

@@ -28,11 +28,11 @@ class LabelPlaceSettings:
     """Room around the labels of a figure."""
 
     edge_points: float = 3.0
-    """Points around all labels of a figure. Chosen by looks."""
+    """Points around all labels of a figure. Chosen by eye."""
     tick_points: float = 6.5
-    """Points that ticks with their gap take. Chosen by looks."""
+    """Points that ticks with their gap take. Chosen by eye."""
     tick_label_points: float = 9.0
-    """Points: size of letters. Chosen by looks."""
+    """Points: size of letters. Chosen by eye."""
 
 
 LABEL_PLACE = LabelPlaceSettings()

@@ -1,4 +1,4 @@
-"""Cost and effect of settings of the body: coupling, filter, frame rate, patella and wrapping.
+"""Cost and effect of multibody settings: coupling, filter, frame rate, patella and wrapping.
 
 Each run changes one setting of the shipped knee bend. It is compared with the run as shipped at
 the same instants. A lower frame rate removes rows of the recordings (motion, shank and ground
@@ -34,8 +34,8 @@ class BodyTradeSettings:
     recorded_frames: int = 101
     """Number of frames of the shipped motion."""
     stride: int = 10
-    """Recorded frames from one compared frame to the next. Chosen because the recordings contain
-    every tenth frame at each frame rate of the study."""
+    """Recorded frames from one compared frame to the next. Chosen because every frame rate of the
+    study contains these frames."""
 
 
 BODY_TRADE = BodyTradeSettings()
@@ -47,7 +47,7 @@ class Change:
 
     Args:
         keys: dotted key of the scene -> value that replaces the shipped one.
-        every: stride of the recorded frames that stay in the recordings.
+        every: stride of the frames that stay in the recordings.
     """
 
     keys: dict[str, Any] = field(default_factory=dict)
@@ -185,18 +185,18 @@ def body_json(rows: Sequence[BodyRow]) -> str:
 def body_table(rows: Sequence[BodyRow]) -> list[str]:
     """Return the lines of the printed table."""
     head = " ".join(f"{text:>12s}" for text in HEADS.values())
-    lines = [f"{'knee bend':20s} {'ms per frame':>12s} {'else s':>6s} {head}"]
+    lines = [f"{'knee bend':20s} {'ms per frame':>12s} {'prep s':>6s} {head}"]
     for row in rows:
-        start = f"{row.name:20s} {1e3 * row.frame_seconds:12.1f} {row.prepare_seconds:6.2f}"
+        times = f"{row.name:20s} {1e3 * row.frame_seconds:12.1f} {row.prepare_seconds:6.2f}"
         if row.changed is None:
             lines.append(f"{row.name:20s} {row.status}")
             continue
         shares = " ".join(f"{100 * row.changed[name]:10.2f} %" for name in HEADS)
-        lines.append(f"{start} {shares}" + ("" if row.status == "ok" else f"  {row.status}"))
+        lines.append(f"{times} {shares}" + ("" if row.status == "ok" else f"  {row.status}"))
     return [
         *lines,
-        "largest change over the frames, of the largest value as shipped; of flexion:"
-        " velocity and acceleration",
+        "largest change over the frames, relative to the largest value as shipped; velocity and"
+        " acceleration are of flexion",
     ]
 
 

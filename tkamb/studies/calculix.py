@@ -1,15 +1,15 @@
-"""CalculiX as an independent check: another program solves the same hexahedra, pose and load.
+"""CalculiX as an independent check of the lattice, on the same hexahedra, pose and load.
 
-CalculiX runs as a process with one thread and a time limit, without a result of the lattice. The
-initial position of the femoral component is that at which an elastic foundation carries the load.
-There is no warm start, so the cold and warm times are equal.
+CalculiX runs as a process with one thread and a time limit. It uses no result of the lattice. At
+the initial position of the femoral component an elastic foundation carries the load. CalculiX has
+no warm start, so its cold and warm times are equal.
 
 The contact nodes lie on the smooth surface of the insert's mesh, as in the lattice. The femoral
 component is faceted. CalculiX gives pressures on the deformed faces. They are converted to nodal
 forces and divided by the undeformed tributary areas, as in the built-in models.
 
 Linear cases use small strain in both programs. With the Ramberg-Osgood law CalculiX uses finite
-strain (true stress over the Eulerian strain), the built-in models small strain.
+strain (true stress as a function of Eulerian strain) and the built-in models use small strain.
 """
 
 import math
@@ -151,7 +151,7 @@ def _iterations(text: str) -> int:
 
 
 def _blocks(lines: Iterable[str]) -> dict[str, Array]:
-    """Return the tables of a .dat file, keyed by the set in their title, or its first word."""
+    """Return the tables of a .dat file, keyed by the set in the title, else by its first word."""
     blocks: dict[str, list[list[float]]] = {}
     rows: list[list[float]] = []
     for line in lines:
@@ -172,8 +172,8 @@ class PeerSettings:
     """Condition on which a result of CalculiX is accepted."""
 
     max_residual: float = 0.01
-    """Share of the load: largest difference between the summed contact forces and the load. Chosen
-    because converged solutions differ by less."""
+    """Largest difference between the summed contact forces and the load, relative to the load.
+    Chosen because converged solutions differ by less."""
 
 
 PEER = PeerSettings()
@@ -188,7 +188,7 @@ class PeerAnswer:
         run: output and cost of the process.
         prepare_seconds: time to make the grid, the initial guess and the deck, s.
         nodes: number of nodes of the insert.
-        balance: sum of the vertical contact forces over the load.
+        balance: sum of the vertical contact forces, divided by the load.
     """
 
     result: ContactResult
@@ -259,7 +259,7 @@ def press_by_calculix(
 
 
 def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, float]:
-    """Return the contact result of a run, and the sum of its contact forces over the load.
+    """Return the contact result of a run, and its vertical contact force over the load.
 
     Raises:
         ComputationError: contact extends beyond the femoral patch of the deck, or the forces do not
@@ -269,14 +269,16 @@ def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, flo
         raise ComputationError("gave no contact stress", "CalculiX")
     approach = problem.depth - float(run.blocks["NREF"][-1, 2]) * MILLIMETRE
     pose = problem.pair.pose_at_approach(problem.pose, approach)
-    bent = _bent(problem, run)
-    force = _nodal_forces(problem, pose, run, bent)
+    deformed = _deformed_map(problem, run)
+    force = _nodal_forces(problem, pose, run, deformed)
     balance = -float(force[:, 1].sum()) / problem.load
     if not abs(balance - 1) <= PEER.max_residual:
-        raise ComputationError(f"gave pressures that sum to {balance:.4f} of the load", "CalculiX")
+        raise ComputationError(
+            f"gave contact forces that sum to {balance:.4f} of the load", "CalculiX"
+        )
     surface = problem.map
     pressure = np.linalg.norm(force, axis=1) / surface.area
-    gap = _gaps(problem, pose, bent)
+    gap = _gaps(problem, pose, deformed)
     covered = covered_areas(
         surface.points, surface.triangles, surface.triangle_area,
         pressure, gap, problem.pair.material,
@@ -288,27 +290,27 @@ def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, flo
     return result, balance
 
 
-def _bent(problem: PressProblem, run: PeerRun) -> ContactMap:
+def _deformed_map(problem: PressProblem, run: PeerRun) -> ContactMap:
     displacement = run.blocks["NINSERT"]
     displacement = displacement[np.argsort(displacement[:, 0]), 1:] * MILLIMETRE
-    deformed = replace(problem.lattice, nodes=problem.lattice.nodes + displacement)
-    return contact_map(deformed, problem.pair.insert)[1]
+    lattice = replace(problem.lattice, nodes=problem.lattice.nodes + displacement)
+    return contact_map(lattice, problem.pair.insert)[1]
 
 
-def _gaps(problem: PressProblem, pose: Array, bent: ContactMap) -> Array:
+def _gaps(problem: PressProblem, pose: Array, deformed: ContactMap) -> Array:
     """Return the vertical gaps (c,) above the deformed nodes, m; inf where no facet is above."""
-    above, _ = problem.floor.over(bent.points, pose)
-    return np.nan_to_num(above[:, 1] - bent.points[:, 1], nan=np.inf)
+    above, _ = problem.floor.over(deformed.points, pose)
+    return np.nan_to_num(above[:, 1] - deformed.points[:, 1], nan=np.inf)
 
 
-def _nodal_forces(problem: PressProblem, pose: Array, run: PeerRun, bent: ContactMap) -> Array:
+def _nodal_forces(problem: PressProblem, pose: Array, run: PeerRun, deformed: ContactMap) -> Array:
     """Return the forces (c, 3) on the contact nodes, N: pressure times deformed tributary area."""
     stress = run.blocks["contact"]
-    pressure = np.zeros(len(bent.points))
+    pressure = np.zeros(len(deformed.points))
     place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)
     pressure[place] = np.maximum(stress[:, 1], 0.0) * MEGAPASCAL
     loaded = pressure > 0
     if not problem.touchable[loaded].all():
         raise ComputationError("found contact outside the femoral patch of the deck", "CalculiX")
-    _, normals = problem.floor.over(bent.points, pose)
-    return np.where(loaded[:, None], (pressure * bent.area)[:, None] * normals, 0.0)
+    _, normals = problem.floor.over(deformed.points, pose)
+    return np.where(loaded[:, None], (pressure * deformed.area)[:, None] * normals, 0.0)

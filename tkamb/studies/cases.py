@@ -135,7 +135,7 @@ KNEE_CASES = Path(__file__).with_name("knee_cases.json")
 RECORDINGS = ("motion.csv", "tibia.csv", "ground_reaction.csv")
 """Recorded tables of the shipped knee bend."""
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
-"""deg: flexion of the cases of the shipped knee. A user's scene has the nearest frames."""
+"""deg: flexions of the cases of a knee. A user's scene gives the frames nearest to them."""
 
 
 @dataclass(frozen=True)
@@ -173,8 +173,10 @@ class StudyCase:
         return content_hash(pair, [self.pose, np.array(self.load)], (pair.material, pair.bearing))
 
     def nearby(self, steps: float) -> Array:
-        """Return the pose some frames later: each 0.06 mm posteriorly, with 0.2 deg more flexion
-        and 0.06 deg more axial rotation."""
+        """Return the pose `steps` frames later.
+
+        Each frame adds 0.06 mm posteriorly, 0.2 deg of flexion and 0.06 deg of axial rotation.
+        """
         increment = np.array([-0.06 * MILLIMETRE, 0, 0, 0.06 * DEGREE, 0, 0.2 * DEGREE])
         moved = knee_pose(steps * increment)
         pose = self.pose.copy()
@@ -247,7 +249,7 @@ _ANALYTIC = {"sphere": _sphere, **dict.fromkeys(BICONDYLAR, _two_condyles)}
 
 
 def _shipped(name: str) -> StudyCase:
-    """Return a case of the shipped knee's meshes at the stored pose and load of its reference."""
+    """Return a case of the shipped knee at the pose and load stored in `KNEE_CASES`."""
     from tkamb.geometry.flat_bottom import insert_placement
     from tkamb.io.recordings.meshes import load_surface
 

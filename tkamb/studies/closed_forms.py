@@ -5,15 +5,15 @@ and nu Poisson's ratio.
 
 - plate: a rigid flat plate on a block of height h and area A with nu = 0. The stress is F/A
   everywhere. The approach is d = h eps(F/A), with the material's curve eps(sigma) = sigma/E +
-  alpha (sigma0/E) (sigma/sigma0)^n. It is exact on any grid while the plastic strain is small,
-  because the fixed bottom resists plastic widening. A column of an elastic foundation follows
-  p = sigma(-ln(1 - d/h)), so its approach is d = h (1 - exp(-eps)).
+  alpha (sigma0/E) (sigma/sigma0)^n. A model is exact on any grid while the plastic strain is small.
+  Large plastic strain widens the block, which the fixed bottom resists. A column of an elastic
+  foundation follows p = sigma(-ln(1 - d/h)), so its approach is d = h (1 - exp(-eps)).
 - slide: the plate on a mobile bearing, for any nu and strain. Two nodes of the bottom are fixed
-  to prevent rigid motion. They also fix their distance, which stiffens the block by up to 2 %.
+  to prevent rigid motion. This stiffens the block by up to 2 %.
 - kept: the plate with the operator cache on disk, which already contains the operator of another
   modulus. Each modulus must have its own operator.
-- layer: a rigid sphere on a linear layer bonded to a rigid base (`elastic_layer`).
-- bed: the sphere on a bed of springs, F = 2 pi R h int_0^(d/h) p(e) de (paraboloid).
+- layer: a rigid sphere on a linear layer bonded to a rigid base (`sphere_on_layer`).
+- bed: a paraboloid on a bed of springs of pressure p(e), F = 2 pi R h int_0^(d/h) p(e) de.
 - hertz: the sphere on a half-space, a³ = 3 F R / (4 E*), d = a²/R, p0 = 3 F / (2 pi a²).
 
 References: Johnson, Contact Mechanics (1985), sections 3.4, 4.2, 4.3 and 5.8,
@@ -56,8 +56,8 @@ class ClosedFormSettings:
     """mm: cell size of the "kept" cases. Chosen because the cache does not store the smaller
     operators of larger cells."""
     sharma_approach_ratio: float = 0.6808
-    """Approach of Sharma's springs under the plate over that of the elastic solid. The springs have
-    nu = 0.35 for every material and are too stiff at free sides. Measured."""
+    """Approach of the plate on Sharma's springs over its approach on the elastic solid. The springs
+    have nu = 0.35 for every material and are too stiff at free sides. Measured."""
 
 
 CLOSED_FORM = ClosedFormSettings()
@@ -171,7 +171,7 @@ def relative_errors(case: ClosedForm, result: ContactResult) -> dict[str, float]
     else:
         mean_pressure = max(side.peak_pressure for side in (result.medial, result.lateral) if side)
     if case.kind == "hertz" and result.medial is not None:
-        mean = 1.5 * result.medial.mean_pressure  # two thirds of the peak
+        mean = 1.5 * result.medial.mean_pressure  # the mean is two thirds of the peak
         mean_pressure = max(mean_pressure, mean, key=lambda value: abs(value / pressure - 1.0))
     return {
         "approach": abs(result.approach / approach - 1.0),
@@ -207,7 +207,7 @@ def solution(case: ClosedForm) -> tuple[float, float]:
 
 
 def closed_forms(quick: bool) -> Iterator[ClosedForm]:
-    """Return the cases: one per model and kind of solution, and unless `quick` their extremes."""
+    """Yield one case per model and kind of solution, and extreme cases unless `quick`."""
     solids = ("lattice", "lattice-linear", "fe")
     for model in (*solids, "lattice-source", "foundation", "foundation-linear"):
         yield ClosedForm("plate", model)
@@ -269,9 +269,9 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
         return lambda strain: young * confined * strain
 
     def pressure(strain: float) -> float:
-        stress = -confined * np.log1p(-strain)
-        highest = young * stress + 1.0
-        return float(brentq(lambda s: _strain(case, s) - stress, 0.0, highest))
+        confined_strain = -confined * np.log1p(-strain)
+        highest = young * confined_strain + 1.0
+        return float(brentq(lambda s: _strain(case, s) - confined_strain, 0.0, highest))
 
     return pressure
 

@@ -240,10 +240,10 @@ BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
 
 def extremes() -> Iterator[Extreme]:
     """Return all extreme cases without duplicates."""
-    seen = set()
+    unique = set()
     for extreme in _all():
-        if extreme not in seen:
-            seen.add(extreme)
+        if extreme not in unique:
+            unique.add(extreme)
             yield extreme
 
 

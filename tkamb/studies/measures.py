@@ -136,13 +136,13 @@ class MeasureSettings:
     """s: time limit of a job. A longer job is stopped and has no result. Chosen because the study
     should take minutes."""
     repeats: int = 3
-    """Most timed preparations and first presses, and fewest timed warm presses. Chosen for a
-    median."""
+    """Largest number of timed preparations and first presses, and smallest number of timed warm
+    presses. Chosen because the median of three ignores one slow press."""
     warm_presses: int = 7
-    """Most timed presses from a neighbouring pose. Chosen for a median."""
+    """Largest number of timed warm presses. Chosen because their median ignores slow ones."""
     enough_seconds: float = 3.0
-    """s: measured time after which only `repeats` warm presses are still timed. Chosen because the
-    study should take minutes."""
+    """s: measured time after which only warm presses are repeated, up to `repeats`. Chosen because
+    the study should take minutes."""
 
 
 MEASURE = MeasureSettings()
@@ -252,14 +252,14 @@ def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure
 def measure(job: Job) -> Measure:
     """Measure a job in this process."""
     model = _model(job)
-    (prepare, cold), (case, state, result, start) = _first(model, job)
+    (prepare, cold), (case, state, result, warm_start) = _first(model, job)
     if result.status is not ContactStatus.OK:
         return Measure(f"{result.status.value}: {'; '.join(result.flags)}", prepare, cold)
     return Measure(
         "ok",
         prepare,
         cold,
-        _warm(model, state, case, start),
+        _warm(model, state, case, warm_start),
         peak_rss(),
         result.iterations,
         state.node_count,
@@ -289,20 +289,20 @@ def _first(
         state = None
         case = study_case(job.case, Path(job.scene) if job.scene else None)
         prepare, state = _timed(model.prepare, case.pair)
-        cold, (result, start) = _timed(model.press_from, state, case.load, case.pose)
+        cold, (result, warm_start) = _timed(model.press_from, state, case.load, case.pose)
         prepares.append(prepare)
         colds.append(cold)
         if len(colds) == MEASURE.repeats or sum(prepares) + sum(colds) > MEASURE.enough_seconds:
-            return (median(prepares), median(colds)), (case, state, result, start)
+            return (median(prepares), median(colds)), (case, state, result, warm_start)
 
 
-def _warm(model: ContactModel, state: Any, case: StudyCase, start: WarmStart) -> float:
+def _warm(model: ContactModel, state: Any, case: StudyCase, warm_start: WarmStart) -> float:
     seconds: list[float] = []
     while len(seconds) < MEASURE.repeats or (
         len(seconds) < MEASURE.warm_presses and sum(seconds) < MEASURE.enough_seconds
     ):
         pose = case.nearby(len(seconds) + 1)
-        duration, (_, start) = _timed(model.press_from, state, case.load, pose, start)
+        duration, (_, warm_start) = _timed(model.press_from, state, case.load, pose, warm_start)
         seconds.append(duration)
     return median(seconds)
 

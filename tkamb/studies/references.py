@@ -122,7 +122,7 @@ def _indented(
 
 
 def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -> Array:
-    """Return displacements (n, m), m/Pa, at radii `at` (n,) of pressed disks of `radii` (m,)."""
+    """Return displacements per pressure (n, k), m/Pa, at radii `at` (n,) under disks (k,)."""
     r, b = at[:, None], radii[None]
     share = np.minimum(r / b, b / r) ** 2
     inside = 4 * b / np.pi * ellipe(share)
@@ -215,7 +215,7 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
 
 
 def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
-    """Return values and uncertainties from grid, as "fe 1 mm" -> its values; see the module."""
+    """Return values and uncertainties (see the module) from "fe 1 mm" -> values of that grid."""
     h = np.array([float(name.split()[1]) for name in solved]) * MILLIMETRE
     family = np.array([FAMILIES.index(name.split()[0]) for name in solved])
     values, uncertainty = {}, {}

@@ -48,8 +48,8 @@ INERTIA_STUDY = InertiaStudySettings()
 NOISES = (1e-3, 1e-2, 0.1, 1.0)
 FRICTIONS = (0.0, 0.2, 0.6, 1.0)
 ARMS_MM = (-20.0, -60.0, -90.0, -98.0, -101.0, -104.0, -108.0, -120.0)
-"""mm: anterior shifts of the tibial insertion of the patellar ligament. Its line is straight. The
-moment arm is zero at -98 to -108 mm, depending on flexion."""
+"""mm: anterior shifts of the tibial insertion of a straight patellar ligament. The moment arm is
+zero at -98 to -108 mm, depending on flexion."""
 DEFECTS = ("hole", "flipped", "doubled", "sliver", "nan", "empty", "tiny")
 
 Check = Callable[["Results", Path], float]
@@ -60,7 +60,7 @@ class SceneExtreme:
     """One extreme of a run.
 
     Args:
-        kind: extreme parameter, "time", "noise", "friction", "arm", or mesh, "femoral", "insert".
+        kind: parameter "time", "noise", "friction" or "arm", or damaged mesh "femoral" or "insert".
         value: value of the parameter, or the defect of the mesh.
     """
 
@@ -101,9 +101,9 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     flags = "; ".join(sorted({status for status in results.status if status != "ok"}))
     if any(status.startswith(FAILED) for status in results.status):
         return Verdict(extreme.label, "run", "flagged", flags, seconds=seconds)
-    right = math.isfinite(error) and error <= VERDICT.max_error
-    kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
-    reason = flags if right or flags else f"{100 * error:.3g} % from the expected result"
+    correct = math.isfinite(error) and error <= VERDICT.max_error
+    kind = "converged" if correct else "flagged" if flags else "unflagged_wrong"
+    reason = flags if correct or flags else f"{100 * error:.3g} % from the expected result"
     finite_error = error if math.isfinite(error) else None
     return Verdict(extreme.label, "run", kind, reason, finite_error, seconds)
 

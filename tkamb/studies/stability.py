@@ -1,4 +1,4 @@
-"""Stability at extreme parameters. Each case runs in its own process, which may crash or hang."""
+"""Stability at extreme parameters. A case may crash or hang, so it runs in its own process."""
 
 import json
 import multiprocessing
@@ -206,7 +206,7 @@ def _ended(case: Case, kind: str, reason: str) -> Verdict:
 
 
 def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:
-    """Return the verdict on a case. An unexpected exception gives a verdict of that kind."""
+    """Return the verdict on a case; "exception" if it raises an unexpected exception."""
     try:
         if isinstance(case, Extreme):
             return judge(case, pressed)

@@ -1,8 +1,8 @@
 """Trade-off of speed and accuracy: every contact model on every case, against references.
 
-A `Row` contains the times and errors of one model on one case. Rows that no other row of the case
-beats form the Pareto front of the case. By default, fine grids and solver options are measured only
-on some cases. With `full` every setting is measured on every case.
+A `Row` contains the times and errors of one model on one case. The rows of a case that no other row
+beats are its Pareto front. By default, fine grids and solver options are measured only on some
+cases. With `full` every setting is measured on every case.
 """
 
 import json

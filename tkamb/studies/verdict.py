@@ -103,7 +103,7 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
     ):
         problems.append(f"the condyles carry {by_sides:.4g} N of {load:.4g} N")
     if solved and abs(peak - highest) > AUDIT.force_tolerance * highest:
-        problems.append(f"the condyles' peak is {peak / highest:.4g} of the map's")
+        problems.append(f"the condyles' peak is {peak / highest:.4g} of the map's peak")
     deepest = -float(np.nanmin(result.gap))
     if solved and deepest > AUDIT.penetration_tolerance * result.approach:
         problems.append(f"a node is {1e6 * deepest:.3g} µm inside the femoral component")
@@ -290,10 +290,10 @@ def compared(
     """Return the verdict on a result with status ok, compared with its reference."""
     differences = errors(quantities(result), quantities(reference))
     distance = max(differences[key] for key in JUDGED)
-    right = math.isfinite(distance) and distance <= VERDICT.max_error
+    correct = math.isfinite(distance) and distance <= VERDICT.max_error
     flags = "; ".join(result.flags)
-    kind = "converged" if right else "flagged" if flags else "unflagged_wrong"
-    reason = flags if right or flags else f"{100 * distance:.3g} % from the reference"
+    kind = "converged" if correct else "flagged" if flags else "unflagged_wrong"
+    reason = flags if correct or flags else f"{100 * distance:.3g} % from the reference"
     return _verdict(extreme, kind, reason, distance, seconds, result)
 
 
@@ -326,8 +326,8 @@ def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactRe
         return searched
     for tolerance in NEWTON_TOLERANCES:
         newton = _model(extreme, newton=True, tolerance=tolerance)
-        for shares, start in (((1.0,), None), (LOAD_STEPS, None), ((1.0,), result)):
-            press = _by_steps(newton, extreme, state, shares, start)
+        for shares, guess in (((1.0,), None), (LOAD_STEPS, None), ((1.0,), result)):
+            press = _by_steps(newton, extreme, state, shares, guess)
             if press is not None:
                 return press
     raise ComputationError("Newton's method does not converge, at once or in steps", "reference")
@@ -338,13 +338,13 @@ def _by_steps(
     extreme: Extreme,
     state: Any,
     shares: tuple[float, ...],
-    start: Guess | None,
+    guess: Guess | None,
 ) -> ContactResult | None:
     """Return Newton's result at the last share of the load; None if a step does not converge."""
     for share in shares:
         try:
             load = share * extreme.load_N
-            result, start = newton.press_from(state, load, extreme.pose, start)
+            result, guess = newton.press_from(state, load, extreme.pose, guess)
         except ComputationError:
             return None
         if result.status is not ContactStatus.OK:

@@ -1,4 +1,4 @@
-"""See a run and turn it around: what is drawn, the page that draws it, and its server."""
+"""The viewer: drawings of a run, the page that displays them, and its server."""
 
 CAMERAS = ("oblique", "anterior", "medial", "lateral", "top of insert", "whole leg")
 """Names of the views. The page defines the direction of each view (assets/controls.js)."""

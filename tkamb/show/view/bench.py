@@ -1,10 +1,9 @@
 """A knee on a bench: one pose, an axial load, placement and ligaments changed by hand.
 
-What `tkamb live` computes. A `BenchRequest` is turned into a case that stands still: no muscles,
-no patella. The axial load acts along the tibia's long axis. Its line passes through the origin of
-the insert as the scene places it, also when the insert is moved by hand. The case is computed by
-the same code as a frame of a run, so that the scene which `bench_scene.write_bench` writes gives
-the same numbers by `tkamb run`.
+`tkamb live` computes such a knee. A `BenchRequest` becomes a static case without muscles and
+patella. The axial load acts along the tibia's long axis, through the origin of the insert frame of
+the scene. This line stays on the bone when the user moves the insert. The code is that of a frame
+of a run. So `tkamb run` gives the same numbers for the scene that `bench_scene.write_bench` writes.
 """
 
 from collections.abc import Mapping
@@ -39,44 +38,43 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BenchLimitSettings:
-    """How far the sliders of `tkamb live` go."""
+    """Ranges of the sliders of `tkamb live`."""
 
     flexion_deg: tuple[float, float] = (-20.0, 160.0)
-    """deg; least and largest flexion. Chosen: with a component turned by `placement_deg` it stays
-    within what a scene accepts, so that every state can be saved."""
+    """deg; smallest and largest flexion. Chosen because a scene accepts them even if a component is
+    rotated by `placement_deg`, so every state can be saved."""
     adduction_deg: float = 20.0
-    """deg; largest varus or valgus. Chosen: as `flexion_deg`."""
+    """deg; largest varus or valgus. Chosen for the same reason as `flexion_deg`."""
     axial_rotation_deg: float = 60.0
-    """deg; largest axial rotation either way. Chosen: as `flexion_deg`."""
+    """deg; largest internal or external rotation. Chosen for the same reason as `flexion_deg`."""
     length_mm: float = 60.0
-    """mm; largest translation of the knee that is accepted. Chosen: the femur is then beside the
-    insert."""
+    """mm; largest translation of the femur. Chosen because the femur is then beside the insert."""
     placement_deg: float = 20.0
-    """deg; largest change of a component's orientation. Chosen: no component is placed as far
-    off."""
+    """deg; largest change of a component's orientation. Chosen because surgical errors are below
+    it."""
     placement_mm: float = 20.0
-    """mm; largest change of a component's position. Chosen: no component is placed as far off."""
+    """mm; largest change of a component's position. Chosen because surgical errors are smaller."""
     load_N: float = 15_000.0
-    """N; largest axial load. Chosen: with the shank's weight it stays below the largest force that
-    a plate may measure."""
+    """N; largest axial load. Chosen because load and weight of the shank together are below the
+    largest force that a scene accepts from a force plate."""
     slack_percent: float = 20.0
-    """%; largest change of the ligaments' slack length, either way. Chosen: ligaments of the knee
-    rupture at 12 to 20 %."""
+    """%; largest increase or decrease of the ligaments' slack lengths. Chosen because ligaments of
+    the knee rupture at strains of 12 to 20 %."""
     finest_mm: float = 0.5
-    """mm; finest map. Chosen: a finer one takes too long to follow a slider."""
+    """mm; smallest spacing of the map. Chosen because a finer map cannot follow a slider."""
     coarsest_mm: float = 10.0
-    """mm; coarsest map. Chosen: as `MapGridSettings`."""
+    """mm; largest spacing of the map. Chosen equal to the limit in `MapGridSettings`."""
     thickness_mm: tuple[float, float] = (4.0, 25.0)
-    """mm; thinnest and thickest insert of a parametric design. Chosen: inserts are sold from 6 to
-    20 mm."""
+    """mm; smallest and largest thickness of a parametric insert. Chosen because inserts are sold
+    with 6 to 20 mm."""
     kept_models: int = 8
-    """Number of prepared contact models that are kept. Chosen: of a lattice each takes 0.1 to
+    """Number of prepared contact models that stay in memory. Chosen because a lattice takes 0.1 to
     0.5 GB."""
     most_threads: int = 2
-    """Number of contact models that are prepared at the same time. Chosen: the machine goes on
-    answering the coarse model while a slider moves."""
+    """Number of contact models that are prepared at the same time. Chosen because the machine must
+    still compute the coarse model while a slider moves."""
     first_penetration: float = 5e-5
-    """m; penetration at which a search for released coordinates begins. Chosen: as in
+    """m; penetration at which a search for released coordinates begins. Chosen equal to
     `initial_pose.first_penetration`."""
 
 
@@ -88,12 +86,12 @@ class Placement:
     """A component moved on its bone, in its own axes: x anterior, y superior, z lateral.
 
     Args:
-        ap_mm: forwards.
-        ml_mm: laterally.
-        varus_deg: about the anterior axis; positive turns the component into varus.
-        rotation_deg: about the superior axis; positive turns it externally.
-        slope_deg: about the lateral axis; positive: posterior slope of an insert, flexion of a
-            femoral component.
+        ap_mm: anterior translation, mm.
+        ml_mm: lateral translation, mm.
+        varus_deg: rotation about the anterior axis, deg; positive is varus.
+        rotation_deg: rotation about the superior axis, deg; positive is external.
+        slope_deg: rotation about the lateral axis, deg; positive is posterior slope of an insert,
+            or flexion of a femoral component.
     """
 
     ap_mm: float = 0.0
@@ -115,15 +113,15 @@ class BenchRequest:
     """One state of the bench. Angles and translations are those of a right knee.
 
     Args:
-        flexion_deg: Grood and Suntay's, as `adduction_deg` (varus) and `axial_rotation_deg`
-            (femur external).
-        ap_mm: anterior position of the femoral component, insert frame; ml_mm: lateral position.
-        load_N: axial, along the tibia, through the insert's origin as recorded.
+        flexion_deg: flexion after Grood and Suntay. `adduction_deg` is varus, and
+            `axial_rotation_deg` is external rotation of the femur.
+        ap_mm: anterior position of the femoral component, insert frame; `ml_mm` is lateral.
+        load_N: axial load along the tibia, through the origin of the recorded insert frame, N.
         femoral: placement of the femoral component on the femur.
         tibial: placement of the insert on the tibia.
-        slack_percent: change of all ligaments' slack lengths.
-        released: coordinates that find their equilibrium.
-        contact: name of the contact model; resolution_mm its spacing.
+        slack_percent: change of the slack lengths of all ligaments, %.
+        released: names of the coordinates that are found by equilibrium.
+        contact: name of the contact model; `resolution_mm` is its spacing.
         thickness_mm: smallest thickness of a parametric insert; None: the insert of the scene.
     """
 
@@ -143,10 +141,10 @@ class BenchRequest:
 
     @staticmethod
     def read(values: Mapping[str, Any]) -> "BenchRequest":
-        """Return the request that a page's JSON object makes.
+        """Return the request of a JSON object from the page.
 
         Raises:
-            InputError: an unknown key, a value that is no number or out of its range.
+            InputError: a key is unknown, or a value is not a number or outside its range.
         """
         known = {one.name for one in fields(BenchRequest)}
         for key in values:
@@ -167,7 +165,7 @@ class BenchRequest:
         return BenchRequest(**made)
 
     def coordinates(self) -> Array:
-        """Return the six coordinates (6,) m and rad of the original components; si is 0."""
+        """Return the knee coordinates (6,), m and rad, of the unmoved components; si is 0."""
         values = {
             "ap": self.ap_mm * MILLIMETRE,
             "ml": self.ml_mm * MILLIMETRE,
@@ -195,7 +193,7 @@ def _range(key: str) -> tuple[float, float]:
 
 def _number(key: str, value: Any, low: float, high: float) -> float:
     good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not low <= value <= high:  # not a number is in no range
+    if not good or not low <= value <= high:  # NaN fails this test too
         raise InputError(f"{key} = {value!r:.60}", "bench", f"give {low:g} to {high:g}")
     return float(value)
 
@@ -231,7 +229,7 @@ def _released(values: Any) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The parts of a case that stay the same on the bench.
+    """A case on the bench: its parts that no request changes.
 
     Args:
         case: case of a scene with [contact].
@@ -243,7 +241,7 @@ class Bench:
 
     @cached_property
     def bundles(self) -> "tuple[Ligament, ...]":
-        """The ligaments, with both ends on femur or tibia itself."""
+        """Return the ligaments with both ends on the links "femur" and "tibia"."""
         return tuple(
             replace(one, proximal=self._carried(one.proximal), distal=self._carried(one.distal))
             for one in self.ligaments
@@ -255,12 +253,12 @@ class Bench:
         return LinkPoint(link, transform(chain.link_in(end.link, link), end.position))
 
     def case_of(self, request: BenchRequest, height: Any = None, like: Case | None = None) -> Case:
-        """Return the case that stands still as a request says.
+        """Return the static case of a request.
 
         Args:
-            request: the state of the bench.
-            height: y (m) of the femoral origin as a function of the pose; None: 0.
-            like: the case with another insert; None: as recorded.
+            request: state of the bench.
+            height: function of the pose that returns y of the femoral origin, m; None: y = 0.
+            like: case with another insert; None: the case of the scene.
         """
         like = like or self.case
         placed = inverse(request.tibial.matrix()) @ knee_pose(request.coordinates())
@@ -309,11 +307,11 @@ class Bench:
         )
 
     def _ground(self, request: BenchRequest) -> GroundReaction:
-        """Return the ground reaction that leaves the axial load at the knee.
+        """Return the ground reaction whose effect at the knee is the axial load.
 
-        Lab and tibia have the same axes and origin. The load stays with the bone where the insert
-        is moved; a second force carries the shank. Their sum is given at its centre of pressure,
-        y = 0, where a moment about y is left over.
+        Laboratory and tibia have the same axes and origin. The line of the load is fixed to the
+        bone. A second force balances the shank's weight. The two forces are returned as their
+        resultant at the centre of pressure (y = 0) with its free moment about y.
         """
         chain, moved = self.case.chain, self._bone(request)
         axial = moved[:3, 1] * request.load_N
@@ -329,14 +327,14 @@ class Bench:
     def _bone(self, request: BenchRequest) -> Array:
         """Return the pose (4, 4) of the tibial bone in the link "tibia" of the case.
 
-        An insert that is moved by hand keeps its place on the link "tibia". The bone, and all that
-        is attached to it, moves the opposite way instead.
+        If the user moves the insert, its pose in the link "tibia" does not change. Instead the bone
+        and its attachments move in the opposite direction.
         """
         insert = self.case.chain.insert_in_tibia
         return insert @ inverse(request.tibial.matrix()) @ inverse(insert)
 
     def _bundle(self, bundle: "Ligament", request: BenchRequest) -> "Ligament":
-        """Return a bundle whose ends stayed on the bones while the components moved."""
+        """Return a bundle after its bones have moved relative to the components."""
         return replace(
             bundle,
             proximal=self._end(bundle.proximal, request),

@@ -35,18 +35,18 @@ if TYPE_CHECKING:
 logger = logging.getLogger("tkamb")
 
 ROWS = 6
-"""Rows of the tables, all equal: computing accelerations needs at least so many."""
+"""Number of equal rows of the tables; accelerations need at least so many."""
 
 
 def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
-    """Write a case of `Bench.case_of` as a scene that `tkamb run` reads; return the scene file.
+    """Write a case of `Bench.case_of` as a scene for `tkamb run`, and return the scene file.
 
     The URDF is copied. Meshes are not copied: the scene holds their paths.
 
     Args:
-        case: a case that stands still.
-        folder: an existing folder; its files of these names are replaced.
-        own: a folder of this session, whose meshes are copied nevertheless; None: no such folder.
+        case: a static case.
+        folder: an existing folder; files with the same names are replaced.
+        own: folder of this session; meshes in it are copied. None: no mesh is copied.
     """
     scene, side = case.scene, -1.0 if case.scene.patient.side == "left" else 1.0
     times = case.motion.time
@@ -77,9 +77,9 @@ def write_motion(folder: Path, times: Sequence[float], coordinates: Array, side:
 
     Args:
         folder: folder for motion.csv.
-        times: (f,) s.
-        coordinates: m and rad.
-        side: -1 of a left knee, whose ML axis points the other way; else 1.
+        times: times, s, shape (f,).
+        coordinates: knee coordinates, m and rad, shape (f, 6).
+        side: -1 for a left knee, because its ML axis is reversed; 1 for a right knee.
     """
     header = ["time_s", *(f"{name}_m" for name in KNEE_COORDINATES[:3])]
     header += [f"{name}_rad" for name in KNEE_COORDINATES[3:]]
@@ -141,7 +141,7 @@ STILL = {
         | {"moment_2": "my_Nm"},
     ),
 }
-"""Tables of a scene that stands still; `write_bench` writes the files that they name."""
+"""Tables of a static scene; `write_bench` writes the files that they name."""
 
 
 def _scene_text(case: Case, side: float, meshes: Mapping[str, Mapping[str, Any]]) -> str:
@@ -171,7 +171,7 @@ def _scene_text(case: Case, side: float, meshes: Mapping[str, Mapping[str, Any]]
 
 
 def _given(table: SceneTable) -> dict[str, Any]:
-    """Return the keys of a table that hold something."""
+    """Return the keys of a table that have a value."""
     values = table.model_dump(exclude_none=True)
     return {key: value for key, value in values.items() if value not in ((), {}, [])}
 
@@ -181,7 +181,7 @@ def ligament_table(bundle: "Ligament", side: float) -> dict[str, Any]:
 
     Args:
         bundle: ligament of a right knee with its slack length; its ends are on links of the URDF.
-        side: -1 of a left knee, else 1.
+        side: -1 for a left knee, 1 for a right knee.
     """
 
     def end(point: LinkPoint) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def ligament_table(bundle: "Ligament", side: float) -> dict[str, Any]:
 
 
 def still_motion(coordinates: Array) -> KneeMotion:
-    """Return poses (f, 6) m and rad of a right knee as a motion without velocity."""
+    """Return a motion without velocity from knee coordinates (f, 6), m and rad, of a right knee."""
     frames = len(coordinates)
     nothing, still = np.zeros((frames, 6)), np.zeros(frames)
     time = np.arange(frames, dtype=float)
@@ -212,18 +212,17 @@ def still_motion(coordinates: Array) -> KneeMotion:
 
 
 def write_knee(knee: Knee, placement: Array, coordinates: Array, folder: Path) -> Path:
-    """Write a `tkamb.Knee` as a scene that stands still, and return its file.
+    """Write a `tkamb.Knee` as a static scene, and return the scene file.
 
-    The scene has the leg that `tkamb new` writes, because no result of the bench depends on the
-    leg. The axes of its tibia are parallel to the axes of the insert, so that the load acts along
-    the y axis of the insert, as in `Knee.press`. Muscles, extensor mechanism and friction are left
-    out: the knee does not move.
+    The scene has the leg of `tkamb new`, because no result of the bench depends on the leg. The
+    axes of its tibia are parallel to those of the insert frame, so the load acts along y of the
+    insert, as in `Knee.press`. The scene has no muscles, extensor mechanism or friction.
 
     Args:
         knee: the knee.
         placement: (4, 4) pose of the insert's mesh in the insert frame (`insert_placement`).
-        coordinates: (f, 6) of a right knee; the first row is written.
-        folder: an empty one.
+        coordinates: knee coordinates (f, 6) of a right knee; only the first row is written.
+        folder: an empty folder.
     """
     sign = -1.0 if knee.left else 1.0
     assert knee.femoral is not None and knee.insert is not None
@@ -279,7 +278,7 @@ def _contact_lines(knee: Knee) -> list[str]:
     """Return [contact] and [material] of a knee.
 
     Raises:
-        InputError: a contact model without a name, or an option or a law that no scene holds.
+        InputError: the contact model has no name, or a scene has no key for an option or a law.
     """
     assert knee.contact is not None
     model: Any = knee.contact.model
@@ -315,7 +314,7 @@ def _contact_lines(knee: Knee) -> list[str]:
 
 
 def _write_obj(path: Path, surface: Surface) -> None:
-    """Write a surface as OBJ, every digit of its coordinates kept."""
+    """Write a surface as OBJ, with all digits of its coordinates."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in surface.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (surface.faces + 1).tolist()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A run into a drawing: geometry of the scene, forces and numbers of results.csv, the maps."""
+"""Drawing of a run: bodies of the scene, forces and numbers of results.csv, pressure maps."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -35,12 +35,12 @@ FOOT = "The foot is a stand-in too, drawn level with the floor whatever it did."
 def draw(
     run: CaseResults, progress: Progress = lambda frames: frames, lattice: bool = False
 ) -> Drawing:
-    """Return what is drawn of a run.
+    """Return the drawing of a run.
 
     Args:
         run: case, mechanics and results that belong together.
-        progress: wraps the frame indices, a progress bar for example.
-        lattice: whether the contact model's grid is drawn too.
+        progress: function that wraps the frame indices, for example a progress bar.
+        lattice: whether the cells of the lattice are drawn too.
     """
     case, mechanics, results = run.case, run.mechanics, run.results
     geometries = run.geometries(progress)
@@ -108,8 +108,8 @@ def _pressure_map(results: "Results", rows: list[int]) -> PressureMap | None:
 def lattice_lines(case: Case) -> Array:
     """Return the edges (s, 2, 3) m of the lattice's outer cell faces, insert frame.
 
-    The grid is the lattice models' at the scene's resolution, whichever model was run; without
-    [contact] there is none.
+    The cells have the scene's resolution, whichever contact model was run. The result is empty
+    without [contact].
 
     Raises:
         InputError: the insert cannot be meshed.
@@ -130,7 +130,7 @@ def lattice_lines(case: Case) -> Array:
 
 
 def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
-    """Return the lines of numbers; what no frame has is left out."""
+    """Return the numbers to display, without those that no frame has."""
     weight = body_weight(results)
 
     def number(name: str, values: Array, unit: str, digits: int = 0) -> Reading:
@@ -167,13 +167,13 @@ def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
 
 
 def frame_labels(axis: HorizontalAxis) -> tuple[str, ...]:
-    """Return where in the motion each frame is, in words."""
+    """Return the place of each frame in the motion, in words."""
     words = {"flexion": "{} of flexion", "cycle": "{} of the cycle", "time": "{}"}[axis.kind]
     return tuple(words.format(axis.at(k)) for k in range(len(axis.values)))
 
 
 def _reading(name: str, write: Callable[..., str], *columns: Array) -> Reading:
-    """Return one text per frame, "–" where no column has a number."""
+    """Return one text per frame; "–" if no column has a number."""
     return Reading(
         name,
         tuple(
@@ -188,7 +188,7 @@ def _magnitude(results: "Results", stem: str) -> Array:
 
 
 def _direction(positive: str, negative: str) -> Callable[[float], str]:
-    """Return what writes an angle (deg) without a sign, with the word for its direction."""
+    """Return a function that writes an angle (deg) with its direction as a word, not a sign."""
     return lambda angle: f"{abs(angle):.1f}° {positive if round(angle, 1) >= 0 else negative}"
 
 

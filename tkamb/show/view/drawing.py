@@ -1,10 +1,10 @@
-"""What is drawn of a run: pure data, in the insert frame, for every frame of the motion.
+"""Data of a drawing in the insert frame, for every frame of the motion.
 
-f frames; x anterior, y superior, z lateral (a left knee is mirrored back on the page). NaN
-hides a thing at that frame. Arrays with a first axis of 1 do not move.
+There are f frames. x is anterior, y superior, z lateral; the page mirrors a left knee back. A
+position of NaN hides an object in that frame. Arrays with a first axis of 1 are static.
 
-The colour scales are viridis and those of ColorBrewer (Brewer 2002), stored as bytes in an asset:
-importing matplotlib would take a tenth of a second.
+The colour scales are viridis and scales of ColorBrewer (Brewer 2002). They are stored as bytes in
+an asset, because importing matplotlib takes 0.1 s.
 """
 
 import json
@@ -29,42 +29,42 @@ Colours = NDArray[np.uint8]
 
 
 def rgb(colour: str) -> Colours:
-    """Return (3,) 0 to 255 of "#rrggbb"."""
+    """Return red, green and blue (3,), 0 to 255, of a colour "#rrggbb"."""
     return np.frombuffer(bytes.fromhex(colour.removeprefix("#")), np.uint8)
 
 
 def pressure_scale() -> Colours:
-    """Return the 256 colours (256, 3) from no pressure to the largest of all frames."""
+    """Return the colours (256, 3) from zero to the largest pressure of all frames."""
     return _scales()["pressure"]
 
 
 def strain_scale() -> Colours:
-    """Return the 256 colours (256, 3) from no strain to the limit."""
+    """Return the colours (256, 3) from zero strain to the limit."""
     return _scales()["strain"]
 
 
 def activation_scale() -> Colours:
-    """Return the 256 colours (256, 3) from no activation to the limit."""
+    """Return the colours (256, 3) from zero activation to the limit."""
     return _scales()["activation"]
 
 
 def wear_scale() -> Colours:
-    """Return the 256 colours (256, 3) from no wear to the deepest."""
+    """Return the colours (256, 3) from zero to the largest wear depth."""
     return _scales()["wear"]
 
 
 def wear_colours(depth: ArrayLike, limit: float) -> Colours:
-    """Return colours (..., 3) of depths of wear; none (<= 0) is the insert's colour."""
+    """Return the colours (..., 3) of wear depths. Depths <= 0 have the insert's colour."""
     return _on_scale(depth, limit, wear_scale(), INSERT)
 
 
 def strain_colours(strain: ArrayLike, limit: float) -> Colours:
-    """Return colours (..., 3) of ligament strains; slack (strain <= 0) is grey."""
+    """Return the colours (..., 3) of ligament strains. Slack ligaments (strain <= 0) are grey."""
     return _on_scale(strain, limit, strain_scale())
 
 
 def activation_colours(activation: ArrayLike, limit: float) -> Colours:
-    """Return colours (..., 3) of activations; none (<= 0) is grey."""
+    """Return the colours (..., 3) of activations. Values <= 0 are grey."""
     return _on_scale(activation, limit, activation_scale())
 
 
@@ -102,7 +102,7 @@ LAYERS = (
     "recorded pose",
     "lattice",
 )
-"""What can be switched on and off, in the order of the page."""
+"""Layers that a user can switch on and off, in the order of the page."""
 
 HIDDEN_AT_FIRST = ("worn insert", "recorded pose", "lattice")
 
@@ -114,11 +114,12 @@ class Solid:
     Args:
         name: unique within the drawing.
         layer: one of LAYERS.
-        surface: in its own frame.
-        colour: "#rrggbb".
-        opacity: 0 to 1.
-        poses: (f, 4, 4) or (1, 4, 4) pose in the insert frame.
-        wear: (n,) mm, worn off each vertex, which colours it; None: one colour.
+        surface: surface in the solid's own frame.
+        colour: colour "#rrggbb".
+        opacity: opacity, 0 to 1.
+        poses: pose in the insert frame, shape (f, 4, 4) or (1, 4, 4).
+        wear: wear depth at each vertex, mm, shape (n,), which determines its colour; None: the
+            solid has one colour.
     """
 
     name: str
@@ -137,9 +138,10 @@ class Strand:
     Args:
         name: unique within the drawing.
         layer: one of LAYERS.
-        points: (f, m, 3) or (1, m, 3) m; a repeated point ends the tube.
-        colours: (f, m, 3) or (1, m, 3), 0 to 255.
-        radius: m.
+        points: points of the centre line, m, shape (f, m, 3) or (1, m, 3). The tube ends at a
+            repeated point.
+        colours: colours at the points, 0 to 255, shape (f, m, 3) or (1, m, 3).
+        radius: radius of the tube, m.
     """
 
     name: str
@@ -155,11 +157,12 @@ class Arrow:
 
     Args:
         name: name in the legend.
-        colour: "#rrggbb".
-        points: (f, 3) m, where it acts.
-        forces: (f, 3) N.
-        ends_there: whether the arrow ends at the point (it presses) or starts there (it pulls).
-        meaning: on what it acts, for the legend.
+        colour: colour "#rrggbb".
+        points: points of application, m, shape (f, 3).
+        forces: forces, N, shape (f, 3).
+        ends_there: True: the arrow ends at the point (compression). False: it starts there
+            (tension).
+        meaning: text of the legend on the body that the force acts on.
     """
 
     name: str
@@ -177,9 +180,9 @@ class Marker:
     Args:
         name: unique within the drawing.
         layer: one of LAYERS.
-        colour: "#rrggbb".
-        points: (f, 3) m.
-        radius: m.
+        colour: colour "#rrggbb".
+        points: centre of the ball, m, shape (f, 3).
+        radius: radius of the ball, m.
     """
 
     name: str
@@ -194,10 +197,11 @@ class PressureMap:
     """Pressure over the insert.
 
     Args:
-        points: (n, 3) m.
-        triangles: (k, 3) indices.
-        pressure: (f, n) MPa, NaN where the frame failed.
-        gap: (f, n) m, positive when apart; says where between the points the contact ends.
+        points: points of the map, m, shape (n, 3).
+        triangles: indices of the points, shape (k, 3).
+        pressure: pressure, MPa, shape (f, n); NaN in a failed frame.
+        gap: gap, m, shape (f, n), positive when apart. It locates the edge of the contact between
+            the points.
     """
 
     points: Array
@@ -207,7 +211,7 @@ class PressureMap:
 
     @property
     def peak(self) -> float:
-        """MPa, over all frames."""
+        """Return the largest pressure of all frames, MPa."""
         return float(np.nanmax(self.pressure, initial=0.0))
 
 
@@ -216,8 +220,8 @@ class Reading:
     """One line of the numbers of a frame.
 
     Args:
-        name: what it is.
-        values: one text per frame, with its unit.
+        name: name of the quantity.
+        values: value with its unit as text, one per frame.
     """
 
     name: str
@@ -226,26 +230,26 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Everything that is drawn of one run.
+    """All objects of the drawing of one run.
 
     Args:
         title: name of the run and its contact model.
         side: "right" or "left".
-        body_weight: N.
+        body_weight: body weight, N.
         contact: name of the contact model; empty without contact.
         labels: place of each frame in the motion, for example "60° of flexion".
-        times: (f,) s.
-        statuses: per frame, "ok" or plain words.
-        readings: the numbers of every frame.
+        times: times of the frames, s, shape (f,).
+        statuses: status of each frame: "ok" or a sentence.
+        readings: displayed numbers of every frame.
         solids: surfaces.
-        strands: ligaments, tendons, paths.
+        strands: ligaments, tendons and paths of centres of pressure.
         arrows: forces.
         markers: contact points and centres of pressure.
-        map: pressure; None without contact.
+        map: pressure map; None without contact.
         strain_limit: upper end of the ligaments' colour scale; 0 without ligaments.
         activation_limit: upper end of the muscles' colour scale; 0 without muscles.
-        lattice: (s, 2, 3) m, lines of the contact model's grid; empty unless asked for.
-        notes: what a viewer must know, plain sentences.
+        lattice: edges of the lattice's cells, m, shape (s, 2, 3); empty unless requested.
+        notes: sentences that help to interpret the drawing.
     """
 
     title: str
@@ -271,5 +275,5 @@ class Drawing:
 
     @property
     def deepest_wear(self) -> float:
-        """Largest depth, mm; 0 without wear."""
+        """Return the largest wear depth, mm; 0 without wear."""
         return max((float(s.wear.max()) for s in self.solids if s.wear is not None), default=0.0)

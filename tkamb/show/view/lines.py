@@ -44,7 +44,7 @@ class ArrowSettings:
     """Arrows of the viewer."""
 
     contact_point_radius: float = 0.6 * MILLIMETRE
-    """m; radius of the sphere at a centre of pressure. Chosen: it is seen and hides little."""
+    """m; radius of the sphere at a centre of pressure. Chosen by eye."""
 
 
 ARROW = ArrowSettings()
@@ -61,7 +61,7 @@ def force_arrows(
     Args:
         results: results of the frames.
         geometries: geometry of the same frames.
-        friction: Coulomb coefficient of the femorotibial contact.
+        friction: coefficient of Coulomb friction of the femorotibial contact.
     """
     columns = {
         "ground reaction": _vector(results, "ground_reaction_{}_N"),
@@ -83,7 +83,7 @@ def force_arrows(
 
 
 def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
-    """Return a ball at each condyle's contact point and at the patella's."""
+    """Return balls at the contact points of the condyles and of the patella."""
     result = {
         f"{side} contact point": [_condyle_point(one, side) for one in geometries]
         for side in ("medial", "lateral")
@@ -117,7 +117,7 @@ def _arrow(
 
 
 def centre_of_pressure(geometry: KneeGeometry) -> Array:
-    """Return where the ground reaction acts (3,) m; NaN without one."""
+    """Return the point of application (3,) of the ground reaction, m, or NaN without a reaction."""
     return geometry.ground.points[0] if geometry.ground else NOTHING
 
 
@@ -205,24 +205,23 @@ def _vector(results: "Results", pattern: str) -> Array:
 
 
 BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIMETRE
-"""m: radii of ligament bundles, tendons and load paths. The first is halved if there are more than
-`many_bundles` bundles."""
+"""m: radii of ligament bundles, tendons and paths of centres of pressure. The radius of a bundle is
+halved if there are more than `many_bundles` bundles."""
 
 
 @dataclass(frozen=True)
 class ViewStrandSettings:
-    """How muscles and ligaments are drawn."""
+    """Look of muscles and ligaments in the viewer."""
 
     muscle_radius: float = 2.0 * MILLIMETRE
-    """m; radius of a muscle's tube. Chosen: it is seen well in the view."""
+    """m; radius of a muscle's tube. Chosen by eye."""
     slack_force: float = 1.0
-    """N: a tendon or muscle with a smaller force is drawn grey. Chosen: far below forces that
-    matter."""
+    """N: a tendon or muscle with a smaller force is grey. Chosen because it is negligible."""
     least_activation: float = 0.1
-    """1: least value at the upper end of the colour scale of activations. Chosen: small activations
-    then look small."""
+    """1: smallest upper end of the colour scale of activations. Chosen because small activations then
+    look small."""
     many_bundles: int = 20
-    """Number of ligament bundles above which each is drawn at half its radius. Chosen: thick ones
+    """Number of ligament bundles above which their radius is halved. Chosen because thick bundles
     would cover each other."""
 
 
@@ -232,9 +231,9 @@ VIEW_STRAND = ViewStrandSettings()
 def ligament_strands(
     mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
 ) -> tuple[tuple[Strand, ...], float]:
-    """Return the bundles coloured by strain, and the upper limit of the colour scale.
+    """Return the bundles, coloured by strain, and the upper end of the colour scale.
 
-    A failed frame has no strains: its bundles are grey and do not affect the limit.
+    The bundles of a failed frame are grey and do not affect the scale.
     """
     bundles = mechanics.ligaments
     if not bundles:
@@ -256,9 +255,9 @@ def ligament_strands(
 def extensor_strands(
     mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
 ) -> tuple[Strand, ...]:
-    """Return muscle and patellar ligament, the part that lies on the bone in another colour.
+    """Return muscle and patellar ligament. Their parts on the bone have another colour.
 
-    In frames where one carries less than a newton it is grey.
+    A strand with less than `slack_force` is grey.
     """
     extensor = mechanics.extensor
     if extensor is None:
@@ -281,11 +280,10 @@ def extensor_strands(
 
 
 def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ...], float]:
-    """Return the muscles across the knee coloured by activation, and the scale's upper limit.
+    """Return the muscles across the knee, coloured by activation, and the upper end of the scale.
 
-    A strand runs from the point where a muscle leaves shank or foot to the point where it reaches
-    thigh or pelvis. It is grey where the muscle carries less than `slack_force`. Frames without a
-    solution have no strands.
+    A strand runs from the last point on shank or foot to the first point on thigh or pelvis. It is
+    grey if the muscle's force is below `slack_force`. Frames without a solution have no strands.
     """
     shares = [one.share if one.share and one.share.status == "ok" else None for one in geometries]
     first = next((share for share in shares if share), None)
@@ -318,8 +316,8 @@ def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ..
 def _tendon(name: str, paths: list[TautPath | None], slack: Mask) -> Strand:
     """Return the strand of a tendon along its taut paths, one path per frame.
 
-    The strand is grey in the frames of `slack` (f,). Its corners are doubled where the colour
-    changes.
+    The strand is grey in frames where `slack` (f,) is True. A corner at which the colour changes
+    occurs twice.
     """
     lines = [_colour_path(path) for path in paths]
     most = max(len(points) for points, _ in lines)
@@ -330,7 +328,7 @@ def _tendon(name: str, paths: list[TautPath | None], slack: Mask) -> Strand:
 
 
 def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
-    """Return points and colours of a path; the part that lies on the bone has its own colour."""
+    """Return points and colours of a path. Its part on the bone has another colour."""
     free, wrapped = rgb(TENDON), rgb(WRAPPED)
     if path is None or not np.isfinite(path.points).all():
         return np.full((2, 3), np.nan), np.stack([free, free])
@@ -344,7 +342,7 @@ def _colour_path(path: TautPath | None) -> tuple[Array, Colours]:
 
 
 def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]:
-    """Return side -> centre of pressure (f, 3) m on the undeformed insert; NaN where off it."""
+    """Return side -> centre of pressure (f, 3) on the undeformed insert, m; NaN if outside."""
     rays, top = insert.rays, float(insert.bounds[1, 1]) + MILLIMETRE
     result = {}
     for side in SIDE_COLOURS:
@@ -359,7 +357,7 @@ def centres_of_pressure(results: "Results", insert: Surface) -> dict[str, Array]
 
 
 def path_strands(centres: dict[str, Array]) -> tuple[Strand, ...]:
-    """Return the path of each centre of pressure, broken where it is missing or jumps."""
+    """Return the path of each centre of pressure, interrupted where it is missing or jumps."""
     strands = []
     for side, points in centres.items():
         for number, stretch in enumerate(stretches(points)):

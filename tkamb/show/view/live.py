@@ -63,7 +63,7 @@ def parametric_insert(case: Case, folder: Path) -> Insert | None:
 def write_insert(insert: Insert, thickness_mm: float, folder: Path) -> Path:
     """Write the insert at a thickness as STL, and return the file.
 
-    The dishes rise or sink with the thickness; the bottom, and with it the insert frame, stays.
+    The thickness moves the dishes along y. The bottom and the insert frame do not move.
     """
     path = folder / f"insert_{thickness_mm:g}_mm.stl"
     write_stl(path, *replace(insert, thickness=thickness_mm).mesh())
@@ -77,7 +77,7 @@ def with_thickness(case: Case, insert: Insert, thickness_mm: float, folder: Path
         case: case with [contact].
         insert: design of its insert.
         thickness_mm: smallest thickness, mm.
-        folder: folder for the mesh; it must exist as long as the case.
+        folder: folder for the mesh; it must exist as long as the case is used.
     """
     return with_insert(case, write_insert(insert, thickness_mm, folder))
 
@@ -132,8 +132,8 @@ class LiveKnee:
 
     Args:
         case: case of a scene with [contact].
-        own: folder of this session, removed with this object; a saved scene copies the meshes in
-            it. None: a new folder.
+        own: folder for the files of this session; None: a new folder. It is removed with this
+            object. A saved scene has copies of its meshes.
 
     Attributes:
         design: design of the insert; None if its mesh does not come from a parametric design.
@@ -196,11 +196,11 @@ class LiveKnee:
             return self._latest
 
     def preparing(self, request: BenchRequest) -> str:
-        """Return in words what a request waits for; empty if it can be answered now.
+        """Return the name of the contact model that is still being prepared; empty if it is ready.
 
-        A model that is not prepared yet is prepared in a thread of its own, because a lattice takes
-        seconds; the other models go on answering. If `most_threads` are preparing already, no
-        thread is started: the page asks again, and a setting that it has left is never prepared.
+        A new thread prepares the model, because a lattice takes seconds. Requests for other models
+        are computed meanwhile. If `most_threads` threads run already, no thread is started. The
+        page then repeats its request, so a setting that the user has left is not prepared.
 
         Raises:
             InputError: the model cannot be prepared.
@@ -238,16 +238,16 @@ class LiveKnee:
     ) -> LiveAnswer:
         """Return the answer to a request.
 
-        The previous state is the initial guess. The answer of a lattice depends on it within the
-        tolerance of the solver.
+        The previous state is the initial guess. It changes the answer of a lattice only within
+        the tolerance of the solver.
 
         Args:
             request: state of the bench.
             number: number from `overtake`; None: newer requests do not cancel this one.
-            from_rest: True: no initial guess, like the first frame of `tkamb run`.
+            from_rest: whether to start without an initial guess, as the first frame of `tkamb run`.
 
         Raises:
-            TkambError: a newer request has come.
+            TkambError: a newer request has arrived.
             InputError: the contact model or spacing does not exist.
         """
         with self._computing:
@@ -285,7 +285,7 @@ class LiveKnee:
         return self.bench.case_of(request, height, self._case_with(request.thickness_mm))
 
     def _case_with(self, thickness_mm: float | None) -> Case:
-        """Return the case with an insert of a thickness.
+        """Return the case with an insert of another thickness.
 
         Raises:
             InputError: the insert's design is not parametric.
@@ -312,15 +312,15 @@ class LiveKnee:
         with self._counting:
             if insert not in self._known:
                 contact = side.mechanics.knee.contact
-                assert contact is not None  # the bench has one
+                assert contact is not None  # a case on the bench has contact
                 self._known[insert] = SharedState(contact.pair, None, None, range(ROWS))
             self._sides.pop(key, None)
-            self._sides[key] = side  # the one used last is last
+            self._sides[key] = side  # the order of use: the latest is last
             self._forget()
         return side
 
     def _forget(self) -> None:
-        """Drop the models that were not used for the longest time, and what only they need."""
+        """Delete the least recently used models, and the inserts that only these models need."""
         for old in [*self._sides][: -BENCH_LIMIT.kept_models]:
             del self._sides[old]
             self._before.pop(old, None)

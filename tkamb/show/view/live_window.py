@@ -47,11 +47,11 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
 COARSE = ("foundation", 2.0)
-"""Contact model and spacing (mm) while a slider moves."""
+"""Contact model and spacing (mm) that are used while a slider moves."""
 STRAIN_LIMIT = 0.1
 """Top of the colour scale of the ligaments' strain."""
 SCALES_MPA = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0, 120.0, 200.0, 500.0, 1000.0)
-"""Tops of the colour scale: the least that holds the peak is taken."""
+"""Possible tops of the colour scale. The smallest one above the peak pressure is used."""
 
 
 class LiveWindow:
@@ -63,7 +63,7 @@ class LiveWindow:
         frame: recorded frame at which the window opens.
 
     Raises:
-        InputError: no such frame.
+        InputError: the motion has no such frame.
     """
 
     def __init__(self, knee: LiveKnee, folder: Path, frame: int = 0) -> None:
@@ -72,7 +72,7 @@ class LiveWindow:
         self.title = f"{knee.case.scene.patient.side.capitalize()} knee, live"
 
     def set_resolution(self, resolution_mm: float) -> None:
-        """Begin with another spacing of the map than the scene's."""
+        """Set the spacing of the map at the beginning; the default is the scene's."""
         self.start = replace(self.start, resolution_mm=resolution_mm)
 
     def server(self, port: int = 0) -> ViewServer:
@@ -84,14 +84,15 @@ class LiveWindow:
         return ViewServer(self.page(), pack([self._drawing()]), None, port, self.question)
 
     def question(self, name: str, content: dict[str, Any]) -> bytes:
-        """Answer one question of the page.
+        """Return the answer to one message of the page.
 
         Args:
-            name: "live" computes a state; "save" computes it from rest and writes it as a scene.
+            name: "live" computes a state. "save" computes it without an initial guess and writes
+                it as a scene.
             content: a `BenchRequest` as JSON object.
 
         Raises:
-            TkambError: no such question, a state that cannot be, or a newer one came.
+            TkambError: the name is unknown, the state is impossible, or a newer request arrived.
         """
         if name == "live":
             request, number = BenchRequest.read(content), self.knee.overtake()
@@ -104,7 +105,7 @@ class LiveWindow:
         raise TkambError("no such question")
 
     def page(self) -> str:
-        """Return the page; it needs the server."""
+        """Return the page. It works only with the server."""
         scripts = [
             "\n" + text.replace("</script", "<\\/script")
             for text in (meshcat_script(), *(asset(PACKAGE, name) for name in SCRIPTS))
@@ -201,8 +202,8 @@ class LiveWindow:
         """Return the answer that a run of the saved scene gives, with the scene's file.
 
         Raises:
-            NotYet: its contact model is being prepared.
-            TkambError: the state has no answer, or cannot be written.
+            NotYet: the contact model is being prepared.
+            TkambError: the state has no result, or the scene cannot be written.
         """
         if words := self.knee.preparing(request):
             raise NotYet(words)
@@ -212,7 +213,7 @@ class LiveWindow:
         return self._packed(answer, str(self.knee.save(request, self._next_folder())))
 
     def _next_folder(self) -> Path:
-        """Return a folder that is not there yet."""
+        """Return the next unused folder."""
         number = 1
         while (self.folder / f"kept-{number}").exists():
             number += 1
@@ -266,11 +267,11 @@ def open_live(
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
         frame: recorded frame at which the window opens.
-        contact: contact model, instead of the scene's.
+        contact: contact model that replaces the scene's.
         folder: folder for saved scenes; None: out/live.
 
     Raises:
-        InputError: nothing to see there, or the scene has no [contact].
+        InputError: the path has no scene, or the scene has no [contact].
     """
     from tkamb.show.view.run import read_source
 
@@ -281,19 +282,19 @@ def open_live(
 def live(
     path: str | Path, *, frame: int = 0, contact: str | None = None, folder: Path | None = None
 ) -> ViewServer:
-    """Serve the live window beside the caller, for notebooks; its address is `url`.
+    """Start the server of the live window in a thread, for notebooks.
 
     Args:
         path: a scene file, or a folder that `tkamb run` wrote.
         frame: recorded frame at which the window opens.
-        contact: contact model, instead of the scene's.
+        contact: contact model that replaces the scene's.
         folder: folder for saved scenes; None: out/live.
 
     Returns:
-        The server, which answers until `close()`.
+        The server. Its address is `url`, and `close()` stops it.
 
     Raises:
-        InputError: nothing to see there, or the scene has no [contact].
+        InputError: the path has no scene, or the scene has no [contact].
     """
     server = open_live(Path(path), frame=frame, contact=contact, folder=folder).server()
     serve_in_background(server)
@@ -301,7 +302,7 @@ def live(
 
 
 def live_knee(knee: Knee, q: Any, load: float, folder: str | Path | None) -> ViewServer:
-    """Serve the live window of a knee beside the caller; see `tkamb.Knee.live`."""
+    """Start the server of the live window of a knee in a thread; see `tkamb.Knee.live`."""
     window = LiveWindow(bench_of_knee(knee, q), Path(folder or Path("out") / "live"))
     window.start = BenchRequest.read(asdict(window.start) | {"load_N": load})
     server = window.server()
@@ -314,11 +315,11 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
 
     Args:
         knee: knee with a named contact model.
-        q: (nq,) or (f, nq): the poses of the slider "recorded frame".
+        q: configuration (nq,), or one per value of the slider "recorded frame", (f, nq).
 
     Raises:
-        InputError: no contact model, or one without a name; a q of another size; a part that a
-            scene does not accept.
+        InputError: the knee has no contact model or one without a name, q has another size, or a
+            scene does not accept a part of the knee.
     """
     if knee.contact is None or knee.femoral is None or knee.insert is None:
         raise InputError("has no contact model", "Knee", "give contact= and implant=")

@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 
 SIZE = (1280, 720)
-"""Pixels; MP4 wants even numbers."""
+"""Width and height of pictures, pixels. MP4 needs even numbers."""
 
 
 @dataclass(frozen=True)
 class FilmSettings:
-    """The film of the viewer."""
+    """Settings of a film of the viewer."""
 
     max_frame_rate: float = 50.0
-    """Frames per second. Chosen: screens show 60."""
+    """Largest number of frames per second. Chosen because browsers play no GIF faster."""
 
 
 FILM = FilmSettings()
@@ -42,19 +42,20 @@ READY = (
     "new Promise((done, fail) => { setTimeout(() => fail('not drawn in 60 s'), 60000); "
     "setInterval(() => document.body.dataset.ready && done(), 20); })"
 )
-"""Waits until the page is drawn: the page's security policy forbids the driver's own waiting."""
+"""Script that waits until the page is drawn. The page's security policy blocks the wait function of
+the browser driver."""
 INSTALL = "install chromium (Debian: apt install chromium)"
 
 
 def check_film(path: Path, option: str) -> None:
-    """Refuse a film that cannot be made here, before anything is drawn.
+    """Raise an InputError if a film cannot be made on this machine. This comes before any drawing.
 
     Args:
         path: path of the film, .gif or .mp4.
         option: command-line option that asks for the film.
 
     Raises:
-        InputError: another ending, no browser, or a package of the extra is not installed.
+        InputError: the suffix is another one, or a browser or a package of the extra is missing.
     """
     if path.suffix.lower() != f".{option.removeprefix('--')}":
         raise InputError(f"'{path.name}' does not end with .{option.removeprefix('--')}", option)
@@ -68,12 +69,12 @@ def check_film(path: Path, option: str) -> None:
 
 
 def write_film(show: "Show", path: Path, progress: Progress = lambda frames: frames) -> None:
-    """Write every frame of a show at the motion's own speed.
+    """Write a film of every frame at the speed of the motion.
 
     Args:
-        show: what is drawn.
-        path: ends with .gif or .mp4.
-        progress: wraps the frame indices.
+        show: the drawings.
+        path: path of the film, .gif or .mp4.
+        progress: function that wraps the frame indices, for example a progress bar.
 
     Raises:
         InputError: as `check_film`, or the folder cannot be written.
@@ -89,7 +90,7 @@ def write_film(show: "Show", path: Path, progress: Progress = lambda frames: fra
 
 
 def film_frames(html: str, count: int, progress: Progress) -> Iterator[bytes]:
-    """Yield a PNG of each frame of a page of `page_html`, as `screenshot` draws it."""
+    """Yield a PNG of each frame of a page of `page_html`, with the look of `screenshot`."""
     with tempfile.TemporaryDirectory(prefix="tkamb-film-") as folder, _playwright()() as driver:
         page_path = Path(folder) / "page.html"
         page_path.write_text(html, encoding="utf-8")
@@ -108,10 +109,10 @@ def film_frames(html: str, count: int, progress: Progress) -> Iterator[bytes]:
 
 
 def _write_gif(pictures: Iterator[bytes], path: Path, rate: float) -> None:
-    """Write a GIF; the 256 colours of each picture are spread evenly over the colours that occur.
+    """Write a GIF. The 256 colours of each picture are spread evenly over the occurring colours.
 
-    Chosen by frequency, as usual, most would be greys of the background, and scales would look
-    wrong."""
+    The usual choice by frequency would give mostly greys of the background and wrong colour
+    scales."""
     spread, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
     first, *rest = (
         Image.open(io.BytesIO(one)).convert("RGB").quantize(256, method=spread, dither=plain)
@@ -141,7 +142,7 @@ def _playwright() -> Any:
 
 
 def _encoder() -> str:
-    """Return the path of an ffmpeg: the machine's, or that of the extra."""
+    """Return the path of ffmpeg, installed on the machine or by the extra."""
     result = shutil.which("ffmpeg")
     if result is not None:
         return result
@@ -158,8 +159,8 @@ POLICY = (
     "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; "
     "img-src data: blob:; connect-src {connect}; base-uri 'none'; form-action 'none'"
 )
-"""The browser itself refuses any request to another place and any script but the page's own, by
-their hashes; meshcat's viewer adds styles as it runs."""
+"""The browser refuses requests to other hosts, and scripts without one of these hashes. Inline
+styles are allowed, because meshcat's viewer adds them."""
 
 BROWSERS = (
     "chromium",
@@ -174,10 +175,10 @@ SOFTWARE_GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsa
 
 @dataclass(frozen=True)
 class PageSettings:
-    """Pictures that a browser takes of the viewer page."""
+    """Pictures of the viewer page by a browser."""
 
     timeout: float = 120.0
-    """s; a browser that takes longer has failed. Chosen: a usual page takes some seconds."""
+    """s; time limit of the browser. Chosen because a page usually takes some seconds."""
 
 
 PAGE = PageSettings()
@@ -197,10 +198,10 @@ def page_html(
         title: heading.
         packed: the drawings (`tkamb.show.view.payload.pack`); None when a server gives them.
         frame: frame at which the page opens.
-        view: camera that is chosen first.
-        live: contact models that the server can compute; None without a server.
+        view: camera at the beginning.
+        live: names of the contact models that the server offers; None without a server.
     """
-    # What stands between script tags must not hold the text that closes them.
+    # The text of a script must not contain its closing tag.
     scripts = [
         "\n" + text.replace("</script", "<\\/script")
         for text in (meshcat_script(), *(asset(PACKAGE, name) for name in SCRIPTS))
@@ -228,7 +229,7 @@ def find_browser() -> str:
     """Return the path of a Chromium-like browser.
 
     Raises:
-        ComputationError: there is none.
+        ComputationError: no browser is installed.
     """
     result = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if result is None:
@@ -239,7 +240,7 @@ def find_browser() -> str:
 
 
 def screenshot(html: str, size: tuple[int, int]) -> bytes:
-    """Return a PNG of a page of `page_html` that stands by itself, without its controls.
+    """Return a PNG of a self-contained page of `page_html`, without its controls.
 
     Args:
         html: the page.
@@ -263,7 +264,7 @@ def screenshot(html: str, size: tuple[int, int]) -> bytes:
             "--disable-dev-shm-usage",
             *SOFTWARE_GRAPHICS,
             *(["--no-sandbox"] if os.geteuid() == 0 else []),
-            # The page unpacks its data after it is loaded: so much of its own time it is given.
+            # The page unpacks its data after it is loaded, and needs virtual time for this.
             "--virtual-time-budget=20000",
             f"--screenshot={picture}",
             "--dump-dom",

@@ -1,9 +1,9 @@
 """Drawings as one compressed block of bytes, the same for the live window and for a file.
 
-Layout, before compression by gzip: the length of the header (uint32, little-endian), the
-header (JSON, padded to 4 bytes), the arrays one after another. In the header an array is
-{"at": byte, "of": element type, "n": elements}. What stands still is a list of meshcat
-commands, msgpack as meshcat's own viewer takes them; what moves are arrays per frame.
+Layout before compression by gzip: the length of the header (uint32, little-endian), the header
+(JSON, padded to 4 bytes), then the arrays. In the header an array is {"at": byte, "of": element
+type, "n": number of elements}. Static objects are a list of meshcat commands in the msgpack form
+that meshcat's viewer reads. Moving objects are arrays with one entry per frame.
 """
 
 import gzip
@@ -47,11 +47,11 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class ShadingSettings:
-    """How surfaces of the viewer are simplified."""
+    """Simplification of the surfaces in the viewer."""
 
     max_triangles: int = 6_000
-    """Triangles per surface; a finer one is decimated before it is drawn. Chosen: with two of that
-    size and the smaller parts a frame takes less than 100 ms without a graphics card."""
+    """Largest number of triangles of a drawn surface. A finer surface is decimated. Chosen because
+    a frame of two such surfaces takes less than 100 ms without a graphics card."""
 
 
 SHADING = ShadingSettings()
@@ -68,7 +68,7 @@ class Shaded:
         vertices: (n, 3) float32, m.
         normals: (n, 3) float32, unit.
         faces: (k, 3) uint32.
-        error: m, how far the drawn surface lies at most from the true one; 0 if not decimated.
+        error: largest distance between the drawn and the true surface, m; 0 if not decimated.
     """
 
     vertices: NDArray[np.float32]
@@ -79,7 +79,7 @@ class Shaded:
 
 @lru_cache(maxsize=16)
 def shade(surface: Surface, most_triangles: int = SHADING.max_triangles) -> Shaded:
-    """Return a surface for drawing; vertices on sharp edges are doubled."""
+    """Return a surface for drawing. Vertices on sharp edges occur once per adjacent side."""
     surface, error = decimate(surface, most_triangles)
     normals = surface.corner_normals
     flat = np.repeat(surface.face_normals[:, None], 3, axis=1)
@@ -96,11 +96,11 @@ def shade(surface: Surface, most_triangles: int = SHADING.max_triangles) -> Shad
 
 
 def decimate(surface: Surface, most_triangles: int) -> tuple[Surface, float]:
-    """Return a surface of at most so many triangles, and how far (m) the two lie apart at most.
+    """Return a decimated surface and its largest distance from the given one, m.
 
     Edges collapse in the order of their quadric error (Garland & Heckbert, Proc SIGGRAPH 97,
-    209). The distance is measured from the vertices and triangle centres of each to a point of
-    the other that is nearly the nearest one: it may be too large by a tenth of a millimetre.
+    209). The distance is measured from the vertices and triangle centres of each surface to nearby
+    points of the other. It may be too large by a tenth of a millimetre.
     """
     if len(surface.faces) <= most_triangles:
         return surface, 0.0
@@ -124,43 +124,44 @@ def _distance(one: Surface, other: Surface) -> float:
 
 @dataclass(frozen=True)
 class ViewPayloadSettings:
-    """Settings of the data for the viewer's page."""
+    """Numbers that scale the drawings of the viewer's page."""
 
     arrow_metres_per_body_weight: float = 0.03
-    """m per body weight: length of an arrow. Chosen: it fits beside the knee."""
+    """m per body weight: length of a force arrow. Chosen because arrows fit beside the knee."""
     pressure_levels: int = 32767
-    """Number of steps from no pressure to the largest. Chosen: no steps are seen."""
+    """Number of levels between zero and the largest pressure. Chosen because the levels are then
+    invisible, and a level fits in 16 bits."""
     most_coloured_triangles: int = 100_000
-    """Largest number of triangles of a surface that shows wear. Chosen: merged triangles would
-    blur its colours."""
+    """Largest number of triangles of a surface that shows wear. Chosen because merged triangles
+    blur the colours of wear."""
 
 
 VIEW_PAYLOAD = ViewPayloadSettings()
 
 
 WHITE = "#ffffff"
-"""Of a material whose vertices have colours of their own."""
+"""Colour of a material whose vertices have their own colours."""
 
 FRONT = 0
-"""three.js: only the outer side of triangles is drawn, which saves half of them."""
+"""Code of three.js: only the outer sides of triangles are drawn, which saves half of the work."""
 
 TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": np.uint32}
 
 
 class Block:
-    """Collects arrays; see the module's layout."""
+    """Arrays in the layout that the module describes."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._size = 0
 
     def put(self, values: Any, kind: str) -> dict[str, Any]:
-        """Add an array and return where it is."""
+        """Add an array and return its place in the block."""
         array = np.ascontiguousarray(values, TYPES[kind])
         return self._add(array.tobytes(), kind, array.size)
 
     def put_bytes(self, text: bytes) -> dict[str, Any]:
-        """Add bytes and return where they are."""
+        """Add bytes and return their place in the block."""
         return self._add(text, "uint8", len(text))
 
     def _add(self, part: bytes, kind: str, count: int) -> dict[str, Any]:
@@ -171,7 +172,7 @@ class Block:
         return span
 
     def compress(self, header: dict[str, Any], level: int = 6) -> bytes:
-        """Return header and arrays, compressed at a level of gzip's."""
+        """Return header and arrays, compressed by gzip at a level from 0 to 9."""
         text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         return gzip.compress(
@@ -209,9 +210,9 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
 
 
 def packed_map(pressure_map: PressureMap, peak: float, words: str) -> bytes:
-    """Return one map alone, on the scale of a page that is open, with words about it."""
+    """Return one pressure map on the scale of an open page, with its legend."""
     block = Block()
-    # On one machine the fastest level is the fastest way.
+    # Browser and server are on one machine, so speed matters more than size.
     return block.compress({"map": _map(block, pressure_map, peak), "words": words}, 1)
 
 
@@ -304,11 +305,11 @@ def _map(block: Block, pressure_map: PressureMap, peak: float) -> dict[str, Any]
 
 
 def map_levels(pressure_map: PressureMap, peak: float) -> NDArray[np.int16]:
-    """Return `pressure_levels` (f, n) of the map as integers: a loaded point's is at least 1.
+    """Return the pressure level (f, n) of each point as an integer, at least 1 if loaded.
 
     Args:
         pressure_map: the map.
-        peak: MPa, top of the scale; a higher pressure has the top level.
+        peak: top of the colour scale, MPa. A higher pressure has the top level.
     """
     level = pressure_levels(pressure_map.pressure, pressure_map.gap, pressure_map.triangles, peak)
     whole = np.maximum(np.round(np.abs(level) * VIEW_PAYLOAD.pressure_levels), 1.0)
@@ -316,7 +317,7 @@ def map_levels(pressure_map: PressureMap, peak: float) -> NDArray[np.int16]:
 
 
 def _insert_transform(root: str, side: str) -> SetTransform:
-    """Return the insert frame (y up) in meshcat's (z up), a left knee mirrored back."""
+    """Return the transform (4, 4) from the insert frame to meshcat's; it mirrors a left knee."""
     turn = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
     if side == "left":
         turn = turn @ np.diag([1.0, 1.0, -1.0, 1.0])
@@ -324,7 +325,7 @@ def _insert_transform(root: str, side: str) -> SetTransform:
 
 
 def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[Any]:
-    """Return the commands that add a solid; wear colours it on a scale up to `deepest` mm."""
+    """Return the commands that add a solid. Wear colours it on a scale from 0 to `deepest` mm."""
     colours, colour = None, solid.colour
     if solid.wear is not None:
         nearest = cKDTree(solid.surface.vertices).query(shape.vertices)[1]
@@ -342,7 +343,7 @@ def _commands(path: str, solid: Solid, shape: Shaded, deepest: float) -> list[An
 
 
 def _node_name(root: str, layer: str, name: str) -> str:
-    """Return a path in the scene tree; a name's own slash would divide it."""
+    """Return a path in the scene tree. Slashes in the name would divide it and are replaced."""
     return f"{root}/{layer}/{name.replace('/', '-')}"
 
 
@@ -351,7 +352,7 @@ def _node(path: str) -> NodePath:
 
 
 class _Mesh(TriangularMeshGeometry):
-    """meshcat's mesh with our normals, and a colour per vertex where there are any."""
+    """meshcat's mesh with the given normals and optional colours per vertex."""
 
     def __init__(self, shape: Shaded, colours: Colours | None) -> None:
         share = None if colours is None else colours / np.float32(255.0)
@@ -359,7 +360,7 @@ class _Mesh(TriangularMeshGeometry):
         self._normals = shape.normals
 
     def lower(self, object_data: Any) -> Any:
-        """Return what three.js loads."""
+        """Return the JSON object of the mesh for three.js."""
         lowered = super().lower(object_data)
         lowered["data"]["attributes"]["normal"] = pack_numpy_array(self._normals.T)
         return lowered

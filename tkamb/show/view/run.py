@@ -31,9 +31,9 @@ class CaseResults:
 
     Args:
         case: the scene with its files read.
-        mechanics: the rigid-body side, whose geometry is drawn.
-        results: the numbers.
-        frames: the motion's frame of each row of the results.
+        mechanics: multibody model of the case; its geometry is drawn.
+        results: results of the case.
+        frames: index of the motion's frame for each row of the results.
     """
 
     case: Case
@@ -42,11 +42,11 @@ class CaseResults:
     frames: tuple[int, ...]
 
     def geometries(self, progress: Progress = lambda frames: frames) -> list[KneeGeometry]:
-        """Return the geometry of the equations of every frame.
+        """Return the geometry of the knee's equations for every frame.
 
-        The contact points of condyles and patella are in the maps of the run, or are computed
-        again. Where body and contact are coupled, both are solved again, because the points of
-        action come from the contact.
+        The contact points of condyles and patella come from the maps of the run, or are computed
+        again. If knee and contact are coupled, both are solved again, because the points of action
+        come from the contact.
         """
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
@@ -63,11 +63,11 @@ class CaseResults:
         return result
 
     def _geometry(self, k: int, row: int | None) -> KneeGeometry:
-        """Return the geometry of the equations of a frame.
+        """Return the geometry of the knee's equations for a frame.
 
         Args:
             k: frame of the motion.
-            row: row of its pressure map; None: it has no map.
+            row: row of the frame's pressure map; None: the frame has no map.
         """
         maps, mechanics = self.results.maps, self.mechanics
         if maps is None or row is None or mechanics.muscles is not None:
@@ -89,7 +89,7 @@ class CaseResults:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Content of a path, its files read once: results and their case, or a case to be run.
+    """Content of a path: results and their case, or a case that has not been run.
 
     Args:
         path: a folder that `tkamb run` wrote, or a scene file.
@@ -104,7 +104,7 @@ class Source:
     kept: Path | None = None
 
     def __len__(self) -> int:
-        """Return the number of frames that there are to see."""
+        """Return the number of frames that can be shown."""
         return len(self.case.motion.time if self.results is None else self.results)
 
     def open(
@@ -112,14 +112,14 @@ class Source:
         progress: Progress = lambda frames: frames,
         announce: Callable[[str], None] = lambda line: None,
     ) -> CaseResults:
-        """Return the run, computed first where there are no results.
+        """Return the run. It is computed first if there are no results.
 
         Args:
             progress: wraps the frame indices of a run.
             announce: takes a line for the user.
 
         Raises:
-            InputError: the scene cannot be run, or is no longer what was run.
+            InputError: the scene cannot be run, or has changed since the run.
         """
         if self.kept is not None:
             announce(f"results of this scene found in {self.kept}")
@@ -133,14 +133,14 @@ class Source:
 def read_source(path: str | Path, contact: str | None = None) -> Source:
     """Return the content of a results folder or a scene file; nothing is run.
 
-    A scene whose results stand in its output folder need not be run again.
+    If a scene's output folder has results of this scene, the source has these results.
 
     Args:
         path: a folder that `tkamb run` wrote, or a scene file.
-        contact: contact model, instead of the scene's; a scene only.
+        contact: contact model that replaces the scene's; only for a scene file.
 
     Raises:
-        InputError: nothing to see there, or the scene is no longer what was run.
+        InputError: the path has nothing to show, or the scene has changed since the run.
     """
     path = Path(path)
     if os.path.isdir(path):
@@ -168,23 +168,23 @@ def open_run(
     contact: str | None = None,
     announce: Callable[[str], None] = lambda line: None,
 ) -> CaseResults:
-    """Return the run behind a results folder or a scene file; see `read_source` and `Source`.
+    """Return the run of a results folder or a scene file; see `read_source` and `Source`.
 
     Raises:
-        InputError: nothing to see there, or the scene is no longer what was run.
+        InputError: the path has nothing to show, or the scene has changed since the run.
     """
     return read_source(path, contact).open(announce=announce)
 
 
 def check_frame(sources: Sequence[Source], frame: int) -> None:
-    """Refuse a frame that none of the runs has, before any is run or drawn.
+    """Raise an InputError if no run has the frame. This comes before any run or drawing.
 
     Args:
         sources: sources of the runs.
         frame: row of the results; negative ones count from the end.
 
     Raises:
-        InputError: no run has it.
+        InputError: no run has the frame.
     """
     most = max(map(len, sources))
     if not -most <= frame < most:
@@ -192,15 +192,15 @@ def check_frame(sources: Sequence[Source], frame: int) -> None:
 
 
 def no_frame(frame: int, most: int) -> InputError:
-    """Return the error for a frame that is beyond the longest run's `most` frames."""
+    """Return the error for a frame that no run has. The longest run has `most` frames."""
     return InputError(f"there is no frame {frame}", "frame", f"give one of 0 to {most - 1}")
 
 
 def match_frames(case: Case, results: Results) -> CaseResults:
-    """Return the run of a case and its results.
+    """Return the run of a case and its results, with the frames matched by time.
 
     Raises:
-        InputError: results at times that the motion does not have.
+        InputError: the results have times that the motion does not have.
     """
     frame_at = {float(time): k for k, time in enumerate(case.motion.time)}
     try:
@@ -216,6 +216,6 @@ def run_of_results(results: Results) -> CaseResults:
     """Return the run of results, whose summary names the scene.
 
     Raises:
-        InputError: the scene is not there, or no longer what was run.
+        InputError: the scene is missing, or has changed since the run.
     """
     return match_frames(case_of_results(results), results)

@@ -1,8 +1,8 @@
 """The server of the live window, and contact of one frame by another model on request.
 
-The server is for this machine only, and gives nothing but the page and its data. Other
-users of the machine reach the port too: every address starts with a random token, which only the
-user's terminal shows.
+The server accepts connections from this machine alone, and sends only the page and its data. Other
+users of the machine can connect too. So every address begins with a random token, which only
+the user's terminal shows.
 """
 
 import argparse
@@ -38,15 +38,16 @@ class ViewServerSettings:
     """Limits of the viewer's local server."""
 
     most_request_bytes: int = 10_000
-    """Bytes of a request; a longer one is refused. Chosen: the page's own requests are far
-    shorter."""
+    """Largest number of bytes of a request; a longer request is refused. Chosen because the page's
+    requests are far shorter."""
     idle_seconds: float = 15.0
-    """s: time without a byte from a client that is connected, after which it is cut off. Chosen: a
-    browser sends its request at once."""
+    """s: a connection is closed if its client sends no byte for this time. Chosen because a browser
+    sends its request at once."""
     longest_line: int = 2000
-    """Characters of an answer in words; a longer one is cut. Chosen: a page shows it whole."""
+    """Largest number of characters of a text answer; the rest is cut off. Chosen because a page can
+    show this many."""
     token_bytes: int = 18
-    """Random bytes of the token in the address. Chosen: it cannot be guessed."""
+    """Number of random bytes of the token in the address. Chosen because nobody can guess it."""
 
 
 VIEW_SERVER = ViewServerSettings()
@@ -59,22 +60,22 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Connection": "close",
 }
-"""Headers of every answer. The page's own policy says what it may load
-(`tkamb.show.view.page.POLICY`); which sites may embed it in a frame must be said in a header."""
+"""Headers of every answer. The policy inside the page limits what it may load
+(`tkamb.show.view.page.POLICY`). Only a header can limit which sites may embed the page."""
 
 
 class ContactSwitch:
-    """Computes a frame of a run with any contact model; each model is prepared once.
+    """Contact of a frame of a run by any contact model. Each model is prepared once.
 
-    Only the latest question is answered: a newer one, or `cancel`, ends those before it as soon as
-    the step that they are at is done.
+    Only the latest request is answered. A newer request, or `cancel`, ends the earlier ones after
+    their current step.
 
     Args:
         run: case with [contact], and its results.
-        peak: MPa, top of the colour scale of the page.
+        peak: top of the colour scale of the page, MPa.
 
     Attributes:
-        stage: the current step, in words; empty when idle.
+        stage: name of the current step; empty if no request is computed.
     """
 
     def __init__(self, run: CaseResults, peak: float) -> None:
@@ -84,19 +85,19 @@ class ContactSwitch:
         self._lock, self._counting, self._latest = Lock(), Lock(), 0
 
     def models(self) -> tuple[str, ...]:
-        """Return the names that can be asked for; none without [contact]."""
+        """Return the names of the available contact models; empty without [contact]."""
         return contact_names() if self.run.case.scene.contact else ()
 
     def answer(self, row: int, model: str) -> bytes:
-        """Return map and plain words of one frame, packed.
+        """Return the pressure map and its legend for one frame, compressed.
 
         Args:
             row: row of the results.
             model: name of the contact model.
 
         Raises:
-            TkambError: no such model or frame, or the model cannot be prepared, or another
-                question came.
+            TkambError: the model or frame does not exist, the model cannot be prepared, or a newer
+                request arrived.
         """
         if not 0 <= row < len(self.run.frames):
             raise TkambError(f"there is no frame {row}")
@@ -111,7 +112,7 @@ class ContactSwitch:
                 self.stage = ""
 
     def cancel(self) -> int:
-        """Cancel earlier questions; return the number of the next question."""
+        """Cancel earlier requests; return the number of the next request."""
         with self._counting:
             self._latest += 1
             return self._latest
@@ -122,7 +123,7 @@ class ContactSwitch:
         self.stage = stage
 
     def lattice(self) -> bytes:
-        """Return the lines of the run's lattice, packed.
+        """Return the edges of the run's lattice, compressed.
 
         Raises:
             TkambError: the insert cannot be meshed.
@@ -168,21 +169,22 @@ class ContactSwitch:
 
 
 class NotYet(TkambError):
-    """The result is still being prepared; the page asks again."""
+    """The contact model is still being prepared; the page repeats its request."""
 
 
 class ViewServer:
-    """Serves one page on the loopback address.
+    """Server of one page on the loopback address.
 
     Requests under another host name (DNS rebinding), from another site, or without the token in
     their address are refused.
 
     Args:
         html: the page.
-        packed: the drawings.
-        switch: computes other contact models; None without.
-        port: 0 for any free one.
-        bench: answers a question of `tkamb live`, by its name and content; None without.
+        packed: the compressed drawings.
+        switch: source of results by other contact models; None: only the drawings.
+        port: port of the server; 0: any free port.
+        bench: function of the name and content of a message of `tkamb live` that returns the
+            answer; None: no such messages.
 
     Raises:
         InputError: the port is taken.
@@ -218,7 +220,7 @@ class ViewServer:
 
     @property
     def url(self) -> str:
-        """Address of the page, token included."""
+        """Return the address of the page with its token."""
         return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
 
     def _repr_html_(self) -> str:
@@ -230,13 +232,13 @@ class ViewServer:
         self._server.serve_forever(poll_interval=0.2)
 
     def close(self) -> None:
-        """Stop."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
 
 
 class _QuietServer(ThreadingHTTPServer):
-    """A server whose clients may leave at any moment: a browser that is closed is no error."""
+    """A server that ignores disconnected clients, for example a closed browser."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report an unexpected error in one line; ignore clients that have disconnected."""
@@ -263,7 +265,7 @@ class _Handler(BaseHTTPRequestHandler):
         return good
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer what the library refuses as everything else: one line, with all headers."""
+        """Answer a request that the library refuses with one line and all headers."""
         self.request_version = "HTTP/1.0"
         self.close_connection = True
         status = HTTPStatus(code)
@@ -289,7 +291,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._send_line(HTTPStatus.REQUEST_TIMEOUT, "the question did not arrive")
         except (TkambError, ValueError, KeyError, RecursionError) as error:
             self._send_line(HTTPStatus.BAD_REQUEST, str(error) or type(error).__name__)
-        except Exception as error:  # the last handler: the window says it, the server goes on
+        except (
+            Exception
+        ) as error:  # the last handler: the page shows the error, and the server continues
             words = f"{type(error).__name__}: {error}"
             self._send_line(HTTPStatus.INTERNAL_SERVER_ERROR, words)
         else:
@@ -313,11 +317,11 @@ class _Handler(BaseHTTPRequestHandler):
         raise TkambError("no such question")
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Stay quiet."""
+        """Print nothing."""
 
     @property
     def _path_below_token(self) -> str:
-        """The path below the token."""
+        """Return the part of the path after the token."""
         return self.path.removeprefix(self.root)
 
     def _question(self) -> dict[str, Any]:
@@ -346,7 +350,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _send_line(self, status: HTTPStatus, words: str) -> None:
         """Send one line of text."""
         line = " ".join(words.split())[: VIEW_SERVER.longest_line]
-        # a name from the question may hold what UTF-8 does not have
+        # a name in the request may contain characters that UTF-8 cannot encode
         self._send(status, "text/plain; charset=utf-8", line.encode(errors="backslashreplace"))
 
     def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:

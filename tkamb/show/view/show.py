@@ -1,4 +1,4 @@
-"""Show runs: in a live window, as one file, as a picture."""
+"""Show runs in a live window, as one file or as a picture."""
 
 import os
 import sys
@@ -27,14 +27,14 @@ Line = Callable[[str], None]
 
 
 class Show:
-    """Runs side by side, drawn once.
+    """Drawings of one or more runs, shown side by side.
 
     Args:
         runs: one or more runs.
         frame: frame at which the page opens.
         camera: one of CAMERAS.
-        lattice: whether the contact model's grid is drawn too; the live window draws it when
-            its layer is switched on.
+        lattice: whether the cells of the lattice are drawn too. The live window draws them when
+            the user switches their layer on.
         progress: wraps the frame indices while the drawings are made.
 
     Raises:
@@ -57,7 +57,7 @@ class Show:
         self.title = " | ".join(drawing.title for drawing in self.drawings)
 
     def at(self, frame: int, camera: str) -> "Show":
-        """Return the same show with another first frame and camera; nothing is drawn anew.
+        """Return the same drawings with another first frame and camera.
 
         Raises:
             InputError: no such frame or camera.
@@ -67,11 +67,11 @@ class Show:
         return other
 
     def html(self) -> str:
-        """Return the page that stands by itself."""
+        """Return the self-contained page."""
         return page_html(self.title, self.packed, frame=self.frame, view=self.camera)
 
     def write_html(self, path: str | Path) -> None:
-        """Write the page that stands by itself, whole or not at all.
+        """Write the self-contained page, whole or not at all.
 
         Raises:
             InputError: the folder cannot be written.
@@ -82,7 +82,7 @@ class Show:
         """Write a picture of the frame, with colour bars and legend but without controls.
 
         Raises:
-            ComputationError: no browser.
+            ComputationError: no browser is installed.
             InputError: the folder cannot be written.
         """
         picture = screenshot(self.html(), size)
@@ -132,7 +132,7 @@ class Show:
 
 
 def open_window(url: str) -> bool:
-    """Open a window of the user's browser; False where there is none or no display."""
+    """Open a window of the user's browser; return False if there is no browser or no display."""
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
@@ -141,20 +141,20 @@ def open_window(url: str) -> bool:
 
 
 def serve_in_background(server: "ViewServer") -> threading.Thread:
-    """Start a server beside the caller, for notebooks and tests."""
+    """Start a server in a thread, for notebooks and tests."""
     thread = threading.Thread(target=server.serve, daemon=True)
     thread.start()
     return thread
 
 
 def show(results: "Results", frame: int = 0) -> Show:
-    """Return a run to look at and turn around, which notebooks show.
+    """Return the 3-D drawing of a run, which notebooks display.
 
     Args:
         results: results of a run.
         frame: frame at which the page opens.
 
     Raises:
-        InputError: the scene is not there, or no longer what was run.
+        InputError: the scene is missing, or has changed since the run.
     """
     return Show([run_of_results(results)], frame=frame)

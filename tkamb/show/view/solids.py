@@ -1,9 +1,9 @@
 """The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-A scene can have the mesh of one bone, around which a muscle wraps. This mesh is drawn. The other
-bones are stand-ins of about the right size between the joint centres, for orientation only; they
-carry no load. The pose of the foot is not measured. The foot is drawn level with the floor and
-pointing forward with the shank, so that the arrow of the ground reaction starts at a foot.
+If a muscle wraps around the mesh of a bone, this mesh is drawn. The other bones are simple bodies
+of about the right size between the joint centres; they only help orientation. The pose of the foot
+is not measured. The foot is drawn level with the floor and points forward with the shank, so the
+arrow of the ground reaction starts at a foot.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ FEMUR_PROFILE = (
     (1.0, 20.0),
 )
 TIBIA_PROFILE = ((0.0, 26.0), (0.05, 24.0), (0.16, 15.0), (0.50, 11.0), (0.85, 11.0), (1.0, 18.0))
-"""Share of the length from the knee, and radius in mm."""
+"""Pairs of distance from the knee, as a share of the tibia's length, and radius, mm."""
 
 PATELLA_DEPTH, PATELLA_WIDTH = 8.0 * MILLIMETRE, 21.0 * MILLIMETRE
 
@@ -54,19 +54,19 @@ SOLE = (
     (172.0, 11.0, -20.0, 11.0),
     (160.0, 10.0, 22.0, 10.0),
 )
-"""mm: balls whose convex hull is the foot: centre (anterior of the ankle, above the sole, to the
-right) and radius."""
+"""mm: balls whose convex hull is the foot. Each has a centre (anterior to the ankle, above the
+sole, to the right) and a radius."""
 
 
 @dataclass(frozen=True)
 class ViewSolidSettings:
-    """Sizes of what the viewer draws beside the implant."""
+    """Sizes of the floor and the ankle in the viewer."""
 
     ankle_radius_mm: float = 20.0
-    """mm: radius of the ball that is drawn at the ankle. Chosen: it looks like an ankle."""
+    """mm: radius of the ball at the ankle. Chosen by eye."""
     plate_centre: float = 60.0 * MILLIMETRE
-    """m: distance of the floor's centre in front of the ankle. Chosen: the middle of a foot lies in
-    front of the ankle."""
+    """m: distance from the ankle to the floor's centre in front of it. Chosen because it is about
+    the middle of a foot."""
 
 
 VIEW_SOLID = ViewSolidSettings()
@@ -90,10 +90,10 @@ def solids(
 
     Args:
         case: the case.
-        recorded: (f, 4, 4) pose_femur_in_insert as measured.
-        states: chain at each frame.
-        maps: the run's maps, whose poses are used.
-        rows: row of the maps of each frame, -1 where there is none.
+        recorded: measured pose_femur_in_insert, shape (f, 4, 4).
+        states: state of the chain in each frame.
+        maps: pressure maps of the run, with the pose of each.
+        rows: row of the map of each frame; -1 for a frame without a map.
     """
     solved = np.stack([state.pose("femur") for state in states])
     still = np.eye(4)[None]
@@ -159,7 +159,7 @@ def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int
 
 
 def _femur(case: Case, states: Sequence[ChainState], poses: Array) -> Solid:
-    """Return the bone that a muscle wraps, else a stand-in up to the hip."""
+    """Return the femur that a muscle wraps around, or else a simple bone up to the hip."""
     bone = case.bone
     if bone is not None:
         return Solid("femur", "bones", bone, BONE, 1.0, poses)
@@ -195,7 +195,7 @@ def _patella(case: Case) -> Surface:
 
 
 def _turned(axis: ArrayLike, towards: Array) -> Array:
-    """Return the smallest turn (4, 4) of an axis (3,) towards a direction (3,)."""
+    """Return the smallest rotation (4, 4) that aligns an axis (3,) with a direction (3,)."""
     rotation, _ = Rotation.align_vectors(np.atleast_2d(towards), np.atleast_2d(axis))
     return pose(rotation.as_matrix(), np.zeros(3))
 
@@ -203,7 +203,7 @@ def _turned(axis: ArrayLike, towards: Array) -> Array:
 def floor_and_foot(
     case: Case, geometries: Sequence[KneeGeometry], frames: Sequence[int]
 ) -> tuple[tuple[Solid, ...], tuple[Marker, ...]]:
-    """Return floor and foot, and the centre of pressure; nothing without a force plate.
+    """Return floor, foot and centre of pressure; empty without a force plate.
 
     Args:
         case: the case.
@@ -255,13 +255,13 @@ def _foot_surface(height: float) -> Surface:
 
 
 def _hull(balls: Sequence[tuple[float, ...]]) -> Surface:
-    """Return the hull of balls: centre and radius in mm."""
+    """Return the convex hull of balls, given by centre and radius in mm."""
     points = [sphere_points() * radius + centre for *centre, radius in balls]
     return hull(np.concatenate(points) * MILLIMETRE, "balls")
 
 
 def hull(points: Array, name: str) -> Surface:
-    """Return the convex hull of points (n, 3), m, its triangles wound outwards."""
+    """Return the convex hull of points (n, 3), m. Its triangles are oriented outwards."""
     result = ConvexHull(points)
     faces = result.simplices
     a, b, c = np.moveaxis(points[faces], 1, 0)
@@ -273,7 +273,7 @@ def hull(points: Array, name: str) -> Surface:
 
 
 def sphere_points(count: int = 640) -> Array:
-    """Return points (n, 3) spread evenly over the unit sphere: a spiral of golden angles."""
+    """Return points (n, 3) spread evenly over the unit sphere, on a spiral of golden angles."""
     k = np.arange(count) + 0.5
     up = 1.0 - 2.0 * k / count
     across = np.sqrt(1.0 - up**2)
@@ -281,7 +281,7 @@ def sphere_points(count: int = 640) -> Array:
 
 
 def box(size: Array, name: str) -> Surface:
-    """Return a box about the origin; size (3,) m."""
+    """Return a box of a size (3,), m, centred at the origin."""
     corners = np.array(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])).reshape(3, 8).T
     return hull(corners * size, name)
 

@@ -110,7 +110,7 @@ class CohortTable(SceneTable):
     title: str = "Cohort"
     frames: str = Field(":", description="frames of every trial, as a Python slice A:B:STEP")
     group_by: tuple[Literal["activity", "trial", "design", "contact"], ...] = Field(
-        (), description="labels of a group; default: the axes with more than one entry, not subject"
+        (), description="labels of a group; default: axes with more than one entry, except subject"
     )
     bin_deg: Annotated[Number, Field(ge=1, le=180)] = Field(
         10.0, description="width of a flexion bin"

@@ -220,7 +220,7 @@ def run_cohort(
         Number of the run -> its outcome, for all runs of the cohort or of the part.
 
     Raises:
-        InputError: the input is invalid, the folder holds another cohort, or cannot be claimed.
+        InputError: the input is invalid, or the folder holds another cohort or is in use.
         ComputationError: a worker process ended during a run.
         KeyboardInterrupt: interrupted. The finished runs stay in the folder.
     """
@@ -264,7 +264,7 @@ def _identity(cohort: Cohort) -> dict[str, Any]:
 
 @contextmanager
 def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Path]]:
-    """Lock the folders of all parts and yield them. Empty for a part, or without `resume`."""
+    """Lock and yield the folders of all parts. Yield none for a part, or without `resume`."""
     with ExitStack() as stack:
         folders = []
         if part is None and resume:

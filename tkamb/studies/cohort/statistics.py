@@ -21,6 +21,7 @@ UNITS = ("_N", "_BW", "_MPa", "_mm2", "_mm", "_deg", "_Nm", "_equilibrium", "_yi
 """Endings of the columns that are averaged."""
 CYCLE = "cycle_percent"
 CYCLE_BIN, WHOLE_CYCLE = 10.0, 100.0
+"""%: width of a bin, and length of the cycle."""
 AXES = ("flexion_deg", CYCLE)
 
 
@@ -29,8 +30,8 @@ class CohortStatisticsSettings:
     """Statistics over the runs of a cohort."""
 
     bin_tolerance: float = 1e-9
-    """Share of the width of a bin: a value this near the upper edge belongs to the next bin. Chosen
-    above round-off: 60 deg converted from radians is 59.99999999999999."""
+    """Distance from the upper edge of a bin, relative to its width, within which a value belongs to
+    the next bin. Chosen above round-off: 60 deg converted from radians is 59.99999999999999."""
 
 
 COHORT_STATISTICS = CohortStatisticsSettings()
@@ -124,7 +125,8 @@ def _group(
     # cycle_percent is NaN in the frames outside the gait cycle
     finite = [np.isfinite(run[axis]) for run in columns]
     indices = [
-        _bin_indices(run[axis][on], axis, width) for run, on in zip(columns, finite, strict=True)
+        _bin_indices(run[axis][mask], axis, width)
+        for run, mask in zip(columns, finite, strict=True)
     ]
     first, last = (
         (min(i.min() for i in indices), max(i.max() for i in indices)) if indices else (0, -1)
@@ -135,7 +137,7 @@ def _group(
     for name in names:
         values = [run.get(name, np.full(len(run["time_s"]), np.nan)) for run in columns]
         parts = zip(values, finite, indices, strict=True)
-        bins[name] = np.array([_means(v[on], i - first, len(edges) - 1) for v, on, i in parts])
+        bins[name] = np.array([_means(v[mask], i - first, len(edges) - 1) for v, mask, i in parts])
         peaks[name] = np.array([np.nanmax(v) if np.isfinite(v).any() else np.nan for v in values])
     wear_names = dict.fromkeys(name for n in successful for name in outcomes[n].wear)
     wear = {
@@ -175,7 +177,7 @@ def _means(values: Array, index: Array, count: int) -> Array:
 
 
 def group_rows(groups: Sequence[Group], group_by: Sequence[str]) -> list[list[str]]:
-    """Return the rows of groups.csv: the header, then for each group and column bins and peak."""
+    """Return the rows of groups.csv: the header, then bins, peaks and wear of each group."""
     head = [*group_by, "axis", "from", "to", "column", "runs", "mean", "sd", "min", "max"]
     rows = [head]
     for group in groups:

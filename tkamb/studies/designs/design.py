@@ -22,6 +22,7 @@ from tkamb.studies.designs.insert import Insert, Post
 
 MEDIAL, LATERAL = -1.0, 1.0
 PHI_REACH, Z_REACH = np.radians(30.0), 9.0
+"""rad, mm: half the size of the search area."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,10 @@ class Design:
         return self.articulation.insert
 
     def write_meshes(self, folder: Path) -> tuple[Path, ...]:
-        """Write the parts as binary STL files in mm, a cam both with and without, return paths."""
+        """Write the parts as binary STL files in mm and return the paths.
+
+        A femoral component with a cam is written with and without it.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         meshes = {
             FEMORAL_MESH: self.femoral.mesh(),
@@ -199,7 +203,7 @@ def _part(kind: type[_Part], table: Mapping[str, Any], file: Path) -> _Part:
         name = key.removesuffix(unit)
         if name not in names or (not unit and name not in ("cam", "post")):
             raise InputError(
-                f"unknown key '{key}'", file, f"known, with _mm or _deg: {', '.join(sorted(names))}"
+                f"unknown key '{key}'", file, f"keys, before the unit: {', '.join(sorted(names))}"
             )
         values[name] = _tuples(value)
     if "medial_arcs" in values:

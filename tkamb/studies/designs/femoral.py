@@ -7,8 +7,8 @@ therefore a piece of a torus, with the sagittal radius at the ridge and the coro
 it. If the J-curves of the two condyles differ, the surface blends from one to the other in the
 groove.
 
-A posterior-stabilised component has a cam: a cylinder across the box that is joined to its walls.
-The cylinder is exact up to `CAM.flange_mm` from a wall. From there it widens to the edge of an
+A posterior-stabilised component has a cam: a cylinder that joins the two walls of the box. The
+cylinder is exact up to `CAM.flange_mm` from a wall. From there it widens to the edge of an
 opening in the wall, so the mesh is one closed body without self-intersection.
 """
 
@@ -34,9 +34,9 @@ class CamSettings:
     stations: int = 13
     """Number of rings of vertices along the cam. Chosen for triangles about as long as wide."""
     flange_mm: float = 1.0
-    """mm: distance between the wall of the box and the cylinder. Chosen to keep them apart."""
+    """mm: distance from a wall of the box to the cylinder. Chosen to leave room to widen it."""
     window_deg: float = 22.0
-    """deg: half the angle, about the origin, of the opening in a wall that joins the cam."""
+    """deg: half the angle that the cam's opening in a wall subtends at the origin."""
     wall_tolerance_mm: float = 1e-6
     """mm: distance within which a vertex lies in the plane of a wall. Chosen above round-off."""
 
@@ -298,7 +298,7 @@ class FemoralComponent:
         return np.asarray(top + (self.width_half - top) * self._taper(phi))
 
     def notch(self, phi: ArrayLike) -> Array:
-        """Return the ML distance of the notch's edge, elliptic in front, from the middle."""
+        """Return the ML distance of the notch's edge from the middle. The front is elliptic."""
         start, end = np.radians(self.notch_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         s = np.where(s < 1e-9, 0.0, s)
@@ -396,7 +396,7 @@ class FemoralComponent:
         )
 
     def _rows(self) -> Array:
-        """Return phi of the rows of vertices, rad; fine at the insert and the notch's front."""
+        """Return phi of the rows of vertices, rad, dense at the insert and the notch's front."""
         start, end = np.radians(self.notch_phi)
         front = start + (end - start) * (1.0 - np.cos(np.radians(np.linspace(0.0, 30.0, 5))))
         rows = self.profile.nodes(ROW_SPACING)

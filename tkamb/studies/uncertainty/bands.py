@@ -276,8 +276,8 @@ def influences(
     variance is due to other nonlinearity, interactions and chance. A result that is constant apart
     from round-off has no rows.
 
-    With fewer than `SAMPLES_PER_INPUT` samples per input, each input is regressed alone. The share
-    2/(n - 1) of the variance, which chance explains in n samples, is then subtracted from its part.
+    With fewer than `SAMPLES_PER_INPUT` samples per input, each input is regressed alone. In n
+    samples chance explains 2/(n - 3) of the unexplained variance. This is subtracted from the part.
 
     Args:
         results: names of the m results.

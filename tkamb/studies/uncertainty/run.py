@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -53,9 +53,6 @@ from tkamb.studies.uncertainty.sampling import (
     normal_samples,
 )
 from tkamb.studies.uncertainty.sensitivity import SobolIndex, sobol_indices
-
-if TYPE_CHECKING:
-    from tkamb.studies.uncertainty.sensitivity import SobolIndex
 
 
 def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
@@ -202,7 +199,7 @@ def estimate_uncertainty(
         progress: wrapper of the iterator of the finished samples.
 
     Raises:
-        InputError: the input is invalid, the folder holds another run, or cannot be claimed.
+        InputError: the input is invalid, or the folder holds another run or is in use.
         ComputationError: a worker process ended during a sample.
         KeyboardInterrupt: interrupted. The finished samples stay in the folder.
     """

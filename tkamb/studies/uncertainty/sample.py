@@ -4,8 +4,8 @@ The errors are applied to the loaded case, in SI units and for a right knee, so 
 again. Meshes, search trees and the prepared contact are those of the nominal scene. Only a varied
 modulus of the insert needs a new preparation of the contact.
 
-Each skin marker has an error on its segment that is constant over the frames. The pose of a segment
-is then wrong by the rigid fit of the displaced markers to their nominal positions
+Each skin marker is displaced on its segment by an error that is constant over the frames. The rigid
+fit of the displaced markers to the nominal ones is the error of the segment's pose
 (`method = "segments"`). A kinematic chain distributes the same errors over more segments.
 """
 
@@ -187,7 +187,7 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
 def thinnable(case: Case) -> bool:
     """Return whether each frame can be computed without the other frames of the motion.
 
-    A solved patella needs them for its derivatives in time, a reference strain for the frame to
+    A solved patella needs them for its derivatives in time. A reference strain needs the frame to
     which it refers.
     """
     solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
@@ -317,7 +317,7 @@ class Sampler:
         per_frame = noise_of_point(point, range(count), self._time, table.correlation_s, table.seed)
         if len(self.case.motion.time) < len(self._time):
             per_frame = per_frame[list(self._chosen)]
-        if point.noise_of is None:  # a screening varies one input, also of correlated ones
+        if point.noise_of is None:  # a screening varies correlated inputs one at a time
             return Draw(self.inputs, point.normal, per_frame, 1.0)
         noise = per_frame @ self._root[:count, :count].T
         return Draw(self.inputs, self._root @ point.normal, noise, table.constant_share)

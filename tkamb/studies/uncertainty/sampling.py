@@ -5,7 +5,8 @@ a smaller one.
 
 Correlated inputs ([[uncertainty.correlation]]) are z = L x, with x independent standard normal and
 L L^T the correlation matrix (Cholesky). This is a Gaussian copula, because every input is a
-function of one normal error. Samples by Iman & Conover (1982) would depend on their number.
+function of one normal error. The method of Iman & Conover (1982) would make a sample depend on the
+number of samples.
 
 References: Cario & Nelson, Modeling and generating random vectors with arbitrary marginal
 distributions and correlation matrix, Northwestern University (1997); Iman & Conover, Commun Stat
@@ -85,7 +86,7 @@ SMALLEST_TAIL = 1e-9
 """Smallest probability that is mapped to a normal quantile. Sobol' points may be 0, and the
 quantile of 0 is infinite."""
 NOISE = 1
-"""Part of the seed of the noise. Hypercubes have 0 instead."""
+"""Number in the seed of the noise. The seeds of the hypercubes have 0 in its place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,7 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
     """Return samples (count, dimensions) of independent standard normal inputs.
 
     "lhs" makes Latin hypercubes of `BLOCK` samples, "sobol" one scrambled Sobol' sequence. The
-    normal quantile maps their probabilities to values.
+    normal quantile function maps these uniform samples to normal ones.
 
     Args:
         method: sampling method, "lhs" or "sobol".

@@ -52,8 +52,8 @@ def sobol_indices(
 ) -> list[SobolIndex]:
     """Return the indices of every input for every result, with the largest total index first.
 
-    y_A and y_B are the results at A and B, and y_AB those at A with the column of the input from B,
-    all without their mean. With sums over the rows of the design the indices are
+    y_A and y_B are the results at A and B, and y_AB those at A with the column of the input from B.
+    The mean of y_A and y_B is subtracted from all. With sums over the rows the indices are
 
         first = sum y_B (y_AB - y_A) / sum y²      (Saltelli et al. 2010)
         total = sum (y_A - y_AB)² / (2 sum y²)     (Jansen 1999)

@@ -46,7 +46,7 @@ class CycleMaps:
         points: map points on the insert, m, shape (m, 3).
         triangles: point numbers of the triangles between them, shape (k, 3).
         pressure: contact pressure, Pa, shape (f, m).
-        poses: femoral poses of the maps, shape (f, 4, 4); the prescribed pose without load.
+        poses: femoral poses of the maps, shape (f, 4, 4). A frame without load has its given pose.
         failed: frame -> reason why its contact or equilibrium failed.
     """
 
@@ -74,22 +74,22 @@ class ContactEngine:
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
         state = self.model.prepare(pair)
         pressure = np.zeros((len(motion), len(state.points)))
-        poses, failed, start = motion.poses.copy(), {}, None
+        poses, failed, warm_start = motion.poses.copy(), {}, None
         drive = motion.drive
         equilibrium = None if drive is None else EquilibriumPoses(self.model, state, drive)
         for k, (pose, load) in enumerate(zip(motion.poses, motion.load, strict=True)):
             if load <= 0:
                 continue
             if equilibrium is not None:
-                pose, reason = equilibrium.at(k, float(load), start)
+                pose, reason = equilibrium.at(k, float(load), warm_start)
                 if reason:
                     failed[k] = reason
                     continue
-            result, end = self.model.press_from(state, float(load), pose, start)
+            result, end = self.model.press_from(state, float(load), pose, warm_start)
             if result.status is not ContactStatus.OK:
                 failed[k] = "; ".join(result.flags) or result.status.value
                 continue
-            pressure[k], poses[k], start = result.pressure, result.pose, end
+            pressure[k], poses[k], warm_start = result.pressure, result.pose, end
         return CycleMaps(state.points, state.triangles, pressure, poses, failed)
 
     def dwell(self, insert: Surface, rotation: Array) -> tuple[float, float]:
@@ -112,15 +112,15 @@ class ContactEngine:
             return result if np.isfinite(result) else 1.0
 
         middle = self.femoral.moved(pose_of(rotation, [0.0] * 3)).bounds.mean(axis=0)
-        # one grid has the origins above each other, the other the middle of the femoral bounds
-        starts = [
+        # one grid is around the femoral origin, the other around the middle of the femoral bounds
+        guesses = [
             np.array([x, z]) - offset
             for offset in (np.zeros(2), middle[[0, 2]])
             for x in GRID
             for z in (-WEAR_GRID.spacing_z, 0.0, WEAR_GRID.spacing_z)
         ]
-        heights = [height(start) for start in starts]
-        best = starts[int(np.argmin(heights))]
+        heights = [height(guess) for guess in guesses]
+        best = guesses[int(np.argmin(heights))]
         if min(heights) >= 1.0:
             raise InputError("is not above the insert", self.femoral.name, "check the axes")
         result = minimize(height, best, method="Nelder-Mead", options=SEARCH)

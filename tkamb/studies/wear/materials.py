@@ -112,7 +112,7 @@ class WearMaterial:
     range_source: str = ASSUMED_RANGE
 
     def with_own_factor(self) -> "WearMaterial":
-        """Return the material for a wear factor of the user: default range, no caution."""
+        """Return the material for a user's wear factor, with the default range and no caution."""
         return replace(self, factor_range=TWO_EITHER_WAY, range_source=ASSUMED_RANGE, caution="")
 
     def all_laws(self) -> dict[str, WearLaw]:

@@ -26,8 +26,8 @@ class CycleMotionSettings:
     """m: displacement per rotation in rad, to add rotations to translations. Chosen as half the
     distance between the condyles."""
     notable_gap: float = 0.1
-    """Share of the extent of the motion: distance between its ends above which the report asks
-    about it. The cycle is not changed. Chosen because recorded cycles close better."""
+    """Distance between the ends of the motion, relative to its extent, above which the report adds
+    a question. Chosen because the ends of recorded cycles are closer."""
 
 
 CYCLE_MOTION = CycleMotionSettings()

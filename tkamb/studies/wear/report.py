@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 MILLION = 1e6
 STATE_NAME, SAMPLES_NAME = ".wear.npz", ".wear_samples"
-"""Of an unfinished simulation: file of the last finished block, and folder of the finished
-samples."""
+"""File of the last finished block and folder of the finished samples, while a simulation is
+unfinished."""
 FIRST = (
     "Worn volume, mass and depth are proportional to the wear factor, which differs by a factor of "
     "two and more between laboratories."
@@ -192,7 +192,7 @@ class WearReport:
         questions += self.case.motion.questions
         if self.first.frames_change > WEAR_REPORT.max_frame_change:
             questions.append(
-                f"half as many frames per cycle change its volume by {self.first.frames_change:.1%}"
+                f"half the frames per cycle change the volume by {self.first.frames_change:.1%}"
                 ": increase --frames-per-cycle"
             )
         if self.state.map_error > WEAR_REPORT.max_map_correction:
@@ -203,7 +203,7 @@ class WearReport:
         if self.state.unsettled:
             questions.append(
                 f"in {self.state.unsettled} blocks the pressure moved away from the worn area, "
-                "even in the shortest block: increase --updates"
+                "although they were halved: increase --updates"
             )
         low, high = PUBLISHED_RATES
         if (
@@ -343,7 +343,7 @@ LABELS = {
 def draw_wear(
     surface: Surface, maps: dict[str, Array], rows: Sequence[Mapping[str, float]], path: Path
 ) -> None:
-    """Draw the maps of the insert in a superior view, with anterior at the top and right at right.
+    """Draw the maps of the insert in a superior view, anterior at the top and right on the right.
 
     The last panel shows the worn volume over the cycles, with its band if the rows have one.
 

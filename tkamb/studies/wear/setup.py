@@ -103,7 +103,7 @@ def wear_setup(
         progress: wrapper of the iterator of the frames to run.
 
     Raises:
-        InputError: the scene, folder or profile is invalid, or has no contact, or a post.
+        InputError: the scene, folder or profile is invalid, has no contact, or has a post.
     """
     if frames < 2:
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")

@@ -34,16 +34,16 @@ class WearSimulationSettings:
     min_depth: float = 1e-9
     """m: depth below which a point counts as unworn. Chosen above the round-off of a mesh."""
     max_pattern_change: float = 0.2
-    """Share of the wear rate that may move to other points during a block, or the block is halved.
-    Larger: fewer blocks, less accurate. Chosen below the error of a wear law."""
+    """Share of the wear rate that moves to other points, above which a block is halved. Larger:
+    fewer blocks, less accurate. Chosen below the error of a wear law."""
     max_block_division: int = 256
     """Largest ratio of the longest block to a halved block. Chosen to allow eight halvings."""
     min_row_share: float = 0.5
     """Share of the rows of a force-controlled profile that must converge. Chosen because fewer rows
     do not describe the cycle."""
     min_improvement: float = 1.1
-    """Factor by which halving a block must reduce the share `max_pattern_change`, or the block is
-    not halved again. Chosen because further halvings then have no effect."""
+    """Factor by which a halving must reduce the share that moves to other points. Otherwise the
+    block is not halved again. Chosen because further halvings then have no effect."""
 
 
 WEAR_SIMULATION = WearSimulationSettings()

@@ -8,8 +8,8 @@ including the superior-inferior one, are released and follow from equilibrium:
 
 - r_i: residual of the released coordinate i.
 - F_i: load of the machine on the femoral component through the origin of its mesh. It is a force,
-  N, along the axis of the insert or a torque, N·m, about the axis of the coordinate. The axial
-  force F is -F on the superior-inferior coordinate.
+  N, along the axis of the insert or a torque, N·m, about the axis of the coordinate. An axial
+  force F is the load -F on the superior-inferior coordinate.
 - S_i: force of the spring that replaces the ligaments.
 - J_i: twist of the femoral component per unit rate of coordinate i, see `knee_axes`.
 - w_contact: contact wrench on the insert.
@@ -207,7 +207,7 @@ class MachineJoint:
     gap: Array
     zero: Array
 
-    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+    def residual(self, coordinates: Array, contact: Array) -> Array:
         """Return the residuals r (..., n) at coordinates (..., 6) with contact wrench (6,)."""
         offset = coordinates - self.zero
         spring = self.stiffness * np.sign(offset) * np.maximum(np.abs(offset) - self.gap, 0.0)
@@ -298,9 +298,9 @@ class WearProfileSettings:
     max_force: float = 1e4
     """N: largest axial force. Chosen as fifteen body weights."""
     step_tolerance: float = 1e-9
-    """Share of the largest step by which a step may exceed it. Chosen above round-off."""
+    """Share by which a step may exceed the largest step. Chosen above round-off."""
     closure_tolerance: float = 0.01
-    """Share of the range of a column: largest difference between its first and last row. Chosen
+    """Largest difference between first and last row of a column, relative to its range. Chosen
     above the noise of a profile."""
 
 

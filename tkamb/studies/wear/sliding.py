@@ -141,7 +141,7 @@ def cross_shear_ratio(work: Array, sliding: Array, normals: Array) -> Array:
     share = np.divide(work, square, out=np.zeros_like(work), where=square > 0)
     uu, vv, uv = ((share * a).sum(axis=0) for a in (u * u, v * v, u * v))
     total = uu + vv
-    difference = np.hypot(uu - vv, 2.0 * uv)  # of the eigenvalues
+    difference = np.hypot(uu - vv, 2.0 * uv)  # lambda_max - lambda_min
     ratio = np.divide(total - difference, 2.0 * total, out=np.zeros_like(total), where=total > 0)
     return np.clip(ratio, 0.0, 0.5)
 

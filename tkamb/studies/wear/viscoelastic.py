@@ -69,8 +69,8 @@ class PronySeries:
     def response(self, step: float) -> tuple[float, Array, Array]:
         """Return the coefficients of the stress after a step of `step` s.
 
-        Primes denote the end of the step. For a strain that is linear in time over the step the
-        hereditary integral is exactly
+        Primes denote the end of the step, and q_i is the stress of term i. For a strain that is
+        linear in time over the step the hereditary integral is exactly
 
             q_i' = a_i q_i + b_i (eps' - eps),    sigma'/M_0 = equilibrium eps' + sum q_i'
 
@@ -203,7 +203,7 @@ class ViscoelasticLattice:
         slope: float,
         offset: Array,
     ) -> Solution:
-        """Solve with growing sets of candidates until they cover the approach."""
+        """Solve with larger sets of candidates until none outside can touch."""
         (gaps, planes), state = undeformed_gaps, self._state
         creep_depth = -float(offset[:, 1].min())  # the undeformed gaps do not include creep
         depth = -float(gaps.min())

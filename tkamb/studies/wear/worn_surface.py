@@ -41,7 +41,7 @@ class ArticularSurface:
 
     A vertex has a third of the area vector of each of its triangles. Its normal n is the direction
     of the sum over its upward-facing triangles, so at the rim the wall has no effect. Its area is
-    the y component of the sum over all its triangles, over n_y.
+    the y component of the sum over all its triangles, divided by n_y.
 
     A worn depth h along the normal moves the vertex down by h/n_y. The volume of a closed surface
     is linear in y, so for any depth exactly
