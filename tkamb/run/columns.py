@@ -220,7 +220,7 @@ COLUMNS: tuple[Column, ...] = (
         )
         for side in ("medial", "lateral")
     ),
-    Column("ap_mm", "femoral origin of the pose of the contact, insert x", _CONTACT),
+    Column("ap_mm", "femoral origin at the pose of the contact, insert x", _CONTACT),
     Column("si_mm", "the same, insert y", _CONTACT),
     Column("ml_mm", "the same, insert z", _CONTACT),
     Column(
