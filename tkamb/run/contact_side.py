@@ -52,8 +52,8 @@ class CouplingSettings:
     """N: largest change of the load in a converged iteration. Chosen because no contact model
     resolves a ten-thousandth of a body weight."""
     point_tolerance: float = 1e-6
-    """m: largest travel of a centre of pressure in a converged iteration. Chosen because it is too
-    small to change a force."""
+    """m: largest travel of a centre of pressure in a converged iteration. A smaller travel
+    does not change a force."""
     max_iterations: int = 20
     """1: iterations after which a frame fails. Chosen because frames that converge need fewer."""
     stiffness_error: float = 0.02
@@ -72,8 +72,8 @@ class ContactSide:
         coupled: whether the contact's resultants replace the contact points in the equations.
         released: names of the released coordinates.
         post: cam and post; None: not modelled.
-        sensitivity: whether to compute the change of the medial force with adduction. It takes one
-            more press with a contact model that has no tangent.
+        sensitivity: whether to compute the change of the medial force with adduction. A contact
+            model without a tangent needs one more press for it.
         prepare_seconds: computing time of the preparation of the contact model, s.
 
     Attributes:
@@ -110,7 +110,7 @@ class ContactSide:
         """Return loads and contact of frame k, coupled as the scene states.
 
         Args:
-            k: frame.
+            k: index of the frame.
             before: contacts of the earlier frames, for warm start and initial guess.
         """
         if self.released is None:
@@ -216,7 +216,7 @@ class ContactSide:
         """Return loads and contact with the released coordinates in equilibrium.
 
         Args:
-            k: frame.
+            k: index of the frame.
             before: contacts of the earlier frames. The initial guess extrapolates the last three
                 equilibria.
         """
