@@ -195,7 +195,10 @@ class Hertz(ContactModel):
                 )
             described = patches[side] = _described(samples, geometry.contact, patch)
             if patch.long_axis > described.thickness:
-                flags.append(f"{SIDES[side]} contact ellipse is wider than the insert is thick")
+                flags.append(
+                    f"the long semi-axis of the {SIDES[side]} contact ellipse exceeds the "
+                    "thickness of the insert: Hertz assumes a half-space"
+                )
         return _collected(state, pose, pressure, patches, tuple(flags))
 
 

@@ -28,7 +28,8 @@ class ContactResultSettings:
 
     max_measured_pressure: float = 100.0 * MEGAPASCAL
     """Pa: peak pressure above which a result is flagged. Chosen because measured stress-strain
-    curves of polyethylene end at 40 to 60 MPa."""
+    curves of polyethylene end at 40 to 60 MPa, and the largest von Mises stress of a Hertz contact
+    is about 0.6 of its peak pressure."""
     least_patch_share: float = 0.05
     """1: smallest share of the force on a patch under a second condyle. Chosen because smaller
     patches belong to the first condyle."""

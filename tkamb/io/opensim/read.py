@@ -126,7 +126,9 @@ def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element
     """
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
-        raise InputError(f"is not an OpenSim model: its root is <{root.tag}>", path)
+        raise InputError(
+            f"is not an OpenSim model: its root is <{root.tag}>", path, "give an .osim file"
+        )
     version = root.get("Version", "")
     if not version.isdigit() or int(version) < MODEL_READ.oldest_version:
         raise InputError(

@@ -336,11 +336,14 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
     if first["type"] == "missing":
         return InputError(f"missing key '{key}'", where, advice)
     message = first["msg"].removeprefix("Value error, ")
+    message = message.removeprefix("Input ")
     if first["type"] in ("float_type", "int_type", "bool_type"):
         message += f", not {_shown(first['input'])}"
+    elif first["type"] == "literal_error":
+        message += f", not {first['input']!r}"
     if first["type"] in ("tuple_type", "list_type"):
         message = _as_list(key, first["input"], option == key)
-    return InputError(f"'{key}': {message}" if key else message, where, advice)
+    return InputError(f"'{key}': {message}" if key and option != key else message, where, advice)
 
 
 def _as_list(key: str, value: Any, from_command_line: bool) -> str:

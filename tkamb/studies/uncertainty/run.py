@@ -208,8 +208,9 @@ def estimate_uncertainty(
     crew = PoolOptions(workers, dask)
     if not STATISTICS_LIMITS.min_samples <= samples <= MOST_SAMPLES:
         raise InputError(
-            f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
+            f"cannot be {samples}",
             "samples",
+            f"give a number from {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
         )
     if directory is None and resume:
         raise InputError("needs the folder of the earlier run", "resume", "give a directory")

@@ -319,7 +319,8 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
         raise InputError(
             f"{count:.2g} cells of {target_size / MILLIMETRE:g} mm are too many",
             insert.name,
-            f"take larger cells ({GRID.max_cells:.0e} at most), and check the mesh's unit",
+            f"give a larger resolution (at most {GRID.max_cells:.0e} cells), and check the unit "
+            "of the mesh",
         )
     field = place_columns(insert, spacing)
     move_to_walls(field, insert)
