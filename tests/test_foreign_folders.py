@@ -106,6 +106,17 @@ def test_a_negative_contact_value_in_the_summary_is_refused_by_wear(copy, tmp_pa
     assert f"contact.{key}" in message
 
 
+def test_a_deck_of_results_without_the_contact_model_is_refused(copy, tmp_path, capfd):
+    path = copy / "summary.json"
+    content = json.loads(path.read_text())
+    del content["contact"]
+    path.write_text(json.dumps(content))
+    _rehash(copy)
+    out = tmp_path / "deck.inp"
+    message = refused(capfd, "export", copy, "--deck", "ccx", "--frame", 0, "--out", out)
+    assert "does not name the contact model" in message
+
+
 def test_a_frame_without_its_flexion_is_refused(copy, capfd):
     path = copy / "results.csv"
     head, row = path.read_text().splitlines()[:2]

@@ -5,8 +5,6 @@ from dataclasses import dataclass, fields
 from importlib import import_module
 from types import ModuleType
 
-import pytest
-
 from tkamb.cli import main
 from tkamb.run.settings import PACKAGE, all_settings, changed_settings, field_docstrings
 

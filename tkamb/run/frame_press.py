@@ -16,6 +16,7 @@ from tkamb.contact.lattice.meshing.contact_map import ContactMap, contact_map
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.meshing.quality import whole_lattice
 from tkamb.contact.lattice.problem import SurfaceFromBelow
+from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import ComputationError, InputError
@@ -26,7 +27,7 @@ from tkamb.run.decks import Deck, febio_text
 from tkamb.run.identity import case_of_results
 from tkamb.run.metrics import lateral_axis_name, map_rows
 from tkamb.run.results import Results
-from tkamb.run.results_folder import read_results
+from tkamb.run.results_folder import SUMMARY_NAME, read_results
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 
@@ -197,6 +198,9 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     if not -count <= frame < count:
         raise InputError(f"there is no frame {frame}", "frame", f"give one of 0 to {count - 1}")
     frame %= count
+    contact = results.summary.get("contact")
+    if not contact:
+        raise InputError("does not name the contact model", folder / SUMMARY_NAME, "run it again")
     row, maps = map_rows(results).get(frame), results.maps
     if maps is None or row is None:
         raise InputError(f"frame {frame} has no pressure map", folder, "choose another frame")
@@ -206,20 +210,22 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     pair, spacing = _pair(results)
     pose = maps.femoral_pose[row]
     problem = press_problem(pair, load, pose, resolution_mm or spacing)
-    model = (results.summary.get("contact") or {}).get("model")
-    origin = f"Frame {frame} of {folder} by {model} at {spacing:g} mm"
+    model = contact_class(contact["model"])
+    origin = f"Frame {frame} of {folder} by {contact['model']} at {spacing:g} mm"
     peak = float(maps.pressure_Pa[row].max())
-    lateral, notes = lateral_axis_name(results), tuple(_notes(results, frame, pair))
+    lateral, notes = lateral_axis_name(results), tuple(_notes(results, frame, pair, model))
     return FramePress(problem, pair.approach(pose), peak, origin, lateral, notes)
 
 
-def _notes(results: Results, frame: int, pair: ContactPair) -> Iterator[str]:
+def _notes(
+    results: Results, frame: int, pair: ContactPair, model: type[ContactModel]
+) -> Iterator[str]:
     """Yield the differences between deck and run, apart from the discretisation."""
-    law, contact = pair.material, results.summary.get("contact") or {}
+    law = pair.material
     yield (
         f"Material '{law.name}', {'linear' if law.is_linear else 'nonlinear'}: "
         f"E {law.young_modulus / MEGAPASCAL:.6g} MPa, nu {law.poisson_ratio:g}; the run's model "
-        f"assumes {contact_class(contact['model']).assumes}."
+        f"assumes {model.assumes}."
     )
     if results.summary.get("side") == "left":
         yield "A left knee, computed as its mirror image, a right one, as in the run's files."
