@@ -285,7 +285,7 @@ def _name_ligaments(axes: Axes, one: LegFrame, view: View) -> None:
 
 
 def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None:
-    """Draw the triangles of a surface, the farthest first and those that face the reader lightest."""
+    """Draw a surface's triangles, farthest first. Those that face the reader are lightest."""
     lean = surface.face_normals @ view.towards
     facing = np.flatnonzero(lean > 0)
     corners = surface.triangles[facing]

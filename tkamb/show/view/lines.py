@@ -218,8 +218,8 @@ class ViewStrandSettings:
     slack_force: float = 1.0
     """N: a tendon or muscle with a smaller force is grey. Chosen because it is negligible."""
     least_activation: float = 0.1
-    """1: smallest upper end of the colour scale of activations. Chosen because small activations then
-    look small."""
+    """1: smallest upper end of the colour scale of activations. Chosen because small activations
+    then look small."""
     many_bundles: int = 20
     """Number of ligament bundles above which their radius is halved. Chosen because thick bundles
     would cover each other."""
