@@ -97,7 +97,7 @@ def test_the_leg_is_drawn_where_the_chain_and_the_plate_are(checked):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--out", "leg.jpg"], "none of .png, .html"),
+        (["--out", "leg.jpg"], "does not end in .png or .html"),
         (["--set", "contact.model=magic"], "magic"),
         (["--set", "contact.material=cheese"], "polyethylene"),
         (["--set", "motion.file=no.csv"], "no.csv"),
