@@ -140,10 +140,13 @@ def plain():
 
 
 def test_a_knee_object_gives_the_same_numbers_as_press(plain, tmp_path):
-    own, state = plain
-    bench = bench_of_knee(own, state[0])
+    plain_knee, state = plain
+    bench = bench_of_knee(plain_knee, state[0])
     request = replace(bench.recorded(0), load_N=900.0)
-    slack, pressed = bench.answer(replace(request, slack_percent=20.0)), own.press(state[0], 900.0)
+    slack, pressed = (
+        bench.answer(replace(request, slack_percent=20.0)),
+        plain_knee.press(state[0], 900.0),
+    )
     for side in ("medial", "lateral"):
         condyle = getattr(pressed, side)
         assert slack.numbers[f"{side}_force_N"] == pytest.approx(condyle.force, rel=1e-6)
@@ -153,10 +156,10 @@ def test_a_knee_object_gives_the_same_numbers_as_press(plain, tmp_path):
 
 
 def test_a_left_knee_object_is_the_mirror_image(plain, tmp_path):
-    own, state = plain
-    body = whole_body(own, True, False)
+    plain_knee, state = plain
+    body = whole_body(plain_knee, True, False)
     left = bench_of_knee(body.knee, body.state(*state)[0])
-    right = bench_of_knee(own, state[0])
+    right = bench_of_knee(plain_knee, state[0])
     request = replace(right.recorded(0), load_N=900.0, tibial=Placement(ml_mm=1.0))
     places = left.recorded(0).coordinates(), right.recorded(0).coordinates()
     assert places[0] == pytest.approx(places[1], abs=1e-9)
@@ -167,15 +170,17 @@ def test_a_left_knee_object_is_the_mirror_image(plain, tmp_path):
 
 
 def test_a_knee_object_needs_a_contact_model_with_a_name(plain):
-    own, state = plain
-    bare = tkamb.Knee(own.model)
+    plain_knee, state = plain
+    bare = tkamb.Knee(plain_knee.model)
     with pytest.raises(InputError, match="contact"):
         bare.live(state[0])
 
-    class Nameless(type(own.contact.model)):
+    class Nameless(type(plain_knee.contact.model)):
         pass
 
-    nameless = tkamb.Knee(own.model, implant=own.implant, contact=Nameless(resolution=3e-3))
+    nameless = tkamb.Knee(
+        plain_knee.model, implant=plain_knee.implant, contact=Nameless(resolution=3e-3)
+    )
     with pytest.raises(InputError, match="Nameless"):
         nameless.live(state[0])
 
@@ -306,37 +311,37 @@ def test_an_unexpected_error_in_a_preparation_reaches_the_page(knee, monkeypatch
 
 
 def test_few_models_are_prepared_at_a_time_and_the_oldest_are_deleted(monkeypatch):
-    own = LiveKnee(load_case(tkamb.load_scene(MODEL / "scene.toml")))
+    bench = LiveKnee(load_case(tkamb.load_scene(MODEL / "scene.toml")))
     go_on, begun = Event(), []
 
     def slow(request):
         begun.append(request.resolution_mm)
         assert go_on.wait(60.0)
-        own._sides[setting(request)] = None
-        with own._counting:
-            own._forget()
+        bench._sides[setting(request)] = None
+        with bench._counting:
+            bench._forget()
 
-    monkeypatch.setattr(own, "_side", slow)
-    requests = [replace(own.recorded(60), resolution_mm=1.0 + 0.1 * k) for k in range(12)]
+    monkeypatch.setattr(bench, "_side", slow)
+    requests = [replace(bench.recorded(60), resolution_mm=1.0 + 0.1 * k) for k in range(12)]
     for request in requests:
-        assert own.preparing(request)
-    assert len(own._threads) == BENCH_LIMIT.most_threads == len(begun)
-    assert "then" in own.preparing(requests[-1])
+        assert bench.preparing(request)
+    assert len(bench._threads) == BENCH_LIMIT.most_threads == len(begun)
+    assert "then" in bench.preparing(requests[-1])
     go_on.set()
     for request in requests[2:]:
-        while own.preparing(request):
+        while bench.preparing(request):
             time.sleep(0.005)
-    assert not own._threads
-    assert [*own._sides] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
+    assert not bench._threads
+    assert [*bench._sides] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
 
 
 def test_an_insert_is_deleted_with_the_last_model_that_needs_it(knee):
-    own = LiveKnee(knee.case)
-    own._cases = dict.fromkeys((8.0, 9.0))
-    own._known = dict.fromkeys((8.0, 9.0))
-    own._sides = {("foundation", 2.0, 9.0): None}
-    own._forget()
-    assert [*own._cases] == [*own._known] == [9.0]
+    bench = LiveKnee(knee.case)
+    bench._cases = dict.fromkeys((8.0, 9.0))
+    bench._shared = dict.fromkeys((8.0, 9.0))
+    bench._sides = {("foundation", 2.0, 9.0): None}
+    bench._forget()
+    assert [*bench._cases] == [*bench._shared] == [9.0]
 
 
 def test_a_scene_without_contact_is_refused(tmp_path, capfd):

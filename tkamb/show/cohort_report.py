@@ -167,7 +167,7 @@ def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card
 
 
 def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:
-    """Return a row per group: worn volume, its range, depth, and the first cycle by each law."""
+    """Return a row per group: worn volume, its range, depth, and initial wear rate by each law."""
     groups = [group for group in groups if "volume_mm3_per_Mc" in group.wear]
     if not groups:
         return None

@@ -39,9 +39,8 @@ class Pairing:
     """Interpolation of another run at the f frames of the first run.
 
     Args:
-        lower: index (f,) of the other run's frame before each frame of the first; -1: the frame
-            cannot be compared.
-        upper: index (f,) of the other run's frame after it.
+        lower: the other run's frame before each frame of the first, shape (f,); -1: not comparable.
+        upper: the other run's frame after each frame of the first, shape (f,).
         weight: weight of the upper frame, 0 to 1, shape (f,).
         exact: whether frames are paired at equal times, without interpolation.
     """

@@ -141,7 +141,7 @@ def shown_frame(comparison: Comparison) -> int:
 
 
 def _mapped(run: Run, frames: int) -> Index:
-    """Return (f,) 1 for every frame of the first run at which this run has a map, else 0."""
+    """Return an array (f,): 1 if this run has a map at the frame of the first run, else 0."""
     if run.pairing is None:
         return np.zeros(frames, np.int64)
     rows = map_rows(run.results)
@@ -152,7 +152,7 @@ def draw_maps(comparison: Comparison, frame: int) -> Figure | None:
     """Return the runs' pressure maps on one colour scale; None without any map.
 
     Args:
-        comparison: the runs.
+        comparison: compared runs.
         frame: frame of the first run. Each other run shows its nearest frame on the axis.
     """
     frames = [

@@ -59,7 +59,7 @@ def draw_insert(view: TopView, largest: float) -> Figure:
 
 
 def largest_pressure(results: "Results") -> float:
-    """Return the top of the colour scale, MPa: the largest pressure, 1 where there is none."""
+    """Return the upper end of the colour scale, MPa: the largest pressure, or 1 if it is zero."""
     assert results.maps is not None
     return float(np.nanmax(results.maps.pressure_Pa)) / MEGAPASCAL or 1.0
 
@@ -76,7 +76,7 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
         edges: left, right, bottom and top of a tile, mm on the page.
         span: left, right, bottom and top of the drawn insert, mm on the page.
         rim: `FRAME_MAP.rim_byte`.
-        largest: MPa, top of the colour scale.
+        largest: upper end of the colour scale, MPa.
         colours: the colour scale, 256 hexadecimal colours in one string.
         centres: side -> centre of pressure of each frame, mm on the page; None: no contact.
     """

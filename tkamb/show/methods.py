@@ -209,8 +209,8 @@ def _motion(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[s
         )
     count, failed = summary.get("frames"), len(summary.get("failed_frames", ()))
     if count:
-        lost = f"{failed} of them failed and are left out" if failed else "none of them failed"
-        yield f"{count} frames were computed; {lost}."
+        failures = f"{failed} of them failed and are left out" if failed else "none of them failed"
+        yield f"{count} frames were computed; {failures}."
 
 
 def _weights(markers: Mapping[str, Any]) -> str:

@@ -88,10 +88,10 @@ class Panel:
         level: (value, label) of a horizontal reference line; None: no line.
         span: (low, high, label) of a shaded range behind the curves; None: no range.
         second: (factor, unit) of a second vertical axis on the right; None: no second axis.
-        logarithmic: True: the vertical axis is logarithmic.
-        from_zero: True: the vertical axis includes zero.
+        logarithmic: whether the vertical axis is logarithmic.
+        from_zero: whether the vertical axis includes zero.
         limits: ends of the vertical axis; None: they follow from the curves.
-        warning: True: the note is highlighted as a warning.
+        warning: whether the note is highlighted as a warning.
     """
 
     name: str

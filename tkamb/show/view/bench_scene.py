@@ -38,15 +38,15 @@ ROWS = 6
 """Number of equal rows in the tables. Accelerations need at least this number."""
 
 
-def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
+def write_bench(case: Case, folder: Path, session: Path | None = None) -> Path:
     """Write a case of `Bench.case_of` as a scene for `tkamb run`, and return the scene file.
 
-    The URDF is copied. The scene holds the paths of meshes outside `own`.
+    The URDF is copied. The scene holds the paths of meshes outside `session`.
 
     Args:
         case: static case.
         folder: existing folder. Files with the same names are replaced.
-        own: folder with meshes of this session, which are copied; None: no mesh is copied.
+        session: folder with meshes of this session, which are copied; None: no mesh is copied.
     """
     scene, side = case.scene, -1.0 if case.scene.patient.side == "left" else 1.0
     times = case.motion.time
@@ -64,7 +64,7 @@ def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
     meshes = {}
     for name in ("femoral", "insert"):
         meshes[name] = getattr(scene.implant, name).model_dump(exclude_none=True)
-        if own is not None and meshes[name]["mesh"].is_relative_to(own):
+        if session is not None and meshes[name]["mesh"].is_relative_to(session):
             copied = shutil.copy(meshes[name]["mesh"], folder)
             meshes[name]["mesh"] = Path(copied).name
     text = _scene_text(case, side, meshes)
@@ -301,11 +301,11 @@ def _contact_lines(knee: Knee) -> list[str]:
             )
     contact: dict[str, Any] = {"model": name, "resolution_mm": model.resolution / MILLIMETRE}
     contact |= {"options": options} if options else {}
-    given = knee.implant.insert_material
-    built_in = next((one for one in MATERIALS if material(one) == given), None)
+    insert_material = knee.implant.insert_material
+    built_in = next((one for one in MATERIALS if material(one) == insert_material), None)
     if built_in is not None:
         return table_lines("[contact]", contact | {"material": built_in})
-    values = material_as_json(given)
+    values = material_as_json(insert_material)
     if values["law"] not in LAW_KEYS:
         raise InputError(f"material law {values['law']}", "Knee.live", "a scene cannot hold it")
     if values["name"] in MATERIALS:

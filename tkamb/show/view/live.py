@@ -132,8 +132,8 @@ class LiveKnee:
 
     Args:
         case: case of a scene with [contact].
-        own: folder for the files of this session, removed with this object; None: a new folder. A
-            saved scene has copies of the meshes in it.
+        session: folder for the files of this session; None: a new folder. It is removed with this
+            object. A saved scene has copies of the meshes in it.
 
     Attributes:
         design: design of the insert; None if its mesh does not come from a parametric design.
@@ -142,18 +142,18 @@ class LiveKnee:
         InputError: the scene has no [contact], or is scaled.
     """
 
-    def __init__(self, case: Case, own: Path | None = None) -> None:
+    def __init__(self, case: Case, session: Path | None = None) -> None:
         if case.scene.contact is None:
             raise InputError("has no [contact]", "scene", "tkamb live shows contact: add the table")
         if case.scene.patient.scale != 1.0:
             raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
         self.case = _without_muscles(case)
         self.bench = Bench(self.case, mechanics_of(self.case, near=True).ligaments)
-        self._own = own or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
-        weakref.finalize(self, shutil.rmtree, self._own, True)
-        self.design = parametric_insert(case, self._own)
+        self._session = session or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
+        weakref.finalize(self, shutil.rmtree, self._session, True)
+        self.design = parametric_insert(case, self._session)
         self._cases: dict[float | None, Case] = {}
-        self._known: dict[float | None, SharedState] = {}
+        self._shared: dict[float | None, SharedState] = {}
         self._sides: dict[Setting, ContactSide] = {}
         self._threads: dict[Setting, Thread] = {}
         self._refused: dict[Setting, TkambError] = {}
@@ -274,7 +274,7 @@ class LiveKnee:
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".tkamb-live-") as beside:
                 whole = Path(beside) / folder.name
                 whole.mkdir()
-                write_bench(self._still_case(request), whole, self._own)
+                write_bench(self._still_case(request), whole, self._session)
                 whole.replace(folder)
         except OSError as error:
             raise InputError(f"cannot be written ({error.strerror})", folder) from None
@@ -296,7 +296,7 @@ class LiveKnee:
             raise InputError("of no parametric design", "thickness_mm", "leave it out")
         if thickness_mm not in self._cases:
             self._cases[thickness_mm] = with_thickness(
-                self.case, self.design, thickness_mm, self._own
+                self.case, self.design, thickness_mm, self._session
             )
         return self._cases[thickness_mm]
 
@@ -307,13 +307,13 @@ class LiveKnee:
             side = self._sides.get(key)
         if side is None:
             case = self.bench.case_of(request, like=self._case_with(insert))
-            mechanics = mechanics_of(case, self._known.get(insert), near=True)
+            mechanics = mechanics_of(case, self._shared.get(insert), near=True)
             side = contact_side(case, mechanics)
         with self._counting:
-            if insert not in self._known:
+            if insert not in self._shared:
                 contact = side.mechanics.knee.contact
                 assert contact is not None  # a case on the bench has contact
-                self._known[insert] = SharedState(contact.pair, None, None, range(ROWS))
+                self._shared[insert] = SharedState(contact.pair, None, None, range(ROWS))
             self._sides.pop(key, None)
             self._sides[key] = side  # the order of use: the latest is last
             self._forget()
@@ -327,7 +327,7 @@ class LiveKnee:
         for old in [*self._refused][: -BENCH_LIMIT.kept_models]:
             del self._refused[old]
         needed = {thickness for _, _, thickness in (*self._sides, *self._threads)}
-        for inserts in (self._cases, self._known):
+        for inserts in (self._cases, self._shared):
             for thickness in inserts.keys() - needed:
                 del inserts[thickness]
 
@@ -345,7 +345,7 @@ class LiveKnee:
             return replace(empty, status=words)
         key = setting(request)
         try:
-            ready, shared = prepared.mechanics.knee.contact, self._known[request.thickness_mm]
+            ready, shared = prepared.mechanics.knee.contact, self._shared[request.thickness_mm]
             mechanics = mechanics_of(case, shared, near=True, contact=ready)
             side = contact_side(case, mechanics, sensitivity=False)
             before = [self._before[key]] if key in self._before and not request.released else []

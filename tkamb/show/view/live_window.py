@@ -326,10 +326,10 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     data = knee.create_data_for_kinematics()
     poses = np.array([knee.at(one, data).pose for one in np.atleast_2d(np.asarray(q, float))])
     coordinates = knee_coordinates(placement @ poses)
-    own = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
+    session = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
     try:
-        case = load_case(load_scene(write_knee(knee, placement, coordinates, own)))
+        case = load_case(load_scene(write_knee(knee, placement, coordinates, session)))
     except InputError:
-        shutil.rmtree(own, ignore_errors=True)
+        shutil.rmtree(session, ignore_errors=True)
         raise
-    return LiveKnee(replace(case, motion=still_motion(coordinates)), own)
+    return LiveKnee(replace(case, motion=still_motion(coordinates)), session)
